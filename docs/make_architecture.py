@@ -1,7 +1,7 @@
 """Draws docs/images/architecture.svg from the package's imports: `python docs/make_architecture.py`. Needs nothing but Python.
 
-Rows are the layers of the import contract in pyproject.toml. An arrow leads from a package to one that it imports, unless others
-lead there too. Packages that all others import have no arrows.
+Rows are the layers of the import contract in pyproject.toml. An arrow leads from a package to one
+that it imports, unless others lead there too. Packages that all others import have no arrows.
 """
 
 from __future__ import annotations
@@ -17,7 +17,14 @@ PACKAGE = ROOT / "vkc_pin"
 FILE = ROOT / "docs" / "images" / "architecture.svg"
 FOUNDATION = {"errors", "utils", "options"}  # imported by all others
 CHECKS = {"validation"}
-COLUMN = {"validation": 1, "procedural": -1, "importing": -1, "simulation": 1, "datasets": 1, "baselines": -1}
+COLUMN = {
+    "validation": 1,
+    "procedural": -1,
+    "importing": -1,
+    "simulation": 1,
+    "datasets": 1,
+    "baselines": -1,
+}
 WIDTH, SPACING, ROW, MARGIN = 860, 250, 88, 46  # [pixels], as are all lengths here
 BOX_WIDTH, BOX_HEIGHT, CHARACTERS = 216, 60, 36
 GAP = 12  # between an arrow and boxes that it passes
@@ -27,7 +34,9 @@ def layers() -> list[list[str]]:
     """Return the layers of the import contract, top first, each with its packages."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = settings["tool"]["importlinter"]["contracts"]
-    (contract,) = (one for one in contracts if one["type"] == "layers" and one["containers"] == ["vkc_pin"])
+    (contract,) = (
+        one for one in contracts if one["type"] == "layers" and one["containers"] == ["vkc_pin"]
+    )
     return [[name.strip() for name in line.split("|")] for line in contract["layers"]]
 
 
@@ -38,7 +47,11 @@ def find_imports() -> dict[str, set[str]]:
     for file in PACKAGE.rglob("*.py"):
         package = file.relative_to(PACKAGE).with_suffix("").parts[0]
         for node in ast.parse(file.read_text(encoding="utf-8")).body:
-            if package in known and isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "vkc_pin":
+            if (
+                package in known
+                and isinstance(node, ast.ImportFrom)
+                and (node.module or "").split(".")[0] == "vkc_pin"
+            ):
                 inside = (node.module or "").split(".")[1:2] or [alias.name for alias in node.names]
                 found[package].update(known.intersection(inside) - {package})
     return found
@@ -47,7 +60,9 @@ def find_imports() -> dict[str, set[str]]:
 def find_arrows() -> list[tuple[str, str]]:
     """Return the imports between packages, without those that also lead there through another package."""
     imports = find_imports().items()
-    graph = {package: others - FOUNDATION for package, others in imports if package not in FOUNDATION}
+    graph = {
+        package: others - FOUNDATION for package, others in imports if package not in FOUNDATION
+    }
 
     def below(package: str) -> set[str]:
         return graph[package].union(*(below(other) for other in graph[package]))
@@ -83,14 +98,20 @@ def place_boxes(rows: list[list[str]]) -> dict[str, tuple[float, float]]:
     return found
 
 
-def draw_arrow(one: tuple[float, float], other: tuple[float, float], boxes: list[tuple[float, float]]) -> str:
+def draw_arrow(
+    one: tuple[float, float], other: tuple[float, float], boxes: list[tuple[float, float]]
+) -> str:
     """Return a line from box to box that passes between the boxes of the rows in between."""
     (x0, y0), (x1, y1) = one, other
     between = [x for x, y in boxes if y0 < y < y1]
     free = [x for x in range(WIDTH) if all(abs(x - box) > BOX_WIDTH / 2 + GAP for box in between)]
     lane = min(free, key=lambda x: (abs(x - x0) + abs(x - x1), abs(x - x1)))
     top, bottom, gap = y0 + BOX_HEIGHT / 2, y1 - BOX_HEIGHT / 2 - 4, ROW - BOX_HEIGHT - 4
-    bends = [(x0, lane, top, top + gap), (lane, x1, bottom - gap, bottom)] if between else [(x0, x1, top, bottom)]
+    bends = (
+        [(x0, lane, top, top + gap), (lane, x1, bottom - gap, bottom)]
+        if between
+        else [(x0, x1, top, bottom)]
+    )
     line = f"M{x0:.0f} {top:.0f}"
     for left, right, begin, end in bends:
         line += f" L{left:.0f} {begin:.0f} C{left:.0f} {end:.0f} {right:.0f} {begin:.0f} {right:.0f} {end:.0f}"
@@ -105,7 +126,8 @@ def draw_box(package: str, x: float, y: float) -> str:
     corner = f'x="{x - BOX_WIDTH / 2:.0f}" y="{y - BOX_HEIGHT / 2:.0f}" width="{BOX_WIDTH}" height="{BOX_HEIGHT}"'
     texts = [f'<text x="{x:.0f}" y="{first + 4:.0f}" class="name">{package}</text>']
     texts += [
-        f'<text x="{x:.0f}" y="{first + 20 + 14 * k:.0f}" class="more">{escape(text)}</text>' for k, text in enumerate(lines)
+        f'<text x="{x:.0f}" y="{first + 20 + 14 * k:.0f}" class="more">{escape(text)}</text>'
+        for k, text in enumerate(lines)
     ]
     return "\n".join([f'<rect {corner} rx="7" class="{kind}"/>', *texts])
 

@@ -24,11 +24,17 @@ EVERY = 6  # of the waypoints that are drawn
 
 def main() -> int:
     """Write a picture of a narrow door on its way shut, from above: straight between knots, and as trees lead the robot."""
-    scene = chores.cluttered_home().with_state("door", {"hinge": 1.52}).with_start(base=(1.2, 2.6, -1.57))
+    scene = (
+        chores.cluttered_home()
+        .with_state("door", {"hinge": 1.52})
+        .with_start(base=(1.2, 2.6, -1.57))
+    )
     seen: list[tuple[TrajectoryProblem, list[np.ndarray]]] = []
     search = joining.RrtPaths.held
 
-    def kept(paths: joining.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray) -> np.ndarray | None:
+    def kept(
+        paths: joining.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray
+    ) -> np.ndarray | None:
         path, knots = search(paths, phase, through, straight), paths.knots
         if path is not None:
             own = held._Search(knots, phase, len(straight))
@@ -45,11 +51,20 @@ def main() -> int:
     phase = len(problem.task.phases) - 1
     with styled():
         figure = new_figure(8.0, 3.9)
-        for number, (way, title) in enumerate(zip(ways, ("straight between knots", "as trees lead it"), strict=True)):
+        for number, (way, title) in enumerate(
+            zip(ways, ("straight between knots", "as trees lead it"), strict=True)
+        ):
             axes = figure.add_subplot(1, 2, number + 1)
-            short = depth(problem, way, problem.contacts.inside(phase), reach=0.0) - problem.options.dist_safe
+            short = (
+                depth(problem, way, problem.contacts.inside(phase), reach=0.0)
+                - problem.options.dist_safe
+            )
             draw_held(axes, problem, way, int(np.argmax(short)) if short.max() > 0.0 else None)
-            overlap = f"{1e3 * short.max():.0f} mm inside at most" if short.max() > 0.0 else "nothing overlaps"
+            overlap = (
+                f"{1e3 * short.max():.0f} mm inside at most"
+                if short.max() > 0.0
+                else "nothing overlaps"
+            )
             axes.set_title(f"{title}: {overlap}")
         save_figure(figure, Path(__file__).parent / "images" / "held.png")
     return 0
@@ -66,17 +81,27 @@ def draw_held(axes: Any, problem: TrajectoryProblem, way: np.ndarray, worst: int
     for shape, label in zip(part.shapes, part.labels, strict=True):
         points = triangles(shape.geometry)[0]
         for k in shown if shape.parentJoint else [0]:
-            placed = pin.SE3(rotations[k, shape.parentJoint], translations[k, shape.parentJoint]) * shape.placement
+            placed = (
+                pin.SE3(rotations[k, shape.parentJoint], translations[k, shape.parentJoint])
+                * shape.placement
+            )
             at = points @ placed.rotation.T + placed.translation
             arm = 1 < shape.parentJoint < 8
-            if label == FLOOR or (not arm and not 0.5 < at[:, 2].min() + 0.5 * np.ptp(at[:, 2]) < 1.5):
+            if label == FLOOR or (
+                not arm and not 0.5 < at[:, 2].min() + 0.5 * np.ptp(at[:, 2]) < 1.5
+            ):
                 continue
             outline = at[ConvexHull(at[:, :2]).vertices, :2]
             if shape.parentJoint == 0:
                 axes.fill(*outline.T, facecolor="0.75", edgecolor="0.5", linewidth=0.5)
             elif arm or label.startswith("door"):
                 colour = COLOURS[1] if k == worst else COLOURS[0] if arm else "0.4"
-                axes.fill(*outline.T, facecolor=(*to_rgb(colour), 0.12), edgecolor=colour, linewidth=1.0 if k == worst else 0.6)
+                axes.fill(
+                    *outline.T,
+                    facecolor=(*to_rgb(colour), 0.12),
+                    edgecolor=colour,
+                    linewidth=1.0 if k == worst else 0.6,
+                )
     axes.set(xlim=(0.9, 2.3), ylim=(0.45, 2.05), aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
 

@@ -12,7 +12,9 @@ PACKAGE, FOLDER = ROOT / "vkc_pin", ROOT / "docs" / "api" / "packages"
 def packages() -> dict[str, dict[str, Path]]:
     """Return package → full name → file of its modules, itself first; "package" stands for the top-level modules."""
     found: dict[str, dict[str, Path]] = {}
-    for file in sorted(PACKAGE.rglob("*.py"), key=lambda file: (file.parent, file.name != "__init__.py", file.name)):
+    for file in sorted(
+        PACKAGE.rglob("*.py"), key=lambda file: (file.parent, file.name != "__init__.py", file.name)
+    ):
         parts = file.relative_to(ROOT).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__init__")
         if name != "vkc_pin" and file.name != "__main__.py":  # importing that is running it
@@ -23,7 +25,11 @@ def packages() -> dict[str, dict[str, Path]]:
 def taken(file: Path) -> dict[str, list[str]]:
     """Return module → names that a package's `__init__.py` imports from it: they are documented as the package's own."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
-    return {node.module: [a.name for a in node.names] for node in tree.body if isinstance(node, ast.ImportFrom) and node.module}
+    return {
+        node.module: [a.name for a in node.names]
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and node.module
+    }
 
 
 def page(package: str, files: dict[str, Path]) -> str:
@@ -42,7 +48,9 @@ def page(package: str, files: dict[str, Path]) -> str:
 def write() -> None:
     """Write a page for every package whose page is missing or stale, and delete those of removed packages."""
     FOLDER.mkdir(exist_ok=True)
-    pages = {FOLDER / f"{package}.md": page(package, files) for package, files in packages().items()}
+    pages = {
+        FOLDER / f"{package}.md": page(package, files) for package, files in packages().items()
+    }
     for file in set(FOLDER.glob("*.md")) - set(pages):
         file.unlink()
     for file, text in pages.items():

@@ -21,7 +21,9 @@ STILL = 0.0
 
 
 def built(attachment: str = "handle") -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
-    problem = program_of(holding(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
+    problem = program_of(
+        holding(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT
+    )
     return problem, ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
 
 
@@ -77,7 +79,10 @@ def test_the_columns_of_a_robot_with_a_door() -> None:
     """Hinge and knob are the object's, not the arm's."""
     scene = door_scene()
     rows = base_poses(
-        reach := program_of(scene, [vkc.Grasp("door")], options=SHORT), reach.segments, reach.start, np.random.default_rng(0)
+        reach := program_of(scene, [vkc.Grasp("door")], options=SHORT),
+        reach.segments,
+        reach.start,
+        np.random.default_rng(0),
     )
     held = scene.with_start(base=rows[0, :3], arm=rows[0, 3:9]).with_held({"door": "handle"})
     problem = program_of(held, [vkc.Actuate("door", {"hinge": 0.3})], options=SHORT)

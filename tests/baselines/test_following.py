@@ -36,7 +36,9 @@ def base(problem: vkc.TrajectoryProblem, *change: float) -> np.ndarray:
     return np.asarray(problem.start[:3] + share * np.array(change or (0.0, 0.0, 0.0)))
 
 
-def followed(problem: vkc.TrajectoryProblem, way: np.ndarray, *, refine: bool = False, seed: int = 0) -> Followed:
+def followed(
+    problem: vkc.TrajectoryProblem, way: np.ndarray, *, refine: bool = False, seed: int = 0
+) -> Followed:
     return follow(problem, way, np.random.default_rng(seed), refine=refine)
 
 
@@ -47,7 +49,9 @@ def check(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> None:
         tilt = row[slide - 1] if len(row) == 11 else 0.0
         assert off(problem.scene, row, handle(row[slide], tilt=tilt)) < CLOSED
         assert spare(problem.scene, row, slide=row[slide], held=True) >= -CLEAR - ROUNDING
-        assert np.all((row >= problem.lower.min(axis=0) - STILL) & (row <= problem.upper.max(axis=0) + STILL))
+        assert np.all(
+            (row >= problem.lower.min(axis=0) - STILL) & (row <= problem.upper.max(axis=0) + STILL)
+        )
 
 
 @pytest.mark.parametrize("refine", [False, True], ids=["B1", "B2"])
@@ -60,7 +64,9 @@ def test_it_follows_to_the_end(change: Sequence[float], refine: bool) -> None:
     check(problem, found.z)
     np.testing.assert_allclose(found.z[:, :3], way, rtol=0.0, atol=STILL)
     np.testing.assert_allclose(found.z[:, -1], GOAL * smooth(8), rtol=0.0, atol=STILL)
-    assert np.abs(np.diff(problem.waypoints(found.z)[:, 3:9], axis=0)).max() < 0.6, "from the waypoint before"
+    assert np.abs(np.diff(problem.waypoints(found.z)[:, 3:9], axis=0)).max() < 0.6, (
+        "from the waypoint before"
+    )
 
 
 def test_every_arm_is_looked_for_from_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +132,9 @@ def test_collision(refine: bool, least: float) -> None:
     np.testing.assert_array_equal(found.z[done:], np.tile(wrong, (8 - done, 1)))
 
 
-def test_where_the_arm_as_it_was_collides_other_arms_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_arm_as_it_was_collides_other_arms_are_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problem = pulling(0.92)
     found = followed(problem, base(problem))
     assert (found.cause, found.share) == ("", 1.0)
@@ -150,7 +158,8 @@ def test_b2_moves_the_object_off_its_time_law_b1_does_not() -> None:
     np.testing.assert_allclose(refined.z[:, :3], base(problem), rtol=0.0, atol=STILL)
 
 
-# --- which of the candidates is taken ----------------------------------------------------------------------------------
+# --- which of the candidates is taken
+# ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -158,10 +167,26 @@ def test_b2_moves_the_object_off_its_time_law_b1_does_not() -> None:
     [
         ((5.0, ""), [(1.0, "")], (5.0, "")),  # what the waypoint before leads to, if it is any good
         ((0.0, "collision"), [(3.0, ""), (1.0, ""), (2.0, "")], (1.0, "")),
-        ((3.0, "collision"), [(2.0, "no inverse kinematics"), (4.0, "collision")], (3.0, "collision")),
-        ((1.0, "no inverse kinematics"), [(4.0, "collision"), (5.0, "collision")], (4.0, "collision")),
-        ((2.0, "no inverse kinematics"), [(3.0, "no inverse kinematics")], (2.0, "no inverse kinematics")),
-        ((3.0, "no inverse kinematics"), [(-2.0, "no inverse kinematics")], (-2.0, "no inverse kinematics")),
+        (
+            (3.0, "collision"),
+            [(2.0, "no inverse kinematics"), (4.0, "collision")],
+            (3.0, "collision"),
+        ),
+        (
+            (1.0, "no inverse kinematics"),
+            [(4.0, "collision"), (5.0, "collision")],
+            (4.0, "collision"),
+        ),
+        (
+            (2.0, "no inverse kinematics"),
+            [(3.0, "no inverse kinematics")],
+            (2.0, "no inverse kinematics"),
+        ),
+        (
+            (3.0, "no inverse kinematics"),
+            [(-2.0, "no inverse kinematics")],
+            (-2.0, "no inverse kinematics"),
+        ),
         ((0.0, "collision"), [], (0.0, "collision")),
     ],
 )
@@ -193,12 +218,17 @@ def test_random_arms_are_within_limits_and_nothing_else_changes() -> None:
     seeds = np.vstack([arm._seeds(problem.start) for _ in range(10)])
     assert len(seeds) == 10 * SEEDS
     assert np.all((seeds >= problem.chain.lower) & (seeds <= problem.chain.upper))
-    np.testing.assert_array_equal(seeds[:, [0, 1, 2, 10]], np.tile(problem.start[[0, 1, 2, 10]], (len(seeds), 1)))
+    np.testing.assert_array_equal(
+        seeds[:, [0, 1, 2, 10]], np.tile(problem.start[[0, 1, 2, 10]], (len(seeds), 1))
+    )
     apart = np.abs(seeds - problem.start)[:, 3:10]
     assert apart.max(axis=0)[:6].min() > 1.0
     assert apart.max(axis=0)[6] > 0.3, "the hand tilts about the bar"
     # Half of them are near where the arm is, the others anywhere.
-    near, anywhere = (apart.reshape(10, SEEDS, 7)[:, part].mean() for part in (slice(SEEDS // 2), slice(SEEDS // 2, None)))
+    near, anywhere = (
+        apart.reshape(10, SEEDS, 7)[:, part].mean()
+        for part in (slice(SEEDS // 2), slice(SEEDS // 2, None))
+    )
     assert near < 0.7 * anywhere
 
 

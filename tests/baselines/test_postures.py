@@ -25,16 +25,25 @@ def pulling() -> vkc.TrajectoryProblem:
     return program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
 
 
-def found(problem: vkc.TrajectoryProblem, waypoint: int | None = None, *, seed: int = 0, near: Any = None) -> np.ndarray:
+def found(
+    problem: vkc.TrajectoryProblem, waypoint: int | None = None, *, seed: int = 0, near: Any = None
+) -> np.ndarray:
     near = problem.start if near is None else near
-    return base_poses(problem, problem.segments if waypoint is None else waypoint, near, np.random.default_rng(seed))
+    return base_poses(
+        problem,
+        problem.segments if waypoint is None else waypoint,
+        near,
+        np.random.default_rng(seed),
+    )
 
 
 def far(rows: np.ndarray, near: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """Return how far rows are from `near`: a metre of the base counts as what moves the hand by a metre."""
     lever = 0.3249  # [m/rad] of this arm
     counts = [1.0 / lever if name in ("base_x", "base_y") else 1.0 for name in names]
-    return np.array([sum(c * abs(a - b) for c, a, b in zip(counts, row, near, strict=True)) for row in rows])
+    return np.array(
+        [sum(c * abs(a - b) for c, a, b in zip(counts, row, near, strict=True)) for row in rows]
+    )
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -101,13 +110,17 @@ def behind_a_board() -> vkc.Scene:
     return with_boxes(drawer_scene(), board=([0.02, 1.0, 1.2], [1.7, 0.0, 0.6]))
 
 
-@pytest.mark.parametrize("scene", [out_of_reach(), behind_a_board()], ids=["out of reach", "always in collision"])
+@pytest.mark.parametrize(
+    "scene", [out_of_reach(), behind_a_board()], ids=["out of reach", "always in collision"]
+)
 def test_nothing_is_reached(scene: vkc.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """And so many seeds are tried as are allowed, rounded up to whole lots."""
     problem, lots = reaching(scene), []
     knot = Knots.knot
 
-    def counted(self: Knots, before: np.ndarray, waypoint: int, how: str) -> tuple[np.ndarray, np.ndarray]:
+    def counted(
+        self: Knots, before: np.ndarray, waypoint: int, how: str
+    ) -> tuple[np.ndarray, np.ndarray]:
         lots.append((len(before), how))
         return knot(self, before, waypoint, how)
 

@@ -14,14 +14,30 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 def along(*points: tuple[float, float]) -> Trajectory:
     positions = np.array([[x, y, 0.0] for x, y in points])
     last = len(points) - 1
-    return Trajectory(("x", "y", "yaw"), np.arange(len(points), dtype=float), positions, (PhaseSpan("go", 0, last),), 3)
+    return Trajectory(
+        ("x", "y", "yaw"),
+        np.arange(len(points), dtype=float),
+        positions,
+        (PhaseSpan("go", 0, last),),
+        3,
+    )
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    post = {"name": "post", "type": "cylinder", "radius": 0.1, "length": 1.0, "position": [0.0, 0.0, 0.5]}
+    post = {
+        "name": "post",
+        "type": "cylinder",
+        "radius": 0.1,
+        "length": 1.0,
+        "position": [0.0, 0.0, 0.5],
+    }
     lamp = {"name": "lamp", "type": "sphere", "radius": 0.1, "position": [0.0, 0.0, 2.2]}
-    document = {"robot": "husky_ur5e", "start": {"base": [2.0, -2.0, 0.0]}, "obstacles": [post, lamp]}
+    document = {
+        "robot": "husky_ur5e",
+        "start": {"base": [2.0, -2.0, 0.0]},
+        "obstacles": [post, lamp],
+    }
     return Scene.from_document(document, load_scene("door").folder)
 
 
@@ -34,12 +50,22 @@ def test_which_way_round(scene: Scene) -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(0.5, 3)), min_size=1, max_size=6))
-def test_paths_on_one_side_are_of_one_class(scene: Scene, points: list[tuple[float, float]]) -> None:
+def test_paths_on_one_side_are_of_one_class(
+    scene: Scene, points: list[tuple[float, float]]
+) -> None:
     assert homotopy(scene, along((-2.0, 0.5), *points, (2.0, 0.5))) == {}
 
 
 def record(number: int, motion: Trajectory, **changes: object) -> dict[str, object]:
-    return {"number": number, "scene": "s", "task": "t", "object": "o", "goal": 1.0, "way": way(motion), **changes}
+    return {
+        "number": number,
+        "scene": "s",
+        "task": "t",
+        "object": "o",
+        "goal": 1.0,
+        "way": way(motion),
+        **changes,
+    }
 
 
 def test_near_duplicates() -> None:

@@ -44,14 +44,22 @@ def test_attempts_are_determined_by_their_number() -> None:
     again, same = attempt(DOCUMENT, 0, {})
     assert record["success"]
     assert data == same
-    times = {name for name in record if name.endswith("_time")} | {"seconds", "memory_mb", "resident_mb"}
-    assert {k: v for k, v in record.items() if k not in times} == {k: v for k, v in again.items() if k not in times}
+    times = {name for name in record if name.endswith("_time")} | {
+        "seconds",
+        "memory_mb",
+        "resident_mb",
+    }
+    assert {k: v for k, v in record.items() if k not in times} == {
+        k: v for k, v in again.items() if k not in times
+    }
     json.dumps(record)
 
 
 def test_attempts_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is kept of rooms and programs is kept once; ten thousand attempts of a process must not add up."""
-    monkeypatch.setattr(outcome, "Plan", Plan)  # the second opinion keeps plans; the same ones are judged in other tests
+    monkeypatch.setattr(
+        outcome, "Plan", Plan
+    )  # the second opinion keeps plans; the same ones are judged in other tests
     left, _ = growth(lambda: attempt(DOCUMENT, 0, {}), warm=8)
     assert left <= 3500.0  # [bytes], where eigenpy's copies in one attempt take 5000
 

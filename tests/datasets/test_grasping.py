@@ -10,7 +10,10 @@ from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate
 
-STEPS = {"drawer": Actuate("drawer", {"slide": 0.2}, "handle"), "door": Actuate("door", {"hinge": 0.6}, "handle")}
+STEPS = {
+    "drawer": Actuate("drawer", {"slide": 0.2}, "handle"),
+    "door": Actuate("door", {"hinge": 0.6}, "handle"),
+}
 
 
 def off(scene: Scene, name: str) -> float:
@@ -41,9 +44,14 @@ def test_the_hand_is_where_it_holds(name: str) -> None:
 def test_none_where_there_is_none() -> None:
     scene = load_scene("drawer")
     document = scene.document
-    attachment, placed = next(iter(scene.objects["drawer"].object.attachments)), scene.objects["drawer"]
+    attachment, placed = (
+        next(iter(scene.objects["drawer"].object.attachments)),
+        scene.objects["drawer"],
+    )
     at = placed.link_placement(placed.object.attachments[attachment].link).translation.tolist()
-    document["obstacles"].append({"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": at})
+    document["obstacles"].append(
+        {"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": at}
+    )
     with pytest.warns(UserWarning, match="stand in others"):
         blocked = Scene.from_document(document, scene.folder)
     step = Actuate("drawer", {"slide": 0.2}, attachment)

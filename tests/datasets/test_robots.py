@@ -14,7 +14,9 @@ from vkc_pin.errors import InputError
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 
-def test_a_robot_without_a_hand_is_imported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_without_a_hand_is_imported_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("coacd")
     recipe = load_recipe({**SMALL, "robots": ["husky_ur5e", {"name": "panda", "height": 0.5}]})
     found = robots.ready_robots(recipe, tmp_path)
@@ -44,4 +46,11 @@ def test_two_robots_of_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="two robots of one name") as caught:
         load_recipe({**SMALL, "robots": paths})
     assert caught.value.field == "robots[1]"
-    assert len(load_recipe({**SMALL, "robots": [{"name": paths[0], "height": z} for z in (0.1, 0.2)]}).fields.robots) == 2
+    assert (
+        len(
+            load_recipe(
+                {**SMALL, "robots": [{"name": paths[0], "height": z} for z in (0.1, 0.2)]}
+            ).fields.robots
+        )
+        == 2
+    )

@@ -27,7 +27,10 @@ def judged_dataset(folder: Path, *, jobs: int = 1) -> list[Verdict]:
     dataset = Dataset.open(folder)
     kept = _kept(folder / VERDICTS)
     left = [shard for shard in dataset.shards if _name(dataset, shard) not in kept]
-    with ProcessPoolExecutor(jobs) as pool, (folder / VERDICTS).open("a", encoding="utf-8") as lines:
+    with (
+        ProcessPoolExecutor(jobs) as pool,
+        (folder / VERDICTS).open("a", encoding="utf-8") as lines,
+    ):
         for shard, verdicts in zip(left, pool.map(_shard, [folder] * len(left), left), strict=True):
             name = _name(dataset, shard)
             kept[name] = verdicts
@@ -74,4 +77,9 @@ def _kept(file: Path) -> dict[str, list[Verdict]]:
     if not file.is_file():
         return {}
     said = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    return {one["shard"]: [Verdict(**{**verdict, "path": Path(verdict["path"])}) for verdict in one["verdicts"]] for one in said}
+    return {
+        one["shard"]: [
+            Verdict(**{**verdict, "path": Path(verdict["path"])}) for verdict in one["verdicts"]
+        ]
+        for one in said
+    }

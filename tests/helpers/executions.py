@@ -46,7 +46,13 @@ def still(scene: Scene, seconds: float = 1.0) -> Trajectory:
         names += [f"{hold.object}.{name}" for name in coordinates]
         values += list(hold.at)
     phase = PhaseSpan("stand", 0, 1, scene.holds)
-    return Trajectory(tuple(names), np.array([0.0, seconds]), np.array([values, values]), (phase,), len(scene.start))
+    return Trajectory(
+        tuple(names),
+        np.array([0.0, seconds]),
+        np.array([values, values]),
+        (phase,),
+        len(scene.start),
+    )
 
 
 def with_mass(scene: Scene, name: str, mass: float) -> Scene:

@@ -20,15 +20,33 @@ def fake_plan(scene: Scene | None = None) -> Plan:
     """Return a plan of 6 s in two phases, whose report blames the forearm and the sofa at 4 s."""
     scene = load_scene("door") if scene is None else scene
     robot = scene.robot.coordinates.names
-    names = (*robot, "door.hinge", "door.knob", "door.handle_free")  # the last is the virtual joint of a grasp
-    times = np.concatenate([np.linspace(0.0, 3.0, 7), 3.0 + np.geomspace(0.1, 3.0, 7)])  # not evenly spaced
+    names = (
+        *robot,
+        "door.hinge",
+        "door.knob",
+        "door.handle_free",
+    )  # the last is the virtual joint of a grasp
+    times = np.concatenate(
+        [np.linspace(0.0, 3.0, 7), 3.0 + np.geomspace(0.1, 3.0, 7)]
+    )  # not evenly spaced
     done = np.linspace(0.0, 1.0, len(times))
     start = np.concatenate([scene.start, np.zeros(3)])
-    end = start + np.concatenate([[2.3, -0.5, -3.9], 0.8 * np.ones(len(robot) - 3), [HINGE, 0.6, 0.3]])
+    end = start + np.concatenate(
+        [[2.3, -0.5, -3.9], 0.8 * np.ones(len(robot) - 3), [HINGE, 0.6, 0.3]]
+    )
     positions = start + np.outer(done**2, end - start)
-    phases = (PhaseSpan("reach door.handle", 0, 6), PhaseSpan("move door.hinge", 6, len(times) - 1, (Hold("door", "handle"),)))
+    phases = (
+        PhaseSpan("reach door.handle", 0, 6),
+        PhaseSpan("move door.hinge", 6, len(times) - 1, (Hold("door", "handle"),)),
+    )
     blame = Violation(
-        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+        "penetration",
+        "forearm_link – sofa",
+        waypoint=9,
+        time=4.0,
+        amount=0.03,
+        unit="m",
+        detail="overlap by 30 mm",
     )
     return Plan(
         scene=scene,

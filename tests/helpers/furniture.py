@@ -12,7 +12,13 @@ BAR = '<collision{}><origin xyz="-0.08 0.5 0" /><geometry><box size="0.02 0.02 0
 
 
 def flap(
-    folder: Path, handle: str = "", *, thick: float = 0.02, before: str = "", behind: float = 0.03, attachments: str = "[]"
+    folder: Path,
+    handle: str = "",
+    *,
+    thick: float = 0.02,
+    before: str = "",
+    behind: float = 0.03,
+    attachments: str = "[]",
 ) -> ArticulatedObject:
     """Return a cabinet, 0.6 wide and 0.8 high, closed by a flap that opens towards -x, with collision elements as its handle.
 

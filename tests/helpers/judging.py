@@ -25,12 +25,25 @@ def names(report: Report) -> set[tuple[str, str]]:
     return {(violation.constraint, violation.subject) for violation in report.violations}
 
 
-def check(plan: vkc.Plan, *, scene: Scene | None = None, trajectory: Trajectory | None = None, **options: float) -> Report:
+def check(
+    plan: vkc.Plan,
+    *,
+    scene: Scene | None = None,
+    trajectory: Trajectory | None = None,
+    **options: float,
+) -> Report:
     """Validate the planned motion with something about it changed."""
-    return validate(scene or plan.scene, plan.steps, trajectory or plan.trajectory, dataclasses.replace(plan.options, **options))
+    return validate(
+        scene or plan.scene,
+        plan.steps,
+        trajectory or plan.trajectory,
+        dataclasses.replace(plan.options, **options),
+    )
 
 
-def with_object(scene: Scene, name: str = "door", *, placement: pin.SE3 | None = None, **fields: object) -> Scene:
+def with_object(
+    scene: Scene, name: str = "door", *, placement: pin.SE3 | None = None, **fields: object
+) -> Scene:
     """Return `scene` with an object that stands elsewhere or has other fields."""
     placed = scene.objects[name]
     changed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, **fields))

@@ -17,7 +17,12 @@ def shelf(x: float, y: float) -> dict[str, Any]:
 
 def littered(*obstacles: dict[str, Any]) -> Scene:
     """Return the scene with obstacles and, always, the bin."""
-    inside = {"name": "bin", "type": "urdf", "file": "furniture/bin.urdf", "position": [*BIN[:2], 0.0]}
+    inside = {
+        "name": "bin",
+        "type": "urdf",
+        "file": "furniture/bin.urdf",
+        "position": [*BIN[:2], 0.0],
+    }
     document = {
         "name": "litter",
         "robot": "husky_ur5e",

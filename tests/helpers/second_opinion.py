@@ -67,6 +67,11 @@ class SecondOpinion:
 
 
 def _digest(plan: Plan) -> str:
-    about = [plan.scene.document, str(plan.scene.folder), plan.to_dict()["steps"], vars(plan.options)]
+    about = [
+        plan.scene.document,
+        str(plan.scene.folder),
+        plan.to_dict()["steps"],
+        vars(plan.options),
+    ]
     content = json.dumps([about, plan.trajectory.to_dict()], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:16]

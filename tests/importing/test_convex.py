@@ -54,7 +54,11 @@ def test_a_convex_mesh_stays_one_piece_of_its_own_volume() -> None:
 
 def test_bodies_become_pieces_of_their_own() -> None:
     """No search: two boxes are two boxes, to the millimetre."""
-    pieces = decompose(trimesh.util.concatenate([box((1, 0.1, 0.1)), box((0.1, 0.1, 1)).apply_translation((0.4, 0, 0.6))]))
+    pieces = decompose(
+        trimesh.util.concatenate(
+            [box((1, 0.1, 0.1)), box((0.1, 0.1, 1)).apply_translation((0.4, 0, 0.6))]
+        )
+    )
     assert sorted(len(piece.vertices) for piece in pieces.meshes) == [8, 8]
     assert pieces.volume == pytest.approx(0.02, rel=1e-6)
 
@@ -111,7 +115,9 @@ def test_volume_of_a_skin_that_is_not_closed() -> None:
 
 def test_what_cannot_be_cut_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flat = tmp_path / "flat.stl"
-    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]]).export(flat)
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]]).export(
+        flat
+    )
     with pytest.raises(vkc.InputError, match="the mesh is flat") as caught:
         decompose(flat)
     assert caught.value.file == flat
@@ -125,7 +131,9 @@ def test_what_cannot_be_cut_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyP
         decompose(tray())
 
 
-def test_a_mesh_that_was_cut_is_not_cut_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesh_that_was_cut_is_not_cut_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is kept gives the same pieces to the last bit; other meshes and settings are cut on their own."""
     monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
     cut, real = [], convex._cut
@@ -140,7 +148,14 @@ def test_a_mesh_that_was_cut_is_not_cut_again(tmp_path: Path, monkeypatch: pytes
     wider = mesh.copy()
     wider.apply_scale((1.0, 1.0, 1.01))
     asked: list[float] = []
-    monkeypatch.setattr(convex, "_cut", lambda mesh, most, *_: (asked.append(most), [mesh.vertices])[1])
-    for other, changed in ((wider, {}), (mesh, {"most_pieces": 6}), (mesh, {"error": 0.03}), (mesh, {"seed": 1})):
+    monkeypatch.setattr(
+        convex, "_cut", lambda mesh, most, *_: (asked.append(most), [mesh.vertices])[1]
+    )
+    for other, changed in (
+        (wider, {}),
+        (mesh, {"most_pieces": 6}),
+        (mesh, {"error": 0.03}),
+        (mesh, {"seed": 1}),
+    ):
         decompose(other, **changed)  # type: ignore[arg-type]
     assert len(asked) == 4

@@ -11,7 +11,9 @@ from vkc_pin.importing.slicing import THICKNESS, flat, slices, thickened
 def test_an_open_angle_becomes_its_arms() -> None:
     """Two plates without ends, at a right angle: cut near where they meet."""
     plates = [trimesh.creation.box((1.0, 0.02, 0.5)), trimesh.creation.box((0.02, 1.0, 0.5))]
-    mesh = trimesh.util.concatenate([plates[0].apply_translation((0.5, 0, 0)), plates[1].apply_translation((0, 0.5, 0))])
+    mesh = trimesh.util.concatenate(
+        [plates[0].apply_translation((0.5, 0, 0)), plates[1].apply_translation((0, 0.5, 0))]
+    )
     mesh.update_faces(np.abs(mesh.face_normals[:, 2]) < 0.5)
     parts = slices(mesh, 4)
     assert 2 <= len(parts) <= 4

@@ -31,7 +31,9 @@ def test_the_bound_obeys_limits() -> None:
     """With a quarter of the acceleration, and twice the time, no velocity is the same share of its limit."""
     plan = drawer_plan()
     robot = plan.scene.robot
-    weak = dataclasses.replace(robot, acceleration=robot.acceleration / 4.0, velocity=robot.velocity / 2.0)
+    weak = dataclasses.replace(
+        robot, acceleration=robot.acceleration / 4.0, velocity=robot.velocity / 2.0
+    )
     scene = dataclasses.replace(plan.scene, robot=weak)
     slow = retimed(scene, plan.trajectory)
     assert bound(scene, slow)[0] > 1.5 * bound(plan.scene, plan.trajectory)[0]

@@ -38,12 +38,15 @@ def fridge() -> vkc.Plan:
     return vkc.plan_chore(home(), [OPEN, *CUP, SHUT])
 
 
-# --- what is foreseen -------------------------------------------------------------------------------------------------
+# --- what is foreseen
+# -------------------------------------------------------------------------------------------------
 
 
 def test_one_hand_cannot_open_a_door_with_a_cup_in_it() -> None:
     steps = [OPEN, G("cold_cup"), A("door", {"hinge": 1.52}), P("cold_cup", (1.75, 3.5, 0.741))]
-    with pytest.raises(InputError, match=r"steps\[2\].object: the robot has one hand, and it holds cold_cup.side") as caught:
+    with pytest.raises(
+        InputError, match=r"steps\[2\].object: the robot has one hand, and it holds cold_cup.side"
+    ) as caught:
         vkc.plan_chore(home(), steps)
     assert caught.value.expected == "Place or Release before"
 
@@ -60,7 +63,9 @@ def test_one_hand_cannot_open_a_door_with_a_cup_in_it() -> None:
         ("tidy up", InputError, "steps[3]", "not a step"),
     ],
 )
-def test_what_cannot_be_done_is_said_at_once(wrong: vkc.Grasp, kind: type, field: str, says: str) -> None:
+def test_what_cannot_be_done_is_said_at_once(
+    wrong: vkc.Grasp, kind: type, field: str, says: str
+) -> None:
     with pytest.raises(kind) as caught:
         vkc.plan_chore(home(), [OPEN, G("cold_cup"), P("cold_cup", TABLE), wrong, SHUT])
     assert caught.value.field == field
@@ -80,7 +85,10 @@ def test_window_is_a_number_of_actions(window: object) -> None:
         vkc.plan_chore(home(), [OPEN], window=window)
 
 
-@pytest.mark.parametrize(("field", "value"), [("initialization", "magic"), ("time_limit", 0), ("seed", -1), ("options", {})])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("initialization", "magic"), ("time_limit", 0), ("seed", -1), ("options", {})],
+)
 def test_other_arguments_are_those_of_plan(field: str, value: object) -> None:
     with pytest.raises(InputError) as caught:
         vkc.plan_chore(home(), [OPEN], **{field: value})
@@ -92,17 +100,22 @@ def test_only_what_holds_already_is_nothing_to_do() -> None:
         vkc.plan_chore(home().with_held({"cup": "side"}), [G("cup")])
 
 
-# --- how the window slides --------------------------------------------------------------------------------------------
+# --- how the window slides
+# --------------------------------------------------------------------------------------------
 
 
 class Problems:
     """Notes the problems that a chore solves, and lets some of them fail, as if no motion had been found."""
 
-    def __init__(self, patch: pytest.MonkeyPatch, fails: Callable[[tuple[vkc.Step, ...]], bool]) -> None:
+    def __init__(
+        self, patch: pytest.MonkeyPatch, fails: Callable[[tuple[vkc.Step, ...]], bool]
+    ) -> None:
         self.asked: list[tuple[tuple[vkc.Step, ...], bool]] = []
         solved = SlidingWindow._solved
 
-        def solve(chore: SlidingWindow, first: int, one: OneProblem, seed: object = None) -> vkc.Plan:
+        def solve(
+            chore: SlidingWindow, first: int, one: OneProblem, seed: object = None
+        ) -> vkc.Plan:
             plan = solved(chore, first, one, seed)
             self.asked.append((one.task.steps, seed is not None))
             if not fails(one.task.steps):
@@ -113,11 +126,15 @@ class Problems:
         patch.setattr(SlidingWindow, "_solved", solve)
 
 
-def test_each_action_is_planned_once_alone_and_with_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_action_is_planned_once_alone_and_with_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problems = Problems(monkeypatch, lambda steps: False)
     plan = vkc.plan_chore(home(), [OPEN, *CUP, SHUT])
     assert plan.success, plan.report()
-    asked = [item for k, item in enumerate(problems.asked) if item not in problems.asked[:k]]  # some twice, if the first fails
+    asked = [
+        item for k, item in enumerate(problems.asked) if item not in problems.asked[:k]
+    ]  # some twice, if the first fails
     assert asked == [
         ((OPEN,), False),
         (CUP, False),
@@ -127,7 +144,9 @@ def test_each_action_is_planned_once_alone_and_with_the_next(monkeypatch: pytest
     ]
 
 
-def test_where_the_next_cannot_be_done_both_are_planned_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_next_cannot_be_done_both_are_planned_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
     plan = vkc.plan_chore(home(), [OPEN, SHUT])
     assert plan.success, plan.report()
@@ -136,10 +155,15 @@ def test_where_the_next_cannot_be_done_both_are_planned_anew(monkeypatch: pytest
     assert not problems.asked[-1][1]  # from seeds of its own
 
 
-def test_no_attachment_is_tried_beside_one_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_attachment_is_tried_beside_one_that_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The handle, taken as asked, and the face that is pushed move the same hinge: one chain has it once."""
     problems = Problems(monkeypatch, lambda steps: any(isinstance(step, A) for step in steps))
-    steps, options = [G("door", "handle_free"), A("door", {"hinge": 0.3})], vkc.Options(max_restarts=1)
+    steps, options = (
+        [G("door", "handle_free"), A("door", {"hinge": 0.3})],
+        vkc.Options(max_restarts=1),
+    )
     plan = vkc.plan_chore(vkc.load_scene("door"), steps, options=options)
     assert (plan.success, plan.status) == (False, "not converged")
     assert [asked for asked, _ in problems.asked] == [tuple(steps)] * len(problems.asked)
@@ -160,11 +184,19 @@ def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPat
 @pytest.mark.long
 def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     Problems(monkeypatch, lambda steps: CUP[0] in steps)
-    plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], window=1, options=vkc.Options(max_outer=1, max_restarts=1))
+    plan = vkc.plan_chore(
+        home(),
+        [vkc.GoTo(0.5, -0.5), OPEN, *CUP],
+        window=1,
+        options=vkc.Options(max_outer=1, max_restarts=1),
+    )
     assert not plan.success
     assert plan.status == "not converged"
     assert plan.validation.notes[0].startswith("steps[2], Grasp(object='cold_cup'")
-    assert [phase.name for phase in plan.trajectory.phases][:2] == ["go to", "reach refrigerator.handle"]
+    assert [phase.name for phase in plan.trajectory.phases][:2] == [
+        "go to",
+        "reach refrigerator.handle",
+    ]
     assert len(plan.steps) == 4
 
 
@@ -204,7 +236,9 @@ def test_ctrl_c_leaves_what_is_done() -> None:
     plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], callback=stop)
     assert (plan.status, plan.success) == ("interrupted", False)
     assert plan.trajectory.phases[0].name == "go to"
-    assert plan.trajectory.positions[plan.trajectory.phases[0].last, :2] == pytest.approx([0.5, -0.5], abs=1e-3)
+    assert plan.trajectory.positions[plan.trajectory.phases[0].last, :2] == pytest.approx(
+        [0.5, -0.5], abs=1e-3
+    )
 
 
 def test_the_robot_does_not_stop_between_ways() -> None:
@@ -216,7 +250,8 @@ def test_the_robot_does_not_stop_between_ways() -> None:
     assert speed[first - 1 : first + 1].min() > 0.1 * speed.max()
 
 
-# --- chores, for real -------------------------------------------------------------------------------------------------
+# --- chores, for real
+# -------------------------------------------------------------------------------------------------
 
 
 def test_a_chore_of_four_steps() -> None:
@@ -245,7 +280,10 @@ def test_a_chore_of_four_steps() -> None:
 def test_metrics_are_those_of_the_whole_chore() -> None:
     plan = fridge()
     assert plan.metrics["base_effort"] == pytest.approx(plan.trajectory.base_effort())
-    parts = sum(plan.metrics[f"time_{part}"] for part in ("initialization", "coal", "casadi", "ipopt", "validation"))
+    parts = sum(
+        plan.metrics[f"time_{part}"]
+        for part in ("initialization", "coal", "casadi", "ipopt", "validation")
+    )
     assert parts <= plan.metrics["planning_time"] + plan.metrics["build_time"]
     assert parts > 0.5 * plan.metrics["planning_time"]
     assert plan.metrics["rounds"] == len(plan.history)
@@ -260,7 +298,9 @@ def test_it_can_be_saved_and_shown(tmp_path: Path) -> None:
 def price(plan: vkc.Plan) -> float:
     """Return how long the robot's way is by the weights of `Options`: a metre of the base 1, a radian of anything 0.158."""
     steps = np.diff(plan.trajectory.positions[:, :9], axis=0)
-    return float(np.linalg.norm(steps[:, :2], axis=1).sum() + np.sqrt(0.025) * np.abs(steps[:, 2:]).sum())
+    return float(
+        np.linalg.norm(steps[:, :2], axis=1).sum() + np.sqrt(0.025) * np.abs(steps[:, 2:]).sum()
+    )
 
 
 @pytest.mark.parametrize("start", [5, 7])

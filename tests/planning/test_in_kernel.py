@@ -26,7 +26,11 @@ def jupyter() -> Iterator[Kernel]:
 
 def printed(outputs: list[dict[str, Any]]) -> str:
     assert not [output for output in outputs if output["kind"] == "error"], outputs
-    return "".join(output["text"] for output in outputs if output["kind"] == "stream" and output["name"] == "stdout")
+    return "".join(
+        output["text"]
+        for output in outputs
+        if output["kind"] == "stream" and output["name"] == "stdout"
+    )
 
 
 def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
@@ -38,7 +42,9 @@ def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
 
 
 def test_the_value_of_a_cell_is_an_overview(jupyter: Kernel) -> None:
-    jupyter.run("from vkc_pin.planning.outcome import joined\nfrom vkc_pin.planning.settings import Settings")
+    jupyter.run(
+        "from vkc_pin.planning.outcome import joined\nfrom vkc_pin.planning.settings import Settings"
+    )
     jupyter.run("plan = joined(scene, steps, Settings('auto', vkc.Options()), [])")
     for code, text in (("plan", "FAILED, interrupted"), ("scene", "obstacles")):
         (output,) = jupyter.run(code)
@@ -95,4 +101,6 @@ finally:
     assert "FAILED, interrupted" in view["data"]["text/html"]
     (value,) = jupyter.run("plan")
     assert "FAILED, interrupted" in value["data"]["text/html"]
-    assert printed(jupyter.run("print(vkc.plan(scene, steps).status)")) == "success\n", "the next one is as if nothing had been"
+    assert printed(jupyter.run("print(vkc.plan(scene, steps).status)")) == "success\n", (
+        "the next one is as if nothing had been"
+    )

@@ -66,7 +66,8 @@ class Counter:
         self.asked += asked() - before
 
 
-# --- what it costs --------------------------------------------------------------------------------------------------
+# --- what it costs
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,9 @@ def plans() -> dict[int, tuple[Plan, int]]:
     return found
 
 
-def test_distances_asked_for_hardly_depend_on_the_number_of_obstacles(plans: dict[int, tuple[Plan, int]]) -> None:
+def test_distances_asked_for_hardly_depend_on_the_number_of_obstacles(
+    plans: dict[int, tuple[Plan, int]],
+) -> None:
     (few, asked_few), (many, asked_many) = plans[30], plans[1000]
     assert few.success
     assert many.success
@@ -113,7 +116,8 @@ def test_pictures_of_clearance_ask_for_few(plans: dict[int, tuple[Plan, int]]) -
     assert max(counts) < 200  # at every moment, of 26,000 pairs
 
 
-# --- contacts -------------------------------------------------------------------------------------------------------
+# --- contacts
+# -------------------------------------------------------------------------------------------------------
 
 
 def all_distances(problem: TrajectoryProblem, part: PhaseGeometry, z: np.ndarray) -> np.ndarray:
@@ -147,16 +151,24 @@ def check_contacts(
     number = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
     which = np.array([number[tuple(pair)] for pair in contacts.pair.tolist()], int)
     every, same = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
-    margins = np.array([part.margins_at(every, same, z, np.full(len(every), row)) for row in range(len(z))])
+    margins = np.array(
+        [part.margins_at(every, same, z, np.full(len(every), row)) for row in range(len(z))]
+    )
     assert len(set(zip(contacts.waypoint.tolist(), which.tolist(), strict=True))) == len(which)
-    np.testing.assert_allclose(contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL)
+    np.testing.assert_allclose(
+        contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL
+    )
     np.testing.assert_array_equal(contacts.margin, margins[contacts.waypoint, which])
     for row in range(len(z)):
-        mine = contacts.distance[contacts.waypoint == row] - contacts.margin[contacts.waypoint == row]
+        mine = (
+            contacts.distance[contacts.waypoint == row] - contacts.margin[contacts.waypoint == row]
+        )
         assert np.all(np.diff(mine) >= 0.0)
         asked = (distances[row] < reach) & (margins[row] > -np.inf)
         lack = np.sort((distances[row] - margins[row])[asked])[:nearest]
-        sure = (np.abs(distances[row] - reach) > COAL).all()  # a pair just at the reach may count or not
+        sure = (
+            np.abs(distances[row] - reach) > COAL
+        ).all()  # a pair just at the reach may count or not
         assert not sure or len(mine) == len(lack)
         np.testing.assert_allclose(mine[: len(lack)], lack[: len(mine)], rtol=0.0, atol=COAL)
 
@@ -166,7 +178,9 @@ REACHES, NUMBERS = st.sampled_from([0.0, 0.02, 0.25, 1.0]), st.sampled_from([Non
 
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([0, 3, 40, 150]), REACHES, NUMBERS)
-def test_contacts_are_those_among_all_pairs(seed: int, count: int, reach: float, nearest: int | None) -> None:
+def test_contacts_are_those_among_all_pairs(
+    seed: int, count: int, reach: float, nearest: int | None
+) -> None:
     problem = program_of(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
     rng = np.random.default_rng(seed)
     for phase in (0, 2):
@@ -175,9 +189,17 @@ def test_contacts_are_those_among_all_pairs(seed: int, count: int, reach: float,
 
 @settings(max_examples=15, deadline=None)
 @given(SEEDS, st.sampled_from([0, 1, 60]), REACHES, NUMBERS)
-def test_contacts_of_what_is_carried_are_those_among_all_pairs(seed: int, count: int, reach: float, nearest: int | None) -> None:
+def test_contacts_of_what_is_carried_are_those_among_all_pairs(
+    seed: int, count: int, reach: float, nearest: int | None
+) -> None:
     """Of a stick in the hand, of a ball on its tip, and of what the motion leaves somewhere."""
-    steps = [Grasp("stick"), Grasp("ball", "pull", "stick.tip"), Reach(POSE), Release("ball"), GoTo(0.0, 0.0)]
+    steps = [
+        Grasp("stick"),
+        Grasp("ball", "pull", "stick.tip"),
+        Reach(POSE),
+        Release("ball"),
+        GoTo(0.0, 0.0),
+    ]
     problem = program_of(cluttered_room(seed, count), steps, options=SHORT)
     rng = np.random.default_rng(seed)
     z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
@@ -191,7 +213,9 @@ def test_contacts_of_what_is_carried_are_those_among_all_pairs(seed: int, count:
 @given(SEEDS, st.sampled_from([3, 60]))
 def test_no_distance_depends_on_what_was_asked_before(seed: int, count: int) -> None:
     problem = program_of(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
-    z = random_configurations(problem.chain.lower, problem.chain.upper, 6, np.random.default_rng(seed))
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, 6, np.random.default_rng(seed)
+    )
     waypoints = np.full(len(z), problem.ends[2])
     few = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=3)
     every = problem.contacts.evaluate(z[::-1], waypoints, reach=0.3)
@@ -201,7 +225,8 @@ def test_no_distance_depends_on_what_was_asked_before(seed: int, count: int) -> 
             np.testing.assert_array_equal(one[mine], other[same])
 
 
-# --- validation -----------------------------------------------------------------------------------------------------
+# --- validation
+# -----------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=20, deadline=None)
@@ -213,7 +238,9 @@ def test_validation_sees_what_brute_force_sees(seed: int, count: int, size: floa
 
 @settings(max_examples=12, deadline=None)
 @given(SEEDS, st.sampled_from([0, 1, 60]), st.sampled_from([0.02, 0.1, 0.5]))
-def test_validation_sees_what_brute_force_sees_of_what_is_carried(seed: int, count: int, size: float) -> None:
+def test_validation_sees_what_brute_force_sees_of_what_is_carried(
+    seed: int, count: int, size: float
+) -> None:
     check_sweep(*whirl(seed, size=size, scene=cluttered_room(seed, count)))
 
 
@@ -222,11 +249,15 @@ def check_sweep(scene: Scene, motion: Trajectory) -> None:
     samples = Samples(scene, motion)
     table = PairTable(scene, Solids(samples.world), motion, 0.02)
     hits = list(sweep(table, samples.z, samples.waypoint_rows))
-    moves = table._moves[table._phase[np.searchsorted(samples.waypoint_rows, np.arange(len(samples.z)))]]
+    moves = table._moves[
+        table._phase[np.searchsorted(samples.waypoint_rows, np.arange(len(samples.z)))]
+    ]
     distances = np.where(moves[:, table.pairs].any(axis=2), brute_force(table, samples.z), np.inf)
     at_samples = min(hit.distance for hit in hits)
     assert at_samples <= distances.min() + COAL
-    assert at_samples >= distances.min() - 2e-3 or min(distances.min(), 0.0) > at_samples  # it looks between samples, too
+    assert (
+        at_samples >= distances.min() - 2e-3 or min(distances.min(), 0.0) > at_samples
+    )  # it looks between samples, too
     found = {(hit.row, hit.first, hit.second) for hit in hits}
     for row, k in np.argwhere(distances < -COAL):
         assert (row, *pair_names(table, k)) in found
@@ -252,41 +283,78 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     assert (bounds <= distances + COAL).all()
     assert (bounds[np.isfinite(bounds)] >= 0.0).all()
     for reach in (0.02, 0.5):
-        close = table.near(placed, np.arange(len(z)), np.arange(len(z)), np.zeros((len(z), len(table.group))), reach)
+        close = table.near(
+            placed,
+            np.arange(len(z)),
+            np.arange(len(z)),
+            np.zeros((len(z), len(table.group))),
+            reach,
+        )
         assert set(map(tuple, np.argwhere((distances < reach - COAL) & moves).tolist())) <= set(
             zip(*map(np.ndarray.tolist, close), strict=True)
         )
-    np.testing.assert_allclose(placed.distances(at, pairs).reshape(-1, count), distances, rtol=0.0, atol=COAL)
+    np.testing.assert_allclose(
+        placed.distances(at, pairs).reshape(-1, count), distances, rtol=0.0, atol=COAL
+    )
     nearest, least = placed.nearest(table.pairs)
     np.testing.assert_allclose(least, distances.min(axis=1), rtol=0.0, atol=COAL)
-    np.testing.assert_allclose(distances[np.arange(len(z)), nearest], distances.min(axis=1), rtol=0.0, atol=COAL)
+    np.testing.assert_allclose(
+        distances[np.arange(len(z)), nearest], distances.min(axis=1), rtol=0.0, atol=COAL
+    )
     moved = np.diff(travelled(table.solids, samples.z)[samples.waypoint_rows], axis=0)
     floor = (distances[:-1] + distances[1:] - moved[:, table.pairs].sum(axis=2)) / 2
     for smallest in (1e-3, 0.1):
-        active = set(zip(*map(np.ndarray.tolist, _Sweep(table)._active(placed, moved, smallest)), strict=True))
+        active = set(
+            zip(
+                *map(np.ndarray.tolist, _Sweep(table)._active(placed, moved, smallest)), strict=True
+            )
+        )
         assert set(map(tuple, np.argwhere(floor < smallest - COAL).tolist())) <= active
 
 
-# --- plans ----------------------------------------------------------------------------------------------------------
+# --- plans
+# ----------------------------------------------------------------------------------------------------------
 
 
 def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     """Let every pair be asked of coal, at every configuration that anybody asks about."""
 
     def all_of_them(
-        near: Clearances, q: np.ndarray, z: np.ndarray, at: np.ndarray, *, reach: float, most: Any = None, standing: bool = True
+        near: Clearances,
+        q: np.ndarray,
+        z: np.ndarray,
+        at: np.ndarray,
+        *,
+        reach: float,
+        most: Any = None,
+        standing: bool = True,
     ) -> Nearest:
         where, every = near.placements.at(q), near.boxes.pairs
         w, k = np.indices((len(q), len(every))).reshape(2, -1)
         margins = near.margins.at(k, at[w], z, w)
         counts = (margins > -np.inf) & (standing | (every[k, 1] < where.shape[1]))
         w, k, margins = w[counts], k[counts], margins[counts]
-        known: dict[str, Any] = {"numbers": k, "margins": margins, "bounds": np.full(len(k), -np.inf), "rounding": 0.0}
+        known: dict[str, Any] = {
+            "numbers": k,
+            "margins": margins,
+            "bounds": np.full(len(k), -np.inf),
+            "rounding": 0.0,
+        }
         edges = np.searchsorted(w, np.arange(len(q) + 1))
-        chosen, found = near.shapes.shortest(where, edges, every[k], reach=reach, most=most, **known)
+        chosen, found = near.shapes.shortest(
+            where, edges, every[k], reach=reach, most=most, **known
+        )
         return Nearest(w[chosen], k[chosen], found.distance, margins[chosen], *found[1:])
 
-    def one_by_one(near: Clearances, q: np.ndarray, z: np.ndarray, waypoint: int, *, reach: float, allowed: float) -> int:
+    def one_by_one(
+        near: Clearances,
+        q: np.ndarray,
+        z: np.ndarray,
+        waypoint: int,
+        *,
+        reach: float,
+        allowed: float,
+    ) -> int:
         found = all_of_them(near, q, z, np.full(len(q), waypoint), reach=reach)
         return int(min(found.row[found.margin - found.distance > allowed], default=len(q)))
 
@@ -294,11 +362,18 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
         return np.full(len(pairs), -np.inf)
 
     def all_of(
-        table: PairTable, _: Placed, first: np.ndarray, last: np.ndarray, moved: np.ndarray, limit: float
+        table: PairTable,
+        _: Placed,
+        first: np.ndarray,
+        last: np.ndarray,
+        moved: np.ndarray,
+        limit: float,
     ) -> tuple[np.ndarray, ...]:
         return np.nonzero(table._moves[table._phase[last]][:, table.pairs].any(axis=2))
 
-    def everywhere(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[np.ndarray, np.ndarray]:
+    def everywhere(
+        shape: coal.CollisionGeometry, placement: pin.SE3
+    ) -> tuple[np.ndarray, np.ndarray]:
         return np.full(3, -1e3), np.full(3, 1e3)
 
     patch.setattr(Clearances, "nearest", all_of_them)
@@ -317,7 +392,9 @@ def test_culling_changes_no_plan(task: str, monkeypatch: pytest.MonkeyPatch) -> 
     scene = crowded(30)
     if task == "stick":  # it is put down further along the table, beside a fence
         steps = [Place("stick", lifted(STICK, [0.0, 0.4, 0.0]))]
-        scene = room(table(), *(box(f"pale_{k}", [0.1] * 3, [1.5, 0.12 * k - 1.0, 0.5]) for k in range(20)))
+        scene = room(
+            table(), *(box(f"pale_{k}", [0.1] * 3, [1.5, 0.12 * k - 1.0, 0.5]) for k in range(20))
+        )
     counts, found = [], []
     for culled in (True, False):
         counter = Counter()
@@ -332,27 +409,43 @@ def test_culling_changes_no_plan(task: str, monkeypatch: pytest.MonkeyPatch) -> 
     assert one.success
     assert other.success
     assert one.initialization == other.initialization
-    np.testing.assert_allclose(one.trajectory.positions, other.trajectory.positions, rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(
+        one.trajectory.positions, other.trajectory.positions, rtol=0.0, atol=1e-5
+    )
     for name in ("clearance", "closure_error", "base_effort", "arm_effort"):
         assert one.metrics[name] == pytest.approx(other.metrics[name], abs=1e-5)
     for name in ("rounds", "iterations"):
         assert one.metrics[name] == other.metrics[name]
 
 
-# --- scenes ---------------------------------------------------------------------------------------------------------
+# --- scenes
+# ---------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([1, 5, 60]), st.sampled_from([np.inf, 0.3, 0.03]))
-def test_the_clearance_at_the_start_is_that_of_all_pairs(seed: int, count: int, reach: float) -> None:
+def test_the_clearance_at_the_start_is_that_of_all_pairs(
+    seed: int, count: int, reach: float
+) -> None:
     scene = cluttered(seed, count)
     model, geometry = scene.robot.model, scene.robot.collision
     data, shapes = model.createData(), geometry.createData()
-    pin.updateGeometryPlacements(model, data, geometry, shapes, scene.robot.coordinates.q(scene.start))
-    moving = [(shape.geometry, where) for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)]
-    standing = [s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR]
+    pin.updateGeometryPlacements(
+        model, data, geometry, shapes, scene.robot.coordinates.q(scene.start)
+    )
+    moving = [
+        (shape.geometry, where)
+        for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+    ]
+    standing = [
+        s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR
+    ]
     standing += standing_geometry(scene.objects["door"])
-    expected = min(shape_distance(shape, where, other.geometry, other.placement) for shape, where in moving for other in standing)
+    expected = min(
+        shape_distance(shape, where, other.geometry, other.placement)
+        for shape, where in moving
+        for other in standing
+    )
     found = scene.start_clearance(reach=reach)
     assert found == (pytest.approx(expected, abs=1e-9) if expected < reach else reach)
     assert clearance(moving, []) == np.inf
@@ -360,7 +453,11 @@ def test_the_clearance_at_the_start_is_that_of_all_pairs(seed: int, count: int, 
 
 def test_what_a_scene_does_not_change_it_shares() -> None:
     scene = crowded(100)
-    moved = scene.with_start(base=[-0.5, 0.2, 0.0]).with_state("door", {"hinge": 0.5}).with_held({"door": "handle"})
+    moved = (
+        scene.with_start(base=[-0.5, 0.2, 0.0])
+        .with_state("door", {"hinge": 0.5})
+        .with_held({"door": "handle"})
+    )
     assert moved.obstacles is scene.obstacles
     assert moved.described is scene.described
     assert moved.document["obstacles"] == scene.document["obstacles"]
@@ -371,8 +468,12 @@ def test_what_a_scene_does_not_change_it_shares() -> None:
 
 def test_a_world_shows_all_its_shapes() -> None:
     world = World(crowded(50))
-    assert [shape.name for shape in world.shapes] == [shape.name for shape in world.collision.geometryObjects]
+    assert [shape.name for shape in world.shapes] == [
+        shape.name for shape in world.collision.geometryObjects
+    ]
     assert len(world.shapes) == len(world.collision_labels)
     for shape, twin in zip(world.shapes, world.collision.geometryObjects, strict=True):
         assert shape.parentJoint == twin.parentJoint
-        np.testing.assert_allclose(shape.placement.homogeneous, twin.placement.homogeneous, atol=1e-12)
+        np.testing.assert_allclose(
+            shape.placement.homogeneous, twin.placement.homogeneous, atol=1e-12
+        )

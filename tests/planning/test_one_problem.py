@@ -41,7 +41,8 @@ class Scripted:
         finally_: Of what all rounds lead to, and the status.
         aside: The seeds that do not script.
         stuck: The seeds from which the solver gets stuck, when it has no patience.
-        events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of them, "b*!" at a higher penalty.
+        events: What happened: "b" a seed was asked for, "b1" it was given one round, "b*" all of
+            them, "b*!" at a higher penalty.
         radii: How far planes were to be believed at first, each time; None: as usual.
         patience: Whether the solver was to have any, each time.
     """
@@ -96,16 +97,26 @@ class Scripted:
         timings = {"coal": 0.5, "casadi": 0.25, "ipopt": 0.125}
         solved = z if height is None else self.z(problem, name, height)
         solution = Solution(solved, problem.timing_for(z).dt, status == "converged", status)
-        return dataclasses.replace(solution, rounds=1, iterations=5, timings=timings, history=[ROUND])
+        return dataclasses.replace(
+            solution, rounds=1, iterations=5, timings=timings, history=[ROUND]
+        )
 
-    def validate(self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, *options: Any) -> vkc.Report:
+    def validate(
+        self, scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, *options: Any
+    ) -> vkc.Report:
         amount = next(self.amounts)
-        wrong = vkc.Violation("goal", "drawer.slide", waypoint=0, time=0.0, amount=amount, unit="m", detail="")
+        wrong = vkc.Violation(
+            "goal", "drawer.slide", waypoint=0, time=0.0, amount=amount, unit="m", detail=""
+        )
         return vkc.Report((wrong,) if amount else ())
 
-    def run(self, steps: Sequence[Any] = PULL, *, scene: vkc.Scene | None = None, **settings: Any) -> vkc.Plan:
+    def run(
+        self, steps: Sequence[Any] = PULL, *, scene: vkc.Scene | None = None, **settings: Any
+    ) -> vkc.Plan:
         scene = scene or drawer_scene()
-        self.one = OneProblem(scene, compile_task(scene, steps, SHORT), Settings("auto", SHORT, **settings))
+        self.one = OneProblem(
+            scene, compile_task(scene, steps, SHORT), Settings("auto", SHORT, **settings)
+        )
         with self.one.settings.budget.running():
             return self.one.run()
 
@@ -152,24 +163,38 @@ def test_real_seeds_are_tried_in_turn_until_validation_accepts_a_motion(
     assert asked == ["seed", "solve"] * len(solved)
     assert len(solved) > 1, "the first seed sufficed: choose another problem"
     assert plan.initialization == given[-1].name
-    assert plan.metrics["rounds"] == sum(solution.rounds for solution in solved) == len(plan.history)
+    assert (
+        plan.metrics["rounds"] == sum(solution.rounds for solution in solved) == len(plan.history)
+    )
     assert plan.metrics["iterations"] == sum(solution.iterations for solution in solved)
     parts = [value for key, value in plan.metrics.items() if key.startswith("time_")]
-    assert all(plan.metrics[f"time_{part}"] > 0.0 for part in ("initialization", "coal", "ipopt", "retiming", "validation"))
+    assert all(
+        plan.metrics[f"time_{part}"] > 0.0
+        for part in ("initialization", "coal", "ipopt", "retiming", "validation")
+    )
     assert sum(parts) <= plan.metrics["planning_time"] + plan.metrics["build_time"]
-    assert plan.metrics["time_ipopt"] == pytest.approx(sum(solution.timings["ipopt"] for solution in solved))
+    assert plan.metrics["time_ipopt"] == pytest.approx(
+        sum(solution.timings["ipopt"] for solution in solved)
+    )
     assert vkc.validate(own.scene, own.steps, plan.trajectory, plan.options).ok
     for solution in solved[:-1]:  # what was given up was no motion
         motion = as_trajectory(vkc.build(own.scene, own.steps), solution.z, solution.dt)
         assert not vkc.validate(own.scene, own.steps, motion, plan.options).ok
 
 
-@pytest.mark.parametrize(("initialization", "all_astray"), [("stationary", False), ("interpolated", True)])
+@pytest.mark.parametrize(
+    ("initialization", "all_astray"), [("stationary", False), ("interpolated", True)]
+)
 def test_what_clearly_misses_is_checked_only_if_nothing_else_is_left(
     initialization: str, all_astray: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A wall from side to side: motions end inside it, or jump through it between two waypoints."""
-    solved, checked, solver, check = list[Solution](), list[vkc.Trajectory](), module.solve, module.validate
+    solved, checked, solver, check = (
+        list[Solution](),
+        list[vkc.Trajectory](),
+        module.solve,
+        module.validate,
+    )
 
     def answered(problem: vkc.TrajectoryProblem, z: np.ndarray, **named: Any) -> Solution:
         solved.append(solver(problem, z, **named))
@@ -181,7 +206,9 @@ def test_what_clearly_misses_is_checked_only_if_nothing_else_is_left(
 
     monkeypatch.setattr(module, "solve", answered)
     monkeypatch.setattr(module, "validate", noted)
-    monkeypatch.setattr(module, "proofs", lambda _: [])  # it would be certain before anything is tried again
+    monkeypatch.setattr(
+        module, "proofs", lambda _: []
+    )  # it would be certain before anything is tried again
     wall = {"name": "wall", "type": "box", "size": [0.6, 9.0, 2.0], "position": [2.0, 0.0, 1.0]}
     plan = vkc.plan(hall(obstacles=[wall]), [vkc.GoTo(4.0, 0.0)], initialization=initialization)
     assert not plan.success
@@ -209,7 +236,11 @@ def test_rounds_of_all_seeds_count(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = script.run(callback=rows.append)
     assert script.events == ["a", "a*", "b", "b*"]
     assert (plan.metrics["rounds"], plan.metrics["iterations"]) == (2.0, 10.0)
-    assert (plan.metrics["time_coal"], plan.metrics["time_casadi"], plan.metrics["time_ipopt"]) == (1.0, 0.5, 0.25)
+    assert (plan.metrics["time_coal"], plan.metrics["time_casadi"], plan.metrics["time_ipopt"]) == (
+        1.0,
+        0.5,
+        0.25,
+    )
     assert set(TIMES) <= {key.removeprefix("time_") for key in plan.metrics}
     assert list(plan.history) == [dataclasses.asdict(ROUND)] * 2
     assert rows == [ROUND] * 2
@@ -235,14 +266,20 @@ def test_a_seed_of_ones_own_is_the_only_one(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_of_failures_the_least_violated_is_returned(monkeypatch: pytest.MonkeyPatch) -> None:
-    script = Scripted(monkeypatch, [3.0, 1.0, 2.0], amounts=[0.5, *[0.2] * 4, 0.3], leads={"b": (2.0, "converged")})
+    script = Scripted(
+        monkeypatch,
+        [3.0, 1.0, 2.0],
+        amounts=[0.5, *[0.2] * 4, 0.3],
+        leads={"b": (2.0, "converged")},
+    )
     plan = script.run()
     assert script.events[-1] == "c*"
     assert (plan.initialization, plan.status) == ("b", "rejected")
     np.testing.assert_array_equal(script.one.z, script.z(script.one.problem, "b", 2.0))
 
 
-# --- time is up, or Ctrl-C -----------------------------------------------------------------------------------------------
+# --- time is up, or Ctrl-C
+# -----------------------------------------------------------------------------------------------
 
 
 def test_no_seed_is_looked_for_when_time_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,9 +295,15 @@ def test_no_seed_is_looked_for_when_time_is_up(monkeypatch: pytest.MonkeyPatch) 
 def test_the_real_solver_stops() -> None:
     """Also while the program is built, and while seeds are looked for: a robot that stands is what there is then."""
     late, spent = "time limit", "effort spent"
-    budgets: list[tuple[dict[str, Any], str]] = [({"time_limit": 1e-3}, late), ({"effort": 1}, spent), ({"effort": 3000}, spent)]
+    budgets: list[tuple[dict[str, Any], str]] = [
+        ({"time_limit": 1e-3}, late),
+        ({"effort": 1}, spent),
+        ({"effort": 3000}, spent),
+    ]
     for budget, status in budgets:
-        plan = vkc.plan(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], planner=vkc.Planner(), **budget)
+        plan = vkc.plan(
+            door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], planner=vkc.Planner(), **budget
+        )
         assert (plan.status, plan.initialization, plan.metrics["rounds"]) == (status, "none", 0)
         assert plan.validation.violations
         assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0
@@ -277,13 +320,18 @@ def test_effort_that_suffices_changes_nothing() -> None:
     assert again.success
     assert again.metrics["effort"] == used
     np.testing.assert_array_equal(again.trajectory.positions, whole.trajectory.positions)
-    short = [vkc.plan(scene, steps, effort=used // 2, planner=planner) for planner in (None, vkc.Planner())]
+    short = [
+        vkc.plan(scene, steps, effort=used // 2, planner=planner)
+        for planner in (None, vkc.Planner())
+    ]
     assert [plan.status for plan in short] == ["effort spent"] * 2
     np.testing.assert_array_equal(short[0].trajectory.positions, short[1].trajectory.positions)
 
 
 @pytest.mark.parametrize(("amounts", "name"), [([1.0, 0.5], "b"), ([0.5, 1.0], "a")])
-def test_ctrl_c_in_the_solver_returns_the_best(amounts: list[float], name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_in_the_solver_returns_the_best(
+    amounts: list[float], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With its own time: how long a motion takes follows from its seed."""
     leads: dict[str, Answer] = {"a": (2.0, "not converged"), "b": (40.0, "interrupted")}
     script = Scripted(monkeypatch, [2.0, 40.0, 40.0], leads=leads, amounts=amounts)
@@ -297,7 +345,9 @@ def test_ctrl_c_in_the_solver_returns_the_best(amounts: list[float], name: str, 
     assert plan.metrics["duration"] == pytest.approx(float(expected.times[-1]), rel=1e-6)
 
 
-@pytest.mark.parametrize(("when", "name"), [("a", "none"), ("a*", "a"), ("b", "a"), ("b*", "a"), ("c*", "a")])
+@pytest.mark.parametrize(
+    ("when", "name"), [("a", "none"), ("a*", "a"), ("b", "a"), ("b*", "a"), ("c*", "a")]
+)
 def test_ctrl_c_anywhere(when: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """While seeds are looked for, too, or by the time that a solution was found."""
     script = Scripted(monkeypatch, [2.0, 1.0, 3.0])
@@ -315,7 +365,8 @@ def test_ctrl_c_anywhere(when: str, name: str, monkeypatch: pytest.MonkeyPatch) 
         np.testing.assert_array_equal(script.one.z, script.z(script.one.problem, name, 2.0))
 
 
-# --- what is weighed -----------------------------------------------------------------------------------------------------
+# --- what is weighed
+# -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -327,15 +378,25 @@ def test_ctrl_c_anywhere(when: str, name: str, monkeypatch: pytest.MonkeyPatch) 
     ],
 )
 def test_a_weight_weighs_what_it_says(field: str, columns: list[int]) -> None:
-    options = [vkc.Options(**{**dataclasses.asdict(SHORT), field: value}) for value in (getattr(SHORT, field), 7.0)]
-    usual, other = (program_of(drawer_scene(), PULL, options=each).effort.metric for each in options)
+    options = [
+        vkc.Options(**{**dataclasses.asdict(SHORT), field: value})
+        for value in (getattr(SHORT, field), 7.0)
+    ]
+    usual, other = (
+        program_of(drawer_scene(), PULL, options=each).effort.metric for each in options
+    )
     np.testing.assert_array_equal(other[columns], 7.0)
     np.testing.assert_array_equal(np.delete(other, columns), np.delete(usual, columns))
 
 
 def test_squares_of_turns_cost_what_the_heading_weighs() -> None:
     """Σ w δ² + w_acc δδ²/dt² over a turn on the spot, by hand."""
-    options = dataclasses.replace(vkc.Options.paper(), reach_waypoints=SHORT.reach_waypoints, velocity_weight_heading=0.7, dt=0.5)
+    options = dataclasses.replace(
+        vkc.Options.paper(),
+        reach_waypoints=SHORT.reach_waypoints,
+        velocity_weight_heading=0.7,
+        dt=0.5,
+    )
     problem = program_of(hall(), [vkc.GoTo(0.0, 0.0, 1.0)], options=options)
     z = np.tile(problem.start, (problem.segments, 1))
     z[:, 2] = np.linspace(0.0, 1.0, problem.segments + 1)[1:] ** 2
@@ -347,12 +408,18 @@ def test_squares_of_turns_cost_what_the_heading_weighs() -> None:
 
 def test_standing_still_costs_nothing() -> None:
     problem = program_of(drawer_scene(), PULL, options=SHORT)
-    assert problem.objective(problem.still, problem.timing_for(problem.still).dt) == pytest.approx(0.0, abs=1e-9)
+    assert problem.objective(problem.still, problem.timing_for(problem.still).dt) == pytest.approx(
+        0.0, abs=1e-9
+    )
 
 
 def test_what_a_problem_leaves_is_trimmed_at_its_end() -> None:
     """Not only when a call ends: a chore has many problems."""
     scene, cache = drawer_scene(), Cache(nbytes=1.0)
-    assert OneProblem(scene, compile_task(scene, PULL, SHORT), Settings("auto", SHORT, cache=cache)).run().success
+    assert (
+        OneProblem(scene, compile_task(scene, PULL, SHORT), Settings("auto", SHORT, cache=cache))
+        .run()
+        .success
+    )
     assert cache.info().entries == 1
     assert cache.info().misses > 1

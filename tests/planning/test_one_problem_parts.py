@@ -24,7 +24,10 @@ from vkc_pin.world.task.compiler import compile_task
 
 def attempt(name: str, *amounts: float, status: str = "rejected") -> _Try:
     """Return where a seed led, violated by so much of each of several things."""
-    wrong = [Violation("goal", f"x{k}", amount=amount, unit="m", detail="") for k, amount in enumerate(amounts)]
+    wrong = [
+        Violation("goal", f"x{k}", amount=amount, unit="m", detail="")
+        for k, amount in enumerate(amounts)
+    ]
     z = np.zeros((1, 1))
     return _Try(name, z, SimpleNamespace(), Report(tuple(wrong)), status)  # type: ignore[arg-type]
 
@@ -49,7 +52,8 @@ class Script:
     """Stands for solver, validation and whoever looks for reasons.
 
     Attributes:
-        events: "a" a seed was asked for, "a*" it was solved, "?" it was asked for proofs, "goals" for goals that are blocked.
+        events: "a" a seed was asked for, "a*" it was solved, "?" it was asked for proofs, "goals"
+            for goals that are blocked.
     """
 
     def __init__(
@@ -70,11 +74,17 @@ class Script:
         one.problem, one.blocked, one._best, one._astray = self.problem, list(blocked), None, None
         self.statuses = statuses or {}
         one._solve, one._judge = self.solved, self.judged  # type: ignore[method-assign]
-        one._proofs = lambda problem: self.asked("?", ["proof"] if self.events.count("?") in proven else [])  # type: ignore
+        one._proofs = lambda problem: self.asked(
+            "?", ["proof"] if self.events.count("?") in proven else []
+        )  # type: ignore
         one._goals = lambda problem: self.asked("goals", list(goals))  # type: ignore[method-assign, assignment]
         one._stationary = lambda problem: attempt("none", 9.0, status="not converged")  # type: ignore[method-assign]
-        monkeypatch.setattr(module, "_ends_free", lambda problem, seed: self.asked(f"free {seed.name}", free))
-        monkeypatch.setattr(module, "ways", lambda *what: self.asked(f"ways {what[3]} {what[4]}", ways))
+        monkeypatch.setattr(
+            module, "_ends_free", lambda problem, seed: self.asked(f"free {seed.name}", free)
+        )
+        monkeypatch.setattr(
+            module, "ways", lambda *what: self.asked(f"ways {what[3]} {what[4]}", ways)
+        )
 
     problem: Any = SimpleNamespace()
 
@@ -85,7 +95,10 @@ class Script:
     def solved(self, problem: Any, seed: Any) -> Any:
         answer, status = self.answers[seed.name], self.statuses.get(seed.name, "not converged")
         return self.asked(
-            f"{seed.name}*", SimpleNamespace(astray=0.0 if isinstance(answer, _Try) else answer, status=status, name=seed.name)
+            f"{seed.name}*",
+            SimpleNamespace(
+                astray=0.0 if isinstance(answer, _Try) else answer, status=status, name=seed.name
+            ),
         )
 
     def judged(self, problem: Any, solution: Any, name: str) -> _Try:
@@ -115,26 +128,40 @@ def test_a_motion_that_is_good_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_least_violated_is_what_remains(monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = {"a": attempt("a", 1.0), "b": attempt("b", 0.5), "c": attempt("c", 0.7, status="not converged")}
+    answers = {
+        "a": attempt("a", 1.0),
+        "b": attempt("b", 0.5),
+        "c": attempt("c", 0.7, status="not converged"),
+    }
     script = Script(monkeypatch, answers)
     assert script.run() == ("b", "rejected", ())
     assert script.events[-2:] == ["?", "ways [] 7"]
 
 
 def test_a_seed_of_ones_own_is_not_asked_for_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
-    script = Script(monkeypatch, {"a": attempt("a", 1.0)}, proven=[0, 1, 2, 3], goals=[goal("no room")], free=False)
+    script = Script(
+        monkeypatch,
+        {"a": attempt("a", 1.0)},
+        proven=[0, 1, 2, 3],
+        goals=[goal("no room")],
+        free=False,
+    )
     assert script.run(searched=False) == ("a", "rejected", ())
     assert script.events == ["a", "a*"]
 
 
 @pytest.mark.parametrize("ending", ["time limit", "interrupted", "effort spent"])
-def test_a_budget_at_its_end_returns_the_best_so_far(ending: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_budget_at_its_end_returns_the_best_so_far(
+    ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     answers = {"a": attempt("a", 0.3), "b": attempt("b", 0.5), "c": GOOD}
     assert Script(monkeypatch, answers, statuses={"b": ending}).run() == ("a", ending, ())
     assert Script(monkeypatch, {"a": GOOD}, statuses={"a": ending}).run() == ("b", "success", ())
 
 
-def test_of_what_is_astray_the_nearest_is_checked_if_there_is_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_what_is_astray_the_nearest_is_checked_if_there_is_nothing_else(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     script = Script(monkeypatch, {"a": 0.3, "b": 0.1, "c": 0.2})
     assert script.run() == ("b", "not converged", ())
     assert script.one._best is None
@@ -161,8 +188,14 @@ def test_goals_at_which_nothing_is_free(monkeypatch: pytest.MonkeyPatch) -> None
     assert script.events == ["a", "a*", "?", "free a", "goals", "b", "b*", "?", "?"]
     free = Script(monkeypatch, answers, goals=[goal("no room")])
     assert free.run() == ("b", "success", ())
-    deep = Script(monkeypatch, answers, goals=[goal("no room"), goal("deep", deep=True)], free=False)
-    assert deep.run() == ("a", "infeasible", ("no room", "deep"))  # so much in something that no seed helps
+    deep = Script(
+        monkeypatch, answers, goals=[goal("no room"), goal("deep", deep=True)], free=False
+    )
+    assert deep.run() == (
+        "a",
+        "infeasible",
+        ("no room", "deep"),
+    )  # so much in something that no seed helps
     none = Script(monkeypatch, answers, free=False)
     assert none.run() == ("b", "success", ())
     assert none.events.count("goals") == 1
@@ -180,10 +213,13 @@ def test_without_any_seed_what_blocks_the_base_is_told(monkeypatch: pytest.Monke
     assert hint.run() == ("a", "rejected", ("no way to it",))
 
 
-# --- reasons ----------------------------------------------------------------------------------------------------------
+# --- reasons
+# ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("hindered", "proven", "told"), [(["h"], ["p"], ["h"]), ([], ["p"], ["p"]), ([], [], [])])
+@pytest.mark.parametrize(
+    ("hindered", "proven", "told"), [(["h"], ["p"], ["h"]), ([], ["p"], ["p"]), ([], [], [])]
+)
 def test_proofs_are_looked_for_once(
     hindered: list[str], proven: list[str], told: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,7 +237,11 @@ def test_proofs_are_looked_for_once(
 def test_each_goal_is_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, int]] = []
     found = {0: None, 1: goal("no room"), 2: goal("no way")}
-    monkeypatch.setattr(module, "blocked", lambda problem, number, seed: asked.append((number, seed)) or found[number])
+    monkeypatch.setattr(
+        module,
+        "blocked",
+        lambda problem, number, seed: asked.append((number, seed)) or found[number],
+    )
     one = object.__new__(OneProblem)
     one.settings, one._explained = SimpleNamespace(random_seed=5), {}  # type: ignore[assignment]
     problem: Any = SimpleNamespace(task=SimpleNamespace(phases=[0, 1, 2]))
@@ -213,17 +253,35 @@ def test_each_goal_is_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def made(*steps: Any, **settings: Any) -> OneProblem:
     scene, options = hall(), vkc.Options(reach_waypoints=6)
-    return OneProblem(scene, compile_task(scene, steps, options), Settings("auto", options, cache=Cache(), **settings))
+    return OneProblem(
+        scene,
+        compile_task(scene, steps, options),
+        Settings("auto", options, cache=Cache(), **settings),
+    )
 
 
 def test_what_there_is_before_anything_has_run() -> None:
     one = made(vkc.GoTo(1.0, 0.0))
-    assert (one.goals_first, one.rounds, one.iterations, one.checking, one.hindered) == (False, 0, 0, 0.0, False)
-    assert (one.history, one.blocked, one._best, one._astray, one._proven) == ([], [], None, None, None)
+    assert (one.goals_first, one.rounds, one.iterations, one.checking, one.hindered) == (
+        False,
+        0,
+        0,
+        0.0,
+        False,
+    )
+    assert (one.history, one.blocked, one._best, one._astray, one._proven) == (
+        [],
+        [],
+        None,
+        None,
+        None,
+    )
     assert set(one.times.values()) == {0.0}
 
 
-def test_seeds_end_where_there_are_none_or_something_is_proven(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seeds_end_where_there_are_none_or_something_is_proven(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """What a search asks about goals on its way, and what is noted of it."""
     given: dict[str, Any] = {}
 
@@ -239,7 +297,12 @@ def test_seeds_end_where_there_are_none_or_something_is_proven(monkeypatch: pyte
     assert given["count"] == one.settings.options.max_restarts
     assert given["notes"] is one.blocked
     assert 0.0 < one.times["initialization"] < 10.0
-    for proven, deep, hopeless in (([], [], False), (["p"], [], True), ([], [False, True], True), ([], [False, False], False)):
+    for proven, deep, hopeless in (
+        ([], [], False),
+        (["p"], [], True),
+        ([], [False, True], True),
+        ([], [False, False], False),
+    ):
         one._proofs = lambda _, proven=proven: proven  # type: ignore[method-assign, misc]
         one._goals = lambda _, phases, deep=deep: [goal("x", deep=d) for d in deep]  # type: ignore
         assert given["hopeless"]([0]) == hopeless
@@ -251,9 +314,16 @@ def test_seeds_end_where_there_are_none_or_something_is_proven(monkeypatch: pyte
 
 @pytest.mark.parametrize(
     ("ok", "converged", "status"),
-    [(True, True, "success"), (True, False, "success"), (False, True, "rejected"), (False, False, "not converged")],
+    [
+        (True, True, "success"),
+        (True, False, "success"),
+        (False, True, "rejected"),
+        (False, False, "not converged"),
+    ],
 )
-def test_what_a_solution_is_worth(ok: bool, converged: bool, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_solution_is_worth(
+    ok: bool, converged: bool, status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What was no solution is not made one by another curve."""
     one = made(vkc.GoTo(1.0, 0.0))
     report = Report() if ok else attempt("x", 1.0).report
@@ -267,13 +337,25 @@ def test_what_a_solution_is_worth(ok: bool, converged: bool, status: str, monkey
     monkeypatch.setattr(module, "accepted", accepted)
     solution: Any = SimpleNamespace(z="z", dt="dt", converged=converged)
     found = one._judge(None, solution, "name")  # type: ignore[arg-type]
-    assert (found.name, found.z, found.trajectory, found.report, found.status) == ("name", "z", "curve", report, status)
-    assert asked == {"jerk_time": 0.0, "waypoints": ("motion", "z", "dt"), **({} if converged else {"repairs": 0})}
+    assert (found.name, found.z, found.trajectory, found.report, found.status) == (
+        "name",
+        "z",
+        "curve",
+        report,
+        status,
+    )
+    assert asked == {
+        "jerk_time": 0.0,
+        "waypoints": ("motion", "z", "dt"),
+        **({} if converged else {"repairs": 0}),
+    }
     assert 0.0 <= one.times["retiming"] < 1.0
 
 
 @pytest.mark.parametrize(("speed", "paced"), [(False, False), (True, True)])
-def test_constraints_on_velocities_keep_the_programs_own_time(speed: bool, paced: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_constraints_on_velocities_keep_the_programs_own_time(
+    speed: bool, paced: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     terms = [vkc.Constraint("place", lambda s: s.coordinate("base_x"), upper=9.0)]
     terms += [vkc.Constraint("speed", lambda s: s.rate("base_x"), upper=9.0)] if speed else []
     one = made(vkc.GoTo(1.0, 0.0), terms=terms)
@@ -297,10 +379,14 @@ def test_constraints_on_velocities_keep_the_programs_own_time(speed: bool, paced
         ({}, 0.015, False),
     ],
 )
-def test_the_ends_of_phases_are_free_and_where_they_should_be(short: dict[int, float], error: float, free: bool) -> None:
+def test_the_ends_of_phases_are_free_and_where_they_should_be(
+    short: dict[int, float], error: float, free: bool
+) -> None:
     rows, missing = np.array(list(short), int), np.array(list(short.values()))
     vectors, pairs = np.zeros((len(rows), 3)), np.zeros((len(rows), 2), int)
-    found = Contacts(rows, pairs, 0.02 - missing, np.full(len(rows), 0.02), vectors, vectors, vectors)
+    found = Contacts(
+        rows, pairs, 0.02 - missing, np.full(len(rows), 0.02), vectors, vectors, vectors
+    )
     problem: Any = SimpleNamespace(
         ends=np.array([3, 6]),
         segments=6,
@@ -330,7 +416,9 @@ def test_each_round_is_told_of(listening: bool) -> None:
     told: list[Any] = []
     one = object.__new__(OneProblem)
     callback = (lambda row: told.append(("callback", row))) if listening else None
-    one.settings = SimpleNamespace(progress=lambda row: told.append(("progress", row)), callback=callback)  # type: ignore
+    one.settings = SimpleNamespace(
+        progress=lambda row: told.append(("progress", row)), callback=callback
+    )  # type: ignore
     one._report("row")  # type: ignore[arg-type]
     assert told == [("progress", "row"), ("callback", "row")][: 1 + listening]
 
@@ -343,7 +431,10 @@ def test_what_is_being_done_is_told_and_timed(monkeypatch: pytest.MonkeyPatch) -
     one = made(vkc.GoTo(1.0, 0.0))
     s = one.settings
     settings: Any = SimpleNamespace(
-        progress=SimpleNamespace(doing=told.append), options=s.options, terms=s.terms, budget=SimpleNamespace(checking=0.0)
+        progress=SimpleNamespace(doing=told.append),
+        options=s.options,
+        terms=s.terms,
+        budget=SimpleNamespace(checking=0.0),
     )
     one.settings = settings
     spent = 0.0
@@ -357,7 +448,12 @@ def test_what_is_being_done_is_told_and_timed(monkeypatch: pytest.MonkeyPatch) -
     told.clear()
     monkeypatch.setattr(module, "initialize", lambda *_, **__: iter("ab"))
     one.settings = SimpleNamespace(  # type: ignore[assignment]
-        progress=settings.progress, options=s.options, cache=s.cache, initialization="auto", random_seed=0, perturbation=0.0
+        progress=settings.progress,
+        options=s.options,
+        cache=s.cache,
+        initialization="auto",
+        random_seed=0,
+        perturbation=0.0,
     )
     assert list(one._seeds(None)) == ["a", "b"]  # type: ignore[arg-type]
     assert told == ["looking for a seed"] * 3

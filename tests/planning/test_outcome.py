@@ -13,11 +13,17 @@ from vkc_pin.planning.settings import Settings
 def test_nothing_moves_and_nothing_is_done(name: str) -> None:
     scene = vkc.load_scene(name)
     settings = Settings("auto", vkc.Options(), random_seed=3)
-    plan = joined(scene, [vkc.GoTo(0.3, 0.2)], settings, [], metrics=[spent(1.5), spent(0.5, rounds=2)])
+    plan = joined(
+        scene, [vkc.GoTo(0.3, 0.2)], settings, [], metrics=[spent(1.5), spent(0.5, rounds=2)]
+    )
     assert (plan.status, plan.success, plan.seed) == ("interrupted", False, 3)
     assert {violation.constraint for violation in plan.validation.violations} == {"goal"}
     assert (plan.trajectory.positions == plan.trajectory.positions[0]).all()
-    assert (plan.metrics["planning_time"], plan.metrics["rounds"], plan.metrics["time_coal"]) == (2.0, 2.0, 0.0)
+    assert (plan.metrics["planning_time"], plan.metrics["rounds"], plan.metrics["time_coal"]) == (
+        2.0,
+        2.0,
+        0.0,
+    )
     assert "FAILED, interrupted" in plan.report()
     assert "interrupted" in plan._repr_html_()
 
@@ -32,7 +38,12 @@ def test_what_is_held_is_held() -> None:
 
 
 def test_it_is_a_plan_like_any_other(tmp_path_factory: pytest.TempPathFactory) -> None:
-    plan = joined(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})], Settings("auto", vkc.Options()), [])
+    plan = joined(
+        vkc.load_scene("door"),
+        [vkc.Actuate("door", {"hinge": 1.2})],
+        Settings("auto", vkc.Options()),
+        [],
+    )
     folder = tmp_path_factory.mktemp("standing")
     assert Plan.load(plan.save(folder / "plan.npz")).report() == plan.report()
     assert plan.to_html(folder / "plan.html").stat().st_size > 100_000

@@ -20,10 +20,21 @@ def saved(door_plan: vkc.Plan, tmp_path: Path) -> Path:
 
 def test_a_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -> None:
     blame = Violation(
-        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+        "penetration",
+        "forearm_link – sofa",
+        waypoint=9,
+        time=4.0,
+        amount=0.03,
+        unit="m",
+        detail="overlap by 30 mm",
     )
     report = Report(
-        (blame,), float("inf"), closure_error=1e-4, closure_angle=2e-4, states=77, notes=("the sofa stands in the way",)
+        (blame,),
+        float("inf"),
+        closure_error=1e-4,
+        closure_angle=2e-4,
+        states=77,
+        notes=("the sofa stands in the way",),
     )
     positions = door_plan.trajectory.positions.copy()
     positions[5, 2] += 1.5  # such reports are not of motions that are right
@@ -32,21 +43,35 @@ def test_a_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path)
     loaded = vkc.Plan.load(failed.save(tmp_path / "failed.npz"))
     assert (loaded.success, loaded.status, loaded.claimed) == (False, "infeasible", report)
     assert (loaded.validation.violations, loaded.validation.notes) == ((blame,), report.notes)
-    late = dataclasses.replace(failed, status="time limit")  # then the violations are those of the motion
+    late = dataclasses.replace(
+        failed, status="time limit"
+    )  # then the violations are those of the motion
     loaded = vkc.Plan.load(late.save(tmp_path / "late.npz"))
-    assert {v.constraint for v in loaded.validation.violations} == {"velocity", "acceleration", "torque"}
-    assert (loaded.success, loaded.status, loaded.validation.notes) == (False, "time limit", report.notes)
+    assert {v.constraint for v in loaded.validation.violations} == {
+        "velocity",
+        "acceleration",
+        "torque",
+    }
+    assert (loaded.success, loaded.status, loaded.validation.notes) == (
+        False,
+        "time limit",
+        report.notes,
+    )
 
 
 def spoiled(plan: vkc.Plan) -> vkc.Plan:
     """The plan of another motion, which says of itself what the right one says."""
     positions = plan.trajectory.positions.copy()
     positions[5, 2] += 1.5
-    return dataclasses.replace(plan, trajectory=dataclasses.replace(plan.trajectory, positions=positions, curve=None))
+    return dataclasses.replace(
+        plan, trajectory=dataclasses.replace(plan.trajectory, positions=positions, curve=None)
+    )
 
 
 @pytest.mark.parametrize("check", [False, True])
-def test_success_is_not_what_the_file_says(door_plan: vkc.Plan, tmp_path: Path, check: bool) -> None:
+def test_success_is_not_what_the_file_says(
+    door_plan: vkc.Plan, tmp_path: Path, check: bool
+) -> None:
     bad = spoiled(door_plan)
     assert bad.success
     loaded = vkc.Plan.load(bad.save(tmp_path / "bad.npz"), check=check)
@@ -73,7 +98,11 @@ def test_a_plan_is_checked_when_somebody_asks(saved: Path, monkeypatch: pytest.M
     assert not asked
     alike = copy.copy(loaded)
     for plan in (loaded, dataclasses.replace(loaded, seed=1)):
-        assert (plan.success, plan.report()[:13], plan.metrics["clearance"] > 0) == (True, "door: success", True)
+        assert (plan.success, plan.report()[:13], plan.metrics["clearance"] > 0) == (
+            True,
+            "door: success",
+            True,
+        )
     assert len(asked) == 1
     assert alike.validation == loaded.validation
     assert len(asked) == 2
@@ -81,9 +110,13 @@ def test_a_plan_is_checked_when_somebody_asks(saved: Path, monkeypatch: pytest.M
     assert len(asked) == 3
 
 
-def test_what_the_file_says_of_the_task_does_not_matter_when_it_is_checked(door_plan: vkc.Plan, tmp_path: Path) -> None:
+def test_what_the_file_says_of_the_task_does_not_matter_when_it_is_checked(
+    door_plan: vkc.Plan, tmp_path: Path
+) -> None:
     blame = Violation("penetration", "a – b", amount=0.03, unit="m", detail="overlap by 30 mm")
-    said = dataclasses.replace(spoiled(door_plan), status="infeasible", validation=Report((blame,), notes=("so it is",)))
+    said = dataclasses.replace(
+        spoiled(door_plan), status="infeasible", validation=Report((blame,), notes=("so it is",))
+    )
     path = said.save(tmp_path / "said.npz")
     assert vkc.Plan.load(path).validation.violations == (blame,)
     checked = vkc.Plan.load(path, check=True).validation
@@ -97,8 +130,12 @@ def test_what_the_file_says_of_the_task_does_not_matter_when_it_is_checked(door_
 
 def test_a_motion_of_another_robot(door_plan: vkc.Plan, tmp_path: Path) -> None:
     names = ("arm", *door_plan.trajectory.names[1:])
-    path = dataclasses.replace(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, names=names)).save(tmp_path / "a")
-    with pytest.raises(vkc.InputError, match=r"trajectory.names: not this robot's coordinates") as caught:
+    path = dataclasses.replace(
+        door_plan, trajectory=dataclasses.replace(door_plan.trajectory, names=names)
+    ).save(tmp_path / "a")
+    with pytest.raises(
+        vkc.InputError, match=r"trajectory.names: not this robot's coordinates"
+    ) as caught:
         vkc.Plan.load(path)
     assert caught.value.file == path
 
@@ -112,7 +149,9 @@ def test_a_motion_without_end(door_plan: vkc.Plan, tmp_path: Path) -> None:
         if said is None:
             loaded = vkc.Plan.load(path)
             assert not loaded.success
-            assert "sampling" in {violation.constraint for violation in loaded.validation.violations}
+            assert "sampling" in {
+                violation.constraint for violation in loaded.validation.violations
+            }
             continue
         with pytest.raises(vkc.InputError, match=said) as caught:
             vkc.Plan.load(path)

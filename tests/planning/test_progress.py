@@ -44,7 +44,9 @@ class Terminal(io.StringIO):
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     stream = Terminal()
     monkeypatch.setattr(module, "sys", SimpleNamespace(stderr=stream))
-    monkeypatch.setattr(module.shutil, "get_terminal_size", lambda *_, **__: os.terminal_size((70, 24)))
+    monkeypatch.setattr(
+        module.shutil, "get_terminal_size", lambda *_, **__: os.terminal_size((70, 24))
+    )
     return stream
 
 
@@ -59,8 +61,13 @@ def test_it_says_what_is_done() -> None:
     line.begin(["reach cup.side", "place cup"])
     line.doing("looking for a seed")
     line(row())
-    assert seen[-2][0] == "0 s · steps 3 to 4 of 18 · looking for a seed · reach cup.side, place cup"
-    assert seen[-1][0] == "0 s · steps 3 to 4 of 18 · round 3, 12.3 mm missing, objective 4.57 · reach cup.side, place cup"
+    assert (
+        seen[-2][0] == "0 s · steps 3 to 4 of 18 · looking for a seed · reach cup.side, place cup"
+    )
+    assert (
+        seen[-1][0]
+        == "0 s · steps 3 to 4 of 18 · round 3, 12.3 mm missing, objective 4.57 · reach cup.side, place cup"
+    )
     line.part(7, 1, 18)
     line(row(shortfall=0.0))
     assert "step 7 of 18 · round 3, clear, " in seen[-1][0]
@@ -84,7 +91,9 @@ def test_a_terminal_has_one_line(terminal: Terminal) -> None:
     assert plan.success
     first, rest = terminal.lines()
     assert rest == ""
-    assert re.match(r".*: success — base \d\.\d\d m, arm .* rad, planned in [\d.]+ s$|.*: success — ", first)
+    assert re.match(
+        r".*: success — base \d\.\d\d m, arm .* rad, planned in [\d.]+ s$|.*: success — ", first
+    )
     assert all(len(part.rstrip()) < 70 for part in re.split(r"[\r\n]", terminal.getvalue()))
     assert "looking for a seed" in terminal.getvalue()
     assert "round 1" in terminal.getvalue()
@@ -111,12 +120,16 @@ def test_ctrl_c_leaves_a_line_as_well(terminal: Terminal, monkeypatch: pytest.Mo
     assert terminal.lines()[1:] == [""]
 
 
-def test_a_terminal_that_goes_away_is_no_reason_to_stop(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_that_goes_away_is_no_reason_to_stop(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def gone(text: str) -> int:
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(terminal, "write", gone)
-    plan = vkc.plan(hall(), [vkc.GoTo(0.3, 0.2)], options=vkc.Options(reach_waypoints=8), progress=True)
+    plan = vkc.plan(
+        hall(), [vkc.GoTo(0.3, 0.2)], options=vkc.Options(reach_waypoints=8), progress=True
+    )
     assert plan.success
 
 
@@ -157,7 +170,14 @@ import vkc_pin as vkc
 vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
 """
     ours, theirs = pty.openpty()
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=theirs, timeout=120, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=theirs,
+        timeout=120,
+        check=True,
+    )
     os.close(theirs)
     text = os.read(ours, 100_000).decode()
     os.close(ours)

@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import STICK, Script, above, carried_over, lifted, moved_base, room, table, tool_at
+from helpers.carrying import (
+    STICK,
+    Script,
+    above,
+    carried_over,
+    lifted,
+    moved_base,
+    room,
+    table,
+    tool_at,
+)
 from helpers.litter import AT, BIN, littered, shelf
 from helpers.small_problems import full_scene, program_of, with_objects
 
@@ -34,7 +44,9 @@ def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -
     names = (*scene.robot.coordinates.names, *(name.replace("__", ".") for name in objects))
     last = [*base, *arm, *objects.values()]
     rows = np.array([np.zeros(len(last)), last])
-    return Trajectory(names, np.array([0.0, 1.0]), rows, (PhaseSpan("move", 0, 1),), len(scene.start))
+    return Trajectory(
+        names, np.array([0.0, 1.0]), rows, (PhaseSpan("move", 0, 1),), len(scene.start)
+    )
 
 
 def test_robot_and_joints_are_where_the_motion_ends() -> None:
@@ -63,24 +75,33 @@ def test_what_ends_a_little_outside_its_limits_is_at_them() -> None:
         cabinet__sleeve_turn=sleeve.freedoms[1].upper + off,
     )
     after = scene_after(scene, motion, [Hold("cabinet", "sleeve")])
-    np.testing.assert_array_equal(after.start, [scene.arena[1], scene.arena[2], 0.0, *robot.upper[3:]])
+    np.testing.assert_array_equal(
+        after.start, [scene.arena[1], scene.arena[2], 0.0, *robot.upper[3:]]
+    )
     np.testing.assert_array_equal(after.objects["door"].state, [door.upper[0], door.lower[1]])
     (hold,) = after.holds
-    assert (hold, hold.at) == (Hold("cabinet", "sleeve"), (sleeve.freedoms[0].lower, sleeve.freedoms[1].upper))
+    assert (hold, hold.at) == (
+        Hold("cabinet", "sleeve"),
+        (sleeve.freedoms[0].lower, sleeve.freedoms[1].upper),
+    )
 
 
 def test_what_is_carried_is_in_the_hand() -> None:
     """Where its attachment says it hangs; so a hand that has closed beside it does not matter any more."""
     scene, values = room(table()), (0.03, 0.2)
     down = above(STICK, values=values)
-    script = Script(scene).go(down).take("stick", values=values).go(moved_base(down, x=-0.4, yaw=0.5))
+    script = (
+        Script(scene).go(down).take("stick", values=values).go(moved_base(down, x=-0.4, yaw=0.5))
+    )
     after = scene_after(scene, script.motion(), [Hold("stick", "grip")])
     assert [(hold, hold.at) for hold in after.holds] == [(Hold("stick", "grip"), values)]
     data = scene.robot.model.createData()
     pin.framesForwardKinematics(scene.robot.model, data, scene.robot.coordinates.q(script.rows[-1]))
     tool = data.oMf[scene.robot.model.getFrameId(scene.robot.tool_frame)]
     placed = after.objects["stick"].placement
-    np.testing.assert_allclose(tool_at(placed, values=values).homogeneous, tool.homogeneous, atol=1e-9)
+    np.testing.assert_allclose(
+        tool_at(placed, values=values).homogeneous, tool.homogeneous, atol=1e-9
+    )
 
 
 def test_what_was_let_go_of_stands_where_it_was_left() -> None:
@@ -89,9 +110,15 @@ def test_what_was_let_go_of_stands_where_it_was_left() -> None:
     after = scene_after(scene, script.motion(), [])
     assert dict(after.held) == {}
     np.testing.assert_allclose(
-        after.objects["stick"].placement.homogeneous, lifted(STICK, [0.0, 0.5, 0.0]).homogeneous, atol=1e-9
+        after.objects["stick"].placement.homogeneous,
+        lifted(STICK, [0.0, 0.5, 0.0]).homogeneous,
+        atol=1e-9,
     )
-    assert Scene.from_document(after.document).objects["stick"].placement.isApprox(after.objects["stick"].placement, 1e-9)
+    assert (
+        Scene.from_document(after.document)
+        .objects["stick"]
+        .placement.isApprox(after.objects["stick"].placement, 1e-9)
+    )
 
 
 def test_what_was_held_at_the_start_can_be_let_go_of() -> None:
@@ -111,7 +138,11 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
     scene = room(table(), objects=("stick", "ball")).with_held({"stick": "grip"})
     turns = scene.objects["ball"].object.attachment("pull").freedoms
     values = [0.5 * (turn.lower + turn.upper) for turn in turns]
-    script = Script(scene).take("ball", "pull", values, by="stick.tip").go(moved_base(scene.start, y=0.3))
+    script = (
+        Script(scene)
+        .take("ball", "pull", values, by="stick.tip")
+        .go(moved_base(scene.start, y=0.3))
+    )
     stick = Hold("stick", "grip")
     holds = (stick, Hold("ball", "pull", stick, "tip"))
     after = scene_after(scene, script.motion(), holds)
@@ -120,7 +151,14 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
 
 
 def fake(status: str, spent: float) -> vkc.Plan:
-    metrics = {"planning_time": spent, "build_time": 0.0, "iterations": spent, "rounds": 1.0, "effort": spent, "own": spent}
+    metrics = {
+        "planning_time": spent,
+        "build_time": 0.0,
+        "iterations": spent,
+        "rounds": 1.0,
+        "effort": spent,
+        "own": spent,
+    }
     return vkc.Plan(
         scene=None,  # type: ignore[arg-type]
         steps=(),
@@ -146,10 +184,17 @@ def fake(status: str, spent: float) -> vkc.Plan:
     ],
 )
 def test_what_is_returned_and_what_it_took(
-    monkeypatch: pytest.MonkeyPatch, whole: str, apart: str | None, status: str, spent: float, own: float
+    monkeypatch: pytest.MonkeyPatch,
+    whole: str,
+    apart: str | None,
+    status: str,
+    spent: float,
+    own: float,
 ) -> None:
     budgets: list[Budget] = []
-    monkeypatch.setattr(module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake(whole, 10.0)))
+    monkeypatch.setattr(
+        module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake(whole, 10.0))
+    )
 
     def step_by_step(scene: Any, task: Any, settings: Settings) -> vkc.Plan:
         assert apart is not None
@@ -165,19 +210,31 @@ def test_what_is_returned_and_what_it_took(
     assert budgets == ([] if apart is None else [settings.budget]), "what is left of it"
 
 
-def test_where_one_problem_fails_the_steps_are_really_planned_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_one_problem_fails_the_steps_are_really_planned_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Of the whole only the solver's word is withheld; that of each step, the joining and validation are the real ones."""
     scene = vkc.load_scene("drawer")
-    steps = [vkc.Actuate("drawer", {"slide": 0.2}), vkc.Release("drawer"), vkc.GoTo(*scene.start[:2])]
+    steps = [
+        vkc.Actuate("drawer", {"slide": 0.2}),
+        vkc.Release("drawer"),
+        vkc.GoTo(*scene.start[:2]),
+    ]
     real, lengths, efforts = OneProblem.run, list[int](), list[float]()
 
     def run(self: OneProblem) -> vkc.Plan:
         plan = real(self)
         lengths.append(len(self.task.steps))
         efforts.append(plan.metrics["effort"])
-        return plan if lengths[-1] == 1 else dataclasses.replace(plan, status="not converged", validation=wrong)
+        return (
+            plan
+            if lengths[-1] == 1
+            else dataclasses.replace(plan, status="not converged", validation=wrong)
+        )
 
-    wrong = vkc.Report((vkc.Violation("goal", "base", waypoint=0, time=0.0, amount=1.0, unit="m", detail=""),))
+    wrong = vkc.Report(
+        (vkc.Violation("goal", "base", waypoint=0, time=0.0, amount=1.0, unit="m", detail=""),)
+    )
     monkeypatch.setattr(OneProblem, "run", run)
     plan = vkc.plan(scene, steps)
     assert plan.success, plan.report()
@@ -192,7 +249,9 @@ def test_where_one_problem_fails_the_steps_are_really_planned_apart(monkeypatch:
 
 
 def test_one_step_that_fails_is_not_planned_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake("rejected", 10.0)))
+    monkeypatch.setattr(
+        module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake("rejected", 10.0))
+    )
     monkeypatch.setattr(module, "step_by_step", lambda *_: pytest.fail("the same again"))
     task = SimpleNamespace(steps=(1,), holds=())
     assert module.all_at_once(None, task, Settings("auto", vkc.Options())).status == "rejected"  # type: ignore[arg-type]
@@ -200,7 +259,9 @@ def test_one_step_that_fails_is_not_planned_again(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.made_up
 @pytest.mark.parametrize(("held", "asked"), [(True, None), (True, "handle"), (False, "handle")])
-def test_what_cannot_be_moved_as_it_is_held_is_taken_anew(monkeypatch: pytest.MonkeyPatch, held: bool, asked: str | None) -> None:
+def test_what_cannot_be_moved_as_it_is_held_is_taken_anew(
+    monkeypatch: pytest.MonkeyPatch, held: bool, asked: str | None
+) -> None:
     """Only where the step moves what is held: then letting go of it comes first, and the motion ends as it should."""
     scene = vkc.load_scene("drawer")
     if held:
@@ -240,18 +301,28 @@ def test_what_cannot_be_put_down_as_it_is_held_is_taken_anew() -> None:
     assert plan.steps == (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
     assert validate(free, plan.steps, plan.trajectory).ok
     first = plan.trajectory.phases[0]
-    np.testing.assert_array_equal(np.ptp(plan.trajectory.positions[: first.last + 1, : len(free.start)], axis=0), 0.0)
-    np.testing.assert_allclose(plan.end_scene().objects["litter"].placement.translation, BIN, atol=2e-3)
+    np.testing.assert_array_equal(
+        np.ptp(plan.trajectory.positions[: first.last + 1, : len(free.start)], axis=0), 0.0
+    )
+    np.testing.assert_allclose(
+        plan.end_scene().objects["litter"].placement.translation, BIN, atol=2e-3
+    )
 
 
 @pytest.mark.made_up
-def test_what_is_taken_anew_is_taken_anew_among_other_steps_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_taken_anew_is_taken_anew_among_other_steps_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Then the steps of the plan are more than those that were asked for, and the motion is one of them all."""
     real = OneProblem.run
 
     def run(self: OneProblem) -> vkc.Plan:
         plan = real(self)
-        return dataclasses.replace(plan, status="not converged") if isinstance(self.task.steps[0], vkc.Actuate) else plan
+        return (
+            dataclasses.replace(plan, status="not converged")
+            if isinstance(self.task.steps[0], vkc.Actuate)
+            else plan
+        )
 
     monkeypatch.setattr(OneProblem, "run", run)
     scene, grasp, opened = (
@@ -266,7 +337,9 @@ def test_what_is_taken_anew_is_taken_anew_among_other_steps_too(monkeypatch: pyt
     assert plan.end_scene().objects["drawer"].state[0] == pytest.approx(0.2, abs=1e-3)
 
 
-def test_a_goal_beyond_a_limit_is_not_asked_of_other_attachments(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_goal_beyond_a_limit_is_not_asked_of_other_attachments(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """No grasp helps, and the report says why."""
     tried, real = list[str](), OneProblem.run
 
@@ -291,7 +364,8 @@ def test_building_before_planning_costs_no_negative_time() -> None:
     assert metrics["planning_time"] >= parts > 0.0
 
 
-# --- attachments that the steps leave open ----------------------------------------------------------------------------
+# --- attachments that the steps leave open
+# ----------------------------------------------------------------------------
 
 
 def with_first(scene: Scene, owner: str, name: str, z: float) -> Scene:
@@ -299,19 +373,31 @@ def with_first(scene: Scene, owner: str, name: str, z: float) -> Scene:
     placed = scene.objects[owner]
     grip = placed.object.attachment()
     lifted = pin.SE3(grip.placement.rotation, grip.placement.translation + np.array([0.0, 0.0, z]))
-    attachments = {name: dataclasses.replace(grip, name=name, placement=lifted), **placed.object.attachments}
+    attachments = {
+        name: dataclasses.replace(grip, name=name, placement=lifted),
+        **placed.object.attachments,
+    }
     return with_objects(
-        scene, {owner: dataclasses.replace(placed, object=dataclasses.replace(placed.object, attachments=attachments))}
+        scene,
+        {
+            owner: dataclasses.replace(
+                placed, object=dataclasses.replace(placed.object, attachments=attachments)
+            )
+        },
     )
 
 
 def refrigerator() -> Scene:
     """Two leaves side by side, each with a handle, before the robot."""
-    return hall("husky_ur5e", "refrigerator_0", description_of("refrigerator_0")).sample_start(np.random.default_rng(0))
+    return hall("husky_ur5e", "refrigerator_0", description_of("refrigerator_0")).sample_start(
+        np.random.default_rng(0)
+    )
 
 
 @pytest.mark.parametrize("planned", [vkc.plan, vkc.plan_chore])
-def test_where_the_first_attachment_leads_nowhere_another_does(planned: Callable[..., vkc.Plan]) -> None:
+def test_where_the_first_attachment_leads_nowhere_another_does(
+    planned: Callable[..., vkc.Plan],
+) -> None:
     scene = with_first(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
     step = vkc.Actuate("drawer", {"slide": 0.2})
     result = planned(scene, [step])
@@ -321,7 +407,9 @@ def test_where_the_first_attachment_leads_nowhere_another_does(planned: Callable
     assert result.trajectory.phases[-1].held == {"drawer": "handle"}
     alone = planned(scene, [asked])
     np.testing.assert_array_equal(result.trajectory.positions, alone.trajectory.positions)
-    assert result.metrics["effort"] > alone.metrics["effort"], "it took what the first one took as well"
+    assert result.metrics["effort"] > alone.metrics["effort"], (
+        "it took what the first one took as well"
+    )
     named = planned(scene, [dataclasses.replace(step, attachment="ceiling")])
     assert not named.success, "who names one means it"
 
@@ -332,7 +420,12 @@ def test_what_was_tried_is_said_where_all_fail() -> None:
     attachments = {name: one for name, one in thing.object.attachments.items() if name == "ceiling"}
     attachments["roof"] = dataclasses.replace(attachments["ceiling"], name="roof")
     scene = with_objects(
-        scene, {"drawer": dataclasses.replace(thing, object=dataclasses.replace(thing.object, attachments=attachments))}
+        scene,
+        {
+            "drawer": dataclasses.replace(
+                thing, object=dataclasses.replace(thing.object, attachments=attachments)
+            )
+        },
     )
     result = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.2})])
     assert result.status == "infeasible"
@@ -353,20 +446,34 @@ def test_two_leaves_of_one_thing_are_opened_as_one_problem() -> None:
     result = vkc.plan(refrigerator(), steps)
     assert result.success, result.report()
     assert "," not in result.initialization, "of one seed"
-    assert [phase.held for phase in result.trajectory.phases] == [{}, {"it": "handle_left"}, {}, {"it": "handle_right"}]
+    assert [phase.held for phase in result.trajectory.phases] == [
+        {},
+        {"it": "handle_left"},
+        {},
+        {"it": "handle_right"},
+    ]
     ends = dict(zip(result.trajectory.names, result.trajectory.positions[-1], strict=True))
-    assert (ends["it.hinge_left"], ends["it.hinge_right"]) == (pytest.approx(0.6, abs=1e-3), pytest.approx(0.5, abs=1e-3))
+    assert (ends["it.hinge_left"], ends["it.hinge_right"]) == (
+        pytest.approx(0.6, abs=1e-3),
+        pytest.approx(0.5, abs=1e-3),
+    )
     assert result.end_scene().held == {"it": "handle_right"}
 
 
 def test_one_leaf_opened_here_and_then_there_is_planned_step_by_step() -> None:
     """The hinge has no place twice in one chain; nor is it held twice where a second plan begins at the end of the first."""
     first, second = (
-        vkc.Actuate("it", {"hinge_left": value}, name) for value, name in ((0.3, "handle_left"), (0.6, "handle_left_free"))
+        vkc.Actuate("it", {"hinge_left": value}, name)
+        for value, name in ((0.3, "handle_left"), (0.6, "handle_left_free"))
     )
     both = vkc.plan(refrigerator(), [first, second])
     assert both.success, both.report()
-    assert [phase.held for phase in both.trajectory.phases] == [{}, {"it": "handle_left"}, {}, {"it": "handle_left_free"}]
+    assert [phase.held for phase in both.trajectory.phases] == [
+        {},
+        {"it": "handle_left"},
+        {},
+        {"it": "handle_left_free"},
+    ]
     begun = vkc.plan(refrigerator(), [first])
     ended = vkc.plan(begun.end_scene(), [second])
     assert ended.success, ended.report()

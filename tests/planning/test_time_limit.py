@@ -17,7 +17,9 @@ from vkc_pin.utils.budget import Budget
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 CALLS: dict[str, Callable[[], vkc.Plan]] = {
     "plan": lambda: vkc.plan(drawer_scene(), PULL, options=SHORT, planner=vkc.Planner()),
-    "steps": lambda: vkc.plan(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, joint=False),
+    "steps": lambda: vkc.plan(
+        drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, joint=False
+    ),
     "trees": lambda: vkc.plan(drawer_scene(), PULL, initialization="rrt"),
     "chore": lambda: vkc.plan_chore(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT),
     "baseline": lambda: plan_separately(drawer_scene(), PULL, method="B2", retries=1),
@@ -41,7 +43,9 @@ class Looks:
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_a_plan_comes_back_wherever_time_is_up(call: Callable[[], vkc.Plan], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_comes_back_wherever_time_is_up(
+    call: Callable[[], vkc.Plan], monkeypatch: pytest.MonkeyPatch
+) -> None:
     looks = Looks(monkeypatch)
     whole = looks.upto(np.inf, call)
     assert whole.success, whole.report()

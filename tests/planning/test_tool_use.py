@@ -26,26 +26,38 @@ def start(seed: int = 5) -> vkc.Scene:
 
 @cache
 def plan() -> vkc.Plan:
-    return vkc.plan(start(), [vkc.Grasp("stick", "grip"), vkc.Touch("stick.tip", TARGET)], initialization="astar")
+    return vkc.plan(
+        start(),
+        [vkc.Grasp("stick", "grip"), vkc.Touch("stick.tip", TARGET)],
+        initialization="astar",
+    )
 
 
 def tip(scene: vkc.Scene, row: np.ndarray, trajectory: vkc.Trajectory) -> np.ndarray:
     """Return where the tip is, from the hand, the grasp's own definition and the stick's URDF."""
     robot = scene.robot
     data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(row[: trajectory.robot_size]))
+    pin.framesForwardKinematics(
+        robot.model, data, robot.coordinates.q(row[: trajectory.robot_size])
+    )
     tool = data.oMf[robot.model.getFrameId(robot.tool_frame)]
     stick = scene.objects["stick"].object
     grasp = stick.attachment(trajectory.phases[-1].held["stick"])
     values = [row[trajectory.names.index(f"stick.{name}")] for name in grasp.coordinates]
-    root = tool * (stick.link_placement(grasp.link, []) * grasp.placement * grasp.motion(values)).inverse()
+    root = (
+        tool
+        * (stick.link_placement(grasp.link, []) * grasp.placement * grasp.motion(values)).inverse()
+    )
     return np.asarray((root * stick.link_placement("tip", [])).translation)
 
 
 def test_the_tip_reaches_its_target_to_a_millimetre() -> None:
     found = plan()
     assert found.success, found.report()
-    assert np.linalg.norm(tip(start(), found.trajectory.positions[-1], found.trajectory) - TARGET) < 1e-3
+    assert (
+        np.linalg.norm(tip(start(), found.trajectory.positions[-1], found.trajectory) - TARGET)
+        < 1e-3
+    )
     assert [dict(phase.held) for phase in found.trajectory.phases] == [{}, {"stick": "grip"}]
 
 
@@ -53,13 +65,16 @@ def test_the_tip_reaches_its_target_to_a_millimetre() -> None:
 def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
     """From one motion, that found with the fixed grasp: what is minimised falls further if the grasp may move.
 
-    Searches from random seeds promise nothing of the kind for one start: either may end in a local minimum. And as the solver
-    stops where a round saves little, going on with the fixed grasp saves something, too.
+    Searches from random seeds promise nothing of the kind for one start: either may end in a local
+    minimum. And as the solver stops where a round saves little, going on with the fixed grasp saves
+    something, too.
     """
     settings, saved = Settings("astar", vkc.Options()), []
     for seed in range(5, 10):
         fixed, again, anywhere = (
-            problem(start(seed), [vkc.Grasp("stick", name), vkc.Touch("stick.tip", TARGET)], settings)
+            problem(
+                start(seed), [vkc.Grasp("stick", name), vkc.Touch("stick.tip", TARGET)], settings
+            )
             for name in ("end", "end", "grip")
         )
         found = fixed.run()
@@ -72,7 +87,9 @@ def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
         same = going_on(fixed, anywhere.problem).z
         assert anywhere.problem.pose_error(same) < 1e-3
         assert objective(anywhere.problem, same) == pytest.approx(before, rel=1e-9)
-        slide, turn = (better.trajectory.column(f"stick.grip_{name}")[-1] for name in ("slide", "turn"))
+        slide, turn = (
+            better.trajectory.column(f"stick.grip_{name}")[-1] for name in ("slide", "turn")
+        )
         assert abs(slide) > 5e-3 or abs(turn) > 5e-2, "it makes no use of it"
         assert objective(anywhere.problem, anywhere.z) < before
         saved.append(objective(anywhere.problem, anywhere.z) / objective(again.problem, again.z))
@@ -106,7 +123,9 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     assert whole.success, whole.report()
     before = objective(one.problem, seed_of(one.problem, pieces).z)
     assert objective(one.problem, one.z) < before
-    assert np.abs(one.z[39, :3] - parts[0].one.z[39, :3]).max() > 1e-3  # the grasp has moved in favour of what follows
+    assert (
+        np.abs(one.z[39, :3] - parts[0].one.z[39, :3]).max() > 1e-3
+    )  # the grasp has moved in favour of what follows
 
 
 def test_each_step_begins_where_the_one_before_it_ends() -> None:
@@ -124,7 +143,9 @@ def test_each_step_begins_where_the_one_before_it_ends() -> None:
     lay, lies = start().objects["stick"].placement, after.objects["stick"].placement
     assert np.linalg.norm(lay.actInv(lies).translation) < 1e-4
     world = World(start())
-    np.testing.assert_allclose(world.placement("stick", world.positions(end)[-1]).homogeneous, lay.homogeneous, atol=1e-9)
+    np.testing.assert_allclose(
+        world.placement("stick", world.positions(end)[-1]).homogeneous, lay.homogeneous, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("bad", [-0.1, np.inf, "much"])

@@ -13,14 +13,18 @@ from vkc_pin.procedural.furniture.catalogue import KINDS
 
 def test_everything_in_a_home_is_offered_once() -> None:
     home = vkc.load_scene("household")
-    offered = {(step.object, *getattr(step, "joints", ())): step for step in vkc.goals(home, share=0.5)}
+    offered = {
+        (step.object, *getattr(step, "joints", ())): step for step in vkc.goals(home, share=0.5)
+    }
     assert {key for key in offered if len(key) == 2} == {
         *(("door", "hinge"), ("drawer", "slide"), ("dishwasher", "rack"), ("dishwasher", "door")),
         *(("refrigerator", "hinge"), ("cabinet", "hinge")),
     }
     grasped = {step.object for step in offered.values() if isinstance(step, vkc.Grasp)}
     assert grasped == {name for name, placed in home.objects.items() if placed.object.free}
-    assert offered["refrigerator", "hinge"] == vkc.Actuate("refrigerator", {"hinge": 1.0}, "handle_free")
+    assert offered["refrigerator", "hinge"] == vkc.Actuate(
+        "refrigerator", {"hinge": 1.0}, "handle_free"
+    )
 
 
 def test_what_is_open_is_closed() -> None:
@@ -34,7 +38,9 @@ def test_joints_without_limits_are_turned_by_a_share_of_a_turn() -> None:
     description = vkc.random_object("valve", 0)
     urdf = description["urdf"].replace('type="revolute"', 'type="continuous"')
     here = {"name": "valve", "type": {**description, "urdf": urdf}, "position": [2.0, 0.0, 0.0]}
-    scene = vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "objects": [here]})
+    scene = vkc.Scene.from_document(
+        {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "objects": [here]}
+    )
     (step,) = vkc.goals(scene, share=0.25)
     assert isinstance(step, vkc.Actuate)
     assert step.joints["turn"] == pytest.approx(np.pi / 2, abs=1e-3)
@@ -45,7 +51,9 @@ def test_no_goal_is_beyond_a_limit() -> None:
     door = scene.objects["door"].object
     (step,) = vkc.goals(scene, share=0.5)
     assert isinstance(step, vkc.Actuate)
-    assert step.joints["hinge"] == door.upper[door.coordinates.index("hinge")] == np.pi / 2.0, "rounded it would be 1.571"
+    assert step.joints["hinge"] == door.upper[door.coordinates.index("hinge")] == np.pi / 2.0, (
+        "rounded it would be 1.571"
+    )
 
 
 @pytest.mark.parametrize("share", [0.0, 1.1, -0.5, "half", float("nan")])
@@ -80,7 +88,9 @@ def test_every_kind_is_opened(kind: str, tmp_path: Path) -> None:
     (step,) = steps
     assert isinstance(step, vkc.Actuate)
     (joint, value), *_ = step.joints.items()
-    assert plan.trajectory.positions[-1, plan.trajectory.names.index(f"{kind}.{joint}")] == pytest.approx(value, abs=1e-3)
+    assert plan.trajectory.positions[
+        -1, plan.trajectory.names.index(f"{kind}.{joint}")
+    ] == pytest.approx(value, abs=1e-3)
     kept = vkc.Plan.load(plan.save(tmp_path / "plan.npz"))
     assert kept.scene.document == room.document
     assert kept.success

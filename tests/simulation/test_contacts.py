@@ -25,19 +25,34 @@ def test_all_that_the_planner_keeps_apart_meets_in_physics(grip: bool) -> None:
     pairs = touching_pairs(world, holds)
     meets = {frozenset(pair) for pair in pairs.always.tolist()}
     for i, kind in enumerate(pairs.types.tolist()):
-        meets |= {frozenset((i, j)) for j, other in enumerate(pairs.affinities.tolist()) if kind & other}
+        meets |= {
+            frozenset((i, j)) for j, other in enumerate(pairs.affinities.tolist()) if kind & other
+        }
     table = PairTable(plan.scene, Solids(world), plan.trajectory, 0.01)
-    silent = {frozenset((one.first, one.second)) for one in allowances(plan.scene, Options().dist_safe) if one.margin < 0.0}
-    wanted = {frozenset(pair) for pair in table.pairs.tolist() if frozenset(labels[k] for k in pair) not in silent}
+    silent = {
+        frozenset((one.first, one.second))
+        for one in allowances(plan.scene, Options().dist_safe)
+        if one.margin < 0.0
+    }
+    wanted = {
+        frozenset(pair)
+        for pair in table.pairs.tolist()
+        if frozenset(labels[k] for k in pair) not in silent
+    }
     assert wanted <= meets
     assert pairs.overlapping == ()
     if grip:
         hand, link = touching(plan.scene, holds[0]), grasped(plan.scene, holds[0])
         never = {
-            frozenset((i, j)) for i in range(len(labels)) for j in range(len(labels)) if labels[i] in hand and labels[j] == link
+            frozenset((i, j))
+            for i in range(len(labels))
+            for j in range(len(labels))
+            if labels[i] in hand and labels[j] == link
         }
         assert never
-        assert not never & {frozenset(pair) for pair in pairs.always.tolist()}  # but by the hold's own bit
+        assert not never & {
+            frozenset(pair) for pair in pairs.always.tolist()
+        }  # but by the hold's own bit
         assert pairs.bits[holds[0]]
 
 
@@ -45,10 +60,16 @@ def test_wheels_do_not_meet_the_floor_and_free_objects_do() -> None:
     scene = holding()
     world = World(scene)
     labels = world.collision_labels
-    below = [pair for pair in touching_pairs(world, scene.holds).always.tolist() if FLOOR in (labels[pair[0]], labels[pair[1]])]
+    below = [
+        pair
+        for pair in touching_pairs(world, scene.holds).always.tolist()
+        if FLOOR in (labels[pair[0]], labels[pair[1]])
+    ]
     on_it = {labels[k] for pair in below for k in pair} - {FLOOR}
     assert any(label.startswith("stick.") for label in on_it)
-    robot = {labels[i] for i, shape in enumerate(world.bodies.geometryObjects) if shape.parentJoint == 1}
+    robot = {
+        labels[i] for i, shape in enumerate(world.bodies.geometryObjects) if shape.parentJoint == 1
+    }
     assert not robot & on_it
 
 
@@ -59,12 +80,17 @@ def test_contacts_that_the_plan_does_not_have_are_told_from_those_it_has() -> No
         ("floor", "nowhere"): [(3.0, 5e-3)],
     }
     found = unwanted(plan.scene, plan.trajectory, seen, 0.01)
-    assert [(contact.first, contact.depth) for contact in found] == [("door.lever", 4e-3), ("floor", 5e-3)]
+    assert [(contact.first, contact.depth) for contact in found] == [
+        ("door.lever", 4e-3),
+        ("floor", 5e-3),
+    ]
     assert found[0].duration == pytest.approx(0.02)
     assert unwanted(plan.scene, plan.trajectory, {}, 0.01) == ()
 
 
 def test_what_stands_on_something_may_touch_it() -> None:
     scene = vkc.load_scene("household")
-    motion = vkc.plan(scene, [vkc.GoTo(float(scene.start[0]) + 0.2, float(scene.start[1]))]).trajectory
+    motion = vkc.plan(
+        scene, [vkc.GoTo(float(scene.start[0]) + 0.2, float(scene.start[1]))]
+    ).trajectory
     assert unwanted(scene, motion, {("coffee_table", "cup.cup"): [(0.5, 2e-3)]}, 0.01) == ()

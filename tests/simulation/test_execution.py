@@ -21,7 +21,9 @@ def test_a_drawer_is_pulled() -> None:
     (miss,) = result.misses
     assert (miss.subject, miss.unit) == ("drawer.slide", "m")
     assert miss.amount < 0.01
-    assert abs(result.trajectory.column("drawer.slide")[-1] - 0.3) == pytest.approx(miss.amount, abs=1e-9)
+    assert abs(result.trajectory.column("drawer.slide")[-1] - 0.3) == pytest.approx(
+        miss.amount, abs=1e-9
+    )
     assert np.degrees(result.tracking.arm[0]) < 1.0
     assert result.tracking.base[0] < 0.02
     (grip,) = result.grips
@@ -37,13 +39,24 @@ def test_a_drawer_is_pulled() -> None:
 def test_one_motor_pulls_with_all_segments_of_a_telescope(tmp_path: Path) -> None:
     scene = telescope_scene(tmp_path, base="fixed")
     file = tmp_path / "robot.urdf"
-    file.write_text(file.read_text().replace('effort="10"', 'effort="300"'))  # the lift carries all that is on it
-    plan = vkc.plan(vkc.Scene.from_document(scene.document, tmp_path), [vkc.Actuate("drawer", {"slide": 0.15})], seed=0)
+    file.write_text(
+        file.read_text().replace('effort="10"', 'effort="300"')
+    )  # the lift carries all that is on it
+    plan = vkc.plan(
+        vkc.Scene.from_document(scene.document, tmp_path),
+        [vkc.Actuate("drawer", {"slide": 0.15})],
+        seed=0,
+    )
     assert plan.success, plan.report()
     result = plan.simulate()
     assert result.ok, result.report()
     assert result.tracking.arm[0] < np.radians(1.0)
-    assert np.abs(result.trajectory.column("out_1") - plan.trajectory.at(result.trajectory.times)[:, 4]).max() < 1e-3
+    assert (
+        np.abs(
+            result.trajectory.column("out_1") - plan.trajectory.at(result.trajectory.times)[:, 4]
+        ).max()
+        < 1e-3
+    )
     assert {*result.tracking.shares} == {*scene.robot.coordinates.names[3:]}
 
 
@@ -62,7 +75,9 @@ def test_a_lever_that_is_not_turned_keeps_the_door_shut() -> None:
     """The same motion of the robot at a latch that needs more: the door stays shut, and its handle is torn from the hand."""
     plan = door_plan()
     document = plan.scene.document
-    scene = Scene.from_document(document, plan.scene.folder).with_start(base=plan.scene.start[:3], arm=plan.scene.start[3:])
+    scene = Scene.from_document(document, plan.scene.folder).with_start(
+        base=plan.scene.start[:3], arm=plan.scene.start[3:]
+    )
     (latch,) = scene.objects["door"].object.latches
     object.__setattr__(latch, "threshold", 0.75)
     result = plan.simulate(actual=scene)
@@ -75,7 +90,9 @@ def test_a_lever_that_is_not_turned_keeps_the_door_shut() -> None:
 def test_what_is_too_heavy_is_lost() -> None:
     scene = holding()
     light = simulate(scene, [vkc.Grasp("stick")], still(scene))
-    heavy = simulate(scene, [vkc.Grasp("stick")], still(scene), actual=with_mass(scene, "stick", 60.0))
+    heavy = simulate(
+        scene, [vkc.Grasp("stick")], still(scene), actual=with_mass(scene, "stick", 60.0)
+    )
     assert light.grips[0].broken is None
     assert heavy.grips[0].broken is not None
     assert "stick.grip was pulled out of the hand" in heavy.report()
@@ -86,7 +103,12 @@ def test_what_was_moved_into_the_way_is_named() -> None:
     plan = drawer_plan()
     middle = plan.trajectory.at(10.0)[:2]
     document = dict(plan.scene.document)
-    crate = {"name": "crate", "type": "box", "size": [0.3, 0.3, 0.4], "position": [*middle.tolist(), 0.2]}
+    crate = {
+        "name": "crate",
+        "type": "box",
+        "size": [0.3, 0.3, 0.4],
+        "position": [*middle.tolist(), 0.2],
+    }
     document["obstacles"] = [*document["obstacles"], crate]
     changed = Scene.from_document(document, plan.scene.folder)
     result = plan.simulate(actual=changed)
@@ -100,7 +122,9 @@ def test_what_was_moved_into_the_way_is_named() -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_computation_that_breaks_down_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_computation_that_breaks_down_is_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     wild = vkc.Physics(timestep=0.01, base_bandwidth=1e7, arm_bandwidth=1e7)
     result = drawer_plan().simulate(physics=wild)

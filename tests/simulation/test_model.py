@@ -34,7 +34,9 @@ def built(scene: Scene, *, guessed: bool = False) -> PhysicalWorld:
 
 
 def random_rows(world: World, count: int) -> np.ndarray:
-    rows = world.start + np.random.default_rng(1).uniform(-2.0, 2.0, (count, world.coordinates.size))
+    rows = world.start + np.random.default_rng(1).uniform(
+        -2.0, 2.0, (count, world.coordinates.size)
+    )
     for name, placed in world.scene.objects.items():
         if placed.object.free:
             columns = world.placement_columns(name)
@@ -57,11 +59,17 @@ def test_bodies_and_shapes_are_where_pinocchio_has_them(name: str, tmp_path: Pat
         for joint in range(1, world.model.njoints):
             body = physical.bodies[joint]
             np.testing.assert_allclose(data.xpos[body], tree.oMi[joint].translation, atol=1e-9)
-            np.testing.assert_allclose(data.xmat[body].reshape(3, 3), tree.oMi[joint].rotation, atol=1e-9)
+            np.testing.assert_allclose(
+                data.xmat[body].reshape(3, 3), tree.oMi[joint].rotation, atol=1e-9
+            )
         np.testing.assert_allclose(physical.row(data.qpos), row, atol=1e-12)
         for number, shape in enumerate(world.shapes):
             geom = int(physical.geoms[number])
-            where = tree.oMi[shape.parentJoint] * shape.placement if shape.parentJoint else shape.placement
+            where = (
+                tree.oMi[shape.parentJoint] * shape.placement
+                if shape.parentJoint
+                else shape.placement
+            )
             place, turn = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
             if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
                 np.testing.assert_allclose(place, where.translation, atol=1e-9)
@@ -83,7 +91,9 @@ def test_masses_agree(name: str) -> None:
         assert physical.model.body_mass[body] == pytest.approx(inertia.mass)
         np.testing.assert_allclose(physical.model.body_ipos[body], inertia.lever, atol=1e-9)
         principal = np.sort(np.linalg.eigvalsh(np.asarray(inertia.inertia)))
-        principal += max(0.0, principal[2] - principal[0] - principal[1])  # the cabinet's are rounded
+        principal += max(
+            0.0, principal[2] - principal[0] - principal[1]
+        )  # the cabinet's are rounded
         np.testing.assert_allclose(np.sort(physical.model.body_inertia[body]), principal, rtol=1e-3)
 
 
@@ -94,7 +104,9 @@ def test_a_coordinate_moves_the_masses_of_all_its_joints(tmp_path: Path) -> None
     data, robot = mujoco.MjData(model), world.scene.robot.coordinates
     slopes = np.zeros((model.nv, robot.size))
     for move in robot.moves:
-        own = model.body_dofadr[physical.bodies[move.joint]] + (move.coordinate if move.coordinate < 3 else 0)
+        own = model.body_dofadr[physical.bodies[move.joint]] + (
+            move.coordinate if move.coordinate < 3 else 0
+        )
         slopes[own, move.coordinate] = move.factor
     for row in random_rows(world, 5):
         data.qpos[:] = physical.qpos(row)
@@ -118,7 +130,9 @@ def test_joints_of_objects_resist_as_their_description_says() -> None:
 
     def executed(**resistance: float) -> SimulationResult:
         own = {"slide": Resistance(**resistance)}
-        changed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, resistance=own))
+        changed = dataclasses.replace(
+            placed, object=dataclasses.replace(placed.object, resistance=own)
+        )
         actual = dataclasses.replace(plan.scene, objects={**plan.scene.objects, "drawer": changed})
         return plan.simulate(actual=actual)
 

@@ -25,7 +25,14 @@ def test_without_mujoco_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("timestep", 0.0), ("timestep", 0.05), ("friction", -1.0), ("grasp_force", float("nan")), ("balanced", 1)]
+    ("name", "value"),
+    [
+        ("timestep", 0.0),
+        ("timestep", 0.05),
+        ("friction", -1.0),
+        ("grasp_force", float("nan")),
+        ("balanced", 1),
+    ],
 )
 def test_values_out_of_range_are_named(name: str, value: object) -> None:
     with pytest.raises(vkc.InputError) as caught:
@@ -43,7 +50,9 @@ def test_an_inertia_that_no_body_has_is_made_one_and_that_is_said() -> None:
     joint = world.model.getJointId("stick.placement")
     world.model.inertias[joint] = pin.Inertia(1.0, np.zeros(3), np.diag([0.01, 0.01, 0.04]))
     (note,) = weigh(world, vkc.Physics())
-    np.testing.assert_allclose(np.asarray(world.model.inertias[joint].inertia), np.diag([0.03, 0.03, 0.06]), rtol=1e-4)
+    np.testing.assert_allclose(
+        np.asarray(world.model.inertias[joint].inertia), np.diag([0.03, 0.03, 0.06]), rtol=1e-4
+    )
     assert "stick.placement" in note
     assert "50 %" in note
 

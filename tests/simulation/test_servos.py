@@ -24,7 +24,9 @@ def test_servos_are_made_for_the_inertia_that_they_move() -> None:
     world = World(plan.scene)
     own = servos(world, world.positions(plan.trajectory), Physics())
     assert [servo.coordinate for servo in own] == list(plan.scene.robot.coordinates.names)
-    assert own[0].stiffness == pytest.approx(20.0**2 * sum(i.mass for i in plan.scene.robot.model.inertias[1:]), rel=1e-6)
+    assert own[0].stiffness == pytest.approx(
+        20.0**2 * sum(i.mass for i in plan.scene.robot.model.inertias[1:]), rel=1e-6
+    )
     assert [servo.limit for servo in own] == [np.inf] * 3 + [150.0] * 3 + [28.0] * 3
     for servo in own[3:]:
         assert servo.stiffness * 0.05 >= servo.limit * (1.0 - 1e-9)
@@ -37,7 +39,9 @@ def test_the_reference_is_the_plan_with_its_velocity() -> None:
     positions, velocities, accelerations = reference(motion, middles)
     np.testing.assert_allclose(accelerations, motion.acceleration(middles)[:, : motion.robot_size])
     np.testing.assert_allclose(positions, motion.at(middles)[:, : motion.robot_size])
-    np.testing.assert_allclose(velocities, motion.velocity(middles)[:, : motion.robot_size], atol=1e-9)
+    np.testing.assert_allclose(
+        velocities, motion.velocity(middles)[:, : motion.robot_size], atol=1e-9
+    )
     straight = dataclasses.replace(motion, curve=None)
     _, steady, none = reference(straight, middles)
     assert not none.any()
@@ -72,7 +76,9 @@ def test_efforts_are_what_mujoco_needs_for_the_same_motion(name: str, tmp_path: 
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     slopes = np.zeros((model.nv, robot.size))
     for move in robot.moves:
-        own = model.body_dofadr[physical.bodies[move.joint]] + (move.coordinate if move.coordinate < 3 else 0)
+        own = model.body_dofadr[physical.bodies[move.joint]] + (
+            move.coordinate if move.coordinate < 3 else 0
+        )
         slopes[own, move.coordinate] = move.factor
     for row, v, a, efforts in zip(rows, velocities, accelerations, found, strict=True):
         data.qpos[:], data.qvel[:], data.qacc[:] = physical.qpos(row), slopes @ v, slopes @ a

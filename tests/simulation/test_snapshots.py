@@ -18,7 +18,9 @@ def test_snapshots_differ_where_things_move(tmp_path: Path) -> None:
     result = drawer_plan().simulate()
     stage = Stage(result)
     try:
-        first, again, last = stage.pictures(np.array([0.0, 0.0, result.trajectory.times[-1]]), stage.viewpoint())
+        first, again, last = stage.pictures(
+            np.array([0.0, 0.0, result.trajectory.times[-1]]), stage.viewpoint()
+        )
     except vkc.VkcError as error:  # no OpenGL on this machine
         pytest.skip(str(error))
     np.testing.assert_array_equal(first, again)

@@ -22,11 +22,17 @@ def test_what_is_held_pulls_with_its_weight(mass: float) -> None:
     model, data = world.model, world.model.createData()
     pin.framesForwardKinematics(model, data, world.coordinates.q(result.rows[-1]))
     joint = model.getJointId("stick.placement")
-    arm = data.oMi[joint].act(model.inertias[joint].lever) - data.oMf[model.getFrameId(scene.robot.tool_frame)].translation
+    arm = (
+        data.oMi[joint].act(model.inertias[joint].lever)
+        - data.oMf[model.getFrameId(scene.robot.tool_frame)].translation
+    )
     weight = np.array([0.0, 0.0, -9.81 * mass])
     assert grip.force == pytest.approx(9.81 * mass, rel=0.02)
     assert grip.torque == pytest.approx(np.linalg.norm(np.cross(arm, weight)), rel=0.05)
-    assert np.linalg.norm(data.oMi[joint].translation - scene.objects["stick"].placement.translation) < 0.02
+    assert (
+        np.linalg.norm(data.oMi[joint].translation - scene.objects["stick"].placement.translation)
+        < 0.02
+    )
 
 
 def test_holds_last_as_long_as_the_plan_says() -> None:

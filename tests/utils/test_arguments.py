@@ -21,7 +21,9 @@ class Hostile:
     def _fail(self, *_: object) -> Any:
         raise RuntimeError("asked")
 
-    __len__ = __iter__ = __getitem__ = __float__ = __int__ = __index__ = __bool__ = __eq__ = __lt__ = __repr__ = __str__ = _fail
+    __len__ = __iter__ = __getitem__ = __float__ = __int__ = __index__ = __bool__ = __eq__ = (
+        __lt__
+    ) = __repr__ = __str__ = _fail
     __hash__ = object.__hash__
 
 
@@ -68,7 +70,11 @@ def test_what_is_of_the_wrong_kind_is_refused(name: str, value: Any) -> None:
 
 
 def test_numbers_have_bounds() -> None:
-    assert (check.number(np.float32(0.5), "it"), check.number(np.array(2), "it"), check.quantity(-1e4, "it")) == (0.5, 2.0, -1e4)
+    assert (
+        check.number(np.float32(0.5), "it"),
+        check.number(np.array(2), "it"),
+        check.quantity(-1e4, "it"),
+    ) == (0.5, 2.0, -1e4)
     for value in (np.nan, np.inf, -np.inf, 10**5000, True, np.bool_(True), "1"):
         with pytest.raises(InputError):
             check.number(value, "it")
@@ -79,7 +85,10 @@ def test_numbers_have_bounds() -> None:
         check.quantity(10001, "it")
     with pytest.raises(InputError, match="an integer of 16610 bits"):
         check.whole(10**5000, "it", low=0)
-    assert (check.whole(np.int8(3), "it", low=3), type(check.whole(np.int8(3), "it", low=3))) == (3, int)
+    assert (check.whole(np.int8(3), "it", low=3), type(check.whole(np.int8(3), "it", low=3))) == (
+        3,
+        int,
+    )
 
 
 def test_arrays_are_of_real_numbers_and_copied() -> None:
@@ -88,7 +97,15 @@ def test_arrays_are_of_real_numbers_and_copied() -> None:
     given[0] = 7.0
     assert found.tolist() == [0.0, 1.0, 2.0]
     assert check.numbers([], "it").shape == (0,)
-    for value in (["1", "2"], [1j], [True, False], [[1], [1, 2]], np.array(["2020"], "datetime64[Y]"), [10**5000], b"12"):
+    for value in (
+        ["1", "2"],
+        [1j],
+        [True, False],
+        [[1], [1, 2]],
+        np.array(["2020"], "datetime64[Y]"),
+        [10**5000],
+        b"12",
+    ):
         with pytest.raises(InputError, match="it: not numbers"):
             check.numbers(value, "it")
 

@@ -46,7 +46,9 @@ def test_an_error_puts_the_handler_back() -> None:
         raise ValueError("mine")
 
 
-def test_a_handler_that_python_did_not_install_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_handler_that_python_did_not_install_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(signal, "getsignal", lambda number: None)
     with Budget().running() as budget:
         assert not budget.ended

@@ -44,7 +44,13 @@ def test_the_last_used_are_kept(asked: list[int], entries: int) -> None:
 
 def test_what_begins_alike_can_be_dropped() -> None:
     cache = Cache()
-    for key in [("program", 1), ("solver", 1, "a"), ("solver", 1, "b"), ("solver", 2, "a"), "solver"]:
+    for key in [
+        ("program", 1),
+        ("solver", 1, "a"),
+        ("solver", 1, "b"),
+        ("solver", 2, "a"),
+        "solver",
+    ]:
         cache.get(key, lambda: sized(1))
     cache.drop("solver", 1)
     assert list(cache._kept) == [("program", 1), ("solver", 2, "a"), "solver"]
@@ -57,11 +63,16 @@ def test_trimming_lets_go_of_the_oldest_until_it_fits(sizes: list[int], nbytes: 
         cache.get(size, lambda size=size: sized(size))
     cache.trim()
     left = cache.info()
-    expected = next(sizes[k:] for k in range(len(sizes)) if sum(sizes[k:]) <= nbytes or k == len(sizes) - 1)
+    expected = next(
+        sizes[k:] for k in range(len(sizes)) if sum(sizes[k:]) <= nbytes or k == len(sizes) - 1
+    )
     assert (left.entries, left.nbytes) == (len(expected), sum(expected))
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries give memory back by themselves, or never")
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc",
+    reason="other C libraries give memory back by themselves, or never",
+)
 def test_trimming_gives_memory_back() -> None:
     """Also what lies between blocks that are still in use: otherwise a process grows with every structure that it meets."""
     cache, between = Cache(nbytes=1.0), []
@@ -97,7 +108,9 @@ def test_the_time_of_parts_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vkc_pin.utils.cache.time.perf_counter", lambda: float(next(clock)))
     cache = Cache()
     cache.get("whole", lambda: (cache.get("part", lambda: sized(1)), sized(2))[1])
-    assert cache.building == 2.0  # the clock is looked at when either begins, and when the whole ends
+    assert (
+        cache.building == 2.0
+    )  # the clock is looked at when either begins, and when the whole ends
 
 
 def test_a_planner_lends_each_a_cache_of_its_own() -> None:
@@ -147,7 +160,10 @@ def test_a_plan_that_raises_gives_its_cache_back() -> None:
     assert planner.info().entries == 1
 
 
-@pytest.mark.parametrize("wrong", [{"entries": 0}, {"entries": 2.5}, {"entries": True}, {"megabytes": 0}, {"megabytes": "1"}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"entries": 0}, {"entries": 2.5}, {"entries": True}, {"megabytes": 0}, {"megabytes": "1"}],
+)
 def test_misuse(wrong: dict[str, Any]) -> None:
     with pytest.raises(vkc.InputError, match=next(iter(wrong))):
         vkc.Planner(**wrong)

@@ -29,7 +29,9 @@ def never() -> None:
 
 
 @given(key=st.binary(), data=PLAIN)
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_what_is_kept_comes_back(here: Path, key: bytes, data: object) -> None:
     for file in here.glob("*.json"):
         file.unlink()
@@ -64,7 +66,9 @@ def test_without_a_folder_nothing_is_kept(here: Path, monkeypatch: pytest.Monkey
     assert not here.exists()
 
 
-def test_a_folder_that_is_full_or_read_only_does_no_harm(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_is_full_or_read_only_does_no_harm(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: object) -> None:
         raise OSError("no space left")
 

@@ -28,7 +28,9 @@ def test_a_module_that_is_missing_says_so(monkeypatch: pytest.MonkeyPatch) -> No
 
     with monkeypatch.context() as patch:
         patch.setattr(needed, "import_module", missing)
-        with pytest.raises(BuildError, match=r"_driving cannot be imported \(no .*compiler.*pip install"):
+        with pytest.raises(
+            BuildError, match=r"_driving cannot be imported \(no .*compiler.*pip install"
+        ):
             a_path()
     assert a_path() is not None
 
@@ -41,7 +43,9 @@ def test_a_package_that_is_there_is_returned() -> None:
 def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(sys.modules, "coacd", None)
     with pytest.raises(vkc.InputError) as caught:
-        needed.optional_package(name, "import", what="cutting a mesh", file="robot.urdf", field="mesh")
+        needed.optional_package(
+            name, "import", what="cutting a mesh", file="robot.urdf", field="mesh"
+        )
     assert 'pip install "vkc-pin[import]"' in str(caught.value)
     assert (caught.value.file, caught.value.field) == ("robot.urdf", "mesh")
     assert "cutting a mesh needs the Python package coacd" in str(caught.value)

@@ -55,7 +55,10 @@ def bent(trajectory: Trajectory, column: int, by: float) -> Trajectory:
     times = curve.times[k] + span * np.array([0.25, 0.75])
     rates = curve.velocity(times)
     rates[:, column] += np.array([4.0, -4.0]) * by / (span / 2.0)
-    rows = (np.insert(old, k + 1, new, axis=0) for old, new in ((curve.positions, curve.at(times)), (curve.rates, rates)))
+    rows = (
+        np.insert(old, k + 1, new, axis=0)
+        for old, new in ((curve.positions, curve.at(times)), (curve.rates, rates))
+    )
     return dataclasses.replace(trajectory, curve=Curve(np.insert(curve.times, k + 1, times), *rows))
 
 
@@ -70,14 +73,22 @@ def test_a_drift_between_two_samples_is_found(plan: Plan, by: float, right: bool
     report = validate(plan.scene, plan.steps, trajectory)
     found = [one for one in report.violations if one.constraint == "closure"]
     assert (not found) == right, report
-    assert report.closure_error == pytest.approx(by, abs=3e-4)  # what the motion drifts by there already
+    assert report.closure_error == pytest.approx(
+        by, abs=3e-4
+    )  # what the motion drifts by there already
     for one in found:
         assert one.subject.startswith("drawer.")
         assert one.amount == pytest.approx(by - LIMITS[0], abs=3e-4)
-        moments = np.linspace(plan.trajectory.times[one.waypoint], plan.trajectory.times[one.waypoint + 1], 2001)
+        moments = np.linspace(
+            plan.trajectory.times[one.waypoint], plan.trajectory.times[one.waypoint + 1], 2001
+        )
         samples = Samples(plan.scene, trajectory)
         _, hold = held_phase(samples)
-        assert one.amount + LIMITS[0] <= samples.grasp_errors_at(hold.object, hold.attachment, moments)[:, 0].max() + RESOLUTION
+        assert (
+            one.amount + LIMITS[0]
+            <= samples.grasp_errors_at(hold.object, hold.attachment, moments)[:, 0].max()
+            + RESOLUTION
+        )
 
 
 def test_the_largest_drift_is_that_of_a_fine_grid(plan: Plan) -> None:
@@ -103,7 +114,9 @@ def test_second_derivatives_stay_below_their_bounds(plan: Plan, seed: int, speed
     curve = Curve(times, positions * speed, rates * speed)
     phase, hold = next((phase, phase.holds[0]) for phase in plan.trajectory.phases if phase.held)
     span = dataclasses.replace(phase, first=0, last=1)
-    trajectory = Trajectory(names, times, positions * speed, (span,), plan.trajectory.robot_size, curve)
+    trajectory = Trajectory(
+        names, times, positions * speed, (span,), plan.trajectory.robot_size, curve
+    )
     samples = Samples(plan.scene, trajectory)
     chains = _hand_levers(samples, span, hold), _grasp_levers(samples, hold)
     velocity, acceleration = _rates(trajectory, times[:1], times[1:])
@@ -121,21 +134,34 @@ def placements(samples: Samples, hold: vkc.Hold, times: Floats) -> Floats:
     """Return the offset of the tool from the handle and the axial vector of their relative rotation, shape (K, 6)."""
     z = samples.world.positions(samples.trajectory, times, samples.free)
     attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
-    turns, origins = samples._frames(z, samples.scene.robot.tool_frame, f"{hold.object}.{attachment.link}")
-    own = [samples.trajectory.names.index(f"{hold.object}.{name}") for name in attachment.coordinates]
+    turns, origins = samples._frames(
+        z, samples.scene.robot.tool_frame, f"{hold.object}.{attachment.link}"
+    )
+    own = [
+        samples.trajectory.names.index(f"{hold.object}.{name}") for name in attachment.coordinates
+    ]
     rows = samples.trajectory.at(times)[:, own]
     found = []
     for turn, origin, row in zip(turns, origins, rows, strict=True):
         tool = attachment.tool(row)
         relative = (turn[1] @ tool.rotation).T @ turn[0]
         skew = 0.5 * (relative - relative.T)
-        found.append([*(origin[0] - origin[1] - turn[1] @ tool.translation), skew[2, 1], skew[0, 2], skew[1, 0]])
+        found.append(
+            [
+                *(origin[0] - origin[1] - turn[1] @ tool.translation),
+                skew[2, 1],
+                skew[0, 2],
+                skew[1, 0],
+            ]
+        )
     return np.array(found)
 
 
 @given(at=st.floats(0.05, 0.95), width=st.floats(0.02, 0.5), height=st.floats(0.6e-3, 0.99e-3))
 @settings(max_examples=50, deadline=None)
-def test_a_peak_between_samples_is_found_from_the_bound_of_its_curvature(at: float, width: float, height: float) -> None:
+def test_a_peak_between_samples_is_found_from_the_bound_of_its_curvature(
+    at: float, width: float, height: float
+) -> None:
     def evaluate(times: Floats) -> Floats:
         bump = height * np.exp(-(((times - at) / width) ** 2))
         return np.column_stack([bump, 0.0 * bump])
@@ -169,7 +195,9 @@ def test_differential_bases_do_not_drift_where_a_held_phase_begins() -> None:
     document = scene.document
     given_robot = document["robot"]
     robot = {"name": given_robot} if isinstance(given_robot, str) else dict(given_robot)
-    scene = Scene.from_document({**document, "robot": {**robot, "base": "differential"}}, scene.folder)
+    scene = Scene.from_document(
+        {**document, "robot": {**robot, "base": "differential"}}, scene.folder
+    )
     plan = vkc.plan(scene, list(steps), seed=27)
     assert plan.success, plan.report()
     samples = Samples(scene, plan.trajectory)

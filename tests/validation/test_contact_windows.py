@@ -59,7 +59,9 @@ def near(
         for first, second in named:
             by_hand = first in HANDS
             held = window.together and window.margin == 0.0
-            assert held or window.margin == (-np.inf if window.together else min(0.005, dist_safe) if by_hand else 0.0)
+            assert held or window.margin == (
+                -np.inf if window.together else min(0.005, dist_safe) if by_hand else 0.0
+            )
             assert window.contact == (0.0 if by_hand and not window.together else CONTACT)
             at = found.setdefault((first, second), [])
             at += [(window.first, window.last)] * ((window.first, window.last) not in at)
@@ -74,7 +76,10 @@ DOOR, TIP = ("door.frame", "door.panel"), ("stick.tip",)
 
 
 def hand_on(
-    label: str, near: tuple[int, int], held: tuple[int, int] | None = None, others: Sequence[str] = ()
+    label: str,
+    near: tuple[int, int],
+    held: tuple[int, int] | None = None,
+    others: Sequence[str] = (),
 ) -> dict[tuple[str, str], list[tuple[int, int]]]:
     """Return what the hand may be close to: the link it holds for a while, and around that time the object's others, too."""
     found = {(link, other): [near] for link in HANDS for other in (label, *others)}
@@ -84,7 +89,9 @@ def hand_on(
 def test_a_hand_and_what_it_holds_around_that_time() -> None:
     door = door_scene()
     assert near(door, still(door)) == {}
-    assert near(door, still(door), [Actuate("door", {"hinge": 1.0})]) == {}  # the motion says where it is held
+    assert (
+        near(door, still(door), [Actuate("door", {"hinge": 1.0})]) == {}
+    )  # the motion says where it is held
     assert near(door.with_held({"door": "handle"}), still(door)) == hand_on(
         "door.lever", (0, 10), (0, 0), DOOR
     )  # let go of at once
@@ -102,7 +109,9 @@ def test_a_hand_that_is_where_it_is_asked_to_grasp() -> None:
     scene = room(table())
     there = Script(scene).go(reaching(tool_at(STICK), above(STICK))).go(np.array(scene.start))
     assert near(scene, there.motion()) == {}
-    assert near(scene, there.motion(), [Grasp("stick")]) == hand_on("stick.stick", (20 - STEPS, 20 + STEPS), others=TIP)
+    assert near(scene, there.motion(), [Grasp("stick")]) == hand_on(
+        "stick.stick", (20 - STEPS, 20 + STEPS), others=TIP
+    )
 
 
 @pytest.mark.parametrize(("attachment", "rigid"), [("handle", True), ("handle_free", False)])
@@ -111,16 +120,26 @@ def test_only_a_grasp_without_freedom_moves_as_one(attachment: str, rigid: bool)
     freedoms = scene.objects["door"].object.attachment(attachment).coordinates
     names = (*scene.robot.coordinates.names, *(f"door.{name}" for name in freedoms))
     rows = np.column_stack([np.tile(scene.start, (2, 1)), np.zeros((2, len(names) - 9))])
-    samples = Samples(scene, Trajectory(names, np.arange(2.0), rows, (PhaseSpan("hold", 0, 1, scene.holds),), 9))
+    samples = Samples(
+        scene, Trajectory(names, np.arange(2.0), rows, (PhaseSpan("hold", 0, 1, scene.holds),), 9)
+    )
     near, lever = windows(samples, Solids(samples.world), [], Options())
     assert (near.together, near.margin, near.contact) == (False, 0.005, 0.0)
-    assert (lever.together, lever.margin, lever.contact) == ((True, 0.0, CONTACT) if rigid else (False, 0.005, CONTACT))
+    assert (lever.together, lever.margin, lever.contact) == (
+        (True, 0.0, CONTACT) if rigid else (False, 0.005, CONTACT)
+    )
 
 
 def carried(scene: Scene, *, aside: float = 0.5) -> Script:
     """Return a motion that takes the stick, lifts it, carries it aside and puts it down there."""
     down = reaching(tool_at(STICK), above(STICK))
-    script = Script(scene).go(down).take("stick").go(np.array(scene.start)).go(moved_base(scene.start, y=aside))
+    script = (
+        Script(scene)
+        .go(down)
+        .take("stick")
+        .go(np.array(scene.start))
+        .go(moved_base(scene.start, y=aside))
+    )
     return script.go(moved_base(down, y=aside)).let_go().go(moved_base(scene.start, y=aside))
 
 
@@ -128,8 +147,13 @@ def test_what_a_carried_thing_rests_on_where_it_is_taken_and_left() -> None:
     """Not what it only passes, and neither what is further away; and only around these times."""
     short = box("board", [0.5, 0.6, 0.02], [0.8, 0.0, TOP - 0.011])
     other = box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - 0.011])
-    between = box("between", [0.3, 0.1, 0.05], [0.8, 0.5, TOP + 0.125])  # 5 cm below the discs when they pass
-    beside, far = box("near", [0.02, 0.1, 0.1], [0.875, 0.0, TOP + 0.05]), box("far", [0.02, 0.1, 0.1], [0.885, 0.0, TOP + 0.05])
+    between = box(
+        "between", [0.3, 0.1, 0.05], [0.8, 0.5, TOP + 0.125]
+    )  # 5 cm below the discs when they pass
+    beside, far = (
+        box("near", [0.02, 0.1, 0.1], [0.875, 0.0, TOP + 0.05]),
+        box("far", [0.02, 0.1, 0.1], [0.885, 0.0, TOP + 0.05]),
+    )
     scene = room(short, other, between, beside, far)
     taken, left = (20, 20 + STEPS), (80 - STEPS, 80)
     assert near(scene, carried(scene, aside=1.0).motion(), dist_safe=0.055) == {
@@ -140,18 +164,35 @@ def test_what_a_carried_thing_rests_on_where_it_is_taken_and_left() -> None:
         ("stick.stick", "other"): [left],
         ("stick.tip", "other"): [left],
     }
-    wide = near(scene, carried(scene, aside=1.0).motion(), dist_safe=0.15)  # the wrist is that close when the hand closes
-    assert {pair for pair in wide if pair[0] in set(scene.robot.links)} == set(hand_on("stick.stick", (0, 0), others=TIP))
+    wide = near(
+        scene, carried(scene, aside=1.0).motion(), dist_safe=0.15
+    )  # the wrist is that close when the hand closes
+    assert {pair for pair in wide if pair[0] in set(scene.robot.links)} == set(
+        hand_on("stick.stick", (0, 0), others=TIP)
+    )
     tight = near(scene, carried(scene, aside=1.0).motion(), dist_safe=1e-3 / 2)
-    assert tight.keys() == hand_on("stick.stick", (0, 0), others=TIP).keys()  # everything is 1 mm away at least
+    assert (
+        tight.keys() == hand_on("stick.stick", (0, 0), others=TIP).keys()
+    )  # everything is 1 mm away at least
 
 
-def test_what_is_in_the_hand_at_the_start_leaves_what_it_lies_on_then_and_rests_nowhere_if_it_stays() -> None:
+def test_what_is_in_the_hand_at_the_start_leaves_what_it_lies_on_then_and_rests_nowhere_if_it_stays() -> (
+    None
+):
     scene = room(table()).with_held({"stick": "grip"})
     low = scene.with_start(arm=reaching(tool_at(STICK), above(STICK))[3:])
     drive = Script(low).go(moved_base(low.start, y=0.3)).motion()
-    assert near(low, drive) == {**hand_on("stick.stick", (0, 20), others=TIP), ("stick.stick", "table"): [(0, STEPS)]}
-    left = Script(low).go(moved_base(low.start, y=0.3)).let_go().go(moved_base(low.start, y=0.3, x=-0.1)).motion()
+    assert near(low, drive) == {
+        **hand_on("stick.stick", (0, 20), others=TIP),
+        ("stick.stick", "table"): [(0, STEPS)],
+    }
+    left = (
+        Script(low)
+        .go(moved_base(low.start, y=0.3))
+        .let_go()
+        .go(moved_base(low.start, y=0.3, x=-0.1))
+        .motion()
+    )
     assert near(low, left) == {
         **hand_on("stick.stick", (0, 20 + STEPS), (0, 20), TIP),
         ("stick.stick", "table"): [(0, STEPS), (20 - STEPS, 20)],
@@ -161,7 +202,12 @@ def test_what_is_in_the_hand_at_the_start_leaves_what_it_lies_on_then_and_rests_
 def test_what_lies_on_the_floor() -> None:
     on_floor = pin.SE3(np.eye(3), np.array([0.8, 1.0, 0.036]))
     scene = with_object(room(objects=("stick", "ball")), "ball", on_floor)
-    taken = Script(scene).take("ball", "grip", (0.0, 0.0, 0.0)).go(moved_base(scene.start, x=-0.2)).motion()
+    taken = (
+        Script(scene)
+        .take("ball", "grip", (0.0, 0.0, 0.0))
+        .go(moved_base(scene.start, x=-0.2))
+        .motion()
+    )
     found = near(scene, taken)
     assert found == {**hand_on("ball.ball", (0, 20)), ("ball.ball", FLOOR): [(0, STEPS)]}
 
@@ -169,9 +215,17 @@ def test_what_lies_on_the_floor() -> None:
 @pytest.mark.parametrize(
     ("gap", "allow", "expected"),
     [
-        (0.005, [], (2, 6, 0.0, CONTACT, False, True)),  # until the front, 18 mm thick, has left it by √(20² - 5²) mm
+        (
+            0.005,
+            [],
+            (2, 6, 0.0, CONTACT, False, True),
+        ),  # until the front, 18 mm thick, has left it by √(20² - 5²) mm
         (-0.002, [], (2, 6, -np.inf, np.inf, True, True)),
-        (-0.002, [{"pair": ["drawer.tray", "side"], "margin": -0.003}], (0, 8, -0.003, CONTACT + 0.003, False, True)),
+        (
+            -0.002,
+            [{"pair": ["drawer.tray", "side"], "margin": -0.003}],
+            (0, 8, -0.003, CONTACT + 0.003, False, True),
+        ),
     ],
 )
 def test_neighbours_at_the_waypoints_at_which_their_joints_have_them_so(
@@ -183,13 +237,24 @@ def test_neighbours_at_the_waypoints_at_which_their_joints_have_them_so(
         scene = changed(side, allow=allow).with_state("drawer", {"slide": 0.3})
     slide = np.array([0.3, 0.1, 0.03, 0.0, 0.0, 0.0, 0.03, 0.1, 0.3])
     rows = np.column_stack([np.tile(scene.start, (9, 1)), slide])
-    motion = Trajectory((*scene.robot.coordinates.names, "drawer.slide"), np.arange(9.0), rows, (PhaseSpan("slide", 0, 8),), 9)
+    motion = Trajectory(
+        (*scene.robot.coordinates.names, "drawer.slide"),
+        np.arange(9.0),
+        rows,
+        (PhaseSpan("slide", 0, 8),),
+        9,
+    )
     samples = Samples(scene, motion)
-    found = [window for window in windows(samples, Solids(samples.world), [], Options()) if len(window.pairs)]
+    found = [
+        window
+        for window in windows(samples, Solids(samples.world), [], Options())
+        if len(window.pairs)
+    ]
     for window in found:
-        assert {frozenset(samples.world.collision_labels[k] for k in pair) for pair in window.pairs.tolist()} == {
-            frozenset(("drawer.tray", "side"))
-        }
+        assert {
+            frozenset(samples.world.collision_labels[k] for k in pair)
+            for pair in window.pairs.tolist()
+        } == {frozenset(("drawer.tray", "side"))}
     assert expected in [tuple(window[1:]) for window in found]
     assert len(found) == 1 + (bool(allow))
 
@@ -200,14 +265,34 @@ def test_what_stands_in_something_leaves_it_once_and_within_a_second() -> None:
         warnings.simplefilter("ignore")
         scene = room(table(gap=-0.002))
     down, up = reaching(tool_at(STICK), above(STICK)), np.array(scene.start)
-    script = Script(scene).go(down).take("stick").go(up).go(down).let_go().go(up).go(down).take("stick").go(up)
+    script = (
+        Script(scene)
+        .go(down)
+        .take("stick")
+        .go(up)
+        .go(down)
+        .let_go()
+        .go(up)
+        .go(down)
+        .take("stick")
+        .go(up)
+    )
     samples = Samples(scene, script.motion())
-    inside = [window for window in windows(samples, Solids(samples.world), [], Options()) if window.margin < 0.0]
+    inside = [
+        window
+        for window in windows(samples, Solids(samples.world), [], Options())
+        if window.margin < 0.0
+    ]
     assert inside
     for window in inside:
         assert (window.first, window.last) == (20, 20 + STEPS)
-        assert (window.margin, window.contact) == (pytest.approx(-0.002, abs=1e-6), pytest.approx(0.002 + CONTACT, abs=1e-6))
-        assert {samples.world.collision_labels[k] for pair in window.pairs.tolist() for k in pair} == {"stick.stick", "table"}
+        assert (window.margin, window.contact) == (
+            pytest.approx(-0.002, abs=1e-6),
+            pytest.approx(0.002 + CONTACT, abs=1e-6),
+        )
+        assert {
+            samples.world.collision_labels[k] for pair in window.pairs.tolist() for k in pair
+        } == {"stick.stick", "table"}
 
 
 def test_things_that_lie_side_by_side() -> None:
@@ -223,7 +308,11 @@ def test_things_that_lie_side_by_side() -> None:
 
 def test_a_tip_and_what_it_holds() -> None:
     scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"})
-    script = Script(scene).take("ball", "pull", (0.0, 0.0, 0.0), by="stick.tip").go(moved_base(scene.start, y=0.5))
+    script = (
+        Script(scene)
+        .take("ball", "pull", (0.0, 0.0, 0.0), by="stick.tip")
+        .go(moved_base(scene.start, y=0.5))
+    )
     found = near(scene, script.motion())
     assert found == {
         **hand_on("stick.stick", (0, 20), others=TIP),
@@ -238,14 +327,18 @@ def test_a_frame_and_what_is_at_its_target_when_it_is_there() -> None:
     tip = scene.objects["stick"].link_placement("tip").translation
     for gap, touches in ((0.0, True), (0.019, True), (0.021, False), (-0.05, True)):
         aside = 0.9 - gap - tip[1]
-        there = Script(room(table(), {**wall, "position": [tip[0], 0.95, tip[2]]}).with_held({"stick": "grip"}))
+        there = Script(
+            room(table(), {**wall, "position": [tip[0], 0.95, tip[2]]}).with_held({"stick": "grip"})
+        )
         there.go(moved_base(scene.start, y=aside)).go(np.array(scene.start))
         target = tip + np.array([0.0, aside, 0.0])
         for goal in (tuple(target), pin.SE3(np.eye(3), target)):
             found = near(there.scene, there.motion(), [Touch("stick.tip", goal)])
             wanted = {("stick.tip", "wall"): [(20 - STEPS, 20 + STEPS)]} if touches else {}
             assert found == {**hand_on("stick.stick", (0, 40), others=TIP), **wanted}
-        assert ("stick.tip", "wall") not in near(there.scene, there.motion(), [Touch("stick.tip", tuple(target + 0.05))])
+        assert ("stick.tip", "wall") not in near(
+            there.scene, there.motion(), [Touch("stick.tip", tuple(target + 0.05))]
+        )
 
 
 def test_what_rides_and_what_it_stands_on() -> None:
@@ -273,7 +366,10 @@ def test_how_close_what_moves_as_one_is_says_nothing_of_a_motion() -> None:
     assert clearances[0] > 0.02
 
 
-@pytest.mark.parametrize(("openings", "told"), [((0.04, 0.04, 0.04), 0), ((None, 0.04, 0.04), 1), ((0.04, None, 0.04), 1)])
+@pytest.mark.parametrize(
+    ("openings", "told"),
+    [((0.04, 0.04, 0.04), 0), ((None, 0.04, 0.04), 1), ((0.04, None, 0.04), 1)],
+)
 def test_fingers_are_open_as_asked_on_the_way_to_what_they_take_and_while_they_hold_it(
     tmp_path: Path, openings: tuple[float | None, ...], told: int
 ) -> None:
@@ -291,9 +387,18 @@ def test_what_can_be_carried_itself_may_be_touched_where_it_is_then() -> None:
     tip = scene.objects["stick"].link_placement("tip").translation
     beside = with_object(scene, "ball", pin.SE3(np.eye(3), tip + np.array([0.0, 0.035, 0.0])))
     for there, touched in ((beside, True), (scene, False)):
-        script = Script(there).go(moved_base(there.start, x=-0.1), steps=2 * STEPS).go(there.start, steps=2 * STEPS)
-        found = near(there, script.motion(), [Touch("stick.tip", tuple(tip))]).get(("stick.tip", "ball.ball"), [])
+        script = (
+            Script(there)
+            .go(moved_base(there.start, x=-0.1), steps=2 * STEPS)
+            .go(there.start, steps=2 * STEPS)
+        )
+        found = near(there, script.motion(), [Touch("stick.tip", tuple(tip))]).get(
+            ("stick.tip", "ball.ball"), []
+        )
         assert ((3 * STEPS, 4 * STEPS) in found) == touched
     inside = [Touch("ball.ball", tuple(tip + np.array([0.0, 0.035, 0.0])))]
     found = near(beside, Script(beside).wait().motion(), inside)
-    assert found == {**hand_on("stick.stick", (0, 2), others=TIP), ("stick.tip", "ball.ball"): [(0, 2)]}
+    assert found == {
+        **hand_on("stick.stick", (0, 2), others=TIP),
+        ("stick.tip", "ball.ball"): [(0, 2)],
+    }

@@ -79,7 +79,13 @@ def test_how_long_the_robot_stands_where_it_takes_something(way: list[float], re
         assert found == []
         return
     (one,) = found
-    assert (one.constraint, one.subject, one.waypoint, one.time, one.unit) == ("dwell", "door.handle", 3, 3.0, "s")
+    assert (one.constraint, one.subject, one.waypoint, one.time, one.unit) == (
+        "dwell",
+        "door.handle",
+        3,
+        3.0,
+        "s",
+    )
     assert one.amount == pytest.approx(2.0 - rest)
     assert one.detail == f"the robot stands still for {rest:.2f} s, 2 s are asked for"
 
@@ -94,12 +100,21 @@ def test_a_millionth_of_a_second_less_is_all_right(late: float, told: bool) -> N
 @pytest.mark.parametrize("piece", [2, 3])
 def test_what_leaves_and_comes_back_does_not_rest(piece: int, by: float, told: bool) -> None:
     """By more than what counts as motion, of any coordinate."""
-    found = rests([0, 1, 2, 2, 2, 3, 4], [span(0, 3), span(3, 6, DOOR)], bulge=(piece, by * MOTION_TOLERANCE))
+    found = rests(
+        [0, 1, 2, 2, 2, 3, 4], [span(0, 3), span(3, 6, DOOR)], bulge=(piece, by * MOTION_TOLERANCE)
+    )
     assert bool(found) == told
 
 
 def test_each_time_something_is_taken_or_let_go_of() -> None:
-    phases = [span(0, 1), span(1, 2, STICK), span(2, 3, STICK, BALL), span(3, 4, STICK), span(4, 5), span(5, 6)]
+    phases = [
+        span(0, 1),
+        span(1, 2, STICK),
+        span(2, 3, STICK, BALL),
+        span(3, 4, STICK),
+        span(4, 5),
+        span(5, 6),
+    ]
     found = rests([0, 1, 2, 3, 4, 5, 6], phases)
     assert [(one.subject, one.waypoint) for one in found] == [
         ("stick.grip", 1),
@@ -114,7 +129,12 @@ def test_each_time_something_is_taken_or_let_go_of() -> None:
 
 @pytest.mark.parametrize(
     ("way", "rest"),
-    [([0, 1, 2, 3, 3, 3, 4], 2.0), ([0, 1, 3, 3, 3, 4, 5], 1.0), ([0, 3, 3, 3, 4, 5, 6], 0.0), ([0, 1, 2, 3, 3, 3, 3], 3.0)],
+    [
+        ([0, 1, 2, 3, 3, 3, 4], 2.0),
+        ([0, 1, 3, 3, 3, 4, 5], 1.0),
+        ([0, 3, 3, 3, 4, 5, 6], 0.0),
+        ([0, 1, 2, 3, 3, 3, 3], 3.0),
+    ],
 )
 def test_fingers_move_from_where_a_phase_begins(way: list[float], rest: float) -> None:
     """What it stood still before does not count."""
@@ -132,14 +152,29 @@ def test_the_first_opening_is_there_from_the_start() -> None:
 GRIPPER = SimpleNamespace(resting=0.08)
 
 
-def told(openings: list[float | None], *holds: tuple[Hold, ...], monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    phases = [span(k, k + 1, *hold, opening=opening) for k, (hold, opening) in enumerate(zip(holds, openings, strict=True))]
+def told(
+    openings: list[float | None], *holds: tuple[Hold, ...], monkeypatch: pytest.MonkeyPatch
+) -> list[tuple[Any, ...]]:
+    phases = [
+        span(k, k + 1, *hold, opening=opening)
+        for k, (hold, opening) in enumerate(zip(holds, openings, strict=True))
+    ]
     asked = {"stick.grip": 0.03, "door.handle": None}
     way = [0.0] * (len(phases) + 1)
     times = 10.0 * np.arange(len(way))
-    found = rests(way, phases, held=holds[0], times=times.tolist(), gripper=GRIPPER, openings=asked, monkeypatch=monkeypatch)
+    found = rests(
+        way,
+        phases,
+        held=holds[0],
+        times=times.tolist(),
+        gripper=GRIPPER,
+        openings=asked,
+        monkeypatch=monkeypatch,
+    )
     assert {one.constraint for one in found} <= {"opening"}
-    return [(one.subject, one.waypoint, one.time, pytest.approx(one.amount), one.unit) for one in found]
+    return [
+        (one.subject, one.waypoint, one.time, pytest.approx(one.amount), one.unit) for one in found
+    ]
 
 
 def test_the_gripper_is_as_far_open_as_the_next_thing_asks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,13 +186,16 @@ def test_the_gripper_is_as_far_open_as_the_next_thing_asks(monkeypatch: pytest.M
         ("stick.grip", 2, 20.0, pytest.approx(0.02), "m"),
     ]
     assert told([None, 0.08], (), (DOOR,), monkeypatch=monkeypatch) == []  # at rest
-    assert told([0.05], (DOOR,), monkeypatch=monkeypatch) == [("door.handle", 0, 0.0, pytest.approx(0.03), "m")]
+    assert told([0.05], (DOOR,), monkeypatch=monkeypatch) == [
+        ("door.handle", 0, 0.0, pytest.approx(0.03), "m")
+    ]
     assert told([0.03, 0.03], (STICK,), (DOOR,), monkeypatch=monkeypatch) == [
         ("door.handle", 1, 10.0, pytest.approx(0.05), "m")
     ]  # what it has, not what it takes next
 
 
-# --- pushes -----------------------------------------------------------------------------------------------------------
+# --- pushes
+# -----------------------------------------------------------------------------------------------------------
 
 
 def pushed(
@@ -170,7 +208,9 @@ def pushed(
         assert rows.tolist() == list(range(10, 10 + len(hands)))
         return [pin.SE3(np.eye(3), np.array([0.0, 0.0, z])) for z in placed[frame]]
 
-    attachment = SimpleNamespace(contact=contact, link="panel", placement=pin.SE3.Identity(), offset=pin.SE3.Identity())
+    attachment = SimpleNamespace(
+        contact=contact, link="panel", placement=pin.SE3.Identity(), offset=pin.SE3.Identity()
+    )
     objects = {"door": SimpleNamespace(object=SimpleNamespace(attachments={"handle": attachment}))}
     monkeypatch.setattr(touching, "hand_frame", lambda robot, given: pin.SE3.Identity())
     samples: Any = SimpleNamespace(
@@ -182,14 +222,19 @@ def pushed(
         times=0.5 * np.arange(30),
     )
     found = check_pushes(samples)
-    return [(one.constraint, one.subject, one.waypoint, one.time, pytest.approx(one.amount), one.unit) for one in found]
+    return [
+        (one.constraint, one.subject, one.waypoint, one.time, pytest.approx(one.amount), one.unit)
+        for one in found
+    ]
 
 
 def test_what_is_pushed_never_comes_back_with_the_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     there = [0.0, 0.1, 0.3, 0.3, 0.6]
     assert pushed(there, there, monkeypatch) == []
     back = [0.0, 0.1, 0.3, 0.25, 0.2, 0.6]
-    assert pushed(back, back, monkeypatch) == [("push", "door.handle", 1, 7.0, pytest.approx(0.1 - CONTACT), "m")]
+    assert pushed(back, back, monkeypatch) == [
+        ("push", "door.handle", 1, 7.0, pytest.approx(0.1 - CONTACT), "m")
+    ]
     assert pushed(back, back, monkeypatch, "grasp") == []
     assert pushed(back, [0.0] * 6, monkeypatch) == []  # the hand goes alone
     for slack, wrong in ((0.9, False), (1.1, True)):
@@ -203,10 +248,13 @@ def test_what_it_had_gone_back_counts_from_the_furthest(monkeypatch: pytest.Monk
     ways = [0.0, 0.1, 0.1 - half, 0.1, 0.1 - half]
     assert pushed(ways, ways, monkeypatch) == []
     ways = [0.0, 0.1, 0.1 - half, 0.1 - 2 * half]
-    assert pushed(ways, ways, monkeypatch) == [("push", "door.handle", 1, 6.5, pytest.approx(2 * half - CONTACT), "m")]
+    assert pushed(ways, ways, monkeypatch) == [
+        ("push", "door.handle", 1, 6.5, pytest.approx(2 * half - CONTACT), "m")
+    ]
 
 
-# --- how long ---------------------------------------------------------------------------------------------------------
+# --- how long
+# ---------------------------------------------------------------------------------------------------------
 
 
 def windows(times: list[float], moving: list[bool], dt: float = 0.25) -> Any:
@@ -222,7 +270,9 @@ def test_what_was_in_contact_may_be_close_for_a_second_or_as_many_steps() -> Non
     made = windows(even, [True] * 20)
     assert [made._until(at) for at in (0, 1, 10, 15, 16, 17, 20)] == [4, 5, 14, 19, 20, 20, 20]
     assert [made._since(at) for at in (20, 19, 10, 5, 4, 3, 0)] == [16, 15, 6, 1, 0, 0, 0]
-    slow = windows([1.0 * k for k in range(21)], [True] * 20)  # steps that take longer: four of them
+    slow = windows(
+        [1.0 * k for k in range(21)], [True] * 20
+    )  # steps that take longer: four of them
     assert (slow._until(5), slow._since(15)) == (9, 11)
     quick = windows([0.125 * k for k in range(21)], [True] * 20)  # or shorter: a second
     assert (quick._until(5), quick._since(15)) == (13, 7)
@@ -241,7 +291,9 @@ def test_what_lasts_from_where_to_where() -> None:
     made = windows([0.0], [])
     made.trajectory.phases = [SimpleNamespace(first=3 * k) for k in range(4)]
     runs = made._runs([{"a", "b"}, {"a"}, {"a", "c"}, {"c"}, {"b", "c"}])
-    assert sorted(runs, key=str) == sorted([("b", None, 0), ("a", None, 6), ("c", 3, None), ("b", 9, None)], key=str)
+    assert sorted(runs, key=str) == sorted(
+        [("b", None, 0), ("a", None, 6), ("c", 3, None), ("b", 9, None)], key=str
+    )
     assert list(made._runs([{"a"}, {"a"}])) == [("a", None, None)]
     assert list(made._runs([set(), set()])) == []
 
@@ -250,7 +302,10 @@ def test_pairs_are_of_the_smaller_and_the_larger() -> None:
     made = windows([0.0], [])
     assert made._pairs([3, 1], [2]).tolist() == [[2, 3], [1, 2]]
     assert made._pairs([], [2]).shape == made._pairs([1], []).shape == (0, 2)
-    made.labels, made.solids = np.array(["stick.tip", "base", "stick.grip", "stick.x"]), SimpleNamespace(bodies=3)
+    made.labels, made.solids = (
+        np.array(["stick.tip", "base", "stick.grip", "stick.x"]),
+        SimpleNamespace(bodies=3),
+    )
     assert made._shapes("stick") == [0, 2]  # what stands beyond is an obstacle of that name
     assert made._between({"stick.tip", "base"}, {"stick.grip"}).tolist() == [[0, 2], [1, 2]]
 
@@ -274,11 +329,22 @@ class Allowed(Allowance):
 
 @pytest.mark.parametrize(
     ("holds", "spans"),
-    [("xxxxx", [(0, 4)]), (".xx..", [(1, 2)]), ("x..xx", [(0, 0), (3, 4)]), (".....", []), ("....x", [(4, 4)])],
+    [
+        ("xxxxx", [(0, 4)]),
+        (".xx..", [(1, 2)]),
+        ("x..xx", [(0, 0), (3, 4)]),
+        (".....", []),
+        ("....x", [(4, 4)]),
+    ],
 )
 @pytest.mark.parametrize(
     ("margin", "contact", "together"),
-    [(0.005, CONTACT, False), (-0.003, CONTACT + 0.003, False), (-0.5 * CONTACT, 1.5 * CONTACT, False), (-np.inf, np.inf, True)],
+    [
+        (0.005, CONTACT, False),
+        (-0.003, CONTACT + 0.003, False),
+        (-0.5 * CONTACT, 1.5 * CONTACT, False),
+        (-np.inf, np.inf, True),
+    ],
 )
 def test_what_is_allowed_where_it_is(
     holds: str, spans: list[tuple[int, int]], margin: float, contact: float, together: bool
@@ -287,7 +353,9 @@ def test_what_is_allowed_where_it_is(
     made = windows([0.0], [True] * 4)
     made.labels = made.keys = np.array(["drawer.tray", "side"])
     made.samples = SimpleNamespace(
-        z=np.zeros((9, 2)), waypoint_rows=np.arange(0, 9, 2), world=SimpleNamespace(coordinates=SimpleNamespace(names=()))
+        z=np.zeros((9, 2)),
+        waypoint_rows=np.arange(0, 9, 2),
+        world=SimpleNamespace(coordinates=SimpleNamespace(names=())),
     )
     one: Any = Allowed([mark == "x" for mark in holds], margin)
     found = list(made._allowed(one))

@@ -41,10 +41,17 @@ def where(q: np.ndarray) -> list[pin.SE3]:
 def test_bounds_hold_and_the_nearest_is_the_nearest(seed: int) -> None:
     shapes, q = solids().world.shapes, configuration(seed)
     placed, at = solids().at(q[None]), where(q)
-    pairs = np.array([(a, b) for a, b in itertools.combinations(range(len(shapes)), 2) if a < solids().bodies])
+    pairs = np.array(
+        [(a, b) for a, b in itertools.combinations(range(len(shapes)), 2) if a < solids().bodies]
+    )
     pairs = pairs[np.random.default_rng(seed).permutation(len(pairs))[:400]]
     first = np.zeros(len(pairs), int)
-    expected = np.array([shape_distance(shapes[a].geometry, at[a], shapes[b].geometry, at[b]) for a, b in pairs.tolist()])
+    expected = np.array(
+        [
+            shape_distance(shapes[a].geometry, at[a], shapes[b].geometry, at[b])
+            for a, b in pairs.tolist()
+        ]
+    )
     np.testing.assert_allclose(placed.distances(first, pairs), expected, atol=COAL)
     bounds = placed.bounds(first, pairs)
     assert (bounds <= expected + COAL).all()
@@ -61,7 +68,10 @@ def test_what_is_around_a_point(seed: int) -> None:
     counted = 0
     for point in [at[0].translation + rng.normal(scale=0.3, size=3) for _ in range(5)]:
         ball, here = coal.Sphere(POINT), pin.SE3(np.eye(3), point)
-        distances = [shape_distance(ball, here, shape.geometry, at[k]) for k, shape in enumerate(solids().world.shapes)]
+        distances = [
+            shape_distance(ball, here, shape.geometry, at[k])
+            for k, shape in enumerate(solids().world.shapes)
+        ]
         near = [k for k, distance in enumerate(distances) if distance < 0.2]
         assert placed.around(point, 0.2) == near
         counted += len(near)
@@ -71,13 +81,19 @@ def test_what_is_around_a_point(seed: int) -> None:
 def test_many_configurations_are_as_one_by_one() -> None:
     q = np.array([configuration(seed) for seed in range(6)])
     together, count = solids().at(q), solids().bodies
-    pairs = np.array([(a, b) for a in range(count) for b in range(count, len(solids().world.shapes))])
+    pairs = np.array(
+        [(a, b) for a in range(count) for b in range(count, len(solids().world.shapes))]
+    )
     which, distances = together.nearest(pairs)
     for state, row in enumerate(q):
         alone, none = solids().at(row[None]), np.zeros(len(pairs), int)
         np.testing.assert_array_equal(alone.nearest(pairs), ([which[state]], [distances[state]]))
-        np.testing.assert_array_equal(alone.distances(none, pairs), together.distances(none + state, pairs))
-        np.testing.assert_array_equal(alone.bounds(none, pairs), together.bounds(none + state, pairs))
+        np.testing.assert_array_equal(
+            alone.distances(none, pairs), together.distances(none + state, pairs)
+        )
+        np.testing.assert_array_equal(
+            alone.bounds(none, pairs), together.bounds(none + state, pairs)
+        )
         for one, other in zip(alone.corners, together.corners, strict=True):
             np.testing.assert_array_equal(one[0], other[state])
 
@@ -85,7 +101,9 @@ def test_many_configurations_are_as_one_by_one() -> None:
 def test_only_what_may_be_nearest_is_asked_of_coal(monkeypatch: pytest.MonkeyPatch) -> None:
     """What bounds show to be further away than another is not looked at, even where they are wrong."""
     mine = Solids(World(door_scene()))
-    pairs = np.array([(a, b) for a in range(mine.bodies) for b in range(mine.bodies, len(mine.world.shapes))])
+    pairs = np.array(
+        [(a, b) for a in range(mine.bodies) for b in range(mine.bodies, len(mine.world.shapes))]
+    )
     placed = mine.at(mine.world.coordinates.q(np.zeros((1, mine.world.coordinates.size))))
     distances = placed.distances(np.zeros(len(pairs), int), pairs)
     (best,), _ = placed.nearest(pairs)

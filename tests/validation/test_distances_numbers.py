@@ -34,7 +34,9 @@ def test_boxes_are_those_around_the_corners_of_turned_boxes() -> None:
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     for state in range(2):
         data = pin.GeometryData(world.collision)
-        pin.updateGeometryPlacements(world.model, world.model.createData(), world.collision, data, q[state])
+        pin.updateGeometryPlacements(
+            world.model, world.model.createData(), world.collision, data, q[state]
+        )
         for g, where in enumerate(data.oMg):
             corners = (mine.center[g] + signs * mine.half[g]) @ where.rotation.T + where.translation
             np.testing.assert_allclose(lower[state, g], corners.min(axis=0), atol=1e-9)
@@ -58,7 +60,9 @@ def test_bounds_of_boxes() -> None:
     unit = ([0.0, 0.0, 0.0], [1.0, 1.0, 1.0])
     assert between(unit, ([1.25, 0.5, 0.5], [2.0, 2.0, 2.0])) == 0.25
     assert between(unit, ([4.0, 5.0, 0.5], [5.0, 6.0, 2.0])) == 5.0
-    assert between(unit, ([-3.0, -5.0, -13.0], [-2.0, -2.0, -5.0])) == pytest.approx(np.sqrt(4.0 + 4.0 + 25.0))
+    assert between(unit, ([-3.0, -5.0, -13.0], [-2.0, -2.0, -5.0])) == pytest.approx(
+        np.sqrt(4.0 + 4.0 + 25.0)
+    )
     assert between(unit, ([0.5, 0.5, 0.5], [2.0, 2.0, 2.0])) == -np.inf
     assert between(unit, ([0.25, 0.25, 0.25], [0.5, 0.5, 0.5])) == -np.inf
     assert between(unit, ([0.5, 0.5, 1.0 + 1e-9], [2.0, 2.0, 2.0])) == pytest.approx(1e-9, rel=1e-6)
@@ -82,7 +86,10 @@ def test_how_far_shapes_move_is_the_sum_over_their_joints() -> None:
             name = model.names[joint]
             if model.joints[joint].shortname() == "JointModelPlanar":
                 kinds.add("planar")
-                ways = np.linalg.norm(np.diff(z[:, :2], axis=0), axis=1) + np.abs(np.diff(z[:, 2])) * far
+                ways = (
+                    np.linalg.norm(np.diff(z[:, :2], axis=0), axis=1)
+                    + np.abs(np.diff(z[:, 2])) * far
+                )
             else:
                 column = z[:, names.index(name)]
                 ways = np.abs(np.diff(column))
@@ -103,7 +110,13 @@ def test_how_far_shapes_move_is_the_sum_over_their_joints() -> None:
 def test_how_far_a_point_at_a_free_joint_moves(angle: float) -> None:
     """By its way and its turn, of quaternions of any length and either sign."""
     turn = np.array([np.sin(angle / 2), 0.0, 0.0, np.cos(angle / 2)])
-    rows = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0], [3.0, 4.0, 0.0, *(-0.5 * turn)], [3.0, 4.0, 2.0, *(3.0 * turn)]])
+    rows = np.array(
+        [
+            [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0],
+            [3.0, 4.0, 0.0, *(-0.5 * turn)],
+            [3.0, 4.0, 2.0, *(3.0 * turn)],
+        ]
+    )
     np.testing.assert_allclose(_free(rows, 0.25), [5.0 + 0.25 * angle, 2.0], atol=1e-7)
 
 
@@ -128,7 +141,11 @@ def test_a_point_has_a_size() -> None:
     assert POINT == 1e-4  # [m]
     mine = solids()
     placed = mine.at(mine.world.coordinates.q(np.zeros((1, mine.world.coordinates.size))))
-    wall = next(k for k in range(mine.bodies, len(mine.world.shapes)) if "wall" in mine.world.collision_labels[k])
+    wall = next(
+        k
+        for k in range(mine.bodies, len(mine.world.shapes))
+        if "wall" in mine.world.collision_labels[k]
+    )
     lower, upper = (corners[0, wall] for corners in placed.corners)
     for axis in range(3):
         for edge, side in ((lower, -1.0), (upper, 1.0)):

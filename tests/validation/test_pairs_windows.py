@@ -11,7 +11,11 @@ from vkc_pin.validation.pairs import PairTable, _Windows
 
 numbers = st.integers(0, 6)
 pairs = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=8, unique=True)
-spans = st.tuples(st.integers(0, 5), st.integers(0, 5), st.lists(st.tuples(numbers, numbers), max_size=4, unique=True))
+spans = st.tuples(
+    st.integers(0, 5),
+    st.integers(0, 5),
+    st.lists(st.tuples(numbers, numbers), max_size=4, unique=True),
+)
 
 
 def made(windows: list[Window], mine: np.ndarray) -> PairTable:
@@ -24,14 +28,28 @@ def made(windows: list[Window], mine: np.ndarray) -> PairTable:
 
 @given(pairs, st.lists(spans, max_size=6), st.data())
 def test_what_holds_for_a_pair_between_two_waypoints(
-    mine: list[tuple[int, int]], given_spans: list[tuple[int, int, list[tuple[int, int]]]], data: st.DataObject
+    mine: list[tuple[int, int]],
+    given_spans: list[tuple[int, int, list[tuple[int, int]]]],
+    data: st.DataObject,
 ) -> None:
     windows = [
-        Window(np.array(own, int).reshape(-1, 2), first, last, 0.01 - 0.004 * k, 1e-4 * (k + 1), k % 2 == 0)
+        Window(
+            np.array(own, int).reshape(-1, 2),
+            first,
+            last,
+            0.01 - 0.004 * k,
+            1e-4 * (k + 1),
+            k % 2 == 0,
+        )
         for k, (first, last, own) in enumerate(given_spans)
     ]
     table = made(windows, np.array(mine))
-    asked = data.draw(st.lists(st.tuples(st.integers(0, len(mine) - 1), st.integers(0, 5), st.integers(0, 2)), max_size=12))
+    asked = data.draw(
+        st.lists(
+            st.tuples(st.integers(0, len(mine) - 1), st.integers(0, 5), st.integers(0, 2)),
+            max_size=12,
+        )
+    )
     which, first, longer = (np.array([row[k] for row in asked], int) for k in range(3))
     last = first + longer
     k, window = table._windows.at(which, first, last)
@@ -47,10 +65,19 @@ def test_what_holds_for_a_pair_between_two_waypoints(
         return [getattr(windows[w], name) for r, w in expected if r == row]
 
     rows = range(len(asked))
-    assert table.contact_at(which, first, last).tolist() == [max([0.0, *of(row, "contact")]) for row in rows]
-    assert table.together_at(which, first, last).tolist() == [any(of(row, "together")) for row in rows]
+    assert table.contact_at(which, first, last).tolist() == [
+        max([0.0, *of(row, "contact")]) for row in rows
+    ]
+    assert table.together_at(which, first, last).tolist() == [
+        any(of(row, "together")) for row in rows
+    ]
     here = [
-        [windows[w].margin for w, (a, b, own) in enumerate(given_spans) if mine[p] in own and a <= t <= b] for p, t, _ in asked
+        [
+            windows[w].margin
+            for w, (a, b, own) in enumerate(given_spans)
+            if mine[p] in own and a <= t <= b
+        ]
+        for p, t, _ in asked
     ]
     assert table.margins_at(which, first).tolist() == [min([0.02, *margins]) for margins in here]
     assert (table.margins == 0.02).all()  # they are left as they are

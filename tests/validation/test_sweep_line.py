@@ -32,7 +32,9 @@ class Line:
         self.margins, self.group = np.full(len(self.pairs), margin), [""] * (2 + len(balls))
         self.own, self.contact, self.together = margins or {}, contact or {}, together or set()
         labels = ["one", "two", *(f"ball_{k}" for k in range(len(balls)))]
-        self.world = SimpleNamespace(coordinates=SimpleNamespace(q=lambda z: z), collision_labels=labels)
+        self.world = SimpleNamespace(
+            coordinates=SimpleNamespace(q=lambda z: z), collision_labels=labels
+        )
         self.solids: Any = self
         self.asked: list[tuple[float, ...]] = []
 
@@ -51,12 +53,19 @@ class Line:
         placed.distances = distances
         return placed
 
-    def near(self, placed: Any, first: np.ndarray, last: np.ndarray, moved: np.ndarray, limit: float) -> Any:
+    def near(
+        self, placed: Any, first: np.ndarray, last: np.ndarray, moved: np.ndarray, limit: float
+    ) -> Any:
         k = np.repeat(np.arange(len(first)), len(self.pairs))
         return k, np.tile(np.arange(len(self.pairs)), len(first))
 
     def margins_at(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
-        return np.array([self.own.get((int(p), int(t)), self.margins[p]) for p, t in zip(pairs, at, strict=True)])
+        return np.array(
+            [
+                self.own.get((int(p), int(t)), self.margins[p])
+                for p, t in zip(pairs, at, strict=True)
+            ]
+        )
 
     def contact_at(self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
         spans = zip(pairs.tolist(), first.tolist(), last.tolist(), strict=True)
@@ -119,8 +128,12 @@ def test_between_waypoints_overlaps_are_told_at_every_sample() -> None:
     line = Line((1.0, 0.05))
     z = np.linspace(0.0, 2.0, 201)
     hits = [hit for hit in swept(line, z, [0, 200]) if not hit.at_waypoint]
-    inside = {round(float(z[hit.row]), 2): round(hit.distance, 6) for hit in hits if hit.distance < -1e-9}
-    assert inside == {round(x, 2): round(abs(x - 1.0) - 0.05, 6) for x in np.arange(0.96, 1.045, 0.01)}
+    inside = {
+        round(float(z[hit.row]), 2): round(hit.distance, 6) for hit in hits if hit.distance < -1e-9
+    }
+    assert inside == {
+        round(x, 2): round(abs(x - 1.0) - 0.05, 6) for x in np.arange(0.96, 1.045, 0.01)
+    }
     assert {hit.second for hit in hits} == {"ball_0"}
 
 
@@ -165,7 +178,10 @@ def test_nothing_slips_between_a_sample_and_the_next(radius: float, told: bool |
         inside = [hit for hit in hits if hit.distance < 0.0]
         if told:
             assert inside
-            assert all((hit.row, hit.at_waypoint, hit.first, hit.second) == (0, False, "one", "ball_0") for hit in inside)
+            assert all(
+                (hit.row, hit.at_waypoint, hit.first, hit.second) == (0, False, "one", "ball_0")
+                for hit in inside
+            )
             assert len(inside) == 1  # one place says so
         assert all(hit.distance >= -radius - 1e-12 for hit in hits)
 
@@ -180,7 +196,11 @@ def test_what_is_in_contact_or_moves_as_one_may_be_in_between() -> None:
     touching = Line((0.5, 0.1), contact={(0, 0, 1): 0.05})
     hits = [hit for hit in swept(touching, [0.44, 0.56], [0, 1]) if not hit.at_waypoint]
     assert [(hit.row, round(hit.distance, 9), hit.contact) for hit in hits] == [(0, -0.1, 0.05)]
-    assert [hit for hit in swept(Line(thin, together={(0, 0, 1)}), [0.0, 1.0, 2.0], [0, 1, 2]) if hit.distance < 0.0] == []
+    assert [
+        hit
+        for hit in swept(Line(thin, together={(0, 0, 1)}), [0.0, 1.0, 2.0], [0, 1, 2])
+        if hit.distance < 0.0
+    ] == []
     other = Line(thin, together={(0, 1, 2), (0, 0, 0)})
     assert [hit for hit in swept(other, [0.0, 1.0, 2.0], [0, 1, 2]) if hit.distance < 0.0] != []
 

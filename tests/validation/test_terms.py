@@ -17,7 +17,9 @@ from vkc_pin.validation.terms import BETWEEN
 START = hall().start
 
 
-def found(scene: vkc.Scene, trajectory: vkc.Trajectory, term: vkc.Constraint, steps: Any = None) -> list[vkc.Violation]:
+def found(
+    scene: vkc.Scene, trajectory: vkc.Trajectory, term: vkc.Constraint, steps: Any = None
+) -> list[vkc.Violation]:
     """Return what validation says of a term alone."""
     steps = steps or [vkc.GoTo(*trajectory.positions[-1, :2])]
     report = vkc.validate(scene, steps, trajectory, terms=[term])
@@ -41,14 +43,26 @@ def test_a_carried_link_is_where_the_hand_has_brought_it() -> None:
     held = [phase for phase in motion.phases if phase.held]
     assert motion.times[held[0].first] <= violation.time <= motion.times[held[-1].last]
     # Nothing is wrong where it stands, before and after.
-    assert found(scene, motion, low(TOP + 0.1, during=[motion.phases[0].name, motion.phases[-1].name]), place) == []
+    assert (
+        found(
+            scene,
+            motion,
+            low(TOP + 0.1, during=[motion.phases[0].name, motion.phases[-1].name]),
+            place,
+        )
+        == []
+    )
     assert len(found(scene, motion, low(TOP + 0.1, holding="stick"), place)) == 1
 
 
 def test_the_worst_is_named_with_place_time_and_entry() -> None:
     scene = hall()
     motion = through(scene, START, moved(START, x=2.0), moved(START, x=2.0, y=1.0))
-    within = vkc.Constraint("within", lambda s: ca.vertcat(s.coordinate("base_x"), s.position("base_link")[1]), upper=[1.5, 0.25])
+    within = vkc.Constraint(
+        "within",
+        lambda s: ca.vertcat(s.coordinate("base_x"), s.position("base_link")[1]),
+        upper=[1.5, 0.25],
+    )
     (violation,) = found(scene, motion, within)
     assert violation.amount == pytest.approx(0.75, abs=1e-9)
     assert violation.waypoint == len(motion.times) - 1
@@ -65,15 +79,27 @@ def test_the_worst_is_named_with_place_time_and_entry() -> None:
 
 def test_costs_are_nothing_to_check() -> None:
     motion = through(hall(), START, moved(START, x=2.0))
-    assert vkc.validate(hall(), [vkc.GoTo(2.0, 0.0)], motion, terms=[vkc.Cost("far", lambda s: s.coordinate("base_x"))]).ok
+    assert vkc.validate(
+        hall(),
+        [vkc.GoTo(2.0, 0.0)],
+        motion,
+        terms=[vkc.Cost("far", lambda s: s.coordinate("base_x"))],
+    ).ok
 
 
-@pytest.mark.parametrize(("bound", "excess", "wrong"), [("lower", 5e-4, False), ("upper", 5e-4, False), ("upper", 2e-3, True)])
+@pytest.mark.parametrize(
+    ("bound", "excess", "wrong"),
+    [("lower", 5e-4, False), ("upper", 5e-4, False), ("upper", 2e-3, True)],
+)
 def test_tolerance_at_waypoints(bound: str, excess: float, wrong: bool) -> None:
     motion = through(hall(), START, moved(START, x=2.0))
     limit = 2.0 - excess if bound == "upper" else excess
     fields = {bound: limit, "during": "drive 1"}
-    term = vkc.Constraint("x", lambda s: s.coordinate("base_x") if bound == "upper" else 2 - s.coordinate("base_x"), **fields)
+    term = vkc.Constraint(
+        "x",
+        lambda s: s.coordinate("base_x") if bound == "upper" else 2 - s.coordinate("base_x"),
+        **fields,
+    )
     assert len(found(hall(), motion, term)) == wrong
     assert found(hall(), motion, dataclasses.replace(term, tolerance=2 * excess)) == []
 
@@ -107,7 +133,9 @@ def test_speeds_are_those_of_the_last_step() -> None:
     speeds = np.abs(np.diff(motion.positions[:, 0])) / DT
     fastest = float(speeds.max())
     for frame in ("tool", "base_link"):
-        slow = vkc.Constraint("slow", lambda s, frame=frame: ca.norm_2(s.velocity(frame)), upper=fastest + 1e-4)
+        slow = vkc.Constraint(
+            "slow", lambda s, frame=frame: ca.norm_2(s.velocity(frame)), upper=fastest + 1e-4
+        )
         assert found(scene, motion, slow) == []
         (violation,) = found(scene, motion, dataclasses.replace(slow, upper=0.9 * fastest))
         assert violation.amount == pytest.approx(0.1 * fastest, rel=1e-3)
@@ -115,7 +143,9 @@ def test_speeds_are_those_of_the_last_step() -> None:
     rate = vkc.Constraint("rate", lambda s: s.rate("base_x"), upper=0.9 * fastest)
     assert found(scene, motion, rate)[0].amount == pytest.approx(0.1 * fastest, rel=1e-6)
     # Nothing jumps at waypoints, so that nothing is worse between them than at both.
-    brakes = vkc.Constraint("brakes", lambda s: s.rate("base_x") - 0.2 * (2.0 - s.coordinate("base_x")), upper=0.0)
+    brakes = vkc.Constraint(
+        "brakes", lambda s: s.rate("base_x") - 0.2 * (2.0 - s.coordinate("base_x")), upper=0.0
+    )
     values = speeds - 0.2 * (2.0 - motion.positions[1:, 0])
     assert values.max() > 0.1
     (violation,) = found(scene, motion, brakes)
@@ -139,11 +169,17 @@ def test_waiting_for_the_gripper_belongs_to_the_phase_before() -> None:
     rows = np.vstack([driven.positions[:11], driven.positions[10:]])  # stands still for a step
     phases = (vkc.PhaseSpan("drive 1", 0, 10), vkc.PhaseSpan("drive 2", 10, 21))
     motion = of_rows(scene, rows, dt=0.5, phases=phases)
-    ahead = vkc.Constraint("ahead", lambda s: s.coordinate("base_x"), lower=rows[12, 0], during="drive 2")
+    ahead = vkc.Constraint(
+        "ahead", lambda s: s.coordinate("base_x"), lower=rows[12, 0], during="drive 2"
+    )
     assert found(scene, motion, ahead) == []
     assert len(found(scene, motion, dataclasses.replace(ahead, lower=rows[13, 0]))) == 1
-    still = dataclasses.replace(motion, positions=np.vstack([rows[:11], np.tile(rows[10], (11, 1))]))
-    assert len(found(scene, still, ahead, [vkc.GoTo(1.0, 0.0)])) == 1  # who does not move at all does not get there
+    still = dataclasses.replace(
+        motion, positions=np.vstack([rows[:11], np.tile(rows[10], (11, 1))])
+    )
+    assert (
+        len(found(scene, still, ahead, [vkc.GoTo(1.0, 0.0)])) == 1
+    )  # who does not move at all does not get there
 
 
 def test_what_is_no_number_is_a_violation() -> None:

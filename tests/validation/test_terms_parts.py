@@ -17,11 +17,18 @@ from vkc_pin.world.task.formula import Formula
 from vkc_pin.world.task.terms import traced
 
 
-def looked_at(way: list[float], phases: list[tuple[int, int, bool]], each: int = 3) -> tuple[list[int], list[int]]:
+def looked_at(
+    way: list[float], phases: list[tuple[int, int, bool]], each: int = 3
+) -> tuple[list[int], list[int]]:
     """Return the waypoints and the samples between them at which a term is asked about; `each` samples a step."""
-    spans = [SimpleNamespace(first=first, last=last, name=f"{active}", held={}) for first, last, active in phases]
+    spans = [
+        SimpleNamespace(first=first, last=last, name=f"{active}", held={})
+        for first, last, active in phases
+    ]
     positions = np.column_stack([way, np.zeros(len(way))])
-    trajectory = SimpleNamespace(times=np.arange(float(len(way))), phases=spans, positions=positions)
+    trajectory = SimpleNamespace(
+        times=np.arange(float(len(way))), phases=spans, positions=positions
+    )
     samples: Any = SimpleNamespace(trajectory=trajectory, waypoint_rows=each * np.arange(len(way)))
     term: Any = SimpleNamespace(active=lambda name, held: name == "True")
     at, between = _rows(samples, term)
@@ -34,16 +41,25 @@ def test_a_term_holds_after_the_first_waypoint_of_its_phases() -> None:
     assert looked_at([0, 1, 2, 3], [(0, 3, False)]) == ([], [])
     assert looked_at([0, 1, 2, 3, 4], [(0, 2, False), (2, 4, True)]) == ([3, 4], [10, 11])
     assert looked_at([0, 1, 2, 3, 4], [(0, 2, True), (2, 4, False)]) == ([1, 2], [4, 5])
-    assert looked_at([0, 1, 2, 3, 4], [(0, 2, True), (2, 4, True)]) == ([1, 2, 3, 4], [4, 5, 7, 8, 10, 11])
+    assert looked_at([0, 1, 2, 3, 4], [(0, 2, True), (2, 4, True)]) == (
+        [1, 2, 3, 4],
+        [4, 5, 7, 8, 10, 11],
+    )
 
 
 def test_while_the_robot_still_stands_nothing_is_asked() -> None:
     """Unless it was asked about before; at its last waypoint it is, but for what stands from the start to the end."""
     assert looked_at([0, 1, 1, 1, 2], [(0, 1, False), (1, 4, True)]) == ([4], [])
-    assert looked_at([0, 1, 1, 1, 2], [(0, 1, True), (1, 4, True)]) == ([1, 2, 3, 4], [4, 5, 7, 8, 10, 11])
+    assert looked_at([0, 1, 1, 1, 2], [(0, 1, True), (1, 4, True)]) == (
+        [1, 2, 3, 4],
+        [4, 5, 7, 8, 10, 11],
+    )
     assert looked_at([0, 1, 1, 1], [(0, 1, False), (1, 3, True)]) == ([3], [])
     assert looked_at([0, 0, 0], [(0, 2, True)]) == ([], [])
-    assert looked_at([0, 0, 1, 0, 0], [(0, 4, True)]) == ([2, 3, 4], [7, 8, 10, 11])  # back where it began
+    assert looked_at([0, 0, 1, 0, 0], [(0, 4, True)]) == (
+        [2, 3, 4],
+        [7, 8, 10, 11],
+    )  # back where it began
     assert looked_at([0, 0, 0, 1], [(0, 1, True), (1, 3, True)]) == ([3], [])
     assert looked_at([0, 0, 0.5, 0.5], [(0, 3, True)], each=2) == ([2, 3], [5])
 
@@ -54,11 +70,18 @@ def test_formulas_are_given_frames_coordinates_and_the_last_steps(moving: bool) 
     scene = hall()
     rows = np.array([moved(scene.start, x=x, yaw=2.0 * x) for x in (0.0, 0.02, 0.06, 0.07)])
     motion = of_rows(scene, rows)
-    motion = vkc.Trajectory(motion.names, np.array([1.0, 1.5, 3.5, 4.0]), rows, motion.phases, motion.robot_size)
+    motion = vkc.Trajectory(
+        motion.names, np.array([1.0, 1.5, 3.5, 4.0]), rows, motion.phases, motion.robot_size
+    )
     samples = Samples(scene, motion)
 
     def expression(s: Any) -> Any:
-        value = s.position("tool")[0] + s.position("forearm_link")[1] + s.coordinate("base_x") + s.coordinate("base_yaw")
+        value = (
+            s.position("tool")[0]
+            + s.position("forearm_link")[1]
+            + s.coordinate("base_x")
+            + s.coordinate("base_yaw")
+        )
         return value + s.rate("base_x") if moving else value
 
     (term,) = traced(scene, [vkc.Constraint("any", expression, upper=0.0)])
@@ -74,9 +97,12 @@ def test_formulas_are_given_frames_coordinates_and_the_last_steps(moving: bool) 
         z = samples.world.positions(motion, np.array([time]))
         pin.framesForwardKinematics(model, data, samples.world.coordinates.q(z)[0])
         parts = [
-            np.append(data.oMf[f].rotation.T.ravel(), data.oMf[f].translation) for f in map(model.getFrameId, formula.frames)
+            np.append(data.oMf[f].rotation.T.ravel(), data.oMf[f].translation)
+            for f in map(model.getFrameId, formula.frames)
         ]
-        return np.concatenate([*parts, [z[0, samples.world.coordinates.index(name)] for name in formula.coordinates]])
+        return np.concatenate(
+            [*parts, [z[0, samples.world.coordinates.index(name)] for name in formula.coordinates]]
+        )
 
     assert len(formula.frames) == 2
     assert len(formula.coordinates) == 2
@@ -98,11 +124,17 @@ def test_formulas_are_given_frames_coordinates_and_the_last_steps(moving: bool) 
         (0.3, 0.5, "1 is more than 0.5 by 0.5", 0.5),
     ],
 )
-def test_by_how_much_and_on_which_side(lower: float, upper: float, detail: str, amount: float) -> None:
+def test_by_how_much_and_on_which_side(
+    lower: float, upper: float, detail: str, amount: float
+) -> None:
     scene = hall()
     motion = of_rows(scene, np.array([moved(scene.start, x=x) for x in (0.0, 0.02, 1.0)]))
     given = vkc.Constraint("x", lambda s: s.coordinate("base_x"), lower=lower, upper=upper)
-    found = [one for one in check_terms(Samples(scene, motion), traced(scene, [given])) if "between" not in one.detail]
+    found = [
+        one
+        for one in check_terms(Samples(scene, motion), traced(scene, [given]))
+        if "between" not in one.detail
+    ]
     assert [(one.detail, one.subject, one.unit) for one in found] == [(detail, "x", "")]
     assert found[0].amount == pytest.approx(amount)
     assert found[0].waypoint == (1 if "less" in detail else 2)
@@ -119,7 +151,11 @@ def test_between_waypoints_ten_times_as_much_is_all_right() -> None:
         import casadi as ca
 
         bump = vkc.Constraint(
-            "bump", lambda s, h=height: 1e-3 * h * ca.fmax(0.0, 1.0 - 4.0 * ca.fabs(s.coordinate("base_x") - 1.5)), upper=0.0
+            "bump",
+            lambda s, h=height: (
+                1e-3 * h * ca.fmax(0.0, 1.0 - 4.0 * ca.fabs(s.coordinate("base_x") - 1.5))
+            ),
+            upper=0.0,
         )
         found = check_terms(samples, traced(scene, [bump]))
         assert len(found) == told

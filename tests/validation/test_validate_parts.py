@@ -27,7 +27,13 @@ from vkc_pin.world.scene.support import LEVEL
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 
-def check(*, phases: list[PhaseSpan] | None = None, times: Any = (0.0, 1.0, 2.0, 3.0), each: int = 2, **fields: Any) -> Any:
+def check(
+    *,
+    phases: list[PhaseSpan] | None = None,
+    times: Any = (0.0, 1.0, 2.0, 3.0),
+    each: int = 2,
+    **fields: Any,
+) -> Any:
     """Return a check of a motion of which only times are known, with `each` samples a step."""
     made = object.__new__(_Check)
     edges = np.array(times)
@@ -42,7 +48,9 @@ def check(*, phases: list[PhaseSpan] | None = None, times: Any = (0.0, 1.0, 2.0,
     )
     defaults: dict[str, Any] = {
         "samples": samples,
-        "trajectory": SimpleNamespace(times=edges, phases=phases or [PhaseSpan("p", 0, len(edges) - 1)]),
+        "trajectory": SimpleNamespace(
+            times=edges, phases=phases or [PhaseSpan("p", 0, len(edges) - 1)]
+        ),
         "options": Options(),
         "found": [],
         "exemptions": {},
@@ -54,7 +62,10 @@ def check(*, phases: list[PhaseSpan] | None = None, times: Any = (0.0, 1.0, 2.0,
 
 
 def told(made: Any) -> list[tuple[Any, ...]]:
-    rows = [(one.constraint, one.subject, one.waypoint, one.time, one.amount, one.unit) for one in made.found]
+    rows = [
+        (one.constraint, one.subject, one.waypoint, one.time, one.amount, one.unit)
+        for one in made.found
+    ]
     made.found.clear()
     return rows
 
@@ -73,7 +84,8 @@ def test_where_something_is_noted() -> None:
     assert told(made) == [("limit", "x", *at, 0.5, "m") for at in ((0, 0.0), (2, 2.0), (1, 1.5))]
 
 
-# --- the report -------------------------------------------------------------------------------------------------------
+# --- the report
+# -------------------------------------------------------------------------------------------------------
 
 
 def violation(kind: str, subject: str, amount: float, time: float, unit: str = "m") -> Violation:
@@ -81,16 +93,28 @@ def violation(kind: str, subject: str, amount: float, time: float, unit: str = "
 
 
 def reported(
-    monkeypatch: pytest.MonkeyPatch, *found: Violation, reason: bool = True, nearest: tuple[float, ...] = (0.3, 0.1, 0.2)
+    monkeypatch: pytest.MonkeyPatch,
+    *found: Violation,
+    reason: bool = True,
+    nearest: tuple[float, ...] = (0.3, 0.1, 0.2),
 ) -> Report:
     """Return the report of a check that finds these."""
     phases = [PhaseSpan(f"p{k}", k, k + 1) for k in range(3)]
     made = check(phases=phases, found=list(found), terms=(), scene=None)
-    for name in ("check_rates", "check_rolling", "check_goals", "check_terms", "check_gripper", "check_pushes"):
+    for name in (
+        "check_rates",
+        "check_rolling",
+        "check_goals",
+        "check_terms",
+        "check_gripper",
+        "check_pushes",
+    ):
         monkeypatch.setattr(module, name, lambda *_: [])
     motors = SimpleNamespace(violations=list, facts=lambda jerk_time: {"torque": jerk_time})
     monkeypatch.setattr(module, "Motors", lambda samples: motors)
-    made._start = made._limits = made._unheld = made._tips = made._latches = made._slides = lambda: None
+    made._start = made._limits = made._unheld = made._tips = made._latches = made._slides = lambda: (
+        None
+    )
     made._closure, made._clearance = lambda: (0.25, 0.5), lambda: np.array(nearest)
     made._within_reason = lambda: reason
     made.options = Options(jerk_time=0.125)
@@ -98,7 +122,9 @@ def reported(
     return report
 
 
-def test_the_worst_of_each_constraint_subject_and_unit_in_order_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_worst_of_each_constraint_subject_and_unit_in_order_of_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     early, late = violation("limit", "x", 0.1, 1.0), violation("limit", "x", 0.2, 5.0)
     other, unit = violation("limit", "y", 0.05, 3.0), violation("limit", "x", 0.01, 2.0, "rad")
     kind, same = violation("goal", "x", 0.02, 3.0), violation("goal", "a", 0.02, 3.0)
@@ -109,7 +135,10 @@ def test_the_worst_of_each_constraint_subject_and_unit_in_order_of_time(monkeypa
 
 
 def test_what_overlaps_is_not_said_to_be_too_close_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    close, deep = violation("clearance", "a – b", 0.01, 1.0), violation("penetration", "a – b", 0.02, 2.0)
+    close, deep = (
+        violation("clearance", "a – b", 0.01, 1.0),
+        violation("penetration", "a – b", 0.02, 2.0),
+    )
     other = violation("clearance", "a – c", 0.01, 3.0)
     assert reported(monkeypatch, close, deep, other).violations == (deep, other)
     assert reported(monkeypatch, close, other).violations == (close, other)
@@ -119,13 +148,23 @@ def test_what_overlaps_is_not_said_to_be_too_close_as_well(monkeypatch: pytest.M
 def test_what_else_a_report_says(monkeypatch: pytest.MonkeyPatch) -> None:
     report = reported(monkeypatch)
     assert (report.ok, report.clearance, report.clearances) == (True, 0.1, (0.3, 0.1, 0.2))
-    assert (report.closure_error, report.closure_angle, report.states, report.torque) == (0.25, 0.5, 7, 0.125)
+    assert (report.closure_error, report.closure_angle, report.states, report.torque) == (
+        0.25,
+        0.5,
+        7,
+        0.125,
+    )
     blind = reported(monkeypatch, reason=False)
     assert (blind.clearance, blind.clearances) == (np.inf, (np.inf,) * 3)
 
 
-@pytest.mark.parametrize(("needed", "most", "right"), [(20.0, 20, True), (21.0, 20, False), (3.0, 2, True), (5.0, 2, False)])
-def test_what_is_longer_than_can_be_looked_at(needed: float, most: int, right: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("needed", "most", "right"),
+    [(20.0, 20, True), (21.0, 20, False), (3.0, 2, True), (5.0, 2, False)],
+)
+def test_what_is_longer_than_can_be_looked_at(
+    needed: float, most: int, right: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At least its waypoints can; it is named where it jumps furthest."""
     monkeypatch.setattr(module, "MOST", most)
     made = check()
@@ -136,7 +175,8 @@ def test_what_is_longer_than_can_be_looked_at(needed: float, most: int, right: b
     assert told(made) == ([] if right else [expected])
 
 
-# --- limits -----------------------------------------------------------------------------------------------------------
+# --- limits
+# -----------------------------------------------------------------------------------------------------------
 
 
 def limited(way: list[float], *, bulge: tuple[int, float] | None = None) -> list[tuple[Any, ...]]:
@@ -153,20 +193,35 @@ def limited(way: list[float], *, bulge: tuple[int, float] | None = None) -> list
     details = [one.detail for one in made.found]
     rows = [(*row[:4], pytest.approx(row[4]), row[5]) for row in told(made)]
     for row, detail in zip(rows, details, strict=True):
-        value = -1.0 - row[4].expected if "-1." in detail.split(" rad")[0] else 2.0 + row[4].expected
-        assert detail == f"{value:.4f} rad is outside -1.0000 to 2.0000 rad by {row[4].expected:.4f} rad"
+        value = (
+            -1.0 - row[4].expected if "-1." in detail.split(" rad")[0] else 2.0 + row[4].expected
+        )
+        assert (
+            detail
+            == f"{value:.4f} rad is outside -1.0000 to 2.0000 rad by {row[4].expected:.4f} rad"
+        )
     return rows
 
 
 def test_limits_are_kept_at_waypoints_and_between_them() -> None:
     assert limited([0.0, 2.0, -1.0, 0.0]) == []
-    assert limited([0.0, 2.25, -1.0, 0.0]) == [("limit", "turn", 1, 1.0, pytest.approx(0.25), "rad")]
+    assert limited([0.0, 2.25, -1.0, 0.0]) == [
+        ("limit", "turn", 1, 1.0, pytest.approx(0.25), "rad")
+    ]
     assert limited([0.0, 1.0, -1.5, 0.0]) == [("limit", "turn", 2, 2.0, pytest.approx(0.5), "rad")]
-    assert limited([0.0, 2.25, -1.5, 0.0]) == [("limit", "turn", 2, 2.0, pytest.approx(0.5), "rad")]  # the worse
+    assert limited([0.0, 2.25, -1.5, 0.0]) == [
+        ("limit", "turn", 2, 2.0, pytest.approx(0.5), "rad")
+    ]  # the worse
     assert limited([0.0, 2.5, -1.25, 0.0]) == [("limit", "turn", 1, 1.0, pytest.approx(0.5), "rad")]
-    assert limited([0.0, 0.0, 1.9, 0.0], bulge=(2, 0.3)) == [("limit", "turn", 2, 2.0, pytest.approx(0.2), "rad")]
-    assert limited([0.0, 0.0, 0.5, 1.9], bulge=(2, 0.3)) == [("limit", "turn", 3, 3.0, pytest.approx(0.2), "rad")]
-    assert limited([0.0, -0.9, 0.0, 1.0], bulge=(0, -0.3)) == [("limit", "turn", 1, 1.0, pytest.approx(0.2), "rad")]
+    assert limited([0.0, 0.0, 1.9, 0.0], bulge=(2, 0.3)) == [
+        ("limit", "turn", 2, 2.0, pytest.approx(0.2), "rad")
+    ]
+    assert limited([0.0, 0.0, 0.5, 1.9], bulge=(2, 0.3)) == [
+        ("limit", "turn", 3, 3.0, pytest.approx(0.2), "rad")
+    ]
+    assert limited([0.0, -0.9, 0.0, 1.0], bulge=(0, -0.3)) == [
+        ("limit", "turn", 1, 1.0, pytest.approx(0.2), "rad")
+    ]
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -182,19 +237,30 @@ def test_where_it_begins_it_may_be_a_little_outside(side: int) -> None:
     edge = {1: 2.0, -1: -1.0}[side]
     out = edge + side * 0.009
     assert limited([out, 0.0, 0.0]) == []
-    assert limited([out, out, 0.0]) == [("limit", "turn", 1, 1.0, pytest.approx(0.009), "rad")]  # it stays outside after that
+    assert limited([out, out, 0.0]) == [
+        ("limit", "turn", 1, 1.0, pytest.approx(0.009), "rad")
+    ]  # it stays outside after that
     assert limited([out, edge + side * 0.0095, 0.0]) != []
-    assert limited([edge + side * 0.015, 0.0, 0.0]) == [("limit", "turn", 0, 0.0, pytest.approx(0.015), "rad")]
-    assert limited([0.5, edge + side * 0.6, 0.5]) == [("limit", "turn", 1, 1.0, pytest.approx(0.6), "rad")]
+    assert limited([edge + side * 0.015, 0.0, 0.0]) == [
+        ("limit", "turn", 0, 0.0, pytest.approx(0.015), "rad")
+    ]
+    assert limited([0.5, edge + side * 0.6, 0.5]) == [
+        ("limit", "turn", 1, 1.0, pytest.approx(0.6), "rad")
+    ]
 
 
-@pytest.mark.parametrize(("off", "told_of"), [(0.9e-9, False), (1.5e-9, True), (-1.5e-9, True), (np.nan, True)])
+@pytest.mark.parametrize(
+    ("off", "told_of"), [(0.9e-9, False), (1.5e-9, True), (-1.5e-9, True), (np.nan, True)]
+)
 def test_where_it_starts(off: float, told_of: bool) -> None:
     """What the world does not know, a hand's choice, may start anywhere."""
     made = check()
     world = SimpleNamespace(start=[1.0, 2.0], coordinates=SimpleNamespace(names=["x", "turn"]))
     made.samples.world = world
-    made.trajectory.names, made.trajectory.positions = ("choice", "x", "turn"), np.array([[7.0, 1.0, 2.0 + off]])
+    made.trajectory.names, made.trajectory.positions = (
+        ("choice", "x", "turn"),
+        np.array([[7.0, 1.0, 2.0 + off]]),
+    )
     made._start()
     details = [one.detail for one in made.found]
     rows = told(made)
@@ -204,10 +270,13 @@ def test_where_it_starts(off: float, told_of: bool) -> None:
         assert details == ["2 rad instead of 2 rad"]
 
 
-# --- what moves and must not ------------------------------------------------------------------------------------------
+# --- what moves and must not
+# ------------------------------------------------------------------------------------------
 
 
-def stilled(way: list[float], phase: PhaseSpan, bulge: tuple[int, float] | None = None) -> list[tuple[Any, ...]]:
+def stilled(
+    way: list[float], phase: PhaseSpan, bulge: tuple[int, float] | None = None
+) -> list[tuple[Any, ...]]:
     column = np.array(way)
     low, high = np.minimum(column[:-1], column[1:]), np.maximum(column[:-1], column[1:])
     if bulge is not None:
@@ -227,7 +296,9 @@ def test_what_must_not_move_in_a_phase() -> None:
     assert stilled([5.0, 1.0, 1.25, 1.0, 9.0], middle) == [("slide", "turn", 2, 2.0, 0.25, "rad")]
     assert stilled([5.0, 1.0, 1.0, 0.5, 9.0], middle) == [("slide", "turn", 3, 3.0, 0.5, "rad")]
     assert stilled([5.0, 1.0, 1.25, 0.5, 9.0], middle) == [("slide", "turn", 3, 3.0, 0.5, "rad")]
-    assert stilled([5.0, 1.0, 1.0, 1.0, 9.0], middle, (2, -0.2)) == [("slide", "turn", 3, 3.0, 0.2, "rad")]
+    assert stilled([5.0, 1.0, 1.0, 1.0, 9.0], middle, (2, -0.2)) == [
+        ("slide", "turn", 3, 3.0, 0.2, "rad")
+    ]
     assert stilled([1.0, 1.0, 1.0 + 0.9e-5, 1.0, 1.0], middle) == []
     assert stilled([1.0, 1.0, 1.0 + 1.2e-5, 1.0, 1.0], middle) != []
 
@@ -236,7 +307,10 @@ def test_what_nobody_holds_and_what_a_hand_does_not_drive() -> None:
     """Of the robot, of what the hand drives, and of what it chooses nothing is said."""
     hold = Hold("door", "handle")
     made = check(phases=[PhaseSpan("p", 0, 1), PhaseSpan("q", 1, 3, (hold,))])
-    made.trajectory.names, made.trajectory.robot_size = ("base", "wrist", "door.hinge", "door.knob", "cup.lid", "door.choice"), 2
+    made.trajectory.names, made.trajectory.robot_size = (
+        ("base", "wrist", "door.hinge", "door.knob", "cup.lid", "door.choice"),
+        2,
+    )
     made.samples.moved_by = lambda holds: {"door.hinge"} if holds else set()
     made.samples.virtual = {"door.choice"}
     noted: list[tuple[Any, ...]] = []
@@ -261,7 +335,10 @@ def test_only_a_hand_that_clamps_must_not_slide() -> None:
         "door": SimpleNamespace(object=SimpleNamespace(attachments={"handle": leaves})),
     }
     both = (Hold("stick", "grip"), Hold("door", "handle"))
-    made = check(phases=[PhaseSpan("p", 0, 1), PhaseSpan("q", 1, 3, both)], scene=SimpleNamespace(objects=objects))
+    made = check(
+        phases=[PhaseSpan("p", 0, 1), PhaseSpan("q", 1, 3, both)],
+        scene=SimpleNamespace(objects=objects),
+    )
     noted: list[tuple[Any, ...]] = []
     made._still = lambda phase, *what: noted.append((phase.name, *what))
     made._slides()
@@ -279,10 +356,13 @@ def test_what_something_stands_on_stays_level(angle: float, tips: bool) -> None:
     turns = [start, little, pin.utils.rotate("y", angle) @ start, start, start]
     made.samples.placements = lambda rows, label: [pin.SE3(turn, np.zeros(3)) for turn in turns]
     made._tips()
-    assert told(made) == ([("tips", "cup", 2, 2.0, pytest.approx(angle - LEVEL), "rad")] if tips else [])
+    assert told(made) == (
+        [("tips", "cup", 2, 2.0, pytest.approx(angle - LEVEL), "rad")] if tips else []
+    )
 
 
-# --- clearance --------------------------------------------------------------------------------------------------------
+# --- clearance
+# --------------------------------------------------------------------------------------------------------
 
 
 class Near(Allowance):
@@ -313,31 +393,52 @@ def close(
     return nearest.tolist(), [(*row[:4], pytest.approx(row[4]), row[5]) for row in told(made)]
 
 
-def hit(row: int, distance: float, *, margin: float = 0.02, contact: float = 0.0, at: bool | None = None) -> Hit:
-    return Hit(row, "a", "b", distance, margin, contact, row % 2 == 0 if at is None else at, shapes=(0, 1))
+def hit(
+    row: int, distance: float, *, margin: float = 0.02, contact: float = 0.0, at: bool | None = None
+) -> Hit:
+    return Hit(
+        row, "a", "b", distance, margin, contact, row % 2 == 0 if at is None else at, shapes=(0, 1)
+    )
 
 
 def test_what_overlaps_and_what_is_too_close(monkeypatch: pytest.MonkeyPatch) -> None:
     """Too close it can be only at waypoints, and not at the start."""
-    assert close(monkeypatch, hit(2, 0.015)) == ([0.015, np.inf], [("clearance", "a – b", 1, 1.0, 0.004, "m")])
+    assert close(monkeypatch, hit(2, 0.015)) == (
+        [0.015, np.inf],
+        [("clearance", "a – b", 1, 1.0, 0.004, "m")],
+    )
     assert close(monkeypatch, hit(2, 0.0191)) == ([0.0191, np.inf], [])
     assert close(monkeypatch, hit(2, 0.0189))[1] != []
     assert close(monkeypatch, hit(3, 0.015)) == ([0.015, np.inf], [])
     assert close(monkeypatch, hit(0, 0.015)) == ([0.015, np.inf], [])
-    assert close(monkeypatch, hit(0, -0.015)) == ([-0.015, np.inf], [("penetration", "a – b", 0, 0.0, 0.015, "m")])
-    assert close(monkeypatch, hit(5, -0.015)) == ([np.inf, -0.015], [("penetration", "a – b", 2, 2.5, 0.015, "m")])
-    assert close(monkeypatch, hit(6, -0.015)) == ([np.inf, -0.015], [("penetration", "a – b", 3, 3.0, 0.015, "m")])
+    assert close(monkeypatch, hit(0, -0.015)) == (
+        [-0.015, np.inf],
+        [("penetration", "a – b", 0, 0.0, 0.015, "m")],
+    )
+    assert close(monkeypatch, hit(5, -0.015)) == (
+        [np.inf, -0.015],
+        [("penetration", "a – b", 2, 2.5, 0.015, "m")],
+    )
+    assert close(monkeypatch, hit(6, -0.015)) == (
+        [np.inf, -0.015],
+        [("penetration", "a – b", 3, 3.0, 0.015, "m")],
+    )
     assert close(monkeypatch, hit(4, 0.3), hit(4, 0.1), hit(2, 0.2)) == ([0.2, 0.1], [])
 
 
-def test_contact_is_no_overlap_and_what_moves_as_one_has_no_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_contact_is_no_overlap_and_what_moves_as_one_has_no_distance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert close(monkeypatch, hit(2, -0.009, margin=0.0, contact=0.01)) == (
         [-0.009, np.inf],
         [("clearance", "a – b", 1, 1.0, 0.008, "m")],
     )
     assert close(monkeypatch, hit(2, -0.011, margin=0.0, contact=0.01))[1][0][0] == "penetration"
     assert close(monkeypatch, hit(3, -0.009, contact=0.01))[1] == []
-    assert close(monkeypatch, hit(2, -0.009, margin=-np.inf, contact=0.01)) == ([np.inf, np.inf], [])
+    assert close(monkeypatch, hit(2, -0.009, margin=-np.inf, contact=0.01)) == (
+        [np.inf, np.inf],
+        [],
+    )
     assert close(monkeypatch, hit(2, -0.02, margin=-np.inf, contact=0.01))[1] != []
 
 
@@ -346,7 +447,10 @@ def test_neighbours_are_none_of_it_where_they_are(monkeypatch: pytest.MonkeyPatc
     nothing = [np.inf, np.inf]
     for pair in (("a", "b"), ("b", "a")):
         assert close(monkeypatch, hit(2, -0.1), allowed=(Near(*pair, {2}),)) == (nothing, [])
-        assert close(monkeypatch, hit(2, -0.1), allowed=(Near(*pair, {3}), Near(*pair, {2}))) == (nothing, [])
+        assert close(monkeypatch, hit(2, -0.1), allowed=(Near(*pair, {3}), Near(*pair, {2}))) == (
+            nothing,
+            [],
+        )
         assert close(monkeypatch, hit(2, -0.1), allowed=(Near(*pair, {3}),))[1] != []
         assert close(monkeypatch, hit(2, -0.1), allowed=(Near(*pair, {2}, 0.001),))[1] != []
     assert close(monkeypatch, hit(2, -0.1), allowed=(Near("a", "c", {2}),))[1] != []

@@ -8,7 +8,15 @@ import trimesh
 
 from vkc_pin.errors import InputError
 from vkc_pin.visualization.plots.top_view import outline
-from vkc_pin.visualization.triangles import Solid, box_solid, coarse, merge_solids, shade, to_solid, tube
+from vkc_pin.visualization.triangles import (
+    Solid,
+    box_solid,
+    coarse,
+    merge_solids,
+    shade,
+    to_solid,
+    tube,
+)
 from vkc_pin.world.files.meshes import MeshPart, to_bvh
 from vkc_pin.world.models.shapes import triangles
 
@@ -36,12 +44,16 @@ def ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
         (to_bvh(MeshPart(*ball())), np.pi / 6, (1, 1, 1)),
     ],
 )
-def test_surface_of_every_shape(shape: coal.CollisionGeometry, volume: float, size: tuple[float, ...]) -> None:
+def test_surface_of_every_shape(
+    shape: coal.CollisionGeometry, volume: float, size: tuple[float, ...]
+) -> None:
     vertices, faces = triangles(shape)
     mesh = trimesh.Trimesh(vertices, faces)
     assert mesh.volume == pytest.approx(volume, rel=0.05), "wound outwards, and nearly round"
     assert np.allclose(np.ptp(vertices, axis=0), size, rtol=0.03)
-    assert np.allclose(vertices.min(axis=0) + vertices.max(axis=0), 0.0, atol=1e-6), "centred as coal's shapes are"
+    assert np.allclose(vertices.min(axis=0) + vertices.max(axis=0), 0.0, atol=1e-6), (
+        "centred as coal's shapes are"
+    )
 
 
 def test_convex_shapes() -> None:
@@ -58,9 +70,13 @@ def test_a_half_space_has_no_surface() -> None:
 
 def test_boxes_have_edges_and_balls_have_none() -> None:
     box = to_solid(coal.Box(1.0, 1.0, 1.0))
-    assert np.allclose(np.sort(np.abs(box.normals), axis=1), [0, 0, 1], atol=0.02), "each side its own normal"
+    assert np.allclose(np.sort(np.abs(box.normals), axis=1), [0, 0, 1], atol=0.02), (
+        "each side its own normal"
+    )
     sphere = to_solid(coal.Sphere(1.0))
-    assert np.einsum("ij,ij->i", sphere.normals, sphere.vertices).min() > 0.97, "normals point straight out"
+    assert np.einsum("ij,ij->i", sphere.normals, sphere.vertices).min() > 0.97, (
+        "normals point straight out"
+    )
 
 
 def test_sides_of_a_box_face_outwards() -> None:
@@ -86,7 +102,9 @@ def test_a_coarse_copy_is_lighter_and_as_large() -> None:
 
 def test_moving_and_merging() -> None:
     solid = box_solid(np.zeros(3), np.ones(3))
-    moved = solid.moved(pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2), np.array([5.0, 0.0, 0.0])))
+    moved = solid.moved(
+        pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2), np.array([5.0, 0.0, 0.0]))
+    )
     assert np.allclose(moved.vertices.min(axis=0), [4.0, 0.0, 0.0], atol=1e-6)
     both = merge_solids([solid, moved])
     assert len(both.vertices) == 2 * len(solid.vertices)
@@ -102,7 +120,9 @@ def test_a_tube_follows_its_line() -> None:
     assert np.allclose(away, 0.01, atol=1e-3)
     corners = solid.vertices[solid.faces]
     turn = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.einsum("ij,ij->i", turn, solid.normals[solid.faces[:, 0]]) > 0).all(), "wound outwards"
+    assert (np.einsum("ij,ij->i", turn, solid.normals[solid.faces[:, 0]]) > 0).all(), (
+        "wound outwards"
+    )
     assert tube(np.zeros((5, 3)), 0.01) is None, "nothing moves"
 
 

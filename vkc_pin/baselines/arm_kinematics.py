@@ -1,6 +1,7 @@
 """Inverse kinematics of the arm alone: base and object stand where they were planned to, and the hand must close the chain.
 
-By the differential inverse kinematics of Pink (https://github.com/stephane-caron/pink), with joint limits.
+By the differential inverse kinematics of Pink (https://github.com/stephane-caron/pink), with joint
+limits.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ class ArmKinematics:
         if pose is None:
             return z, True
         model, chain = self._model(pose), self.problem.chain
-        task = pink.tasks.FrameTask(_FRAME, position_cost=1.0, orientation_cost=1.0, lm_damping=1e-3)
+        task = pink.tasks.FrameTask(
+            _FRAME, position_cost=1.0, orientation_cost=1.0, lm_damping=1e-3
+        )
         task.set_target(self.problem.targets[pose])
         box = _Box(self.columns, chain.lower, chain.upper, z.copy())
         configuration = pink.Configuration(model, model.createData(), chain.coordinates.q(box.z))
@@ -56,7 +59,9 @@ class ArmKinematics:
             if np.abs(task.compute_error(configuration)).max() < TOLERANCE:
                 return box.z, True
             try:
-                step = pink.solve_ik(configuration, [task], 1.0, QP, damping=1e-9, limits=[box], safety_break=False)
+                step = pink.solve_ik(
+                    configuration, [task], 1.0, QP, damping=1e-9, limits=[box], safety_break=False
+                )
             except pink.exceptions.NoSolutionFound:
                 break
             box.take(step)
@@ -66,7 +71,10 @@ class ArmKinematics:
     def _model(self, pose: int) -> pin.Model:
         """Return the chain's model with a frame for what must be at the target of a pose."""
         if pose not in self._models:
-            row, model = self.problem.transcription.structure.poses[pose], pin.Model(self.problem.chain.model)
+            row, model = (
+                self.problem.transcription.structure.poses[pose],
+                pin.Model(self.problem.chain.model),
+            )
             model.addFrame(pin.Frame(_FRAME, row.joint, row.local, pin.FrameType.OP_FRAME))
             self._models[pose] = model
         return self._models[pose]

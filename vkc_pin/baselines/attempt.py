@@ -41,7 +41,10 @@ Doable = Actuate | Place | GoTo | Reach
 
 FINER = 2
 """How many times more waypoints than elsewhere objects are moved in, unless told: an arm that only follows needs small steps."""
-_STANDS, _ENDS = 4, 10  # base poses that are tried in turn, the nearest first, at the handle and at the end
+_STANDS, _ENDS = (
+    4,
+    10,
+)  # base poses that are tried in turn, the nearest first, at the handle and at the end
 _BASE = slice(3)  # its coordinates
 
 
@@ -90,11 +93,17 @@ class Attempt:
                     self._drive_and_reach([step], self._poses(self._problem([step])), _STANDS)
                 else:  # drive somewhere, at whichever heading is best if none is asked for
                     goals = headings(step, float(self.scene.start[2]))
-                    self._withdrawn(functools.partial(self._drive, goals), FailedError("no base path"))
+                    self._withdrawn(
+                        functools.partial(self._drive, goals), FailedError("no base path")
+                    )
         except (FailedError, SpentError) as error:
             failure = error if isinstance(error, FailedError) else FailedError(str(error))
             parts = [*self.parts, *failure.parts] or [still(self.scene, self.options)]
-            return join(parts, pause=self.options.grasp_time), len(self.parts) + failure.came, failure.cause
+            return (
+                join(parts, pause=self.options.grasp_time),
+                len(self.parts) + failure.came,
+                failure.cause,
+            )
         return join(self.parts, pause=self.options.grasp_time), np.inf, ""
 
     def _actuate(self, step: Actuate) -> None:
@@ -138,7 +147,9 @@ class Attempt:
 
         self._first(postures(self._problem([self._here()])), held, failure)
 
-    def _first(self, choices: Iterable[Floats], stage: Callable[[Floats], None], failure: FailedError) -> None:
+    def _first(
+        self, choices: Iterable[Floats], stage: Callable[[Floats], None], failure: FailedError
+    ) -> None:
         """Do a stage with the first choice with which it works; if there is none, raise the failure that came furthest."""
         scene, before = self.scene, self.parts
         for choice in choices:
@@ -167,7 +178,9 @@ class Attempt:
         ends = np.tile(stay.start, (len(poses) + 1, 1))
         ends[:-1, :3] = poses[:, :3]
         depth = Knots(stay, self.rng).depth(ends, stay.segments)
-        return np.asarray(poses[depth[:-1] <= min(depth[-1], CLOSE_ENOUGH)])  # the arm may be as close to the robot as it is
+        return np.asarray(
+            poses[depth[:-1] <= min(depth[-1], CLOSE_ENOUGH)]
+        )  # the arm may be as close to the robot as it is
 
     def _withdraw(self, path: Floats) -> None:
         """Move the arm along configurations, shape (K, n), to the last of them, the base stands; nothing to do if K = 0."""
@@ -176,7 +189,9 @@ class Attempt:
         problem = _fixed(self._problem([self._here()]), _BASE)
         arm = slice(3, problem.chain.robot.coordinates.size)
         problem = _fixed(problem, arm, path[-1, arm], rows=-1)
-        seeds = [Seed("straight", through(problem, path[k:])) for k in (0, -1)[: len(path)]]  # along it, and directly
+        seeds = [
+            Seed("straight", through(problem, path[k:])) for k in (0, -1)[: len(path)]
+        ]  # along it, and directly
         self._take(problem, *self._solve(problem, iter(seeds), "arm does not reach"))
 
     def _drive(self, goals: Floats) -> None:
@@ -185,24 +200,39 @@ class Attempt:
         problem = self._problem([GoTo(x, y, yaw if len(goals) == 1 else None)])
         problem = _fixed(problem, slice(3, problem.chain.robot.coordinates.size))
         bare = at_home(problem) and not self.scene.held and len(goals) == 1
-        seeds = initialize(problem, "astar", self._seed()) if bare else BasePaths(problem, whole=True).seeds(problem, goals)
+        seeds = (
+            initialize(problem, "astar", self._seed())
+            if bare
+            else BasePaths(problem, whole=True).seeds(problem, goals)
+        )
         self._take(problem, *self._solve(problem, seeds, "no base path"))
 
     def _reach(self, steps: Sequence[Step], pose: Floats) -> None:
         """Take hold of the object, or put it down, the base stands."""
         problem = _fixed(self._problem(steps), _BASE)
         last = np.append(problem.start[:3], pose[3:])
-        seeds = [Seed("straight", problem.start + smooth(problem.segments)[:, None] * (last - problem.start))]
+        seeds = [
+            Seed(
+                "straight",
+                problem.start + smooth(problem.segments)[:, None] * (last - problem.start),
+            )
+        ]
         phase = problem.task.phases[-1]
         if phase.lowered:  # from above
             above = Approach(Knots(problem, self.rng)).away(last, phase)[::-1]
-            seeds = [Seed("from above", through(problem, np.vstack([above, last])))] * (len(above) > 0) + seeds
+            seeds = [Seed("from above", through(problem, np.vstack([above, last])))] * (
+                len(above) > 0
+            ) + seeds
         more = initialize(problem, "interpolated", self._seed())
-        self._take(problem, *self._solve(problem, itertools.chain(seeds, more), "arm does not reach"))
+        self._take(
+            problem, *self._solve(problem, itertools.chain(seeds, more), "arm does not reach")
+        )
 
     def _move(self, step: Actuate) -> None:
         """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
-        problem = self._problem([step], replace(self.options, move_waypoints=self.finer * self.options.move_waypoints))
+        problem = self._problem(
+            [step], replace(self.options, move_waypoints=self.finer * self.options.move_waypoints)
+        )
         paths, failure = BasePaths(problem), FailedError("no base path")
         for pose in self._poses(problem)[:_ENDS]:
             base = paths.along(problem, pose[:3])
@@ -222,18 +252,26 @@ class Attempt:
                 self._take(problem, followed.z, timing.dt)
                 return
             if not failure.parts or followed.share > failure.share:
-                failure = FailedError(cause, as_trajectory(problem, followed.z, timing.dt), followed.share)
+                failure = FailedError(
+                    cause, as_trajectory(problem, followed.z, timing.dt), followed.share
+                )
         raise failure
 
     def _here(self) -> GoTo:
         return GoTo(*self.scene.start[:3].tolist())
 
-    def _problem(self, steps: Sequence[Step], options: Options | None = None, scene: Scene | None = None) -> TrajectoryProblem:
+    def _problem(
+        self, steps: Sequence[Step], options: Options | None = None, scene: Scene | None = None
+    ) -> TrajectoryProblem:
         """Return the problem of steps from where the motion has come to, or from another scene."""
         options, scene = options or self.options, scene or self.scene
-        return TrajectoryProblem(scene, compile_task(scene, steps, options), options, cache=self.cache)
+        return TrajectoryProblem(
+            scene, compile_task(scene, steps, options), options, cache=self.cache
+        )
 
-    def _solve(self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str) -> tuple[Floats, Floats]:
+    def _solve(
+        self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str
+    ) -> tuple[Floats, Floats]:
         """Return the first solution from a seed: z_1..z_N, shape (N, n), and the time of every step, shape (N,) [s]."""
         failure = FailedError(cause)
         for seed in seeds:
@@ -258,9 +296,14 @@ class Attempt:
 
 
 def _fixed(
-    problem: TrajectoryProblem, columns: slice, values: Floats | None = None, rows: slice | int = slice(None)
+    problem: TrajectoryProblem,
+    columns: slice,
+    values: Floats | None = None,
+    rows: slice | int = slice(None),
 ) -> TrajectoryProblem:
     """Return a problem in which coordinates are at `values`, or else where they start, at some waypoints, by default all."""
     lower, upper = problem.lower.copy(), problem.upper.copy()
-    lower[rows, columns] = upper[rows, columns] = problem.start[columns] if values is None else values
+    lower[rows, columns] = upper[rows, columns] = (
+        problem.start[columns] if values is None else values
+    )
     return problem.with_bounds(lower, upper)

@@ -17,8 +17,13 @@ __all__ = ["FailedError", "Followed", "follow"]
 
 SEEDS = 16
 """From so many random arms inverse kinematics is tried where it leads to nothing from the waypoint before."""
-_KINDS = ("", "collision", "no inverse kinematics")  # what may be wrong with a configuration, the best first
-_SPREAD = 1.0  # [rad], of half of them about the waypoint before; the others are anywhere within the limits
+_KINDS = (
+    "",
+    "collision",
+    "no inverse kinematics",
+)  # what may be wrong with a configuration, the best first
+# [rad], of half of them about the waypoint before; the others are anywhere within the limits
+_SPREAD = 1.0
 
 
 class FailedError(Exception):
@@ -46,7 +51,8 @@ class Followed:
     """Where following led.
 
     Attributes:
-        z: z_1..z_N, shape (N, n); if it failed, all stands still from there on, in what was nearest to working.
+        z: z_1..z_N, shape (N, n); if it failed, all stands still from there on, in what was nearest
+            to working.
         share: Share of the waypoints up to which it worked.
         cause: "", "no inverse kinematics", or "collision" if all there is is not free.
     """
@@ -56,15 +62,17 @@ class Followed:
     cause: str
 
 
-def follow(problem: TrajectoryProblem, base: Floats, rng: np.random.Generator, *, refine: bool) -> Followed:
+def follow(
+    problem: TrajectoryProblem, base: Floats, rng: np.random.Generator, *, refine: bool
+) -> Followed:
     """Find the arm for every waypoint from the one before.
 
     Args:
         problem: Moves joints of what is held, and nothing else.
         base: x, y, yaw [m, rad] at its waypoints, shape (N, 3).
         rng: Draws seeds.
-        refine: Move arm and object at each waypoint out of collision (B2), instead of taking the object where the time law has
-            it and the arm as inverse kinematics finds it (B1).
+        refine: Move arm and object at each waypoint out of collision (B2), instead of taking the
+            object where the time law has it and the arm as inverse kinematics finds it (B1).
     """
     knots = Knots(problem, rng)
     z = knots.objects.copy()
@@ -103,7 +111,14 @@ class _Arm:
         """Return what inverse kinematics, and refinement, lead to from `z`, and what is wrong with it."""
         found, closed = self.kinematics.solve(z, waypoint)
         if self.refine and not (closed and self._free(found, waypoint)):
-            found, closed = refined(self.problem, self.knots, found, wanted=z, waypoint=waypoint, columns=self.kinematics.columns)
+            found, closed = refined(
+                self.problem,
+                self.knots,
+                found,
+                wanted=z,
+                waypoint=waypoint,
+                columns=self.kinematics.columns,
+            )
         if not closed:
             return found, "no inverse kinematics"
         return found, "" if self._free(found, waypoint) else "collision"
@@ -114,7 +129,10 @@ class _Arm:
     def _seeds(self, z: Floats) -> Floats:
         """Return `z` with other arms, shape (SEEDS, n)."""
         columns, chain, rng = self.kinematics.columns, self.problem.chain, self.knots.rng
-        lower, upper = np.maximum(chain.lower[columns], -np.pi), np.minimum(chain.upper[columns], np.pi)
+        lower, upper = (
+            np.maximum(chain.lower[columns], -np.pi),
+            np.minimum(chain.upper[columns], np.pi),
+        )
         arms = rng.uniform(np.minimum(lower, upper), upper, (SEEDS, len(columns)))
         near = z[columns] + rng.normal(0.0, _SPREAD, (SEEDS // 2, len(columns)))
         arms[: SEEDS // 2] = np.clip(near, chain.lower[columns], chain.upper[columns])

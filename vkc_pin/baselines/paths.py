@@ -20,7 +20,10 @@ from vkc_pin.world.task.steps import GoTo
 
 __all__ = ["BasePaths", "headings"]
 
-_STEPS, _STEP = 25, 0.08  # poses on a straight path that are looked at: at least so many, and at most so far apart [m]
+_STEPS, _STEP = (
+    25,
+    0.08,
+)  # poses on a straight path that are looked at: at least so many, and at most so far apart [m]
 
 
 class BasePaths:
@@ -35,7 +38,8 @@ class BasePaths:
 
         Args:
             problem: Whose base it is.
-            whole: The arm counts as well, as it is at the start, with what it holds; otherwise the bare base alone.
+            whole: The arm counts as well, as it is at the start, with what it holds; otherwise the
+                bare base alone.
         """
         self.omni = problem.chain.robot.base == "omni"
         z = problem.start.copy()
@@ -44,10 +48,15 @@ class BasePaths:
         base = [shape for joint, shape in moving if whole or joint == 1]
         arena, margin = problem.scene.arena, problem.options.dist_safe
         turning = problem.chain.robot.lever
-        self._grid = functools.partial(BaseGrid, base, [], standing, arena, turning=turning, cache=problem.cache)
+        self._grid = functools.partial(
+            BaseGrid, base, [], standing, arena, turning=turning, cache=problem.cache
+        )
         self.grid = self._grid(margin)
         # Without margins where an optimisation follows: it restores them.
-        self._fine: dict[str, Any] = {"margin": 0.0 if whole else margin, "cells": fine_cells(arena, margin)}
+        self._fine: dict[str, Any] = {
+            "margin": 0.0 if whole else margin,
+            "cells": fine_cells(arena, margin),
+        }
 
     @functools.cached_property
     def finer(self) -> BaseGrid:
@@ -59,8 +68,8 @@ class BasePaths:
 
         Args:
             start: x, y, yaw [m, rad].
-            goals: The same, shape (3,), or several of them, shape (G, 3): the first that can be reached straight, else the one
-                to which the path is the shortest.
+            goals: The same, shape (3,), or several of them, shape (G, 3): the first that can be
+                reached straight, else the one to which the path is the shortest.
             steps: How many poses.
         """
         goals = np.atleast_2d(goals)
@@ -77,7 +86,11 @@ class BasePaths:
         base = [problem.start[None, :3]]
         for phase in problem.task.phases:
             moves = phase.kind == "move"
-            part = self.path(base[-1][-1], goal, phase.segments) if moves else np.tile(base[-1][-1], (phase.segments, 1))
+            part = (
+                self.path(base[-1][-1], goal, phase.segments)
+                if moves
+                else np.tile(base[-1][-1], (phase.segments, 1))
+            )
             if part is None:
                 return None
             base.append(part)
@@ -94,7 +107,11 @@ class BasePaths:
 
 def headings(step: GoTo, yaw: float) -> Floats:
     """Return the poses in which a step may end, shape (G, 3): one, or one per heading, those nearest to `yaw` [rad] first."""
-    turns = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False) if step.yaw is None else np.array([step.yaw - yaw])
+    turns = (
+        np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False)
+        if step.yaw is None
+        else np.array([step.yaw - yaw])
+    )
     turns = wrapped(turns)
     turns = turns[np.argsort(np.abs(turns), kind="stable")]
     return np.column_stack([np.tile([step.x, step.y], (len(turns), 1)), yaw + turns])

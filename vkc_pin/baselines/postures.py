@@ -22,16 +22,19 @@ TRIES = 20_000
 _SAME = 1e-6  # [rad]
 
 
-def base_poses(problem: TrajectoryProblem, waypoint: int, near: Floats, rng: np.random.Generator) -> Floats:
+def base_poses(
+    problem: TrajectoryProblem, waypoint: int, near: Floats, rng: np.random.Generator
+) -> Floats:
     """Return configurations, the nearest first, that are what must hold at a waypoint and are free of collision.
 
-    As in the code of Jiao et al. (IROS 2021): inverse kinematics of base and arm together from random seeds, up to `ENOUGH`
-    solutions in `TRIES` tries.
+    As in the code of Jiao et al. (IROS 2021): inverse kinematics of base and arm together from
+    random seeds, up to `ENOUGH` solutions in `TRIES` tries.
 
     Args:
         problem: The problem.
         waypoint: The waypoint.
-        near: The configuration that they should be near, shape (n,), as `VirtualKinematicChain.metric` measures.
+        near: The configuration that they should be near, shape (n,), as
+            `VirtualKinematicChain.metric` measures.
         rng: Draws the seeds.
 
     Returns:
@@ -52,9 +55,9 @@ def base_poses(problem: TrajectoryProblem, waypoint: int, near: Floats, rng: np.
 def postures(problem: TrajectoryProblem) -> Iterator[Floats]:
     """Yield configurations, shape (n,), in which the base may drive away from where it is, and the ones that lead to them.
 
-    Each is a path of the arm while the base stands, shape (K, n), and ends in what the base then drives in: nothing to do (K =
-    0), back from what it lets go of, or up with what it carries, from there to home, and from there folded, for narrow
-    passages. Those that are not free are left out.
+    Each is a path of the arm while the base stands, shape (K, n), and ends in what the base then
+    drives in: nothing to do (K = 0), back from what it lets go of, or up with what it carries, from
+    there to home, and from there folded, for narrow passages. Those that are not free are left out.
 
     Args:
         problem: Lets go of what stands fixed in the world and carries the rest along.
@@ -73,7 +76,9 @@ def postures(problem: TrajectoryProblem) -> Iterator[Floats]:
     paths += [] if at_home(problem) else [np.vstack([away, home])]
     yield from filter(is_free, paths)
     folded = home.copy()
-    folded[3 : robot.coordinates.size] = Routes(problem).folded_arm(0)  # looked for only if nothing else will do
+    folded[3 : robot.coordinates.size] = Routes(problem).folded_arm(
+        0
+    )  # looked for only if nothing else will do
     yield from filter(is_free, [np.vstack([paths[-1], folded])])
 
 

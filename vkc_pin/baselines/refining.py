@@ -19,24 +19,34 @@ CLEAR = CLOSE_ENOUGH
 _ROUNDS = 12
 _REACH = 0.05  # [m] beyond the clearance: contacts that are looked at
 _LONGEST = 0.2  # [m] and [rad] of one round in one coordinate
-_OBJECT = 10.0  # what moving the object's joints away from their time law costs, beside the arm's away from where it was
+# what moving the object's joints away from their time law costs, beside the arm's away from where
+# it was
+_OBJECT = 10.0
 _SLACK = 1e3  # what a metre of clearance costs that there is no room for
 _REGULAR = 1e-6  # makes the program strictly convex in the slack
 
 
 def refined(
-    problem: TrajectoryProblem, knots: Knots, z: Floats, *, wanted: Floats, waypoint: int, columns: Ints
+    problem: TrajectoryProblem,
+    knots: Knots,
+    z: Floats,
+    *,
+    wanted: Floats,
+    waypoint: int,
+    columns: Ints,
 ) -> tuple[Floats, bool]:
     """Return the configuration near `wanted` that rounds from `z` lead to, and whether the chain is closed there.
 
-    Each round minimises Σ w (z − z*)² + slack over the arm, the freedoms of its grasps and the object's joints, so that the
-    linearised closure holds and the linearised distances of close pairs keep their margins.
+    Each round minimises Σ w (z − z*)² + slack over the arm, the freedoms of its grasps and the
+    object's joints, so that the linearised closure holds and the linearised distances of close
+    pairs keep their margins.
 
     Args:
         problem: The problem.
         knots: Of it.
         z: Where to begin, shape (n,).
-        wanted: z*: the arm at the waypoint before, the object where its time law has it, shape (n,).
+        wanted: z*: the arm at the waypoint before, the object where its time law has it, shape
+            (n,).
         waypoint: The waypoint.
         columns: The coordinates of arm and grasps.
     """
@@ -52,7 +62,9 @@ def refined(
     for _ in range(_ROUNDS):
         residual, jacobian = (part[0] for part in solver.evaluate(z[None], target))
         reach = problem.options.largest_margin + _REACH
-        contacts = problem.contacts.evaluate(z[None], np.array([waypoint]), reach=reach, nearest=None)
+        contacts = problem.contacts.evaluate(
+            z[None], np.array([waypoint]), reach=reach, nearest=None
+        )
         if np.abs(residual).max() < TOLERANCE and contacts.violation() <= CLEAR:
             return z, True
         gradients = problem.contacts.gradients(z[None], contacts)[:, free]

@@ -40,7 +40,8 @@ class DatasetCheck:
         folder: Whose.
         episodes: How many there are.
         refused: Number of an episode → what the validation says against it.
-        problems: What else is wrong, a line each: damaged files, numbers that occur twice, near-duplicates.
+        problems: What else is wrong, a line each: damaged files, numbers that occur twice,
+            near-duplicates.
         records: What is known of every episode, see `statistics`.
         page: The page of statistics.
     """
@@ -67,7 +68,9 @@ class DatasetCheck:
         found += [f"  ... and {len(told) - _SHOWN} more"] if len(told) > _SHOWN else []
         wound = Counter(tuple(sorted(record["winding"])) != () for record in self.records)
         if self.records:
-            found.append(f"  paths of the base that go round something: {wound[True]} of {len(self.records)}")
+            found.append(
+                f"  paths of the base that go round something: {wound[True]} of {len(self.records)}"
+            )
         if self.page is not None:
             found.append(f"  statistics: {self.page}")
         return found
@@ -77,12 +80,17 @@ class DatasetCheck:
 
 
 def check_dataset(
-    folder: str | Path, *, jobs: int = 1, page: str | Path | None = None, seed: int = 0, progress: bool = False
+    folder: str | Path,
+    *,
+    jobs: int = 1,
+    page: str | Path | None = None,
+    seed: int = 0,
+    progress: bool = False,
 ) -> DatasetCheck:
     """Validate every episode of a dataset again, and write a page of statistics.
 
-    Nothing is taken from planning: scenes are built anew from the files by their content, motions are read from the shards, and
-    the independent validation looks at both.
+    Nothing is taken from planning: scenes are built anew from the files by their content, motions
+    are read from the shards, and the independent validation looks at both.
 
     Args:
         folder: The dataset.
@@ -104,11 +112,18 @@ def check_dataset(
     check_writable(target, field="page")
     shards = dataset.shards
     recipe = dataset.recipe.document
-    tasks = ((str(k), (str(shard), str(dataset.folder / "scenes"), recipe)) for k, shard in enumerate(shards))
+    tasks = (
+        (str(k), (str(shard), str(dataset.folder / "scenes"), recipe))
+        for k, shard in enumerate(shards)
+    )
     found: dict[int, tuple[list[dict[str, Any]], list[str]]] = {}
     with tqdm(total=len(shards), unit="shard", disable=not progress) as bar:
         for key, result in results(checked_shard, tasks, jobs=jobs, dask=clustered()):
-            found[int(key)] = ([], [f"{shards[int(key)]}: {result.reason}"]) if isinstance(result, Died) else result
+            found[int(key)] = (
+                ([], [f"{shards[int(key)]}: {result.reason}"])
+                if isinstance(result, Died)
+                else result
+            )
             bar.update()
     records = [record for k in sorted(found) for record in found[k][0]]
     problems = [text for k in sorted(found) for text in found[k][1]]
@@ -120,10 +135,14 @@ def check_dataset(
     pictured = _named(dataset, whole_ones, {records[k]["number"] for k in chosen})
     text = statistics_page(dataset.recipe, records, failures, pictured, refused, problems)
     write_atomically(target, text.encode())
-    return DatasetCheck(dataset.folder, len(records), refused, tuple(problems), tuple(records), target)
+    return DatasetCheck(
+        dataset.folder, len(records), refused, tuple(problems), tuple(records), target
+    )
 
 
-def checked_shard(task: tuple[str, str, Mapping[str, Any]]) -> tuple[list[dict[str, Any]], list[str]]:
+def checked_shard(
+    task: tuple[str, str, Mapping[str, Any]],
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Return what is known of the episodes of a shard, by its scenes' folder and its recipe, and what is wrong with the file."""
     shard, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2])
     records: list[dict[str, Any]] = []
@@ -143,7 +162,9 @@ def _looked_at(episode: Episode, recipe: Recipe) -> dict[str, Any]:
     try:
         scene = episode.scene()
         report = episode.validate()
-        said = [str(violation) for violation in report.violations] + report.contradictions(episode.claimed)
+        said = [str(violation) for violation in report.violations] + report.contradictions(
+            episode.claimed
+        )
         if episode.terms != terms_of(recipe, scene, about):
             said.append("its own terms are not those of the recipe")
         refused, winding = "; ".join(said[:3]), homotopy(scene, motion)
@@ -165,7 +186,9 @@ def _looked_at(episode: Episode, recipe: Recipe) -> dict[str, Any]:
 def _together(dataset: Dataset, records: list[dict[str, Any]]) -> Iterator[str]:
     """Yield what is wrong with the episodes as a whole."""
     counts = Counter(record["number"] for record in records)
-    yield from (f"episode {number} is there {count} times" for number, count in counts.items() if count > 1)
+    yield from (
+        f"episode {number} is there {count} times" for number, count in counts.items() if count > 1
+    )
     seen = Seen()
     for record in sorted(records, key=lambda record: int(record["number"])):
         twin = seen.twin(record)
@@ -189,5 +212,7 @@ def _table(path: Path) -> list[dict[str, str]]:
 def _named(dataset: Dataset, shards: Iterable[Path], numbers: set[int]) -> list[Episode]:
     """Return the episodes of some numbers, reading only the shards that have them."""
     shards = (shard for shard in shards if numbers & set(numbers_of(shard)))
-    every = itertools.chain.from_iterable(episodes_of(shard, dataset.folder / "scenes") for shard in shards)
+    every = itertools.chain.from_iterable(
+        episodes_of(shard, dataset.folder / "scenes") for shard in shards
+    )
     return [episode for episode in every if episode.number in numbers]

@@ -22,8 +22,30 @@ __all__ = ["EPISODES_A_SHARD", "Dataset", "Register", "write_table"]
 EPISODES_A_SHARD = 100
 """Episodes in one file; the last of each robot has fewer."""
 _COLUMNS = (
-    *("number", "task", "robot", "room", "object", "kind", "attachment", "joint", "goal", "variant", "status", "reason"),
-    *("duration", "base_effort", "arm_effort", "clearance", "waypoints", "scene", "seconds", "planning_time"),
+    *(
+        "number",
+        "task",
+        "robot",
+        "room",
+        "object",
+        "kind",
+        "attachment",
+        "joint",
+        "goal",
+        "variant",
+        "status",
+        "reason",
+    ),
+    *(
+        "duration",
+        "base_effort",
+        "arm_effort",
+        "clearance",
+        "waypoints",
+        "scene",
+        "seconds",
+        "planning_time",
+    ),
 )
 
 
@@ -48,7 +70,11 @@ class Dataset:
         """
         path = file_path(folder, "folder", "a folder that `vkc-pin generate` has written")
         if not (path / "recipe.yaml").is_file():
-            raise InputError("there is no dataset", file=path, expected="a folder that `vkc-pin generate` has written")
+            raise InputError(
+                "there is no dataset",
+                file=path,
+                expected="a folder that `vkc-pin generate` has written",
+            )
         return cls(path, load_recipe(path / "recipe.yaml"))
 
     @property
@@ -73,8 +99,8 @@ class Dataset:
 class Register:
     """Decides, in the order of their numbers, which attempts are episodes of a dataset, and puts these into shards.
 
-    Attempts end in any order; what they become depends on those of lower numbers alone, so that neither the number of processes
-    nor any stop makes a difference.
+    Attempts end in any order; what they become depends on those of lower numbers alone, so that
+    neither the number of processes nor any stop makes a difference.
 
     Attributes:
         accepted: Of the records of the episodes what tables have, in order.

@@ -50,11 +50,13 @@ class Seen:
 def homotopy(scene: Scene, trajectory: Trajectory) -> dict[str, int]:
     """Return around which things the base's path winds otherwise than the straight line from its start to its end.
 
-    Two paths with the same ends can be deformed into each other, as far as winding tells, if this is the same; see Bhattacharya,
-    Likhachev and Kumar, "Topological constraints in search-based robot path planning", Autonomous Robots 33 (2012).
+    Two paths with the same ends can be deformed into each other, as far as winding tells, if this
+    is the same; see Bhattacharya, Likhachev and Kumar, "Topological constraints in search-based
+    robot path planning", Autonomous Robots 33 (2012).
 
     Returns:
-        Obstacle or object → whole turns, those that are not 0: positive where the path leaves it to its left.
+        Obstacle or object → whole turns, those that are not 0: positive where the path leaves it to
+        its left.
     """
     path = _path(trajectory)
     found = {}
@@ -96,5 +98,7 @@ def spread(values: Sequence[float], low: float, high: float, cells: int = 10) ->
     """Return the share of equal cells of an interval in which there is a value."""
     if high <= low or not len(values):
         return 0.0
-    cell = np.clip(((np.asarray(values, float) - low) / (high - low) * cells).astype(int), 0, cells - 1)
+    cell = np.clip(
+        ((np.asarray(values, float) - low) / (high - low) * cells).astype(int), 0, cells - 1
+    )
     return len(set(cell.tolist())) / cells

@@ -36,11 +36,26 @@ from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Episode", "Made", "attempt", "attempts", "made_of", "moments", "packed", "scene_name", "unpacked", "work_file"]
+__all__ = [
+    "Episode",
+    "Made",
+    "attempt",
+    "attempts",
+    "made_of",
+    "moments",
+    "packed",
+    "scene_name",
+    "unpacked",
+    "work_file",
+]
 
 _PLANNER = {"entries": 512, "megabytes": 96.0}
 _DIGITS = 12  # of a scene's name
-_GRID = 2.0**-30  # [m], [rad], [m/s], ...: motions are kept to 0.5e-9; what is below is noise, which does not compress
+_GRID = (
+    2.0**-30
+    # [m], [rad], [m/s], ...: motions are kept to 0.5e-9; what is below is noise, which does not
+    # compress
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +64,8 @@ class Episode:
 
     Attributes:
         number: With the recipe, this determines it.
-        about: What was drawn and what came out: task, robot, room, object, kind, attachment, joint, goal, variant, metrics.
+        about: What was drawn and what came out: task, robot, room, object, kind, attachment, joint,
+            goal, variant, metrics.
         document: The scene as plain data, without its start.
         start: The start, as part of the scene's description.
         where: The folder that relative paths in the scene start from; None: the package's scenes.
@@ -124,7 +140,9 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
     try:
         recipe = _recipe(json.dumps(said, sort_keys=True))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is said of a robot would be said again of every episode
+            warnings.simplefilter(
+                "ignore"
+            )  # what is said of a robot would be said again of every episode
             asked = problem(recipe, number, robots, _planner())
             record |= {**asked.about, "setup_time": round(time.perf_counter() - began, 4)}
             found = plan(
@@ -143,7 +161,9 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
                 executed = simulate(found.scene, found.steps, found.trajectory)
                 record |= _physics(executed)
                 if executed.ok and recipe.cameras:
-                    images = taken(executed, recipe.cameras, moments(found.trajectory, recipe.fields.rate)).to_bytes()
+                    images = taken(
+                        executed, recipe.cameras, moments(found.trajectory, recipe.fields.rate)
+                    ).to_bytes()
             if record["success"]:
                 about = asked.about | {"metrics": _metrics(found)}
                 data, more = packed(number, about, found, images)
@@ -151,9 +171,20 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
     except NoProblemError as error:
         record |= {"status": "no problem", "reason": str(error)}
     except Exception as error:  # one episode must not end ten thousand
-        record |= {"success": False, "status": "error", "reason": f"{type(error).__name__}: {error}"}
-    record |= {"seconds": round(time.perf_counter() - began, 4), "cpu_time": round(time.process_time() - worked, 4)}
-    record |= {"memory_mb": round(peak_memory(), 1), "resident_mb": round(resident_memory(), 1), "process": process_name()}
+        record |= {
+            "success": False,
+            "status": "error",
+            "reason": f"{type(error).__name__}: {error}",
+        }
+    record |= {
+        "seconds": round(time.perf_counter() - began, 4),
+        "cpu_time": round(time.process_time() - worked, 4),
+    }
+    record |= {
+        "memory_mb": round(peak_memory(), 1),
+        "resident_mb": round(resident_memory(), 1),
+        "process": process_name(),
+    }
     return record, data if record["success"] else b""
 
 
@@ -162,7 +193,9 @@ _PERTURBED = 0.05  # [m], [rad] of noise on the seeds of further variants
 
 def _outcome(found: Plan) -> dict[str, Any]:
     worst = [str(one) for one in found.validation.violations[:1]]
-    reason = "" if found.success else "; ".join([*worst, *found.validation.notes[:2]]) or found.status
+    reason = (
+        "" if found.success else "; ".join([*worst, *found.validation.notes[:2]]) or found.status
+    )
     return {
         "success": found.success,
         "status": found.status,
@@ -179,7 +212,12 @@ def _physics(executed: SimulationResult) -> dict[str, Any]:
     """Return what physics says otherwise; see `simulation.execution`."""
     if executed.ok:
         return {"simulated": True}
-    return {"success": False, "status": "physics", "reason": "; ".join(executed.problems()), "simulated": True}
+    return {
+        "success": False,
+        "status": "physics",
+        "reason": "; ".join(executed.problems()),
+        "simulated": True,
+    }
 
 
 def moments(motion: Trajectory, rate: float) -> Floats:
@@ -190,7 +228,15 @@ def moments(motion: Trajectory, rate: float) -> Floats:
 
 def _metrics(found: Plan) -> dict[str, float]:
     """Return what does not depend on the machine of a plan's metrics."""
-    names = ("base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "duration", "effort")
+    names = (
+        "base_effort",
+        "base_effort_l1",
+        "arm_effort",
+        "clearance",
+        "closure_error",
+        "duration",
+        "effort",
+    )
     return {name: float(found.metrics[name]) for name in names if np.isfinite(found.metrics[name])}
 
 
@@ -199,7 +245,9 @@ def scene_name(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
-def packed(number: int, about: Mapping[str, Any], found: Plan, images: bytes = b"") -> tuple[bytes, dict[str, Any]]:
+def packed(
+    number: int, about: Mapping[str, Any], found: Plan, images: bytes = b""
+) -> tuple[bytes, dict[str, Any]]:
     """Return a plan as bytes that `unpacked` reads, and what the journal says of it: scene, start, way and metrics.
 
     Args:
@@ -212,7 +260,9 @@ def packed(number: int, about: Mapping[str, Any], found: Plan, images: bytes = b
     start = document.pop("start")
     document["robot"]["name"] = about["robot"]
     motion = found.trajectory.to_dict()
-    arrays = {name: _coarse(motion.pop(name)) for name in ("positions",)} | {"times": np.array(motion.pop("times"), float)}
+    arrays = {name: _coarse(motion.pop(name)) for name in ("positions",)} | {
+        "times": np.array(motion.pop("times"), float)
+    }
     for name, values in motion.pop("curve", {}).items():
         arrays[f"knot_{name}"] = np.array(values, float) if name == "times" else _coarse(values)
     outside = found.scene.folder.resolve() != folder("scenes").resolve()
@@ -226,12 +276,17 @@ def packed(number: int, about: Mapping[str, Any], found: Plan, images: bytes = b
         "terms": [term_to_dict(term) for term in found.terms],
         "options": asdict(found.options),
         "motion": motion,
-        "validation": {**found.validation.to_dict(), "clearance": _finite(found.validation.clearance)},
+        "validation": {
+            **found.validation.to_dict(),
+            "clearance": _finite(found.validation.clearance),
+        },
     }
     data["validation"]["clearances"] = [_finite(value) for value in found.validation.clearances]
     buffer = io.BytesIO()
     seen: Any = {"images": np.frombuffer(images, np.uint8)} if images else {}
-    np.savez_compressed(buffer, allow_pickle=False, about=np.array(json.dumps(data)), **arrays, **seen)
+    np.savez_compressed(
+        buffer, allow_pickle=False, about=np.array(json.dumps(data)), **arrays, **seen
+    )
     more = {
         "scene": scene_name(document),
         "start": np.asarray(found.scene.start).round(4).tolist(),
@@ -257,11 +312,19 @@ def unpacked(data: bytes, robots: Path | None = None) -> Episode:
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     about, seen = json.loads(str(arrays.pop("about"))), arrays.pop("images", None)
-    found = made_of(about, {name: np.asarray(values, float) for name, values in arrays.items()}, robots)
-    return found if seen is None else replace(found, load_images=functools.partial(Images.from_bytes, seen.tobytes()))
+    found = made_of(
+        about, {name: np.asarray(values, float) for name, values in arrays.items()}, robots
+    )
+    return (
+        found
+        if seen is None
+        else replace(found, load_images=functools.partial(Images.from_bytes, seen.tobytes()))
+    )
 
 
-def made_of(data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path | None = None) -> Episode:
+def made_of(
+    data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path | None = None
+) -> Episode:
     """Return an episode of its description and its arrays; see `packed`.
 
     Raises:
@@ -270,10 +333,14 @@ def made_of(data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path 
     try:
         motion = {**data["motion"], "times": arrays["times"], "positions": arrays["positions"]}
         if "knot_times" in arrays:
-            motion["curve"] = {name: arrays[f"knot_{name}"] for name in ("times", "positions", "rates")}
+            motion["curve"] = {
+                name: arrays[f"knot_{name}"] for name in ("times", "positions", "rates")
+            }
         report = dict(data["validation"])
         report["clearance"] = np.inf if report["clearance"] is None else report["clearance"]
-        report["clearances"] = [np.inf if value is None else value for value in report["clearances"]]
+        report["clearances"] = [
+            np.inf if value is None else value for value in report["clearances"]
+        ]
         return Episode(
             number=int(data["number"]),
             about=data["about"],
@@ -289,7 +356,9 @@ def made_of(data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path 
         )
     except (LookupError, TypeError, AttributeError) as error:
         raise InputError(
-            "not an episode", expected="what generating has written", got=f"{type(error).__name__}: {error}"
+            "not an episode",
+            expected="what generating has written",
+            got=f"{type(error).__name__}: {error}",
         ) from error
 
 

@@ -31,7 +31,12 @@ from vkc_pin.utils.parallel.engine import Died, needs_dask, results
 from vkc_pin.utils.parallel.journal import Journal
 from vkc_pin.utils.parallel.machine import process_name, versions
 from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.files.writing import check_links, check_replaceable, check_writable, write_atomically
+from vkc_pin.world.files.writing import (
+    check_links,
+    check_replaceable,
+    check_writable,
+    write_atomically,
+)
 from vkc_pin.world.task.terms import Term
 
 __all__ = ["generate"]
@@ -57,30 +62,38 @@ def generate(
 ) -> Dataset:
     """Make a dataset of episodes, each a scene with a motion that the independent validation accepts; or go on making it.
 
-    The recipe and a number determine an episode; the dataset consists of the first `episodes` numbers, from 0, that become one.
-    The rest is in failures.csv with its reason. Neither `jobs` nor stops make a difference to what is in shards and scenes. Every
-    attempt that ends is in the journal at once; the same call goes on where one was stopped, and with more `episodes` adds some.
+    The recipe and a number determine an episode; the dataset consists of the first `episodes`
+    numbers, from 0, that become one. The rest is in failures.csv with its reason. Neither `jobs`
+    nor stops make a difference to what is in shards and scenes. Every attempt that ends is in the
+    journal at once; the same call goes on where one was stopped, and with more `episodes` adds
+    some.
 
     Args:
         recipe: The name or path of a recipe, or what such a file says.
         episodes: How many, at least 1.
         out: The folder, made if need be.
-        jobs: Processes on this machine; more than 1 are Dask's (the extra `cluster`), started anew when they die.
+        jobs: Processes on this machine; more than 1 are Dask's (the extra `cluster`), started anew
+            when they die.
         scheduler: Address of a Dask scheduler whose workers are used instead, "tcp://host:8786".
         variants: Motions for each problem, instead of the recipe's number.
-        simulate: Whether only episodes count that physics confirms (the extra `sim`), instead of what the recipe says.
-        cameras: Keep what cameras on the robot see of it as well: those of the recipe, or one above the base and one beside the
-            fingers. Only of what is simulated. Recipes that name cameras need not be asked.
-        terms: Own constraints and costs that every motion keeps to, beside those of the recipe, whose part they become. Frames
-            are "base", "hand", "object" (the link that the hand takes hold of), or those of every robot of the recipe;
-            `holding="object"` is while it is held.
+        simulate: Whether only episodes count that physics confirms (the extra `sim`), instead of
+            what the recipe says.
+        cameras: Keep what cameras on the robot see of it as well: those of the recipe, or one above
+            the base and one beside the fingers. Only of what is simulated. Recipes that name
+            cameras need not be asked.
+        terms: Own constraints and costs that every motion keeps to, beside those of the recipe,
+            whose part they become. Frames are "base", "hand", "object" (the link that the hand
+            takes hold of), or those of every robot of the recipe; `holding="object"` is while it is
+            held.
         lerobot: Write LeRobot's layout as well.
         progress: Show a progress bar with the time left.
 
     Raises:
         UnknownNameError: The recipe names something that does not exist.
-        InputError: The recipe is wrong, `out` holds something else, or what is needed is not installed; nothing is written then.
-        VkcError: Hardly any attempt becomes an episode; or there are cameras, and no OpenGL without a screen.
+        InputError: The recipe is wrong, `out` holds something else, or what is needed is not
+            installed; nothing is written then.
+        VkcError: Hardly any attempt becomes an episode; or there are cameras, and no OpenGL without
+            a screen.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
     wanted, jobs = whole(episodes, "episodes", low=1), whole(jobs, "jobs", low=1, high=4096)
@@ -107,7 +120,11 @@ def generate(
         numbers = dataset.numbers()
         if (there := len(numbers)) > wanted:
             raise InputError(
-                "there are more episodes already", file=folder, field="episodes", expected=f"at least {there}", got=wanted
+                "there are more episodes already",
+                file=folder,
+                field="episodes",
+                expected=f"at least {there}",
+                got=wanted,
             )
         register = Register(dataset, wanted)
         for key in _lost(dataset, journal, set(numbers)):
@@ -131,7 +148,9 @@ def _journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
         raise InputError("this is no folder", file=folder, field="out")
     if folder.is_dir() and not file.is_file() and any(folder.iterdir()):
         expected = "a new or empty folder, or one with episodes of this recipe"
-        raise InputError("there is something else in this folder", file=folder, field="out", expected=expected)
+        raise InputError(
+            "there is something else in this folder", file=folder, field="out", expected=expected
+        )
     if folder.is_dir():
         check_links(folder)
     check_writable(file)
@@ -144,7 +163,10 @@ def _journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
 def _at_work(folder: Path, recipe: Recipe) -> None:
     """Write what the folder has from the first moment on."""
     (folder / "work").mkdir(exist_ok=True)
-    write_atomically(folder / "recipe.yaml", yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True).encode())
+    write_atomically(
+        folder / "recipe.yaml",
+        yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True).encode(),
+    )
 
 
 def _kept(journal: Journal, key: str) -> dict[str, Any]:
@@ -154,11 +176,20 @@ def _kept(journal: Journal, key: str) -> dict[str, Any]:
 
 def _lost(dataset: Dataset, journal: Journal, there: Set[int]) -> list[str]:
     """Return which episodes somebody has removed: the journal says that they succeeded, and neither shard nor file has them."""
-    good = [key for key in journal.lines if int(key) not in there and _kept(journal, key)["success"]]
+    good = [
+        key for key in journal.lines if int(key) not in there and _kept(journal, key)["success"]
+    ]
     return [key for key in good if not work_file(dataset.folder, int(key)).is_file()]
 
 
-def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, scheduler: str | None, progress: bool) -> None:
+def _run(
+    dataset: Dataset,
+    register: Register,
+    journal: Journal,
+    jobs: int,
+    scheduler: str | None,
+    progress: bool,
+) -> None:
     """Make attempts, lowest numbers first, until there are enough episodes."""
     document, fields = dataset.recipe.document, dataset.recipe.fields
     clock, most = _Clock(), max(_LEAST, _PATIENCE * register.wanted)
@@ -179,7 +210,13 @@ def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, sche
                 yield ",".join(map(str, left)), (document, left, robots)
 
     journal.append({"session": {"jobs": jobs}})
-    bar = tqdm(total=register.wanted, initial=len(register.accepted), unit="episode", smoothing=0.05, disable=not progress)
+    bar = tqdm(
+        total=register.wanted,
+        initial=len(register.accepted),
+        unit="episode",
+        smoothing=0.05,
+        disable=not progress,
+    )
     found = results(
         parts,
         tasks(),
@@ -193,10 +230,14 @@ def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, sche
         with bar, contextlib.closing(found) as lines:
             for key, result in lines:
                 numbers = [int(number) for number in key.split(",")]
-                if isinstance(result, Died) and len(numbers) > 1:  # which of them it was shows when they are alone
+                if (
+                    isinstance(result, Died) and len(numbers) > 1
+                ):  # which of them it was shows when they are alone
                     again.extend(numbers)
                     continue
-                for record, data in [_died(numbers[0], result)] if isinstance(result, Died) else result:
+                for record, data in (
+                    [_died(numbers[0], result)] if isinstance(result, Died) else result
+                ):
                     if record["status"] == "interrupted":
                         raise KeyboardInterrupt
                     _keep(dataset, journal, record, data, clock)
@@ -209,9 +250,13 @@ def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, sche
         text = f"{len(register.accepted)} of {register.wanted} episodes are made and kept in {dataset.folder}"
         raise KeyboardInterrupt(text) from None
     if not register.full:
-        reasons = "; ".join(dict.fromkeys(str(record["reason"]) for record in register.failures[-200:]))[:500]
+        reasons = "; ".join(
+            dict.fromkeys(str(record["reason"]) for record in register.failures[-200:])
+        )[:500]
         problem = f"{register.decided} attempts gave {len(register.accepted)} episodes of {register.wanted}"
-        raise VkcError(f"{problem}, which are kept in {dataset.folder}; the last ones failed because: {reasons}")
+        raise VkcError(
+            f"{problem}, which are kept in {dataset.folder}; the last ones failed because: {reasons}"
+        )
 
 
 class _Clock:
@@ -235,13 +280,19 @@ class _Clock:
         return {"seconds": round(seconds, 3), "client_seconds": round(client, 4)}
 
 
-def _keep(dataset: Dataset, journal: Journal, record: dict[str, Any], data: bytes, clock: _Clock) -> None:
+def _keep(
+    dataset: Dataset, journal: Journal, record: dict[str, Any], data: bytes, clock: _Clock
+) -> None:
     """Write an attempt down: first the episode, then the line that says that it is there."""
     if data:
         write_atomically(work_file(dataset.folder, record["number"]), data)
     clock.attempted(record)
-    memory: dict[str, Any] = {name: record.pop(name) for name in ("memory_mb", "resident_mb", "process") if name in record}
-    journal.append({"key": str(record["number"]), "records": [record], "memory_mb": 0.0, **memory, **clock.now})
+    memory: dict[str, Any] = {
+        name: record.pop(name) for name in ("memory_mb", "resident_mb", "process") if name in record
+    }
+    journal.append(
+        {"key": str(record["number"]), "records": [record], "memory_mb": 0.0, **memory, **clock.now}
+    )
 
 
 def _died(number: int, died: Died) -> Made:
@@ -259,19 +310,26 @@ def _describe(dataset: Dataset, register: Register) -> None:
         "versions": versions(),
         "recipe": yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True),
     }
-    write_atomically(dataset.folder / "README.md", card(about, register.accepted, register.failures).encode())
+    write_atomically(
+        dataset.folder / "README.md", card(about, register.accepted, register.failures).encode()
+    )
 
 
 def _as_lerobot(dataset: Dataset) -> None:
     """Write every robot's episodes in LeRobot's layout."""
     for shards in sorted((dataset.folder / "shards").iterdir()):
         own = (
-            episode for shard in sorted(shards.glob("*.hdf5")) for episode in hdf5.episodes_of(shard, dataset.folder / "scenes")
+            episode
+            for shard in sorted(shards.glob("*.hdf5"))
+            for episode in hdf5.episodes_of(shard, dataset.folder / "scenes")
         )
         first = next(own)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             robot = first.scene().robot
         lerobot_layout.write_lerobot(
-            dataset.folder / "lerobot" / shards.name, itertools.chain([first], own), robot, dataset.recipe.fields.rate
+            dataset.folder / "lerobot" / shards.name,
+            itertools.chain([first], own),
+            robot,
+            dataset.recipe.fields.rate,
         )

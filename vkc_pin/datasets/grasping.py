@@ -24,7 +24,12 @@ _DRAWS = 6  # batches before there is none
 
 
 def grasped(
-    scene: Scene, step: Actuate, rng: np.random.Generator, options: Options, planner: Planner, terms: Sequence[Term] = ()
+    scene: Scene,
+    step: Actuate,
+    rng: np.random.Generator,
+    options: Options,
+    planner: Planner,
+    terms: Sequence[Term] = (),
 ) -> Scene | None:
     """Return the scene with the robot at a random free configuration that holds what a step moves; None if none is found.
 
@@ -39,25 +44,42 @@ def grasped(
         terms: What the motion must keep to, for the program; the start need not.
     """
     name, attachment = step.object, str(step.attachment)
-    holding = scene.with_held({name: attachment})  # wherever the hand is: the chain does not depend on it
+    holding = scene.with_held(
+        {name: attachment}
+    )  # wherever the hand is: the chain does not depend on it
     with planner.lent() as cache:
-        problem = TrajectoryProblem(holding, compile_task(holding, [step], options), options, traced(scene, terms), cache=cache)
+        problem = TrajectoryProblem(
+            holding,
+            compile_task(holding, [step], options),
+            options,
+            traced(scene, terms),
+            cache=cache,
+        )
         chain, robot = problem.chain, scene.robot.coordinates.size
         search = Knots(problem, rng)
         pose = search.pose_at(1)
-        freedoms = [chain.index(f"{name}.{own}") for own in scene.objects[name].object.attachments[attachment].coordinates]
+        freedoms = [
+            chain.index(f"{name}.{own}")
+            for own in scene.objects[name].object.attachments[attachment].coordinates
+        ]
         if pose is None:
             return None
         solver, target = search.solver(pose)
         for _ in range(_DRAWS):
             z = np.tile(problem.start, (_BATCH, 1))
-            z[:, freedoms] = rng.uniform(chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms)))
+            z[:, freedoms] = rng.uniform(
+                chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms))
+            )
             z, _ = search.knot(z, 1, "scatter")
-            z[:, search.driven] = problem.start[search.driven]  # as it is at the start, not a step later
+            z[:, search.driven] = problem.start[
+                search.driven
+            ]  # as it is at the start, not a step later
             lower, upper = np.tile(chain.lower, (_BATCH, 1)), np.tile(chain.upper, (_BATCH, 1))
             fixed = [*freedoms, *search.driven.tolist()]
             lower[:, fixed] = upper[:, fixed] = z[:, fixed]
-            z, found = solver.solve(z, target, lower=lower, upper=upper, weights=search.weights, tolerance=_EXACT)
+            z, found = solver.solve(
+                z, target, lower=lower, upper=upper, weights=search.weights, tolerance=_EXACT
+            )
             z = z[found]
             z = z[depth(problem, z, 0) <= 0.0] if len(z) else z
             if len(z):

@@ -75,12 +75,15 @@ def problem(recipe: Recipe, number: int, robots: Mapping[str, str], planner: Pla
 
     Args:
         recipe: The recipe.
-        number: From 0. Numbers that share a quotient by `variants` share all but the seed of planning.
-        robots: Name of a robot in the recipe → what to load, where that is something else; see `robots`.
+        number: From 0. Numbers that share a quotient by `variants` share all but the seed of
+            planning.
+        robots: Name of a robot in the recipe → what to load, where that is something else; see
+            `robots`.
         planner: Keeps what looking for grasps builds.
 
     Raises:
-        NoProblemError: The ranges leave nothing: no room has a place for everything, no start is free, no grasp is.
+        NoProblemError: The ranges leave nothing: no room has a place for everything, no start is
+            free, no grasp is.
     """
     fields = recipe.fields
     asked, variant = divmod(number, fields.variants)
@@ -92,13 +95,24 @@ def problem(recipe: Recipe, number: int, robots: Mapping[str, str], planner: Pla
         robot = place.scene.robot.name
     else:
         rooms = fields.rooms.count or block + 1
-        entry = fields.robots[(block + block // rooms) % len(fields.robots)]  # in turn, and another one every time round
-        place = _place(said, fields.rooms.first + block % rooms, robots.get(entry.name, entry.name), entry.height)
+        entry = fields.robots[
+            (block + block // rooms) % len(fields.robots)
+        ]  # in turn, and another one every time round
+        place = _place(
+            said,
+            fields.rooms.first + block % rooms,
+            robots.get(entry.name, entry.name),
+            entry.height,
+        )
         robot = entry.name
     about: dict[str, Any] = {"task": task, "robot": robot_name(robot), "room": place.scene.name}
-    scene, steps, more = (_fetch if task == "fetch-place" else _open)(recipe, place, rng, task == "given-open", planner)
+    scene, steps, more = (_fetch if task == "fetch-place" else _open)(
+        recipe, place, rng, task == "given-open", planner
+    )
     about |= {**more, "variant": variant}
-    return Problem(number, scene, steps, recipe.options, variant, about, terms_of(recipe, scene, about))
+    return Problem(
+        number, scene, steps, recipe.options, variant, about, terms_of(recipe, scene, about)
+    )
 
 
 def terms_of(recipe: Recipe, scene: Scene, about: Mapping[str, Any]) -> tuple[Term, ...]:
@@ -114,7 +128,9 @@ def _layout(said: str, room: int) -> Layout:
     """Return a random room, whatever robot it is for; processes keep the last ones."""
     recipe = load_recipe(json.loads(said))
     rng, fields = recipe.rng("room", room), recipe.fields
-    kinds = rng.choice(fields.objects, min(fields.rooms.objects, len(fields.objects)), replace=False)
+    kinds = rng.choice(
+        fields.objects, min(fields.rooms.objects, len(fields.objects)), replace=False
+    )
     fetched = "fetch-place" in fields.tasks
     settings = RoomSettings(
         clutter=round(float(rng.uniform(*fields.rooms.clutter)), 3),
@@ -136,7 +152,10 @@ def _place(said: str, room: int, robot: str, height: float | None) -> _Place:
         document = scene.document
         if robot != scene.robot.name or height is not None:
             document["robot"] = {"name": robot}
-            document["start"] = {"base": document["start"]["base"], **({} if height is None else {"z": height})}
+            document["start"] = {
+                "base": document["start"]["base"],
+                **({} if height is None else {"z": height}),
+            }
             scene = Scene.from_document(document, scene.folder)
         return _Place(scene, layout)
     except VkcError as error:
@@ -160,7 +179,11 @@ def _open(
     attachment = str(step.attachment)
     if fields.grasps == "any":
         link = item.attachments[attachment].link
-        same = [one.name for one in item.attachments.values() if one.link == link and one.contact == "grasp"]
+        same = [
+            one.name
+            for one in item.attachments.values()
+            if one.link == link and one.contact == "grasp"
+        ]
         attachment = str(rng.choice(sorted(same)))
     step = Actuate(name, step.joints, attachment)
     ((joint, goal),) = step.joints.items()
@@ -173,7 +196,11 @@ def _open(
     else:
         scene = _started(recipe, place, rng, scene.objects[name].placement.translation)
     kind = _kind(recipe, item.name)
-    return scene, (step,), {"object": name, "kind": kind, "attachment": attachment, "joint": joint, "goal": goal}
+    return (
+        scene,
+        (step,),
+        {"object": name, "kind": kind, "attachment": attachment, "joint": joint, "goal": goal},
+    )
 
 
 def _fetch(
@@ -186,16 +213,30 @@ def _fetch(
     name = str(rng.choice(sorted(free)))
     placed = scene.objects[name]
     attachments = sorted(placed.object.attachments)
-    attachment = str(rng.choice(attachments)) if fields.grasps == "any" else next(iter(placed.object.attachments))
-    others = [part for part in layout.parts if part.name.startswith("table_") and part.name != "table_1"]
+    attachment = (
+        str(rng.choice(attachments))
+        if fields.grasps == "any"
+        else next(iter(placed.object.attachments))
+    )
+    others = [
+        part for part in layout.parts if part.name.startswith("table_") and part.name != "table_1"
+    ]
     on = others[int(rng.integers(len(others)))]
     target = _on_table(on, placed.object.name, rng, fields.goal.edge)
     scene = _started(recipe, place, rng, placed.placement.translation)
-    drawn = {"object": name, "kind": placed.object.name, "attachment": attachment, "joint": "", "goal": list(target)}
+    drawn = {
+        "object": name,
+        "kind": placed.object.name,
+        "attachment": attachment,
+        "joint": "",
+        "goal": list(target),
+    }
     return scene, (Grasp(name, attachment), Place(name, target)), drawn
 
 
-def _on_table(on: Part, kind: str, rng: np.random.Generator, edge: tuple[float, float]) -> tuple[float, float, float]:
+def _on_table(
+    on: Part, kind: str, rng: np.random.Generator, edge: tuple[float, float]
+) -> tuple[float, float, float]:
     """Return a place on a table, near the side at which a robot can stand, in the world frame [m]."""
     depth, width, height = on.size
     x = -depth / 2.0 + min(float(rng.uniform(*edge)), depth - _MARGIN)
@@ -209,15 +250,21 @@ def _started(recipe: Recipe, place: _Place, rng: np.random.Generator, goal: Floa
     low, high = scene.robot.start_limits
     x, y = np.array(scene.arena).reshape(2, 2)
     anywhere = (rng.uniform([x[0], y[0], -np.pi], [x[1], y[1], np.pi]) for _ in range(_STARTS))
-    for base in itertools.islice(scene.start_region.draws(rng) if scene.start_region else anywhere, _STARTS):
+    for base in itertools.islice(
+        scene.start_region.draws(rng) if scene.start_region else anywhere, _STARTS
+    ):
         base = np.round(base, 4)
-        if not start.distance[0] <= np.linalg.norm(base[:2] - goal[:2]) <= start.distance[1] or not _connected(place, base):
+        if not start.distance[0] <= np.linalg.norm(base[:2] - goal[:2]) <= start.distance[
+            1
+        ] or not _connected(place, base):
             continue
         arm = scene.robot.home + rng.uniform(-1.0, 1.0, len(scene.robot.home)) * start.arm
         there = scene.with_start(base=base, arm=np.clip(np.round(arm, 4), low[3:], high[3:]))
         if there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
             return there
-    raise NoProblemError(f"no free start in {scene.name} within {list(start.distance)} m of the goal")
+    raise NoProblemError(
+        f"no free start in {scene.name} within {list(start.distance)} m of the goal"
+    )
 
 
 def _connected(place: _Place, base: Floats) -> bool:

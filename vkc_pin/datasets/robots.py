@@ -20,7 +20,8 @@ from vkc_pin.world.scene.scene import load_scene
 
 __all__ = ["check_frames", "ready_robots"]
 
-_SAMPLES = 1000  # configurations for pairs that need no check, as of robots that are loaded without an SRDF
+# configurations for pairs that need no check, as of robots that are loaded without an SRDF
+_SAMPLES = 1000
 
 
 def check_frames(recipe: Recipe) -> None:
@@ -52,8 +53,9 @@ def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
 
     Args:
         recipe: The recipe.
-        folder: Where folders are made; what is there is not made again. On a cluster, all workers must see it. Of a robot by path
-            that says what its hand is, there is what points to its URDF.
+        folder: Where folders are made; what is there is not made again. On a cluster, all workers
+            must see it. Of a robot by path that says what its hand is, there is what points to its
+            URDF.
 
     Raises:
         InputError: A robot cannot be imported.
@@ -81,4 +83,6 @@ def _point(source: Path, folder: Path) -> None:
     for field in ("urdf", "srdf"):
         if field in said:
             said[field] = str((beside.parent / said[field]).resolve())
-    write_atomically(folder / "robot.yaml", yaml.safe_dump(said, sort_keys=False, allow_unicode=True).encode())
+    write_atomically(
+        folder / "robot.yaml", yaml.safe_dump(said, sort_keys=False, allow_unicode=True).encode()
+    )

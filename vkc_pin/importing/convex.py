@@ -1,7 +1,7 @@
 """Convex pieces of concave meshes, by CoACD (Wei et al., SIGGRAPH 2022), and how much more than the mesh they fill.
 
-What a piece does not cover would be driven through, so the pieces contain the surface that they are made from. CoACD takes closed
-meshes of few triangles; others are cut by planes, see `slicing`.
+What a piece does not cover would be driven through, so the pieces contain the surface that they are
+made from. CoACD takes closed meshes of few triangles; others are cut by planes, see `slicing`.
 """
 
 from __future__ import annotations
@@ -39,11 +39,16 @@ _VERSION = 1  # of what is kept on disk: another one whenever the same mesh woul
 _MOST_TRIANGLES = 2000  # that CoACD is given: with more it takes minutes
 _CORNERS = 40  # of a piece, at most; as in the collision geometry that comes with the package
 _SPARE = 1.5  # times as many corners as asked for are left alone: making them fewer takes a second
-_PER_CELL, _MOST_SAMPLES = 16, 4_000_000  # points by which cells of that grid are found that the skin passes
+_PER_CELL, _MOST_SAMPLES = (
+    16,
+    4_000_000,
+)  # points by which cells of that grid are found that the skin passes
 _SAMPLES = 1000  # points on a surface, beside its corners
 _SPECK = 1e-6  # [m] radius of what distances are measured to
 _CELLS = 96  # of the longest edge, in which volumes of open meshes are counted
-_SEARCH = {"resolution": 1000}  # points by which CoACD judges a cut: half its default takes half the time
+_SEARCH = {
+    "resolution": 1000
+}  # points by which CoACD judges a cut: half its default takes half the time
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +57,8 @@ class Pieces:
 
     Attributes:
         meshes: The pieces, closed, in the frame of the mesh, [m].
-        solid: Volume of the mesh itself [m³], of which everything is part that cannot be reached from outside.
+        solid: Volume of the mesh itself [m³], of which everything is part that cannot be reached
+            from outside.
         error: How far the pieces stand out over the mesh's surface at most [m], measured at points.
     """
 
@@ -82,19 +88,24 @@ def decompose(
 ) -> Pieces:
     """Return convex pieces that contain a mesh.
 
-    That is its hull where this is close to it, else the hulls of the bodies that it consists of, else the parts that CoACD cuts
-    it into. The same mesh gives the same pieces; the parts of one that had to be cut are kept on disk.
+    That is its hull where this is close to it, else the hulls of the bodies that it consists of,
+    else the parts that CoACD cuts it into. The same mesh gives the same pieces; the parts of one
+    that had to be cut are kept on disk.
 
     Args:
         mesh: A mesh file in [m], or a mesh; it need not be closed.
         most_pieces: The largest number of pieces.
-        error: How far the pieces may stand out over the mesh's surface [m]; unless that takes more pieces.
-        overhead: A hull that fills no more than this share more than the mesh is left whole, wherever it stands out.
-        corners: A piece with half as many again, or more, becomes a polytope around it that has no more than these.
+        error: How far the pieces may stand out over the mesh's surface [m]; unless that takes more
+            pieces.
+        overhead: A hull that fills no more than this share more than the mesh is left whole,
+            wherever it stands out.
+        corners: A piece with half as many again, or more, becomes a polytope around it that has no
+            more than these.
         seed: Of the random numbers.
 
     Raises:
-        InputError: The mesh cannot be read, is empty or flat, or CoACD is not installed and would be needed.
+        InputError: The mesh cannot be read, is empty or flat, or CoACD is not installed and would
+            be needed.
     """
     import trimesh
 
@@ -102,7 +113,9 @@ def decompose(
     whole(corners, "corners", low=8)
     error, overhead = quantity(error, "error"), number(overhead, "overhead", low=0.0)
     if error <= 0.0:
-        raise InputError("not a distance", field="error", expected="a number above 0 [m]", got=error)
+        raise InputError(
+            "not a distance", field="error", expected="a number above 0 [m]", got=error
+        )
     if isinstance(mesh, trimesh.Trimesh):
         file, given = None, mesh
     else:
@@ -110,18 +123,27 @@ def decompose(
         given = load_mesh(file)
     hull = _hull(given.vertices, file)
     found, solid = [hull], min(solid_volume(given), float(hull.volume))
-    if most_pieces > 1 and hull.volume > (1.0 + overhead) * solid and _standing_out(found, given) > error:
+    if (
+        most_pieces > 1
+        and hull.volume > (1.0 + overhead) * solid
+        and _standing_out(found, given) > error
+    ):
         found = _bodies(given, most_pieces)
         if not found or _standing_out(found, given) > error:
 
             def cut() -> list[list[list[float]]]:
                 parts = _cut(given, most_pieces, error, seed, file) or [np.asarray(hull.vertices)]
-                return [piece.vertices.tolist() for piece in _simple(_containing(parts, _surface(given)), corners)]
+                return [
+                    piece.vertices.tolist()
+                    for piece in _simple(_containing(parts, _surface(given)), corners)
+                ]
 
             parts = record(_key(given, most_pieces, error, corners, seed), cut)
             found = [compute_hull(np.array(part)) for part in parts]
     pieces = tuple(_simple(found, corners))
-    solid = min(solid, float(sum(piece.volume for piece in pieces)))  # which contain it: of open meshes, it is but measured
+    solid = min(
+        solid, float(sum(piece.volume for piece in pieces))
+    )  # which contain it: of open meshes, it is but measured
     return Pieces(pieces, solid, _standing_out(pieces, given))
 
 
@@ -137,7 +159,8 @@ def concavity(mesh: trimesh.Trimesh) -> float:
 def solid_volume(mesh: trimesh.Trimesh) -> float:
     """Return the volume of a mesh [m³]; of one that is not closed, that of the cells of a grid that nothing reaches from outside.
 
-    Cells that the skin itself passes count half. Holes narrower than a hundredth of the mesh count as closed.
+    Cells that the skin itself passes count half. Holes narrower than a hundredth of the mesh count
+    as closed.
     """
     import trimesh
     from scipy import ndimage
@@ -158,13 +181,18 @@ def solid_volume(mesh: trimesh.Trimesh) -> float:
 
 def _key(mesh: trimesh.Trimesh, *settings: float) -> bytes:
     """Return all that the pieces of a mesh depend on."""
-    surface = hashlib.sha256(np.asarray(mesh.vertices, float).tobytes() + np.asarray(mesh.faces, np.int64).tobytes())
+    surface = hashlib.sha256(
+        np.asarray(mesh.vertices, float).tobytes() + np.asarray(mesh.faces, np.int64).tobytes()
+    )
     return json.dumps(("pieces", _VERSION, settings, surface.hexdigest())).encode()
 
 
 def _simple(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.Trimesh]:
     """Return pieces with few corners: polytopes around those that have many."""
-    return [outer_hull(one.vertices, vertices=corners) if len(one.vertices) > _SPARE * corners else one for one in pieces]
+    return [
+        outer_hull(one.vertices, vertices=corners) if len(one.vertices) > _SPARE * corners else one
+        for one in pieces
+    ]
 
 
 def _bodies(mesh: trimesh.Trimesh, most: int) -> list[trimesh.Trimesh]:
@@ -172,23 +200,40 @@ def _bodies(mesh: trimesh.Trimesh, most: int) -> list[trimesh.Trimesh]:
     merged = _merged(mesh)
     if not 1 < merged.body_count <= most:
         return []
-    bodies = [np.asarray(body.vertices) for body in merged.split(only_watertight=False, repair=False)]
+    bodies = [
+        np.asarray(body.vertices) for body in merged.split(only_watertight=False, repair=False)
+    ]
     return [] if any(map(flat, bodies)) else [_hull(body, None) for body in bodies]
 
 
-def _cut(mesh: trimesh.Trimesh, most: int, error: float, seed: int, file: Path | None) -> list[Floats]:
+def _cut(
+    mesh: trimesh.Trimesh, most: int, error: float, seed: int, file: Path | None
+) -> list[Floats]:
     """Return the corners of parts of a mesh: those that CoACD cuts it into, or slices if it is open or has many triangles."""
     import trimesh
 
     merged = _merged(mesh)
     if not merged.is_volume or len(merged.faces) > _MOST_TRIANGLES:
-        coarse = coarser(MeshPart(np.asarray(merged.vertices), np.asarray(merged.faces)), merged.extents.max() / _CELLS)
-        return [thickened(part) for part in slices(trimesh.Trimesh(coarse.vertices, coarse.faces), most)]
-    coacd = optional_package("coacd", "import", what="cutting a concave mesh into convex pieces", file=file)
+        coarse = coarser(
+            MeshPart(np.asarray(merged.vertices), np.asarray(merged.faces)),
+            merged.extents.max() / _CELLS,
+        )
+        return [
+            thickened(part) for part in slices(trimesh.Trimesh(coarse.vertices, coarse.faces), most)
+        ]
+    coacd = optional_package(
+        "coacd", "import", what="cutting a concave mesh into convex pieces", file=file
+    )
     coacd.set_log_level("off")
     given = coacd.Mesh(merged.vertices, merged.faces)
     parts = coacd.run_coacd(
-        given, threshold=error, real_metric=True, max_convex_hull=most, seed=seed, preprocess_mode="off", **_SEARCH
+        given,
+        threshold=error,
+        real_metric=True,
+        max_convex_hull=most,
+        seed=seed,
+        preprocess_mode="off",
+        **_SEARCH,
     )
     return [corners for vertices, _ in parts if not flat(corners := np.asarray(vertices))]
 
@@ -203,7 +248,12 @@ def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _hull(points: Any, file: Path | None) -> trimesh.Trimesh:
     points = np.asarray(points, float)
     if flat(points):
-        raise InputError("the mesh is flat", file=file, expected="triangles around a volume", got="triangles in one plane")
+        raise InputError(
+            "the mesh is flat",
+            file=file,
+            expected="triangles around a volume",
+            got="triangles in one plane",
+        )
     return compute_hull(points)
 
 
@@ -219,25 +269,41 @@ def _standing_out(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> f
     """Return how far the outer surface of pieces lies from a mesh at most [m], measured at points."""
     import trimesh
 
-    triangles, here, request, result = to_bvh(mesh), coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult()
+    triangles, here, request, result = (
+        to_bvh(mesh),
+        coal.Transform3s(),
+        coal.DistanceRequest(),
+        coal.DistanceResult(),
+    )
     triangles.computeLocalAABB()
     speck, furthest = coal.Sphere(_SPECK), 0.0
     for piece in pieces:
-        points = np.vstack([piece.triangles_center, trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)[0]])
+        points = np.vstack(
+            [piece.triangles_center, trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)[0]]
+        )
         hidden = np.zeros(len(points), bool)
         for other in pieces:
             if other is not piece:
                 hidden |= _outside(other, points) < -_SPECK
         for point in points[~hidden]:
             result.clear()
-            furthest = max(furthest, coal.distance(speck, coal.Transform3s(np.eye(3), point), triangles, here, request, result))
+            furthest = max(
+                furthest,
+                coal.distance(
+                    speck, coal.Transform3s(np.eye(3), point), triangles, here, request, result
+                ),
+            )
     return furthest
 
 
 def _outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
     """Return how far points, shape (n, 3), lie beyond the faces of a convex piece, shape (n,) [m]; negative inside."""
     normals = np.asarray(piece.face_normals)
-    return np.asarray((points @ normals.T - np.einsum("ij,ij->i", normals, np.asarray(piece.triangles)[:, 0])).max(axis=1))
+    return np.asarray(
+        (
+            points @ normals.T - np.einsum("ij,ij->i", normals, np.asarray(piece.triangles)[:, 0])
+        ).max(axis=1)
+    )
 
 
 def _containing(parts: list[Floats], surface: Floats) -> list[trimesh.Trimesh]:

@@ -1,7 +1,7 @@
 """Cuts triangles that enclose no volume, or are many, by planes into parts with small hulls.
 
-CoACD rebuilds open meshes as skins of some ten thousand triangles and then takes minutes. Hulls of parts need neither a closed
-mesh nor many cuts.
+CoACD rebuilds open meshes as skins of some ten thousand triangles and then takes minutes. Hulls of
+parts need neither a closed mesh nor many cuts.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ _GAIN = 0.01  # of the whole hull's volume: a cut that takes away less is not wo
 def slices(mesh: trimesh.Trimesh, most: int) -> list[Floats]:
     """Return the points of parts of a mesh, shape (n, 3) each, cut at planes so that the volume of their hulls is small.
 
-    One after the other, that part is cut into two where its best cut takes away most. Planes are across the axes of the mesh and
-    its principal ones. The points of a cut belong to both sides, so that the hulls contain the mesh.
+    One after the other, that part is cut into two where its best cut takes away most. Planes are
+    across the axes of the mesh and its principal ones. The points of a cut belong to both sides, so
+    that the hulls contain the mesh.
 
     Args:
         mesh: Any triangles; they need not be closed.
@@ -63,7 +64,9 @@ def thickened(points: Floats) -> Floats:
     if not flat(points):
         return points
     axes = np.linalg.svd(points - points.mean(axis=0))[2]
-    layers = [points + 0.5 * side * THICKNESS * axis for axis in axes for side in (-1.0, 1.0)]  # also what is but a line
+    layers = [
+        points + 0.5 * side * THICKNESS * axis for axis in axes for side in (-1.0, 1.0)
+    ]  # also what is but a line
     return np.vstack(layers)
 
 
@@ -94,7 +97,9 @@ def _side(points: Floats, edges: Ints, along: Floats, place: float) -> tuple[Flo
     start, end = crossing[:, 0], crossing[:, 1]
     share = ((place - along[start]) / (along[end] - along[start]))[:, None]
     cut = points[start] * (1.0 - share) + points[end] * share
-    stumps = np.column_stack([index[np.where(kept[start], start, end)], kept.sum() + np.arange(len(cut))])
+    stumps = np.column_stack(
+        [index[np.where(kept[start], start, end)], kept.sum() + np.arange(len(cut))]
+    )
     return np.vstack([points[kept], cut]), np.vstack([index[inside], stumps])
 
 

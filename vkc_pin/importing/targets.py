@@ -43,12 +43,20 @@ def check_target(folder: Path, command: str, *, force: bool) -> None:
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
-    own = folder.is_dir() and any(made_by(command) in _first_line(file) for file in folder.glob("*.yaml"))
+    own = folder.is_dir() and any(
+        made_by(command) in _first_line(file) for file in folder.glob("*.yaml")
+    )
     if force and own:
         return
-    expected = "a new or an empty folder" + (", or force=True (--force) to replace it" if own else "")
-    got = "a file" if not folder.is_dir() else f"what {command} made before" if own else "other files"
-    raise InputError("there is something already", file=folder, field="folder", expected=expected, got=got)
+    expected = "a new or an empty folder" + (
+        ", or force=True (--force) to replace it" if own else ""
+    )
+    got = (
+        "a file" if not folder.is_dir() else f"what {command} made before" if own else "other files"
+    )
+    raise InputError(
+        "there is something already", file=folder, field="folder", expected=expected, got=got
+    )
 
 
 def _first_line(file: Path) -> str:

@@ -37,10 +37,12 @@ def plan_chore(
 ) -> Plan:
     """Plan many steps over several objects, each with the next ones in mind.
 
-    What is done with one object, from taking hold of it on, is an action. Every `window` actions that follow one another are
-    planned as one problem; the motion of the first of them is kept, and the window moves on by one, from the state in which
-    that motion leaves robot and world. So no grasp and no place of the base is chosen from which the next action cannot be
-    done. Should it come to that all the same, the last decision is given up, and planned anew with one more action in mind.
+    What is done with one object, from taking hold of it on, is an action. Every `window` actions
+    that follow one another are planned as one problem; the motion of the first of them is kept, and
+    the window moves on by one, from the state in which that motion leaves robot and world. So no
+    grasp and no place of the base is chosen from which the next action cannot be done. Should it
+    come to that all the same, the last decision is given up, and planned anew with one more action
+    in mind.
 
     Args:
         scene: Robot, objects and obstacles.
@@ -57,11 +59,13 @@ def plan_chore(
         planner: As for `planner.plan`.
 
     Returns:
-        One plan of all steps, checked as a whole. If a step fails: of those before it, with the best motion there is of
-        that one, and a note that names it. After Ctrl-C: of what was decided by then.
+        One plan of all steps, checked as a whole. If a step fails: of those before it, with the
+        best motion there is of that one, and a note that names it. After Ctrl-C: of what was
+        decided by then.
 
     Raises:
-        InputError: A step names something that is not there, or cannot be done at its place in the list; the error names it.
+        InputError: A step names something that is not there, or cannot be done at its place in the
+            list; the error names it.
     """
     settings = settings_for(
         scene,
@@ -78,7 +82,11 @@ def plan_chore(
     def run(settings: Settings) -> Plan:
         tasks = foresee(scene, asked, settings.options)
         check_active(settings.terms, [stretch for task in tasks for stretch in stretches(task)])
-        through = dict.fromkeys(hold for task in tasks for hold in task.holds if hold.by is not None)
-        return SlidingWindow(scene.with_approaches(through, stacklevel=5), asked, window, settings).run()
+        through = dict.fromkeys(
+            hold for task in tasks for hold in task.holds if hold.by is not None
+        )
+        return SlidingWindow(
+            scene.with_approaches(through, stacklevel=5), asked, window, settings
+        ).run()
 
     return guarded(run, settings, progress, planner)

@@ -37,7 +37,8 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["OneProblem"]
 
-_CHECK = 2e-3  # [s] a waypoint that checking a motion takes, rather more than less; counts until it was done once
+# [s] a waypoint that checking a motion takes, rather more than less; counts until it was done once
+_CHECK = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,9 @@ class _Try:
 
     def noted(self, notes: Iterable[str]) -> _Try:
         """Return the same with notes in its report."""
-        return dataclasses.replace(self, report=dataclasses.replace(self.report, notes=tuple(notes)))
+        return dataclasses.replace(
+            self, report=dataclasses.replace(self.report, notes=tuple(notes))
+        )
 
 
 class OneProblem:
@@ -78,16 +81,19 @@ class OneProblem:
     Attributes:
         scene: Where it begins.
         task: What is asked for.
-        goals_first: Whether free configurations are looked for at the goals before any seed, since most likely there are none.
+        goals_first: Whether free configurations are looked for at the goals before any seed, since
+            most likely there are none.
         problem: The program, once it is built.
         z: Its best z_1..z_N, shape (N, n), once `run` has found something.
         initialization: The name of the seed that led there.
         checking: How long the last check of a motion took [s].
-        hindered: Whether it is certain that no grasp helps: it is wrong before anything moves, or a joint's own way leads into
-            something.
+        hindered: Whether it is certain that no grasp helps: it is wrong before anything moves, or a
+            joint's own way leads into something.
     """
 
-    def __init__(self, scene: Scene, task: Task, settings: Settings, *, goals_first: bool = False) -> None:
+    def __init__(
+        self, scene: Scene, task: Task, settings: Settings, *, goals_first: bool = False
+    ) -> None:
         self.scene, self.task, self.settings, self.goals_first = scene, task, settings, goals_first
         self.times = dict.fromkeys(TIMES, 0.0)
         self.rounds = self.iterations = 0
@@ -95,7 +101,9 @@ class OneProblem:
         self.history: list[dict[str, float]] = []
         self.blocked: list[str] = []  # phases in which there is no way for the base
         self._best: _Try | None = None
-        self._astray: tuple[Solution, str] | None = None  # the nearest of those that nobody need check
+        self._astray: tuple[Solution, str] | None = (
+            None  # the nearest of those that nobody need check
+        )
         self._explained: dict[int, Blocked | None] = {}
         self._proven: list[str] | None = None
 
@@ -103,8 +111,8 @@ class OneProblem:
         """Try seeds until validation accepts a motion, there are no more, or the budget is at its end.
 
         Args:
-            seed: Makes the only seed to try, a motion that is nearly good as it is, so that there is no need of patience with it;
-                None: those of the settings' initialization.
+            seed: Makes the only seed to try, a motion that is nearly good as it is, so that there
+                is no need of patience with it; None: those of the settings' initialization.
         """
         began = time.perf_counter()
         cache, budget = self.settings.cache, self.settings.budget
@@ -117,12 +125,18 @@ class OneProblem:
         self.z, self.initialization = best.z, best.name
         cache.trim()  # a chore has many problems, whose solvers grow while they are used
         build_time, took = cache.building - built, time.perf_counter() - began
-        return self._plan(best, status, spent(took - build_time, build_time, effort=budget.used - used, **self._counts()))
+        return self._plan(
+            best,
+            status,
+            spent(took - build_time, build_time, effort=budget.used - used, **self._counts()),
+        )
 
     def _planned(self, seed: Callable[[TrajectoryProblem], Seed] | None) -> tuple[_Try, str]:
         """Return the best try and the plan's status; see `run`."""
         s = self.settings
-        problem = self.problem = TrajectoryProblem(self.scene, self.task, s.options, s.terms, cache=s.cache)
+        problem = self.problem = TrajectoryProblem(
+            self.scene, self.task, s.options, s.terms, cache=s.cache
+        )
         s.budget.checking = s.budget.checking or _CHECK * problem.segments
         reasons = impossible(problem)
         if reasons:
@@ -141,13 +155,19 @@ class OneProblem:
         waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
         return PhaseWaypoints(phases, self.problem.chain.names, waypoints, self.initialization)
 
-    def _try_seeds(self, problem: TrajectoryProblem, seeds: Iterator[Seed], *, searched: bool) -> tuple[_Try, str]:
+    def _try_seeds(
+        self, problem: TrajectoryProblem, seeds: Iterator[Seed], *, searched: bool
+    ) -> tuple[_Try, str]:
         """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
         notes: list[Blocked] = []
         for number, seed in enumerate(seeds, start=1):
             solution = self._solve(problem, seed)
             if solution.astray:
-                self._astray = min(self._astray or (solution, seed.name), (solution, seed.name), key=lambda one: one[0].astray)
+                self._astray = min(
+                    self._astray or (solution, seed.name),
+                    (solution, seed.name),
+                    key=lambda one: one[0].astray,
+                )
             else:
                 found = self._judge(problem, solution, seed.name)
                 if self._best is None or found.better(self._best):
@@ -161,7 +181,9 @@ class OneProblem:
                 break
             if number == 1 and searched and not _ends_free(problem, seed):
                 notes = self._goals(problem)
-            elif notes:  # two seeds failed, and random configurations find no free one at a goal either
+            elif (
+                notes
+            ):  # two seeds failed, and random configurations find no free one at a goal either
                 break
             if any(goal.deep for goal in notes):
                 break
@@ -174,13 +196,19 @@ class OneProblem:
         if nearest is None:
             lines += self.blocked
         elif searched and not lines:
-            lines, cut_off = ways(problem, best.z, best.report, self.blocked, self.settings.random_seed)
+            lines, cut_off = ways(
+                problem, best.z, best.report, self.blocked, self.settings.random_seed
+            )
             status = "infeasible" if cut_off else status
         return best.noted(lines), status
 
     def _nearest(self) -> _Try | None:
         """Return the best try, one that is astray if there is no other; None: there is none."""
-        return self._judge(self.problem, *self._astray) if self._best is None and self._astray else self._best
+        return (
+            self._judge(self.problem, *self._astray)
+            if self._best is None and self._astray
+            else self._best
+        )
 
     def _proofs(self, problem: TrajectoryProblem) -> list[str]:
         """Return what is certain, looked for once, and only when something has failed: most tasks can be done."""
@@ -189,7 +217,9 @@ class OneProblem:
             self.hindered, self._proven = bool(hindered), hindered or proofs(problem)
         return self._proven
 
-    def _goals(self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None) -> list[Blocked]:
+    def _goals(
+        self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None
+    ) -> list[Blocked]:
         """Return the goals of some phases, None: of all, for which no free configuration is found, each looked for once."""
         found = []
         for number in range(len(problem.task.phases)) if numbers is None else numbers:
@@ -207,7 +237,10 @@ class OneProblem:
             count=s.options.max_restarts,
             perturbation=s.perturbation,
             notes=self.blocked,
-            hopeless=lambda phases: bool(self._proofs(problem)) or any(goal.deep for goal in self._goals(problem, phases)),
+            hopeless=lambda phases: (
+                bool(self._proofs(problem))
+                or any(goal.deep for goal in self._goals(problem, phases))
+            ),
         )
         while True:
             began, built = time.perf_counter(), s.cache.building
@@ -215,7 +248,9 @@ class OneProblem:
             try:
                 seed = next(seeds, None)
             finally:
-                self.times["initialization"] += time.perf_counter() - began - (s.cache.building - built)
+                self.times["initialization"] += (
+                    time.perf_counter() - began - (s.cache.building - built)
+                )
             if seed is None or self._proven:
                 return
             yield seed
@@ -243,9 +278,13 @@ class OneProblem:
         if self._paced:
             trajectory, report = waypoints, self._check(waypoints)
         else:
-            repairs = {} if solution.converged else {"repairs": 0}  # what is wrong with others is not the curve's fault
+            repairs = (
+                {} if solution.converged else {"repairs": 0}
+            )  # what is wrong with others is not the curve's fault
             jerk_time = self.settings.options.jerk_time
-            trajectory, report = accepted(self.scene, waypoints, self._check, jerk_time=jerk_time, **repairs)
+            trajectory, report = accepted(
+                self.scene, waypoints, self._check, jerk_time=jerk_time, **repairs
+            )
         self.times["retiming"] += time.perf_counter() - began - (self.times["validation"] - checked)
         status = "success" if report.ok else "rejected" if solution.converged else "not converged"
         return _Try(name, solution.z, trajectory, report, status)
@@ -259,14 +298,18 @@ class OneProblem:
         """Check a motion, and note how long that takes."""
         began = time.perf_counter()
         self.settings.progress.doing("checking")
-        report = validate(self.scene, self.task.steps, trajectory, self.settings.options, self.settings.terms)
+        report = validate(
+            self.scene, self.task.steps, trajectory, self.settings.options, self.settings.terms
+        )
         self.checking = self.settings.budget.checking = time.perf_counter() - began
         self.times["validation"] += self.checking
         return report
 
     def _stationary(self, problem: TrajectoryProblem) -> _Try:
         """Return a motion in which all stands still for as long as the task takes."""
-        return self._judge(problem, Solution(problem.still, problem.timing_for(problem.still).dt), "none")
+        return self._judge(
+            problem, Solution(problem.still, problem.timing_for(problem.still).dt), "none"
+        )
 
     def _standing(self) -> _Try:
         """Return one in which all stands still for a moment: what there is before the first seed."""
@@ -296,5 +339,10 @@ class OneProblem:
 def _ends_free(problem: TrajectoryProblem, seed: Seed) -> bool:
     """Return whether a seed's configurations at the ends of the phases are free and what they should be."""
     ends = problem.ends - 1
-    free = problem.evaluate_contacts(seed.z, reach=problem.options.largest_margin).shortfall(problem.segments)[ends] <= 0.0
+    free = (
+        problem.evaluate_contacts(seed.z, reach=problem.options.largest_margin).shortfall(
+            problem.segments
+        )[ends]
+        <= 0.0
+    )
     return bool(free.all()) and problem.pose_error(seed.z) < 1e-2

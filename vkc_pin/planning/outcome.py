@@ -50,7 +50,10 @@ def spent(
         effort: Units; see `Budget`.
         times: What was spent on `TIMES`, and whatever else [s]; None: nothing.
     """
-    parts = {f"time_{name}": value for name, value in {**dict.fromkeys(TIMES, 0.0), **(times or {})}.items()}
+    parts = {
+        f"time_{name}": value
+        for name, value in {**dict.fromkeys(TIMES, 0.0), **(times or {})}.items()
+    }
     counts = {"iterations": float(iterations), "rounds": float(rounds), "effort": float(effort)}
     return {"planning_time": planning_time, "build_time": build_time, **counts, **parts}
 
@@ -128,7 +131,8 @@ def joined(
         steps: What was asked for.
         settings: How it was to be planned.
         parts: The plans, each from where the one before it ends.
-        began: Value of `time.perf_counter()` since which all counts as planning; None: what is in `metrics`, and the check.
+        began: Value of `time.perf_counter()` since which all counts as planning; None: what is in
+            `metrics`, and the check.
         metrics: What planning took; None: what the parts did. The check of all of it comes on top.
         notes: For the report, before those of the last part.
         history: A row for every round of the solver; None: those of the parts.
@@ -144,9 +148,16 @@ def joined(
         for key in ("planning_time", "time_validation"):
             took[key] += time.perf_counter() - checked
         report = dataclasses.replace(report, notes=(*notes, *parts[-1].validation.notes))
-        status, name = "success" if report.ok else status, ", ".join(part.initialization for part in parts)
+        status, name = (
+            "success" if report.ok else status,
+            ", ".join(part.initialization for part in parts),
+        )
     else:
-        trajectory, status, name = still(scene, settings.options), settings.budget.ended or "interrupted", "none"
+        trajectory, status, name = (
+            still(scene, settings.options),
+            settings.budget.ended or "interrupted",
+            "none",
+        )
         report = validate(scene, steps, trajectory, settings.options, settings.terms)
     if began is not None:
         took["planning_time"] = time.perf_counter() - began - took["build_time"]
@@ -173,7 +184,11 @@ def still(scene: Scene, options: Options) -> Trajectory:
         values |= {f"{name}.{joint}": value for joint, value in joints}
     for hold in scene.holds:
         names = scene.objects[hold.object].object.attachment(hold.attachment).coordinates
-        values |= {f"{hold.object}.{name}": value for name, value in zip(names, hold.at, strict=True)}
+        values |= {
+            f"{hold.object}.{name}": value for name, value in zip(names, hold.at, strict=True)
+        }
     row = list(values.values())
     phases = (PhaseSpan("stand", 0, 1, scene.holds, opening_at_start(scene)),)
-    return Trajectory(tuple(values), np.array([0.0, options.dt]), np.array([row, row]), phases, len(scene.start))
+    return Trajectory(
+        tuple(values), np.array([0.0, options.dt]), np.array([row, row]), phases, len(scene.start)
+    )

@@ -21,7 +21,12 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import foresee
 from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
-from vkc_pin.world.trajectory.formats.archives import folder_from_data, folder_to_data, read_archive, write_archive
+from vkc_pin.world.trajectory.formats.archives import (
+    folder_from_data,
+    folder_to_data,
+    read_archive,
+    write_archive,
+)
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import scene_after, units_of
 
@@ -44,16 +49,19 @@ class Plan:
         steps: What was asked for.
         options: How it was planned.
         trajectory: The motion; if planning failed, the best there was.
-        validation: What the independent check says of it. For a loaded plan it is made when it is first asked for.
-        status: "success", "infeasible", "not converged", "time limit", "effort spent", "interrupted", "rejected";
-            of baselines that fail, the stage.
-        metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort [rad], clearance [m],
-            closure_error [m], duration [s], torque [share of what a motor has], iterations, rounds, effort [units, see
-            `planner.plan`], and what it was spent on: time_initialization, _coal, _casadi, _ipopt, _retiming, _validation [s].
+        validation: What the independent check says of it. For a loaded plan it is made when it is
+            first asked for.
+        status: "success", "infeasible", "not converged", "time limit", "effort spent",
+            "interrupted", "rejected"; of baselines that fail, the stage.
+        metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort
+            [rad], clearance [m], closure_error [m], duration [s], torque [share of what a motor
+            has], iterations, rounds, effort [units, see `planner.plan`], and what it was spent on:
+            time_initialization, _coal, _casadi, _ipopt, _retiming, _validation [s].
         seed, initialization: Of the random numbers; which seed trajectory it came from.
         history: One row per round of the solver.
         terms: The user's own constraints and costs, with their expressions as data.
-        claimed: What the file says that a plan was loaded from, on which nothing here relies; else None.
+        claimed: What the file says that a plan was loaded from, on which nothing here relies; else
+            None.
     """
 
     scene: Scene
@@ -81,7 +89,12 @@ class Plan:
             InputError: It is no success, so that nothing ends.
         """
         if not self.success:
-            raise InputError("this plan is no success", field="end_scene", expected="a motion that is valid", got=self.status)
+            raise InputError(
+                "this plan is no success",
+                field="end_scene",
+                expected="a motion that is valid",
+                got=self.status,
+            )
         after = foresee(self.scene, self.steps, self.options)[-1].after
         return scene_after(self.scene, self.trajectory, after)
 
@@ -110,7 +123,11 @@ class Plan:
             f"Ipopt {m['time_ipopt']:.3f}, validation {m['time_validation']:.3f}; "
             f"{int(m['rounds'])} rounds, {int(m['iterations'])} Ipopt iterations, "
             f"effort {int(m.get('effort', 0))}, seed {self.initialization}",
-            *(f"  {line}" for line in self.validation.by_phase(self.trajectory) if len(self.steps) > 1),
+            *(
+                f"  {line}"
+                for line in self.validation.by_phase(self.trajectory)
+                if len(self.steps) > 1
+            ),
             *(f"  {line}" for line in self.validation.lines()),
         ]
         return "\n".join(lines)
@@ -122,7 +139,9 @@ class Plan:
             "steps": [step_to_dict(step) for step in self.steps],
             "success": self.success,
             "status": self.status,
-            "metrics": {key: value if np.isfinite(value) else None for key, value in self.metrics.items()},
+            "metrics": {
+                key: value if np.isfinite(value) else None for key, value in self.metrics.items()
+            },
             "seed": self.seed,
             "initialization": self.initialization,
             "violations": [asdict(violation) for violation in self.validation.violations],
@@ -185,9 +204,10 @@ class Plan:
     def save(self, path: str | Path) -> Path:
         """Save it, with its scene, steps, options and report, as an .npz file without pickles; return the path.
 
-        The scene's description is in the file; the meshes and URDFs it names are not. A scene of the package finds them
-        in whatever installation loads the plan; for others the file keeps where their folder is, seen from the plan and
-        absolutely, so that plan and scene can move together and the plan alone.
+        The scene's description is in the file; the meshes and URDFs it names are not. A scene of
+        the package finds them in whatever installation loads the plan; for others the file keeps
+        where their folder is, seen from the plan and absolutely, so that plan and scene can move
+        together and the plan alone.
         """
         about = {
             "scene": self.scene.document,
@@ -209,17 +229,20 @@ class Plan:
     def load(cls, path: str | Path, *, check: bool = False) -> Plan:
         """Return the plan that `save` wrote to `path`.
 
-        What the file says of its motion is kept as `claimed`, and not relied on: `validation`, `success`, `status` and `metrics`
-        are those of a check that is made when they are first asked for, which takes as long as the check after planning. The
-        file's are only what planning took, and what it found out about the task: the notes, and why a task is infeasible.
+        What the file says of its motion is kept as `claimed`, and not relied on: `validation`,
+        `success`, `status` and `metrics` are those of a check that is made when they are first
+        asked for, which takes as long as the check after planning. The file's are only what
+        planning took, and what it found out about the task: the notes, and why a task is
+        infeasible.
 
         Args:
             path: The file.
             check: Check the motion at once; then not even that is the file's.
 
         Raises:
-            InputError: The file is missing, damaged, no plan, or of another format, something in it does not fit, the motion is
-                none of its scene's robot and objects, or what the scene names is not there.
+            InputError: The file is missing, damaged, no plan, or of another format, something in it
+                does not fit, the motion is none of its scene's robot and objects, or what the scene
+                names is not there.
         """
         path = file_path(path, "path", "a saved plan (.npz)")
         about, arrays = read_archive(path)
@@ -231,20 +254,49 @@ class Plan:
         except InputError as error:
             if error.file is not None:
                 raise
-            raise InputError(error.problem, file=path, field=error.field, expected=error.expected, got=error.got) from error
-        except (ValueError, LookupError, TypeError, AttributeError, OSError, OverflowError, RecursionError) as error:
-            raise InputError("not a saved plan", file=path, expected="a file written by Plan.save", got=str(error)) from error
+            raise InputError(
+                error.problem, file=path, field=error.field, expected=error.expected, got=error.got
+            ) from error
+        except (
+            ValueError,
+            LookupError,
+            TypeError,
+            AttributeError,
+            OSError,
+            OverflowError,
+            RecursionError,
+        ) as error:
+            raise InputError(
+                "not a saved plan",
+                file=path,
+                expected="a file written by Plan.save",
+                got=str(error),
+            ) from error
         return plan
 
     @classmethod
     def _made_of(
-        cls, about: Mapping[str, Any], arrays: Mapping[str, Floats], path: Path, validation: Callable[[Plan], Report]
+        cls,
+        about: Mapping[str, Any],
+        arrays: Mapping[str, Floats],
+        path: Path,
+        validation: Callable[[Plan], Report],
     ) -> Plan:
-        trajectory, status = Trajectory.from_dict({**about["trajectory"], **arrays}), about["status"]
+        trajectory, status = (
+            Trajectory.from_dict({**about["trajectory"], **arrays}),
+            about["status"],
+        )
         claimed, metrics = Report.from_dict(about["validation"]), about["metrics"]
         for name, value in {**trajectory.metrics(), **claimed.measures()}.items():
-            if metrics[name] != value and not abs(metrics[name] - value) <= 1e-9 * max(1.0, abs(value)):
-                raise InputError("not that of motion and report", field=f"metrics.{name}", expected=value, got=metrics[name])
+            if metrics[name] != value and not abs(metrics[name] - value) <= 1e-9 * max(
+                1.0, abs(value)
+            ):
+                raise InputError(
+                    "not that of motion and report",
+                    field=f"metrics.{name}",
+                    expected=value,
+                    got=metrics[name],
+                )
         for name in about["options"]:
             if name not in (options := [item.name for item in fields(Options)]):
                 raise UnknownNameError("option", name, options, field=f"options.{name}")
@@ -254,7 +306,9 @@ class Plan:
             options=_saved(about["options"]),
             trajectory=trajectory,
             validation=cast(Report, validation),
-            status=cast(str, lambda plan: "success" if plan.validation.ok else "rejected") if status == "success" else status,
+            status=cast(str, lambda plan: "success" if plan.validation.ok else "rejected")
+            if status == "success"
+            else status,
             metrics=cast(Mapping[str, float], lambda plan: {**metrics, **_measured(plan)}),
             seed=about["seed"],
             initialization=about["initialization"],
@@ -275,7 +329,11 @@ def _recalled(plan: Plan) -> Report:
     if claimed is None or report.ok:
         return report
     report = replace(report, notes=claimed.notes)
-    return report.with_reasons(claimed.violations or report.violations) if vars(plan)["status"] == "infeasible" else report
+    return (
+        report.with_reasons(claimed.violations or report.violations)
+        if vars(plan)["status"] == "infeasible"
+        else report
+    )
 
 
 def _measured(plan: Plan) -> dict[str, float]:
@@ -307,4 +365,6 @@ for _name in ("validation", "status", "metrics"):
 
 def _saved(options: Mapping[str, Any]) -> Options:
     """Return options that were saved: those without a clearance between the robot's links had one for all pairs."""
-    return Options(**{**({"self_distance": options["dist_safe"]} if "dist_safe" in options else {}), **options})
+    return Options(
+        **{**({"self_distance": options["dist_safe"]} if "dist_safe" in options else {}), **options}
+    )

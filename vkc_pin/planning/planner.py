@@ -27,13 +27,15 @@ __all__ = ["Planner", "borrowed", "guarded", "plan"]
 class Planner:
     """Keeps what planning builds and can use again: symbolic programs with their solvers, kinematics, tables of shapes.
 
-    Pass one as `planner=` to keep apart what different parts of a program build, or to bound it; without one, all calls share
-    the process's own. It makes no difference to a motion what a planner has kept. Threads may plan with one planner at once: each
-    plan borrows a cache of its own, and at the end leaves it to the next.
+    Pass one as `planner=` to keep apart what different parts of a program build, or to bound it;
+    without one, all calls share the process's own. It makes no difference to a motion what a
+    planner has kept. Threads may plan with one planner at once: each plan borrows a cache of its
+    own, and at the end leaves it to the next.
 
     Args:
         entries: How many objects are kept at most.
-        megabytes: How much memory they take at most, as estimated [MB]. While plans run they may take more.
+        megabytes: How much memory they take at most, as estimated [MB]. While plans run they may
+            take more.
     """
 
     def __init__(self, *, entries: int = 512, megabytes: float = 128.0) -> None:
@@ -64,7 +66,11 @@ class Planner:
     def lent(self) -> Iterator[Cache]:
         """Lend a cache that nobody else has, the one that was used last if it is free; at the end make room."""
         with self._lock:
-            cache = self._idle.pop() if self._idle else Cache(entries=self.entries, nbytes=1e6 * self.megabytes)
+            cache = (
+                self._idle.pop()
+                if self._idle
+                else Cache(entries=self.entries, nbytes=1e6 * self.megabytes)
+            )
         try:
             yield cache
         finally:
@@ -106,30 +112,41 @@ def plan(
 
     Args:
         scene: Robot, objects and obstacles; the motion starts at the scene's start.
-        steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `Touch`, `Place`, `Release`, `GoTo`.
-        initialization: "auto", "interpolated", "astar", "rrt" or "stationary"; see `initialization.initialize`.
+        steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `Touch`,
+            `Place`, `Release`, `GoTo`.
+        initialization: "auto", "interpolated", "astar", "rrt" or "stationary"; see
+            `initialization.initialize`.
         options: How to plan; `Options()` if left out.
-        callback: Called after every round of the solver with an `Iteration`, whose fields are named columns.
-        time_limit: Seconds by the clock, from the call on and with all that is built and checked, after which the best motion so
-            far is returned, with status "time limit". What succeeds within it depends on the machine and on what else runs there.
-        effort: The same as a count of work, with status "effort spent": how many configurations may be looked at, by searches for
-            seeds, and in every iteration of Ipopt at each waypoint. The same call succeeds with it on every machine, or fails.
-            What a plan took is in `metrics["effort"]`; 100 000 take some ten seconds.
-        seed: Of the random numbers. The same call gives the same trajectory on the same machine, bit for bit, whatever was
-            planned before; only `time_limit` can make a difference.
-        joint: Plan all steps as one problem; otherwise each from where the one before it ends, for comparison.
-        perturbation: Standard deviation of smooth noise on the seeds, [m] and [rad], to see how much hangs on them.
-        progress: Show one line that changes in its place: in a notebook or a terminal; elsewhere nothing is shown.
+        callback: Called after every round of the solver with an `Iteration`, whose fields are named
+            columns.
+        time_limit: Seconds by the clock, from the call on and with all that is built and checked,
+            after which the best motion so far is returned, with status "time limit". What succeeds
+            within it depends on the machine and on what else runs there.
+        effort: The same as a count of work, with status "effort spent": how many configurations may
+            be looked at, by searches for seeds, and in every iteration of Ipopt at each waypoint.
+            The same call succeeds with it on every machine, or fails. What a plan took is in
+            `metrics["effort"]`; 100 000 take some ten seconds.
+        seed: Of the random numbers. The same call gives the same trajectory on the same machine,
+            bit for bit, whatever was planned before; only `time_limit` can make a difference.
+        joint: Plan all steps as one problem; otherwise each from where the one before it ends, for
+            comparison.
+        perturbation: Standard deviation of smooth noise on the seeds, [m] and [rad], to see how
+            much hangs on them.
+        progress: Show one line that changes in its place: in a notebook or a terminal; elsewhere
+            nothing is shown.
         terms: Own constraints and costs, beside those of every motion; see `Constraint` and `Cost`.
         planner: Keeps what can be used again; None: the process's own.
 
     Returns:
-        A plan, in every case: `plan.success` is true only if the independent `validation` found nothing wrong, and
-        `plan.report()` names what is violated otherwise. Ctrl-C, or interrupting a notebook's kernel, ends planning with the best
-        iterate so far and status "interrupted"; a second Ctrl-C raises KeyboardInterrupt.
+        A plan, in every case: `plan.success` is true only if the independent `validation` found
+            nothing wrong, and
+        `plan.report()` names what is violated otherwise. Ctrl-C, or interrupting a notebook's
+        kernel, ends planning with the best iterate so far and status "interrupted"; a second Ctrl-C
+        raises KeyboardInterrupt.
 
     Raises:
-        InputError: The steps or terms name something that is not there or cannot be done, or an argument is wrong.
+        InputError: The steps or terms name something that is not there or cannot be done, or an
+            argument is wrong.
     """
     settings = settings_for(
         scene,
@@ -147,7 +164,9 @@ def plan(
 
     def run(settings: Settings) -> Plan:
         task = compile_task(scene, steps, settings.options)
-        ready = scene.with_approaches((hold for hold in task.holds if hold.by is not None), stacklevel=5)
+        ready = scene.with_approaches(
+            (hold for hold in task.holds if hold.by is not None), stacklevel=5
+        )
         task = task if ready is scene else compile_task(ready, steps, settings.options)
         check_active(settings.terms, stretches(task))
         return all_at_once(ready, task, settings) if joint else step_by_step(ready, task, settings)
@@ -155,7 +174,12 @@ def plan(
     return guarded(run, settings, progress, planner)
 
 
-def guarded(run: Callable[[Settings], Plan], settings: Settings, progress: bool, planner: Planner | None = None) -> Plan:
+def guarded(
+    run: Callable[[Settings], Plan],
+    settings: Settings,
+    progress: bool,
+    planner: Planner | None = None,
+) -> Plan:
     """Return what `run` returns, whose settings' budget runs, and which is lent a cache; show its progress."""
     with borrowed(planner) as cache, shown(progress) as line, settings.budget.running():
         found = run(dataclasses.replace(settings, progress=line, cache=cache))

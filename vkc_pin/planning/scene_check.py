@@ -34,9 +34,11 @@ class ReachableAttachment:
 
     Attributes:
         object, attachment: Where.
-        approach: The direction in which the hand comes, in the world frame, shape (3,); at zero of the grasp's freedoms.
+        approach: The direction in which the hand comes, in the world frame, shape (3,); at zero of
+            the grasp's freedoms.
         closing: The line along which its fingers close, shape (3,).
-        configuration: The robot's coordinates of the clearest grasp that was found, shape (n,); None: none was found.
+        configuration: The robot's coordinates of the clearest grasp that was found, shape (n,);
+            None: none was found.
         clearance: The smallest distance there of what must keep `dist_safe`, at most 0.25 [m].
         because: Why none was found.
     """
@@ -55,7 +57,11 @@ class ReachableAttachment:
         if self.configuration is None:
             return f"{head}: not reached, {self.because}"
         x, y, yaw = self.configuration[:3]
-        least = f"{1e3 * self.clearance:.0f} mm" if self.clearance < _FAR else f"more than {1e3 * _FAR:.0f} mm"
+        least = (
+            f"{1e3 * self.clearance:.0f} mm"
+            if self.clearance < _FAR
+            else f"more than {1e3 * _FAR:.0f} mm"
+        )
         return f"{head}: reached from ({x:.2f}, {y:.2f}) at {yaw:.2f} rad, with {least} of air"
 
 
@@ -66,7 +72,8 @@ class SceneCheck:
     Attributes:
         scene: The scene.
         dist_safe: What counts as close [m].
-        robot: What the robot, with what it holds, is close to at the start: itself, objects and obstacles.
+        robot: What the robot, with what it holds, is close to at the start: itself, objects and
+            obstacles.
         close: What else can move and is close to something.
         allowed: Which pairs of links may be close, as the scene says or as they are built.
         attachments: Of all objects that are not in the hand.
@@ -90,8 +97,13 @@ class SceneCheck:
     def lines(self) -> list[str]:
         """Return it as lines of text."""
         scene = self.scene
-        found = [f"{scene.name}: {scene.robot.name}, {len(scene.objects)} objects, {len(scene.obstacle_names)} obstacles"]
-        near, stuck = ([pair for pair in self.close if (pair.distance < 0.0) == inside] for inside in (False, True))
+        found = [
+            f"{scene.name}: {scene.robot.name}, {len(scene.objects)} objects, {len(scene.obstacle_names)} obstacles"
+        ]
+        near, stuck = (
+            [pair for pair in self.close if (pair.distance < 0.0) == inside]
+            for inside in (False, True)
+        )
         for title, entries in (
             ("nothing can be planned, because", self.problems),
             (f"the robot is closer than {1e3 * self.dist_safe:g} mm to", self.robot),
@@ -130,8 +142,15 @@ class SceneCheck:
             grasp = placed.object.attachments[one.attachment]
             tool = placed.link_placement(grasp.link) * grasp.tool(np.zeros(len(grasp.freedoms)))
             base = None if one.configuration is None else one.configuration[:3]
-            arrows.append(Approach(f"{one.object}.{one.attachment}", tool.translation, one.approach, base))
-        stuck = [label for pair in (*self.robot, *self.close) if pair.distance < 0.0 for label in (pair.first, pair.second)]
+            arrows.append(
+                Approach(f"{one.object}.{one.attachment}", tool.translation, one.approach, base)
+            )
+        stuck = [
+            label
+            for pair in (*self.robot, *self.close)
+            if pair.distance < 0.0
+            for label in (pair.first, pair.second)
+        ]
         return plot_scene(self.scene, arrows, stuck, path)
 
 
@@ -144,7 +163,8 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
         seed: Of the random configurations with which attachments are tried, as for `plan`.
 
     Returns:
-        What was found. It promises nothing: what is reached need not be on any path, and what is not may be all the same.
+        What was found. It promises nothing: what is reached need not be on any path, and what is
+        not may be all the same.
 
     Raises:
         InputError: An argument is wrong.
@@ -153,8 +173,12 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
     options = Options() if options is None else instance(options, Options, "options")
     seed, cache = whole(seed, "seed", low=0), Cache()
     reach = [Reach(scene.tool_placement())]
-    problem = TrajectoryProblem(scene, compile_task(scene, reach, options, nothing=True), options, (), cache=cache)
-    contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=options.dist_safe)
+    problem = TrajectoryProblem(
+        scene, compile_task(scene, reach, options, nothing=True), options, (), cache=cache
+    )
+    contacts = problem.contacts.evaluate(
+        problem.start[None], np.array([0]), reach=options.dist_safe
+    )
     labels = problem.contacts.phases[0].labels
     pairs: dict[tuple[str, str], float] = {}
     for (i, j), distance in zip(contacts.pair.tolist(), contacts.distance.tolist(), strict=True):
@@ -163,7 +187,12 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
     return SceneCheck(
         scene=scene,
         dist_safe=options.dist_safe,
-        robot=tuple(sorted((Close(*key, distance) for key, distance in pairs.items()), key=lambda pair: pair.distance)),
+        robot=tuple(
+            sorted(
+                (Close(*key, distance) for key, distance in pairs.items()),
+                key=lambda pair: pair.distance,
+            )
+        ),
         close=tuple(close_pairs(scene, options.dist_safe)),
         allowed=allowances(scene, options.dist_safe),
         attachments=tuple(_attachments(scene, options, seed, cache)),
@@ -171,13 +200,20 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
     )
 
 
-def _attachments(scene: Scene, options: Options, seed: int, cache: Cache) -> Iterator[ReachableAttachment]:
+def _attachments(
+    scene: Scene, options: Options, seed: int, cache: Cache
+) -> Iterator[ReachableAttachment]:
     """Yield what can be said of all attachments."""
     empty = scene.with_held({})
     for name, placed in scene.objects.items():
-        for attachment, grasp in placed.object.attachments.items() if name not in scene.held else ():
+        for attachment, grasp in (
+            placed.object.attachments.items() if name not in scene.held else ()
+        ):
             turned = (placed.link_placement(grasp.link) * grasp.placement).rotation
-            about: dict[str, Any] = {"approach": turned[:, 2].copy(), "closing": turned[:, 0].copy()}
+            about: dict[str, Any] = {
+                "approach": turned[:, 2].copy(),
+                "closing": turned[:, 0].copy(),
+            }
             try:
                 task = compile_task(empty, [Grasp(name, attachment)], options, nothing=True)
             except InputError as error:
@@ -210,6 +246,9 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
 
 def _said(one: Allowance) -> str:
     kept = "at any distance" if one.margin == -np.inf else f"down to {1e3 * one.margin:.4g} mm"
-    ends = {name: [f"{end:.3g}" if np.isfinite(end) else "its limit" for end in both] for name, both in one.ranges.items()}
+    ends = {
+        name: [f"{end:.3g}" if np.isfinite(end) else "its limit" for end in both]
+        for name, both in one.ranges.items()
+    }
     while_ = ", ".join(f"{name} from {low} to {high}" for name, (low, high) in ends.items())
     return f"{one} {kept}, " + (f"with {while_}" if while_ else "as the scene says")

@@ -63,11 +63,22 @@ def settings_for(
     budget = budget_for(time_limit, effort)
     check_arguments(scene, options, seed)
     known(initialization, INITIALIZATIONS, "initialization", "initialization")
-    if (noise := number(perturbation, "perturbation", "a number of at least 0", low=0.0)) > LARGEST_NOISE:
-        raise InputError("out of range", field="perturbation", expected=f"at most {LARGEST_NOISE:g}", got=noise)
+    if (
+        noise := number(perturbation, "perturbation", "a number of at least 0", low=0.0)
+    ) > LARGEST_NOISE:
+        raise InputError(
+            "out of range", field="perturbation", expected=f"at most {LARGEST_NOISE:g}", got=noise
+        )
     if callback is not None and not callable(callback):
-        raise InputError("cannot be called", field="callback", expected="a function of an Iteration", got=shown(callback))
-    return Settings(initialization, options, callback, int(seed), noise, traced(scene, terms), budget=budget)
+        raise InputError(
+            "cannot be called",
+            field="callback",
+            expected="a function of an Iteration",
+            got=shown(callback),
+        )
+    return Settings(
+        initialization, options, callback, int(seed), noise, traced(scene, terms), budget=budget
+    )
 
 
 def budget_for(time_limit: object, effort: object) -> Budget:

@@ -54,8 +54,8 @@ def step_by_step(scene: Scene, task: Task, settings: Settings) -> Plan:
 def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:
     """Plan steps as one problem, in which every grasp and every base pose can change in favour of what follows.
 
-    Where that fails, or holds move the same joint, which one chain can have only once, each step is planned from where the one
-    before it ends: what that comes to is a motion all the same.
+    Where that fails, or holds move the same joint, which one chain can have only once, each step is
+    planned from where the one before it ends: what that comes to is a motion all the same.
 
     Args:
         scene: Robot, objects and obstacles.
@@ -78,8 +78,8 @@ def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:
 def by_any_attachment(scene: Scene, task: Task, settings: Settings) -> tuple[OneProblem, Plan]:
     """Plan a task as one problem; if that fails, by the other attachments that its steps leave open, one after the other.
 
-    What is held and cannot be moved so is let go of and taken anew. Attachments at which no free configuration is found for the
-    end of a phase are left aside at once.
+    What is held and cannot be moved so is let go of and taken anew. Attachments at which no free
+    configuration is found for the end of a phase are left aside at once.
 
     Args:
         scene: Robot, objects and obstacles.
@@ -87,16 +87,21 @@ def by_any_attachment(scene: Scene, task: Task, settings: Settings) -> tuple[One
         settings: How to plan.
 
     Returns:
-        The problem that was solved, and its plan, whose steps name the attachment unless it is the first that will do; if all
-        fail, the first, with what is in the way of the others among the notes.
+        The problem that was solved, and its plan, whose steps name the attachment unless it is the
+        first that will do; if all fail, the first, with what is in the way of the others among the
+        notes.
     """
     first = OneProblem(scene, task, settings)
     result = first.run()
     plans, notes = [result], list[str]()
-    for name, steps in alternatives(scene, task, anew=not settings.terms):  # terms may name phases by their numbers
+    for name, steps in alternatives(
+        scene, task, anew=not settings.terms
+    ):  # terms may name phases by their numbers
         if plans[-1].success or plans[-1].status in ENDINGS or first.hindered:
             break
-        one = OneProblem(scene, compile_task(scene, steps, settings.options), settings, goals_first=True)
+        one = OneProblem(
+            scene, compile_task(scene, steps, settings.options), settings, goals_first=True
+        )
         plans.append(one.run())
         if plans[-1].success:
             return one, charged(plans[-1], [plan.metrics for plan in plans])
@@ -105,7 +110,10 @@ def by_any_attachment(scene: Scene, task: Task, settings: Settings) -> tuple[One
         return first, result
     status = plans[-1].status if plans[-1].status in ENDINGS else result.status
     report = dataclasses.replace(result.validation, notes=(*result.validation.notes, *notes))
-    return first, charged(dataclasses.replace(result, validation=report, status=status), [plan.metrics for plan in plans])
+    return first, charged(
+        dataclasses.replace(result, validation=report, status=status),
+        [plan.metrics for plan in plans],
+    )
 
 
 def stages(scene: Scene, task: Task, settings: Settings) -> list[Stage]:
@@ -119,7 +127,11 @@ def stages(scene: Scene, task: Task, settings: Settings) -> list[Stage]:
     current, parts = scene, list[Stage]()
     for number, step in enumerate(task.steps):
         # Where a step ends is known only once it is planned; the first begins where all do.
-        own = task.until(1) if not number else compile_task(current, [step], settings.options, nothing=True)
+        own = (
+            task.until(1)
+            if not number
+            else compile_task(current, [step], settings.options, nothing=True)
+        )
         if not own.phases:
             continue
         settings.progress.part(number + 1, 1, len(task.steps))

@@ -35,7 +35,8 @@ class _Part:
     """One action's part of a motion.
 
     Attributes:
-        plan: The motion of the action alone, from the scene in which it begins; None if nothing is to be done.
+        plan: The motion of the action alone, from the scene in which it begins; None if nothing is
+            to be done.
         piece: Its waypoints.
         after: The scene in which it ends.
         rests: Whether the robot stands still at its end.
@@ -59,7 +60,9 @@ class SlidingWindow:
         spent, history: What every problem took, and every round of the solver.
     """
 
-    def __init__(self, scene: Scene, steps: tuple[Step, ...], window: int, settings: Settings) -> None:
+    def __init__(
+        self, scene: Scene, steps: tuple[Step, ...], window: int, settings: Settings
+    ) -> None:
         self.scene, self.steps, self.window, self.settings = scene, steps, window, settings
         self.actions = actions_of(steps)
         self.kept: list[_Part] = []
@@ -100,7 +103,8 @@ class SlidingWindow:
     def _plan_window(self, window: int) -> Plan | None:
         """Decide on the next action with those after it in mind.
 
-        If that is not possible, return the plan of the first action that could not be planned, from where those ahead end.
+        If that is not possible, return the plan of the first action that could not be planned, from
+        where those ahead end.
         """
         first = len(self.kept)
         last = self._last(first, window)
@@ -135,7 +139,8 @@ class SlidingWindow:
     def _last(self, first: int, window: int) -> int:
         """Return the end of a window: as wide as it may be.
 
-        But without what can be said only once the rest is planned, or has no place in one chain with it.
+        But without what can be said only once the rest is planned, or has no place in one chain
+        with it.
         """
         last = first + 1
         while last < min(first + window, len(self.actions)):
@@ -151,15 +156,24 @@ class SlidingWindow:
     def _look_ahead(self) -> Plan | None:
         """Plan one more action alone, from where those planned ahead end; return the plan if it fails.
 
-        What fails is tried by the other attachments that it leaves open; the one that leads there is the action's from then on.
+        What fails is tried by the other attachments that it leaves open; the one that leads there
+        is the action's from then on.
         """
-        number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
+        number, scene = (
+            len(self.kept) + len(self.ahead),
+            self.ahead[-1].after if self.ahead else self._now,
+        )
         failed, chosen = self._alone(number, scene), self.actions[number]
         if failed is None or failed.status in ENDINGS:
             return failed
-        for _, steps in alternatives(scene, self._task(scene, number, number + 1, self.settings.options)):
+        for _, steps in alternatives(
+            scene, self._task(scene, number, number + 1, self.settings.options)
+        ):
             self.actions[number] = steps
-            held_twice = clash(scene, self._task(scene, number, number + 1, self.settings.options).holds) is not None
+            held_twice = (
+                clash(scene, self._task(scene, number, number + 1, self.settings.options).holds)
+                is not None
+            )
             other = failed if held_twice else self._alone(number, scene, goals_first=True)
             if other is None:
                 return None
@@ -183,7 +197,9 @@ class SlidingWindow:
                 break
         return plan
 
-    def _solved(self, first: int, one: OneProblem, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
+    def _solved(
+        self, first: int, one: OneProblem, seed: Callable[[TrajectoryProblem], Seed] | None = None
+    ) -> Plan:
         """Return the plan of a problem that begins with the action `first`."""
         done = len(self._steps(0, first))
         self.settings.progress.part(done + 1, len(one.task.steps), len(self.steps))
@@ -200,16 +216,29 @@ class SlidingWindow:
         for number in range(first, last):
             task = one.task.until(len(self._steps(first, number + 1)))
             end = len(task.phases)
-            names = [*one.scene.robot.coordinates.names, *(name for hold in task.holds for name in one.problem.chain.added[hold])]
+            names = [
+                *one.scene.robot.coordinates.names,
+                *(name for hold in task.holds for name in one.problem.chain.added[hold]),
+            ]
             part, piece, rests = None, _NOTHING, True
             if end > begin:
-                trajectory = cut(plan.trajectory, names, begin, end if end < len(one.task.phases) else None)
+                trajectory = cut(
+                    plan.trajectory, names, begin, end if end < len(one.task.phases) else None
+                )
                 steps = self._steps(number, number + 1)
-                seed = ahead[number].piece.seed if number in ahead else one.initialization  # where it came from at first
-                part = dataclasses.replace(plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed)
-                piece = PhaseWaypoints(whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed)
+                seed = (
+                    ahead[number].piece.seed if number in ahead else one.initialization
+                )  # where it came from at first
+                part = dataclasses.replace(
+                    plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed
+                )
+                piece = PhaseWaypoints(
+                    whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed
+                )
                 ends = one.problem.ends
-                rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.stops
+                rests = (
+                    end == len(ends) or ends[end - 1] in one.problem.transcription.structure.stops
+                )
                 scene = scene_after(scene, trajectory, task.after)
             parts.append(_Part(part, piece, scene, rests, one.checking / (last - first)))
             begin = end
@@ -222,11 +251,13 @@ class SlidingWindow:
         """Compile actions anew: from where in the world they begin is known only once those before them are planned."""
         return compile_task(scene, self._steps(first, last), options, nothing=True)
 
-    def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0, *, goals_first: bool = False) -> OneProblem:
+    def _problem(
+        self, scene: Scene, first: int, last: int, attempt: int = 0, *, goals_first: bool = False
+    ) -> OneProblem:
         """Return the problem of the actions from `first` to before `last`.
 
-        There are few seeds to an attempt: where an action cannot be done from where the last one ends, all others fail as well,
-        slowly, and to plan the two together is the way out.
+        There are few seeds to an attempt: where an action cannot be done from where the last one
+        ends, all others fail as well, slowly, and to plan the two together is the way out.
 
         Args:
             scene: Where they begin.
@@ -236,8 +267,12 @@ class SlidingWindow:
             goals_first: See `OneProblem`.
         """
         options = dataclasses.replace(self.settings.options, max_restarts=1)
-        settings = dataclasses.replace(self.settings, options=options, random_seed=self.settings.random_seed + attempt)
-        return OneProblem(scene, self._task(scene, first, last, options), settings, goals_first=goals_first)
+        settings = dataclasses.replace(
+            self.settings, options=options, random_seed=self.settings.random_seed + attempt
+        )
+        return OneProblem(
+            scene, self._task(scene, first, last, options), settings, goals_first=goals_first
+        )
 
     def _joined(self, failed: Plan | None) -> Plan:
         """Return one plan of all that is decided, and of what failed."""
@@ -246,7 +281,9 @@ class SlidingWindow:
         if failed is not None:
             parts.append(failed)
             number = len(self._steps(0, len(self.kept)))
-            notes.append(f"steps[{number}], {self._steps(0, len(self.actions))[number]}, could not be planned: {failed.status}")
+            notes.append(
+                f"steps[{number}], {self._steps(0, len(self.actions))[number]}, could not be planned: {failed.status}"
+            )
         return joined(
             self.scene,
             self._steps(0, len(self.actions)),

@@ -27,9 +27,10 @@ _OBJECTS = 2  # at most, of one room
 def goals(scene: Scene, *, share: float = 0.5) -> tuple[Step, ...]:
     """Return what a hand can do with the objects of a scene, each as a step of its own.
 
-    Of every object that stands fixed, each joint on the base that some attachment moves is moved up if it is in the lower half of
-    its range, else down, by the attachment that leaves the hand most freedom. What is free is grasped. Nobody asks a planner
-    whether any of it can be done from where the robot starts.
+    Of every object that stands fixed, each joint on the base that some attachment moves is moved up
+    if it is in the lower half of its range, else down, by the attachment that leaves the hand most
+    freedom. What is free is grasped. Nobody asks a planner whether any of it can be done from where
+    the robot starts.
 
     Args:
         scene: The scene.
@@ -52,19 +53,23 @@ def goals(scene: Scene, *, share: float = 0.5) -> tuple[Step, ...]:
     return tuple(found)
 
 
-def random_task(seed: int, settings: RoomSettings | None = None, **changes: Any) -> tuple[Scene, tuple[Step, ...]]:
+def random_task(
+    seed: int, settings: RoomSettings | None = None, **changes: Any
+) -> tuple[Scene, tuple[Step, ...]]:
     """Return a random room, and something to open, to close or to grasp in it; the same in every run.
 
     Args:
         seed: Which task, from 0; the room is `random_room(seed, ...)`.
         settings: What the room is like; None: `RoomSettings()`.
-        changes: Fields of `RoomSettings` that are to be otherwise. Without `objects`, one or two of `random_object` are drawn.
+        changes: Fields of `RoomSettings` that are to be otherwise. Without `objects`, one or two of
+            `random_object` are drawn.
 
     Returns:
         Scene and steps, as `plan` takes them.
 
     Raises:
-        InputError: A number or a field is out of range, or the things find no place in a room of this size.
+        InputError: A number or a field is out of range, or the things find no place in a room of
+            this size.
         UnknownNameError: There is no such field, or no such type of object.
     """
     rng = np.random.default_rng([6, whole(seed, "seed", low=0)])
@@ -76,7 +81,12 @@ def random_task(seed: int, settings: RoomSettings | None = None, **changes: Any)
     scene = random_room(seed, settings, **changes)
     offered = goals(scene, share=share)
     if not offered:
-        raise InputError("nothing can be done here", field="objects", expected="something to open or to carry", got="nothing")
+        raise InputError(
+            "nothing can be done here",
+            field="objects",
+            expected="something to open or to carry",
+            got="nothing",
+        )
     return scene, (offered[int(rng.integers(len(offered)))],)
 
 
@@ -97,7 +107,9 @@ def _openings(name: str, placed: PlacedObject, share: float) -> list[Step]:
         )
         by = share * (upper - lower)
         goal = now + by if now <= (lower + upper) / 2.0 else now - by
-        within = float(np.clip(round(goal, 3), lower, upper))  # in this order: rounded, a limit may be beyond itself
+        within = float(
+            np.clip(round(goal, 3), lower, upper)
+        )  # in this order: rounded, a limit may be beyond itself
         steps.append(Actuate(name, {joint: within}, _freest(attachments).name))
     return steps
 

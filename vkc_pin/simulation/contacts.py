@@ -1,8 +1,9 @@
 """What may touch what, by the planner's own rules, and which contacts of an executed motion the plan did not have.
 
-The pairs are those that the planner keeps apart: the robot's own pairs that can collide, robot and objects with each other and
-with the world, and the floor below what is carried or on the arm. Pairs that overlap from the start, or need no clearance, do not
-push each other apart. Neither do a hand and the link that it is welded to, while it is.
+The pairs are those that the planner keeps apart: the robot's own pairs that can collide, robot and
+objects with each other and with the world, and the floor below what is carried or on the arm. Pairs
+that overlap from the start, or need no clearance, do not push each other apart. Neither do a hand
+and the link that it is welded to, while it is.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Contact", "Pairs", "touching_pairs", "unwanted"]
 
-_TOUCHING = 2e-3  # [m] what is planned to be closer than this may as well touch: descriptions put cups a millimetre above tables
+# [m] what is planned to be closer than this may as well touch: descriptions put cups a millimetre
+# above tables
+_TOUCHING = 2e-3
 _GROUPS = 31  # bits of MuJoCo's contact types
 
 
@@ -64,8 +67,10 @@ class Pairs:
 
     Attributes:
         always: Pairs that do at any time, by the numbers of their shapes, shape (P, 2).
-        types, affinities: Of every shape, shape (G,): bits of `contype` and `conaffinity`, by which the pairs of holds meet.
-        bits: Hold → the bit by which what holds meets the link that it holds, unless it does; 0 if they never meet.
+        types, affinities: Of every shape, shape (G,): bits of `contype` and `conaffinity`, by which
+            the pairs of holds meet.
+        bits: Hold → the bit by which what holds meets the link that it holds, unless it does; 0 if
+            they never meet.
         overlapping: Links with shapes that overlap at the start and so never meet.
     """
 
@@ -84,7 +89,9 @@ def touching_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
         holds: All that is ever held firmly enough to be welded.
     """
     labels, joints = world.collision_labels, [shape.parentJoint for shape in world.shapes]
-    pairs = np.array([pair for pair in _candidates(world) if joints[pair[0]] or joints[pair[1]]], int).reshape(-1, 2)
+    pairs = np.array(
+        [pair for pair in _candidates(world) if joints[pair[0]] or joints[pair[1]]], int
+    ).reshape(-1, 2)
     silent = {
         pair
         for one in allowances(world.scene, Options().dist_safe)
@@ -100,7 +107,11 @@ def touching_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
     quiet[deep] = True
     never = {named[k] for k in np.flatnonzero(quiet).tolist()}
     types, affinities = np.zeros((2, len(labels)), int)
-    bits, groups, gripped = dict[Hold, int](), dict[tuple[frozenset[str], str], int](), set[frozenset[str]]()
+    bits, groups, gripped = (
+        dict[Hold, int](),
+        dict[tuple[frozenset[str], str], int](),
+        set[frozenset[str]](),
+    )
     for hold in holds:
         hands, link = frozenset(touching(world.scene, hold)), grasped(world.scene, hold)
         own = {frozenset((hand, link)) for hand in hands}
@@ -124,8 +135,12 @@ def _candidates(world: World) -> Iterable[tuple[int, int]]:
     yield from ((pair.first, pair.second) for pair in scene.robot.collision.collisionPairs)
     for i in range(bodies):
         for j in range(max(i + 1, robots), len(labels)):
-            stands = j >= bodies and labels[j] == FLOOR  # as wheels do; objects that do not move freely hang in their walls
-            if stands and not (world.shapes[i].parentJoint > 1 if i < robots else owners[i] in free):
+            stands = (
+                j >= bodies and labels[j] == FLOOR
+            )  # as wheels do; objects that do not move freely hang in their walls
+            if stands and not (
+                world.shapes[i].parentJoint > 1 if i < robots else owners[i] in free
+            ):
                 continue
             same = robots <= i and j < bodies and owners[i] == owners[j]
             links = frozenset(labels[k].partition(".")[2] for k in (i, j))
@@ -134,7 +149,10 @@ def _candidates(world: World) -> Iterable[tuple[int, int]]:
 
 
 def unwanted(
-    scene: Scene, trajectory: Trajectory, seen: dict[tuple[str, str], list[tuple[float, float]]], period: float
+    scene: Scene,
+    trajectory: Trajectory,
+    seen: dict[tuple[str, str], list[tuple[float, float]]],
+    period: float,
 ) -> tuple[Contact, ...]:
     """Return contacts that the plan does not have: the links are further apart in it for `EASED_TIME` before and after.
 
@@ -150,16 +168,23 @@ def unwanted(
     placed = Solids(world).at(world.coordinates.q(world.positions(trajectory)))
     found = []
     for (first, second), samples in seen.items():
-        ones, others = ([k for k, label in enumerate(world.collision_labels) if label == one] for one in (first, second))
+        ones, others = (
+            [k for k, label in enumerate(world.collision_labels) if label == one]
+            for one in (first, second)
+        )
         together = np.zeros(0)
         if ones and others:
             pairs = np.array([(i, j) for i in ones for j in others])
             _, distances = placed.nearest(np.sort(pairs, axis=1))
             together = trajectory.times[distances < _TOUCHING]
         moments = np.array(samples)
-        far = np.array([np.min(np.abs(together - t), initial=np.inf) > EASED_TIME for t in moments[:, 0]])
+        far = np.array(
+            [np.min(np.abs(together - t), initial=np.inf) > EASED_TIME for t in moments[:, 0]]
+        )
         moments = moments[far]
         if len(moments):
             time, depth = moments[np.argmax(moments[:, 1])].tolist()
-            found.append(Contact(first, second, time, float(moments[0, 0]), period * len(moments), depth))
+            found.append(
+                Contact(first, second, time, float(moments[0, 0]), period * len(moments), depth)
+            )
     return tuple(sorted(found, key=lambda contact: contact.begin))

@@ -33,7 +33,8 @@ __all__ = ["GRASPS", "simulate"]
 GRASPS = ("weld", "friction")
 """How a hand can hold on."""
 _FINE = 5e-4  # [s] the longest step with which fingers hold by friction; see `Builder`
-_CLOSED = 0.2  # [s] for which fingers have closed on what is in the hand at the start, before they carry it
+# [s] for which fingers have closed on what is in the hand at the start, before they carry it
+_CLOSED = 0.2
 _FRAME, _LOOK = 0.02, 0.01  # [s] between recorded states, and between two looks at the contacts
 
 
@@ -52,17 +53,19 @@ def simulate(
         scene: The scene that it was planned in.
         steps: What it was to bring about.
         trajectory: The motion.
-        actual: The scene that it happens in, if that is another: something stands elsewhere, or is heavier.
-        grasp: "weld": what is held is welded to the hand as long as the motion says, unless it is pulled too hard. "friction":
-            fingers close on it, and nothing but their friction holds it; the robot waits while they close and open.
+        actual: The scene that it happens in, if that is another: something stands elsewhere, or is
+            heavier.
+        grasp: "weld": what is held is welded to the hand as long as the motion says, unless it is
+            pulled too hard. "friction": fingers close on it, and nothing but their friction holds
+            it; the robot waits while they close and open.
         physics: What to assume; `Physics()` if left out.
 
     Returns:
         What came of it.
 
     Raises:
-        InputError: MuJoCo is not installed, `actual` has another robot or lacks objects, or an argument is
-            none of its kind.
+        InputError: MuJoCo is not installed, `actual` has another robot or lacks objects, or an
+            argument is none of its kind.
     """
     mujoco = engine()
     physics = Physics() if physics is None else instance(physics, Physics, "physics")
@@ -70,14 +73,24 @@ def simulate(
         raise InputError("unknown", field="grasp", expected=", ".join(GRASPS), got=grasp)
     steps, here = as_list(steps), scene if actual is None else instance(actual, Scene, "actual")
     for name, placed in scene.objects.items():
-        if name not in here.objects or here.objects[name].object.coordinates.names != placed.object.coordinates.names:
+        if (
+            name not in here.objects
+            or here.objects[name].object.coordinates.names != placed.object.coordinates.names
+        ):
             raise InputError(
-                "an object of the plan's scene is not there", field="actual", expected=name, got=", ".join(here.objects)
+                "an object of the plan's scene is not there",
+                field="actual",
+                expected=name,
+                got=", ".join(here.objects),
             )
     if here.robot.coordinates.names != scene.robot.coordinates.names:
-        raise InputError("another robot", field="actual", expected=scene.robot.name, got=here.robot.name)
+        raise InputError(
+            "another robot", field="actual", expected=scene.robot.name, got=here.robot.name
+        )
     run = _Run(here, trajectory, physics, friction=grasp == "friction")
-    mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory; see `diverged`
+    mujoco.set_mju_user_warning(
+        lambda text: None
+    )  # it would write a file into the working directory; see `diverged`
     try:
         run.go()
     finally:
@@ -113,7 +126,9 @@ class _Run:
             _, squeezed = split(schedule, float(self.trajectory.times[0]))
             waits = grip_changes(self.trajectory, squeezed)
             self.trajectory = paused(self.trajectory, waits, physics.grip_time)
-            schedule, squeezed = split(spans(self.scene, self.trajectory), float(self.trajectory.times[0]))
+            schedule, squeezed = split(
+                spans(self.scene, self.trajectory), float(self.trajectory.times[0])
+            )
         trajectory, welded = self.trajectory, list(dict.fromkeys(hold for hold, _, _ in schedule))
         self.planned = self.tree.positions(trajectory)
         self.servos: tuple[Servo, ...] = servos(self.tree, self.planned, physics)
@@ -121,19 +136,34 @@ class _Run:
         if self.fingers is not None:
             self.servos = limited(self.servos, self.fingers, self.tree, physics)
         squeezing = [hold for hold, _, _ in squeezed]
-        self.pairs: Pairs = touching_pairs(self.tree, [hold for hold in holds if hold not in squeezing])
+        self.pairs: Pairs = touching_pairs(
+            self.tree, [hold for hold in holds if hold not in squeezing]
+        )
         latches = latched(self.scene)
         shut = [(joint, at) for joint, at, _, _ in latches]
         builder = Builder(self.tree, physics, gripping=bool(squeezed))
-        more = {} if self.fingers is None else {"before": self.fingers.add_bodies, "more": self.fingers.add_drives}
+        more = (
+            {}
+            if self.fingers is None
+            else {"before": self.fingers.add_bodies, "more": self.fingers.add_drives}
+        )
         self.physical: PhysicalWorld = builder.built(self.pairs, self.servos, welded, shut, **more)
-        self.grips = Grips(self.physical, welded, schedule, self.pairs, trajectory, physics, touching=squeezing)
+        self.grips = Grips(
+            self.physical, welded, schedule, self.pairs, trajectory, physics, touching=squeezing
+        )
         self.latches = Latches(self.physical, latches, len(welded), physics)
         self.squeezes: Squeezes | None = None
         if self.fingers is not None:
-            self.squeezes = Squeezes(self.physical, self.fingers, squeezed, trajectory, physics, _LOOK)
-        settle = max(physics.settle, physics.grip_time + _CLOSED if self.scene.holds and squeezed else 0.0)
-        start, end = float(trajectory.times[0]) - settle, float(trajectory.times[-1]) + physics.settle
+            self.squeezes = Squeezes(
+                self.physical, self.fingers, squeezed, trajectory, physics, _LOOK
+            )
+        settle = max(
+            physics.settle, physics.grip_time + _CLOSED if self.scene.holds and squeezed else 0.0
+        )
+        start, end = (
+            float(trajectory.times[0]) - settle,
+            float(trajectory.times[-1]) + physics.settle,
+        )
         steps = np.arange(int(np.ceil((end - start) / physics.timestep - 1e-9)) + 1)
         self.times: Floats = np.asarray(start + physics.timestep * steps, float)
         self.diverged: float | None = None
@@ -149,13 +179,19 @@ class _Run:
         fingers = finger_rows(self.tree, self.planned, self.trajectory.times, self.times)
         wanted = np.column_stack([motion[0], fingers])
         ahead = efforts_for(self.tree, self.servos, wanted, motion)
-        ahead[:, : motion[1].shape[1]] += motion[1] * [servo.damping for servo in self.servos[: motion[1].shape[1]]]
+        ahead[:, : motion[1].shape[1]] += motion[1] * [
+            servo.damping for servo in self.servos[: motion[1].shape[1]]
+        ]
         commands = wanted + ahead / [servo.stiffness for servo in self.servos]
         if self.squeezes is not None and self.fingers is not None:
             closing, commanded = self.fingers.addresses(self.physical)
-            rest = fingers if self.fingers.sides is None else np.zeros((len(self.times), len(closing)))
+            rest = (
+                fingers if self.fingers.sides is None else np.zeros((len(self.times), len(closing)))
+            )
             squeeze = self.squeezes.commands(self.times, rest)
-        driven, dofs = (where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs))
+        driven, dofs = (
+            where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs)
+        )
         labels = np.zeros(model.ngeom, int)
         labels[self.physical.geoms] = np.arange(len(self.physical.geoms))
         look, frame = (max(1, round(span / physics.timestep)) for span in (_LOOK, _FRAME))
@@ -178,11 +214,20 @@ class _Run:
                 self._look(data, labels, clock)
             if k % look == 0 and self.squeezes is not None:
                 self.squeezes.measure(data, clock)
-            if not np.isfinite(data.qpos).all() or data.warning[mj.mjtWarning.mjWARN_BADQACC].number:
-                self.times, self.errors, self.efforts = self.times[: k + 1], self.errors[: k + 1], self.efforts[: k + 1]
+            if (
+                not np.isfinite(data.qpos).all()
+                or data.warning[mj.mjtWarning.mjWARN_BADQACC].number
+            ):
+                self.times, self.errors, self.efforts = (
+                    self.times[: k + 1],
+                    self.errors[: k + 1],
+                    self.efforts[: k + 1],
+                )
                 self.diverged = clock
                 break
-        records += [records[-1]] * (len(kept) - len(records))  # where it broke down, all stays as it was last
+        records += [records[-1]] * (
+            len(kept) - len(records)
+        )  # where it broke down, all stays as it was last
         self.states: Floats = np.array(records)
 
     def _look(self, data: Any, labels: Any, clock: float) -> None:
@@ -214,8 +259,12 @@ class _Run:
             told = "; ".join(" – ".join(pair) for pair in self.pairs.overlapping)
             notes.append(f"overlap at the start, and go through each other: {told}")
         if self.fingers is not None and self.fingers.sides is not None:
-            notes.append("the hand's fingers do not move in its description: its two sides slide towards each other")
-        grips = [grip for grip in self.grips.grips if grip.end > grip.begin or grip.broken is not None]
+            notes.append(
+                "the hand's fingers do not move in its description: its two sides slide towards each other"
+            )
+        grips = [
+            grip for grip in self.grips.grips if grip.end > grip.begin or grip.broken is not None
+        ]
         grips += [] if self.squeezes is None else self.squeezes.grips
         executed = self._executed(rows)
         misses = missed(scene, steps, self.trajectory, self.tree, executed.times, rows)
@@ -226,7 +275,9 @@ class _Run:
             trajectory=executed,
             rows=rows,
             misses=misses,
-            tracking=Tracking.of(self.times, self.errors, self.efforts, self.servos, self.trajectory.robot_size),
+            tracking=Tracking.of(
+                self.times, self.errors, self.efforts, self.servos, self.trajectory.robot_size
+            ),
             grips=tuple(grips),
             contacts=contacts,
             physics=self.physics,
@@ -241,9 +292,13 @@ class _Run:
         for column, name in enumerate(names):
             if name in own:
                 positions[:, column] = rows[:, own.index(name)]
-        ends = np.searchsorted(self.clocks, [self.trajectory.times[phase.last] for phase in self.trajectory.phases])
+        ends = np.searchsorted(
+            self.clocks, [self.trajectory.times[phase.last] for phase in self.trajectory.phases]
+        )
         last, before, phases = len(self.clocks) - 1, 0, []
-        for number, (phase, end) in enumerate(zip(self.trajectory.phases, ends.tolist(), strict=True)):
+        for number, (phase, end) in enumerate(
+            zip(self.trajectory.phases, ends.tolist(), strict=True)
+        ):
             left = len(self.trajectory.phases) - 1 - number
             end = last if left == 0 else min(max(end, before + 1), last - left)
             phases.append(replace(phase, first=before, last=end))

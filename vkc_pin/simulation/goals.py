@@ -49,11 +49,17 @@ class Miss:
 
 
 def missed(
-    scene: Scene, steps: Sequence[Step], trajectory: Trajectory, world: World, times: Floats, rows: Floats
+    scene: Scene,
+    steps: Sequence[Step],
+    trajectory: Trajectory,
+    world: World,
+    times: Floats,
+    rows: Floats,
 ) -> tuple[Miss, ...]:
     """Return how far everything that was asked for is from where it should be.
 
-    Each step is looked at when the plan has it done first, after those before it; the last one at the end.
+    Each step is looked at when the plan has it done first, after those before it; the last one at
+    the end.
 
     Args:
         scene: The scene that was planned in.
@@ -70,12 +76,20 @@ def missed(
     def done(step: Step, k: int) -> bool:
         if isinstance(step, Grasp | Release):
             held = trajectory.phases[k].held
-            return (step.object in held) == isinstance(step, Grasp) if step.object is not None else not held
+            return (
+                (step.object in held) == isinstance(step, Grasp)
+                if step.object is not None
+                else not held
+            )
         return all(amount <= _DONE for _, amount, _ in _misses(planned, step, ends[k], ends[k]))
 
     for number, step in enumerate(steps):
         last = len(ends) - 1
-        start = last if number == len(steps) - 1 else next((k for k in range(start, last) if done(step, k)), last)
+        start = (
+            last
+            if number == len(steps) - 1
+            else next((k for k in range(start, last) if done(step, k)), last)
+        )
         at = float(trajectory.times[edges[start]])
         row = len(times) - 1 if start == last else int(np.argmin(np.abs(times - at)))
         for subject, amount, unit in _misses(world, step, rows[row], ends[start]):
@@ -83,7 +97,9 @@ def missed(
     return tuple(found)
 
 
-def _misses(world: World, step: Step, row: Floats, planned: Floats) -> Iterator[tuple[str, float, str]]:
+def _misses(
+    world: World, step: Step, row: Floats, planned: Floats
+) -> Iterator[tuple[str, float, str]]:
     """Yield how far each subject of a step is from its goal where the world is at `row`; `planned` is where the plan has it."""
     names, units = world.coordinates.names, world.coordinates.units
     if isinstance(step, Actuate):
@@ -98,13 +114,21 @@ def _misses(world: World, step: Step, row: Floats, planned: Floats) -> Iterator[
         scene = world.scene
         link = f"{step.object}.{scene.objects[step.object].object.attachment(step.attachment).link}"
         hand = step.by or scene.robot.tool_frame
-        one, other = (_placement(world, at, link).actInv(_placement(world, at, hand)) for at in (row, planned))
-        yield f"grasp of {step.object}", float(np.linalg.norm(one.translation - other.translation)), "m"
+        one, other = (
+            _placement(world, at, link).actInv(_placement(world, at, hand)) for at in (row, planned)
+        )
+        yield (
+            f"grasp of {step.object}",
+            float(np.linalg.norm(one.translation - other.translation)),
+            "m",
+        )
     elif isinstance(step, Reach | Touch | Place):
         yield from _posed(world, step, row)
 
 
-def _posed(world: World, step: Reach | Touch | Place, row: Floats) -> Iterator[tuple[str, float, str]]:
+def _posed(
+    world: World, step: Reach | Touch | Place, row: Floats
+) -> Iterator[tuple[str, float, str]]:
     robot = world.scene.robot
     if isinstance(step, Place):
         frame = f"{step.object}.{world.scene.objects[step.object].object.base_link}"
@@ -112,12 +136,24 @@ def _posed(world: World, step: Reach | Touch | Place, row: Floats) -> Iterator[t
         frame = step.frame or robot.tool_frame
     goal: Any = step.target if isinstance(step, Touch) else step.pose
     placement, posed = _placement(world, row, frame), isinstance(goal, pin.SE3)
-    yield frame, float(np.linalg.norm(placement.translation - (goal.translation if posed else np.asarray(goal)))), "m"
+    yield (
+        frame,
+        float(
+            np.linalg.norm(
+                placement.translation - (goal.translation if posed else np.asarray(goal))
+            )
+        ),
+        "m",
+    )
     if posed:
         yield frame, float(np.linalg.norm(pin.log3(goal.rotation.T @ placement.rotation))), "rad"
     elif isinstance(step, Place):  # as upright as it stood, at any heading
         upright = step.object in world.scene.held
-        stands = np.array([0.0, 0.0, 1.0]) if upright else world.scene.objects[step.object].placement.rotation[2]
+        stands = (
+            np.array([0.0, 0.0, 1.0])
+            if upright
+            else world.scene.objects[step.object].placement.rotation[2]
+        )
         yield frame, float(np.arccos(np.clip(placement.rotation[2] @ stands, -1.0, 1.0))), "rad"
 
 

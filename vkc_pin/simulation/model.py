@@ -1,8 +1,9 @@
 """A scene as a MuJoCo model: the plain tree of robot and objects that validation and pictures use, with its masses.
 
-Bodies are the joints of `World.model` with their inertias, geoms the convex shapes that the planner avoids. What may touch
-what is listed pair by pair, see `contacts`; MuJoCo's own rules by bodies play no part. Joints that follow others are held to
-them by equalities: the motor of what leads moves all.
+Bodies are the joints of `World.model` with their inertias, geoms the convex shapes that the planner
+avoids. What may touch what is listed pair by pair, see `contacts`; MuJoCo's own rules by bodies
+play no part. Joints that follow others are held to them by equalities: the motor of what leads
+moves all.
 """
 
 from __future__ import annotations
@@ -29,8 +30,14 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Builder", "PhysicalWorld", "quaternion"]
 
-_CARRIER_MASS, _CARRIER_INERTIA = 0.05, 1e-4  # [kg], [kg·m²] of what stands between hand and link where a grasp leaves freedoms
-_CONTACT = (0.01, 1.0)  # time constant [s] and damping ratio of contacts: twice as hard as MuJoCo's usual ones
+_CARRIER_MASS, _CARRIER_INERTIA = (
+    0.05,
+    1e-4,
+)  # [kg], [kg·m²] of what stands between hand and link where a grasp leaves freedoms
+_CONTACT = (
+    0.01,
+    1.0,
+)  # time constant [s] and damping ratio of contacts: twice as hard as MuJoCo's usual ones
 _CARRIER_DAMPING = 0.02  # of these freedoms, [N·m·s/rad] or [N·s/m]
 
 
@@ -44,7 +51,8 @@ class PhysicalWorld:
         bodies: For each joint of the tree its body, shape (joints,).
         geoms: For each shape its geom, shape (G,).
         columns: Where each coordinate of the world is in MuJoCo's `qpos`, shape (n,).
-        dofs: Where each coordinate of the world is among MuJoCo's velocities, shape (n,); -1 for those of free joints.
+        dofs: Where each coordinate of the world is among MuJoCo's velocities, shape (n,); -1 for
+            those of free joints.
         carriers: Hold → where the coordinates of its freedoms are in `qpos`.
     """
 
@@ -77,8 +85,9 @@ class Builder:
     Args:
         world: The tree, all of whose bodies have masses; see `physics.weigh`.
         physics: What to assume.
-        gripping: Whether anything is held by friction. MuJoCo's contacts resist slipping by damping, and leave out centripetal
-            accelerations: what is carried round a bend creeps out of the hand unless friction acts within two time steps.
+        gripping: Whether anything is held by friction. MuJoCo's contacts resist slipping by
+            damping, and leave out centripetal accelerations: what is carried round a bend creeps
+            out of the hand unless friction acts within two time steps.
 
     Attributes:
         mj: The package `mujoco`.
@@ -112,14 +121,22 @@ class Builder:
         Args:
             pairs: What may touch what.
             servos: Of the coordinates that are driven.
-            holds: All that is ever welded, each with a weld of its own, in this order; they are not active.
-            latches: Coordinates with where they are held, each with an equality of its own after those; not active.
+            holds: All that is ever welded, each with a weld of its own, in this order; they are not
+                active.
+            latches: Coordinates with where they are held, each with an equality of its own after
+                those; not active.
             before: What to add before the shapes: bodies, say.
             more: What else to add, at the end: light, say.
         """
         mj, spec, option = self.mj, self.spec, self.spec.option
-        option.timestep, option.integrator = self.physics.timestep, mj.mjtIntegrator.mjINT_IMPLICITFAST
-        option.cone, option.impratio = mj.mjtCone.mjCONE_ELLIPTIC, 10.0  # what is held by friction hardly creeps
+        option.timestep, option.integrator = (
+            self.physics.timestep,
+            mj.mjtIntegrator.mjINT_IMPLICITFAST,
+        )
+        option.cone, option.impratio = (
+            mj.mjtCone.mjCONE_ELLIPTIC,
+            10.0,
+        )  # what is held by friction hardly creeps
         spec.compiler.degree = False
         self._bodies(servos)
         if before is not None:
@@ -130,7 +147,9 @@ class Builder:
         for coordinate, value in latches:
             self._fixed(coordinate, value)
         if self.world.scene.robot.base == "fixed":
-            for coordinate, value in zip(self.world.coordinates.names[:3], self.world.start[:3], strict=True):
+            for coordinate, value in zip(
+                self.world.coordinates.names[:3], self.world.start[:3], strict=True
+            ):
                 self._fixed(coordinate, float(value), active=True)
         for servo in servos:
             servo.add_to(self.spec, self.mj)
@@ -142,9 +161,14 @@ class Builder:
             model = spec.compile()
         except ValueError as error:
             raise InputError("MuJoCo refuses the scene", field="scene", got=str(error)) from error
-        bodies = np.array([0, *(int(model.body(f"body {j}").id) for j in range(1, self.world.model.njoints))])
+        bodies = np.array(
+            [0, *(int(model.body(f"body {j}").id) for j in range(1, self.world.model.njoints))]
+        )
         geoms = np.array([int(model.geom(f"shape {k}").id) for k in range(len(self.world.shapes))])
-        columns = {hold: np.array([model.joint(k).qposadr[0] for k in own], int) for hold, own in self._carried.items()}
+        columns = {
+            hold: np.array([model.joint(k).qposadr[0] for k in own], int)
+            for hold, own in self._carried.items()
+        }
         return PhysicalWorld(self.world, model, bodies, geoms, *self._addresses(model), columns)
 
     def _bodies(self, servos: Sequence[Servo]) -> None:
@@ -154,17 +178,26 @@ class Builder:
         pin.forwardKinematics(tree, data, pin.neutral(tree))
         self.bodies = [self.spec.worldbody]
         names: dict[int, list[str]] = {}
-        for name, joint in zip(self.world.coordinates.names, self.world.coordinates.joints, strict=True):
+        for name, joint in zip(
+            self.world.coordinates.names, self.world.coordinates.joints, strict=True
+        ):
             names.setdefault(joint, []).append(name)
         follows = {move.joint: move for move in self.world.coordinates.followers}
-        names |= {joint: [self.world.coordinates.names[move.coordinate]] for joint, move in follows.items()}
+        names |= {
+            joint: [self.world.coordinates.names[move.coordinate]]
+            for joint, move in follows.items()
+        }
         for j in range(1, tree.njoints):
             place = tree.jointPlacements[j]
-            body = self.bodies[tree.parents[j]].add_body(name=f"body {j}", pos=place.translation, quat=quaternion(place))
+            body = self.bodies[tree.parents[j]].add_body(
+                name=f"body {j}", pos=place.translation, quat=quaternion(place)
+            )
             inertia = tree.inertias[j]
             body.mass, body.ipos, body.explicitinertial = inertia.mass, inertia.lever, True
             body.fullinertia = np.asarray(inertia.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-            body.gravcomp = float(names[j][0] in driven or self._balanced(j))  # controllers of arms carry what these weigh
+            body.gravcomp = float(
+                names[j][0] in driven or self._balanced(j)
+            )  # controllers of arms carry what these weigh
             self.bodies.append(body)
             axes = np.asarray(data.joints[j].S).reshape(6, -1)
             if j in follows:  # Pinocchio's axis is for a unit of what leads it
@@ -172,7 +205,9 @@ class Builder:
             else:
                 self._joints(body, j, names[j], axes, driven)
 
-    def _joints(self, body: Any, j: int, names: Sequence[str], axes: Floats, driven: Mapping[str, Servo]) -> None:
+    def _joints(
+        self, body: Any, j: int, names: Sequence[str], axes: Floats, driven: Mapping[str, Servo]
+    ) -> None:
         """Add what moves a body."""
         tree = self.world.model
         if tree.joints[j].shortname() == "JointModelFreeFlyer":
@@ -189,7 +224,10 @@ class Builder:
             usual = self.physics.prismatic_damping if slides else self.physics.revolute_damping
             joint.damping[0], joint.frictionloss = stated.damping or usual, stated.friction
             joint.stiffness[0], joint.springref = stated.stiffness, stated.springref
-            lower, upper = self.world.coordinates.lower[column], self.world.coordinates.upper[column]
+            lower, upper = (
+                self.world.coordinates.lower[column],
+                self.world.coordinates.upper[column],
+            )
             if np.isfinite([lower, upper]).all():
                 joint.limited, joint.range = self.mj.mjtLimited.mjLIMITED_TRUE, [lower, upper]
 
@@ -197,7 +235,9 @@ class Builder:
         """Add a joint along or about an axis, of a twist, shape (6,); return it, and whether it slides."""
         kind, slides = self.mj.mjtJoint, bool(np.linalg.norm(twist[:3]) > 0.5)
         axis = twist[:3] if slides else twist[3:]
-        return body.add_joint(name=name, axis=axis, type=kind.mjJNT_SLIDE if slides else kind.mjJNT_HINGE), slides
+        return body.add_joint(
+            name=name, axis=axis, type=kind.mjJNT_SLIDE if slides else kind.mjJNT_HINGE
+        ), slides
 
     def _balanced(self, joint: int) -> bool:
         """Return whether springs carry what a joint of an object carries."""
@@ -210,7 +250,12 @@ class Builder:
             body, place = self.moved.get(number, (self.bodies[shape.parentJoint], shape.placement))
             geom = self.geom(body, f"shape {number}", shape.geometry, place)
             geom.contype, geom.conaffinity = int(pairs.types[number]), int(pairs.affinities[number])
-            geom.friction[0], geom.condim, geom.solref, geom.group = self.physics.friction, 4, _CONTACT, 3
+            geom.friction[0], geom.condim, geom.solref, geom.group = (
+                self.physics.friction,
+                4,
+                _CONTACT,
+                3,
+            )
             geom.rgba = [*np.asarray(shape.meshColor)[:3], 1.0]
         for first, second in pairs.always.tolist():
             pair = self.spec.add_pair(geomname1=f"shape {first}", geomname2=f"shape {second}")
@@ -218,15 +263,28 @@ class Builder:
             if self.gripping:
                 pair.solreffriction = [2.0 * self.physics.timestep, 1.0]
 
-    def geom(self, body: Any, name: str, shape: coal.CollisionGeometry, place: pin.SE3, *, thin: bool = False) -> Any:
+    def geom(
+        self,
+        body: Any,
+        name: str,
+        shape: coal.CollisionGeometry,
+        place: pin.SE3,
+        *,
+        thin: bool = False,
+    ) -> Any:
         """Add a shape to a body; a `thin` one may have no volume."""
-        kinds, where = self.mj.mjtGeom, {"name": name, "pos": place.translation, "quat": quaternion(place)}
+        kinds, where = (
+            self.mj.mjtGeom,
+            {"name": name, "pos": place.translation, "quat": quaternion(place)},
+        )
         if isinstance(shape, coal.Box):
             return body.add_geom(type=kinds.mjGEOM_BOX, size=shape.halfSide, **where)
         if isinstance(shape, coal.Sphere):
             return body.add_geom(type=kinds.mjGEOM_SPHERE, size=[shape.radius, 0.0, 0.0], **where)
         if isinstance(shape, coal.Cylinder | coal.Capsule):
-            kind = kinds.mjGEOM_CYLINDER if isinstance(shape, coal.Cylinder) else kinds.mjGEOM_CAPSULE
+            kind = (
+                kinds.mjGEOM_CYLINDER if isinstance(shape, coal.Cylinder) else kinds.mjGEOM_CAPSULE
+            )
             return body.add_geom(type=kind, size=[shape.radius, shape.halfLength, 0.0], **where)
         if isinstance(shape, coal.Ellipsoid):
             return body.add_geom(type=kinds.mjGEOM_ELLIPSOID, size=shape.radii, **where)
@@ -249,7 +307,9 @@ class Builder:
         held, place = self.frame(f"{hold.object}.{attachment.link}")
         if not moves_as_one(scene, hold):
             held = self._carrier(hold, held, place * attachment.placement)
-        weld = self.spec.add_equality(type=self.mj.mjtEq.mjEQ_WELD, objtype=self.mj.mjtObj.mjOBJ_BODY, active=False)
+        weld = self.spec.add_equality(
+            type=self.mj.mjtEq.mjEQ_WELD, objtype=self.mj.mjtObj.mjOBJ_BODY, active=False
+        )
         weld.name1, weld.name2, weld.data[10] = holder.name, held.name, 1.0
         weld.solref = [2.0 * self.physics.timestep, 1.0]  # as hard as can be integrated
 
@@ -257,11 +317,21 @@ class Builder:
         attachment = self.world.scene.objects[hold.object].object.attachment(hold.attachment)
         name = f"carrier {len(self._carried)}"
         body = link.add_body(name=name, pos=place.translation, quat=quaternion(place), gravcomp=1.0)
-        body.mass, body.inertia, body.explicitinertial = _CARRIER_MASS, np.full(3, _CARRIER_INERTIA), True
+        body.mass, body.inertia, body.explicitinertial = (
+            _CARRIER_MASS,
+            np.full(3, _CARRIER_INERTIA),
+            True,
+        )
         joints = self._carried[hold] = []
         for k, freedom in enumerate(attachment.freedoms):
-            kind = self.mj.mjtJoint.mjJNT_HINGE if freedom.kind == "revolute" else self.mj.mjtJoint.mjJNT_SLIDE
-            joint = body.add_joint(name=f"{name} {k}", type=kind, axis=freedom.axis, pos=freedom.through)
+            kind = (
+                self.mj.mjtJoint.mjJNT_HINGE
+                if freedom.kind == "revolute"
+                else self.mj.mjtJoint.mjJNT_SLIDE
+            )
+            joint = body.add_joint(
+                name=f"{name} {k}", type=kind, axis=freedom.axis, pos=freedom.through
+            )
             joint.damping[0] = _CARRIER_DAMPING
             joints.append(joint.name)
         return body
@@ -276,13 +346,18 @@ class Builder:
     def _follow(self, move: Moved) -> None:
         """Add an equality that holds a joint where the one that it follows has it."""
         equality = self._fixed(str(self.world.model.names[move.joint]), move.offset, active=True)
-        equality.name2, equality.data[1] = self.world.coordinates.names[move.coordinate], move.factor
+        equality.name2, equality.data[1] = (
+            self.world.coordinates.names[move.coordinate],
+            move.factor,
+        )
         equality.solref = [2.0 * self.physics.timestep, 1.0]  # as hard as can be integrated
 
     def _addresses(self, model: Any) -> tuple[Ints, Ints]:
         """Return where the coordinates of the world are in MuJoCo's positions and velocities."""
         columns, dofs, done, tree = list[int](), list[int](), set[int](), self.world.model
-        for name, j in zip(self.world.coordinates.names, self.world.coordinates.joints, strict=True):
+        for name, j in zip(
+            self.world.coordinates.names, self.world.coordinates.joints, strict=True
+        ):
             if tree.joints[j].shortname() != "JointModelFreeFlyer":
                 joint = model.joint(name)
                 columns.append(int(joint.qposadr[0]))
@@ -290,7 +365,9 @@ class Builder:
             elif j not in done:
                 done.add(j)
                 first = int(model.joint(str(tree.names[j])).qposadr[0])
-                columns += [first + k for k in (0, 1, 2, 4, 5, 6, 3)]  # MuJoCo's quaternions begin with w
+                columns += [
+                    first + k for k in (0, 1, 2, 4, 5, 6, 3)
+                ]  # MuJoCo's quaternions begin with w
                 dofs += [-1] * 7
         return np.array(columns), np.array(dofs)
 

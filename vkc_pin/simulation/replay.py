@@ -55,16 +55,24 @@ class Replay(World):
         self._times, self._rows = times, rows.copy()
         for name in (name for name, placed in scene.objects.items() if placed.object.free):
             turns = self._rows[:, self.placement_columns(name)][:, 3:]
-            signs = np.cumprod(np.concatenate([[1.0], np.where(np.einsum("kc,kc->k", turns[1:], turns[:-1]) < 0.0, -1.0, 1.0)]))
+            signs = np.cumprod(
+                np.concatenate(
+                    [[1.0], np.where(np.einsum("kc,kc->k", turns[1:], turns[:-1]) < 0.0, -1.0, 1.0)]
+                )
+            )
             self._rows[:, self.placement_columns(name)][:, 3:] *= signs[:, None]
 
-    def positions(self, trajectory: Trajectory, times: Any = None, free: FreeObjects | None = None) -> Floats:
+    def positions(
+        self, trajectory: Trajectory, times: Any = None, free: FreeObjects | None = None
+    ) -> Floats:
         """Return where everything was at times [s], shape (K,); see `World.positions`."""
         moments = trajectory.times if times is None else np.asarray(times, float)
         return np.column_stack([np.interp(moments, self._times, column) for column in self._rows.T])
 
 
-def page(executed: Executed, path: str | Path, *, headline: str, notes: Sequence[tuple[str, float]] = ()) -> Path:
+def page(
+    executed: Executed, path: str | Path, *, headline: str, notes: Sequence[tuple[str, float]] = ()
+) -> Path:
     """Write one self-contained web page: what happened, and what was planned as a translucent ghost; return its path.
 
     Args:
@@ -83,13 +91,19 @@ def page(executed: Executed, path: str | Path, *, headline: str, notes: Sequence
     world, recorder = Replay(executed.scene, times, executed.rows), Recorder()
     beside = sample_motion(World(executed.scene), executed.planned, moments)
     viewer = meshcat.Visualizer(window=recorder)
-    Drawing(viewer, executed.scene, executed.trajectory, world=world, times=moments, beside=beside).draw(play=False)
+    Drawing(
+        viewer, executed.scene, executed.trajectory, world=world, times=moments, beside=beside
+    ).draw(play=False)
     begin = float(times[0])
     film = {
         "duration": float(times[-1]) - begin,
-        "phases": [{"name": phase.name, "last": float(times[phase.last]) - begin} for phase in phases],
+        "phases": [
+            {"name": phase.name, "last": float(times[phase.last]) - begin} for phase in phases
+        ],
         "notes": [{"text": text, "time": time - begin} for text, time in notes],
         "headline": f"{headline} (translucent: as planned)",
         "ghosts": False,
     }
-    return write_atomically(path, render_page(recorder, title=f"{headline} – vkc_pin", film=film).encode("utf-8"))
+    return write_atomically(
+        path, render_page(recorder, title=f"{headline} – vkc_pin", film=film).encode("utf-8")
+    )

@@ -38,7 +38,8 @@ class Tracking:
     """How well the servos follow, and with what force.
 
     Attributes:
-        arm: Largest and root mean square error of an arm's joint [rad]; of sliding ones [m] at a metre a radian.
+        arm: Largest and root mean square error of an arm's joint [rad]; of sliding ones [m] at a
+            metre a radian.
         base: The same of the base's position on the floor [m].
         heading: The same of its heading [rad].
         worst: The joint of the arm's largest error, and when that was [s].
@@ -54,11 +55,15 @@ class Tracking:
     shares: dict[str, float]
 
     @classmethod
-    def of(cls, times: Floats, errors: Floats, efforts: Floats, servos: Sequence[Servo], size: int) -> Tracking:
+    def of(
+        cls, times: Floats, errors: Floats, efforts: Floats, servos: Sequence[Servo], size: int
+    ) -> Tracking:
         """Return it of errors and efforts at times, shape (K, servos) each; what comes after `size` coordinates are fingers."""
 
         def both(values: Floats) -> tuple[float, float]:
-            return float(np.abs(values).max(initial=0.0)), float(np.sqrt(np.mean(np.square(values)))) if values.size else 0.0
+            return float(np.abs(values).max(initial=0.0)), float(
+                np.sqrt(np.mean(np.square(values)))
+            ) if values.size else 0.0
 
         names = [servo.coordinate for servo in servos]
         peaks = np.abs(efforts).max(axis=0)
@@ -70,7 +75,11 @@ class Tracking:
             heading=both(errors[:, 2]),
             worst=(names[3 + int(at[1])] if arm.size else "", float(times[int(at[0])])),
             efforts=dict(zip(names, peaks.tolist(), strict=True)),
-            shares={s.coordinate: float(p / s.limit) for s, p in zip(servos, peaks, strict=True) if np.isfinite(s.limit)},
+            shares={
+                s.coordinate: float(p / s.limit)
+                for s, p in zip(servos, peaks, strict=True)
+                if np.isfinite(s.limit)
+            },
         )
 
 
@@ -82,8 +91,10 @@ class SimulationResult:
         scene: Where it happened.
         steps: What was asked for.
         planned: The motion that was followed.
-        trajectory: The motion that came of it, every 20 ms, with the same coordinates; freedoms of grasps as planned.
-        rows: The same of everything, carried objects with their placements, shape (K, n); see `world.trajectory.world_model.World`.
+        trajectory: The motion that came of it, every 20 ms, with the same coordinates; freedoms of
+            grasps as planned.
+        rows: The same of everything, carried objects with their placements, shape (K, n); see
+            `world.trajectory.world_model.World`.
         misses: How far everything that was asked for is from where it should be.
         tracking: How well the servos follow.
         grips: What was held, and how hard it pulled.
@@ -118,10 +129,16 @@ class SimulationResult:
 
     def problems(self) -> list[str]:
         """Return what went wrong, a line each."""
-        found = [] if self.diverged is None else [f"the computation broke down at {self.diverged:.2f} s"]
+        found = (
+            []
+            if self.diverged is None
+            else [f"the computation broke down at {self.diverged:.2f} s"]
+        )
         found += [str(miss) for miss in self.misses if miss.amount > GOAL[miss.unit]]
         found += [
-            f"{grip.what} was pulled out of the hand at {grip.broken:.2f} s" for grip in self.grips if grip.broken is not None
+            f"{grip.what} was pulled out of the hand at {grip.broken:.2f} s"
+            for grip in self.grips
+            if grip.broken is not None
         ]
         return found + [str(contact) for contact in self.contacts if contact.depth > DEPTH]
 
@@ -131,25 +148,36 @@ class SimulationResult:
         head = "ok" if self.ok else f"FAILED, {len(problems)} problem(s)"
         degrees = [np.degrees(value) for value in (*t.arm, *t.heading)]
         lines = [
-            f"{self.scene.name} in physics: {head} — " + ", ".join(phase.name for phase in self.planned.phases),
+            f"{self.scene.name} in physics: {head} — "
+            + ", ".join(phase.name for phase in self.planned.phases),
             *(f"  goal        {miss}" for miss in self.misses),
             f"  tracking    arm within {degrees[0]:.2f}° ({degrees[1]:.3f}° rms; worst {t.worst[0]} at {t.worst[1]:.2f} s), "
             f"base within {1e3 * t.base[0]:.1f} mm ({1e3 * t.base[1]:.2f} mm rms), heading within {degrees[2]:.2f}°",
         ]
         for grip in self.grips:
-            broken = "" if grip.broken is None else f", PULLED OUT OF THE HAND at {grip.broken:.2f} s"
+            broken = (
+                "" if grip.broken is None else f", PULLED OUT OF THE HAND at {grip.broken:.2f} s"
+            )
             force = f"{grip.force:.0f} N and {grip.torque:.1f} N·m at most"
             slip = f", slips by {1e3 * grip.slip:.1f} mm" if grip.slip else ""
-            lines.append(f"  grasp       {grip.what}, {grip.begin:.1f} to {grip.end:.1f} s: {force}{slip}{broken}")
+            lines.append(
+                f"  grasp       {grip.what}, {grip.begin:.1f} to {grip.end:.1f} s: {force}{slip}{broken}"
+            )
         shares = sorted(t.shares.items(), key=lambda item: -item[1])
         if shares:
             told = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in shares[:_TOLD])
             lines.append(f"  motors      at most {told} of their limits")
         lines.append(
-            f"  contacts    {len(self.contacts)} that the plan does not have" if self.contacts else "  contacts    as planned"
+            f"  contacts    {len(self.contacts)} that the plan does not have"
+            if self.contacts
+            else "  contacts    as planned"
         )
         lines += [f"  - {contact}" for contact in self.contacts[:_LISTED]]
-        lines += [f"  ... and {len(self.contacts) - _LISTED} more"] if len(self.contacts) > _LISTED else []
+        lines += (
+            [f"  ... and {len(self.contacts) - _LISTED} more"]
+            if len(self.contacts) > _LISTED
+            else []
+        )
         lines += [f"  note        {note}" for note in self.notes]
         lines += [f"  because     {problem}" for problem in problems]
         return "\n".join(lines)
@@ -178,8 +206,17 @@ class SimulationResult:
     def to_html(self, path: str | Path) -> Path:
         """Write one self-contained page with what happened, and what was planned as a ghost beside it; return its path."""
         notes = [(str(contact), contact.time) for contact in self.contacts if contact.depth > DEPTH]
-        notes += [(f"{grip.what} is pulled out of the hand", grip.broken) for grip in self.grips if grip.broken is not None]
-        return page(self, path, headline=f"{self.scene.name} in physics: {'ok' if self.ok else 'FAILED'}", notes=notes)
+        notes += [
+            (f"{grip.what} is pulled out of the hand", grip.broken)
+            for grip in self.grips
+            if grip.broken is not None
+        ]
+        return page(
+            self,
+            path,
+            headline=f"{self.scene.name} in physics: {'ok' if self.ok else 'FAILED'}",
+            notes=notes,
+        )
 
     def plot(self, path: str | Path, *, count: int = 6) -> Path:
         """Write a picture (.png) of `count` snapshots; return its path. See `snapshots.strip`."""

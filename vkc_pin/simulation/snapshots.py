@@ -64,8 +64,13 @@ class Stage:
         shapes, robot = len(self._world.shapes), executed.scene.robot
         weigh(self._world, Physics())
         none = Pairs(np.zeros((0, 2), int), np.zeros(shapes, int), np.zeros(shapes, int), {}, ())
-        count = len(executed.scene.start) + (0 if robot.gripper is None else len(robot.gripper.names))
-        servos = [Servo(name, 1.0, 1.0, 1.0, 0.0, np.inf) for name in self._world.coordinates.names[:count]]
+        count = len(executed.scene.start) + (
+            0 if robot.gripper is None else len(robot.gripper.names)
+        )
+        servos = [
+            Servo(name, 1.0, 1.0, 1.0, 0.0, np.inf)
+            for name in self._world.coordinates.names[:count]
+        ]
 
         def dressed(builder: Builder) -> None:
             _dress(builder, size, veil)
@@ -83,8 +88,14 @@ class Stage:
     def drawn(self) -> Iterator[tuple[int, str, bool]]:
         """What can be seen: a geom, the link or obstacle that it belongs to, and whether that is the robot's."""
         world, model = self._world, self.model
-        for number, (shape, label) in enumerate(zip(world.visual.geometryObjects, world.visual_labels, strict=True)):
-            yield int(model.geom(f"seen {number}").id), label, shape.parentJoint > 0 and "." not in label
+        for number, (shape, label) in enumerate(
+            zip(world.visual.geometryObjects, world.visual_labels, strict=True)
+        ):
+            yield (
+                int(model.geom(f"seen {number}").id),
+                label,
+                shape.parentJoint > 0 and "." not in label,
+            )
         for number, label in enumerate(world.collision_labels):
             if label == FLOOR:
                 yield int(model.geom(f"shape {number}").id), label, False
@@ -97,7 +108,9 @@ class Stage:
         """Return MuJoCo's configuration of coordinates of the world, shape (n,)."""
         return self._physical.qpos(row)
 
-    def pictures(self, times: Floats, viewpoint: tuple[Floats, Floats]) -> Iterator[NDArray[np.uint8]]:
+    def pictures(
+        self, times: Floats, viewpoint: tuple[Floats, Floats]
+    ) -> Iterator[NDArray[np.uint8]]:
         """Yield a picture of what was at each of some times [s], shape (K,): shape (height, width, 3).
 
         Args:
@@ -116,12 +129,17 @@ class Stage:
         camera.elevation = float(np.degrees(np.arcsin(ahead[2] / camera.distance)))
         window = mj.MjrRect(0, 0, *_SIZE)
         with drawing_context(_SIZE):
-            stage, render = mj.MjvScene(model, maxgeom=20_000), mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100)
+            stage, render = (
+                mj.MjvScene(model, maxgeom=20_000),
+                mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100),
+            )
             mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN, render)
             for row in self.rows(times):
                 data.qpos[:] = self.qpos(row)
                 mj.mj_forward(model, data)
-                mj.mjv_updateScene(model, data, option, mj.MjvPerturb(), camera, mj.mjtCatBit.mjCAT_ALL, stage)
+                mj.mjv_updateScene(
+                    model, data, option, mj.MjvPerturb(), camera, mj.mjtCatBit.mjCAT_ALL, stage
+                )
                 mj.mjr_render(window, stage, render)
                 pixels = np.zeros((_SIZE[1], _SIZE[0], 3), np.uint8)
                 mj.mjr_readPixels(pixels, None, window, render)
@@ -137,7 +155,9 @@ class Stage:
 
         viewer, executed = meshcat.Visualizer(window=Recorder()), self._executed
         times = np.linspace(executed.trajectory.times[0], executed.trajectory.times[-1], 60)
-        return Drawing(viewer, executed.scene, executed.trajectory, world=self._world, times=times).viewpoint()
+        return Drawing(
+            viewer, executed.scene, executed.trajectory, world=self._world, times=times
+        ).viewpoint()
 
 
 def strip(executed: Executed, path: str | Path, *, count: int = 6) -> Path:
@@ -173,7 +193,14 @@ def strip(executed: Executed, path: str | Path, *, count: int = 6) -> Path:
         axes = figure.add_subplot(rows, columns, number)
         axes.imshow(picture)
         axes.set_axis_off()
-        phase = next((p.name for p in executed.planned.phases if time <= executed.planned.times[p.last] + 1e-9), "")
+        phase = next(
+            (
+                p.name
+                for p in executed.planned.phases
+                if time <= executed.planned.times[p.last] + 1e-9
+            ),
+            "",
+        )
         axes.set_title(f"{time:.1f} s – {phase}", fontsize=10)
     data = io.BytesIO()
     figure.savefig(data, format="png")
@@ -195,17 +222,34 @@ def film(executed: Executed, path: str | Path, *, rate: float = 25.0) -> Path:
         InputError: `rate` is out of range, or there is no ffmpeg.
         VkcError: There is no OpenGL without a screen, or ffmpeg refuses.
     """
-    rate, encoder = arguments.number(rate, "rate", "pictures a second", low=1.0, high=_FASTEST), _ffmpeg()
+    rate, encoder = (
+        arguments.number(rate, "rate", "pictures a second", low=1.0, high=_FASTEST),
+        _ffmpeg(),
+    )
     times = np.arange(executed.trajectory.times[0], executed.trajectory.times[-1], 1.0 / rate)
     stage, size = Stage(executed), "x".join(map(str, _SIZE))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "film.mp4")
         taken = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(rate), "-i", "-"]
-        command = [encoder, "-loglevel", "error", *taken, "-c:v", "libx264", "-pix_fmt", "yuv420p", str(file)]
-        pictures = b"".join(picture.tobytes() for picture in stage.pictures(times, stage.viewpoint()))
+        command = [
+            encoder,
+            "-loglevel",
+            "error",
+            *taken,
+            "-c:v",
+            "libx264",
+            "-pix_fmt",
+            "yuv420p",
+            str(file),
+        ]
+        pictures = b"".join(
+            picture.tobytes() for picture in stage.pictures(times, stage.viewpoint())
+        )
         done = subprocess.run(command, input=pictures, capture_output=True, check=False)
         if done.returncode:
-            raise VkcError(f"ffmpeg writes no video: {done.stderr.decode(errors='replace').strip()}")
+            raise VkcError(
+                f"ffmpeg writes no video: {done.stderr.decode(errors='replace').strip()}"
+            )
         return write_atomically(path, file.read_bytes())
 
 
@@ -216,14 +260,22 @@ def _ffmpeg() -> str:
     try:
         return str(importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe())
     except (ImportError, RuntimeError) as error:
-        raise InputError("videos need ffmpeg", expected="ffmpeg, or pip install imageio-ffmpeg", got="neither") from error
+        raise InputError(
+            "videos need ffmpeg", expected="ffmpeg, or pip install imageio-ffmpeg", got="neither"
+        ) from error
 
 
 def _dress(builder: Builder, size: tuple[int, int], veil: float) -> None:
     """Add what is seen: visual meshes instead of collision shapes, walls that may be looked through, light and sky."""
     mj, spec, world = builder.mj, builder.spec, builder.world
     for number, shape in enumerate(world.visual.geometryObjects):
-        geom = builder.geom(builder.bodies[shape.parentJoint], f"seen {number}", shape.geometry, shape.placement, thin=True)
+        geom = builder.geom(
+            builder.bodies[shape.parentJoint],
+            f"seen {number}",
+            shape.geometry,
+            shape.placement,
+            thin=True,
+        )
         geom.contype = geom.conaffinity = 0
         geom.density, geom.group, geom.rgba = 0.0, _SEEN, np.asarray(shape.meshColor)
         if shape.parentJoint == 0 and is_wall(shape):
@@ -233,10 +285,21 @@ def _dress(builder: Builder, size: tuple[int, int], veil: float) -> None:
             spec.geom(f"shape {number}").group = _SEEN
     look = spec.visual
     look.global_.offwidth, look.global_.offheight, look.global_.fovy = *size, FIELD_OF_VIEW
-    look.headlight.ambient, look.headlight.diffuse, look.headlight.specular = [0.45] * 3, [0.35] * 3, [0.0] * 3
+    look.headlight.ambient, look.headlight.diffuse, look.headlight.specular = (
+        [0.45] * 3,
+        [0.35] * 3,
+        [0.0] * 3,
+    )
     sun = mj.mjtLightType.mjLIGHT_DIRECTIONAL
-    spec.worldbody.add_light(type=sun, dir=[0.1, 0.15, -1.0], pos=[0.0, 0.0, 6.0], diffuse=[0.5] * 3)
-    sky = {"type": mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT, "width": 64, "height": 384}
+    spec.worldbody.add_light(
+        type=sun, dir=[0.1, 0.15, -1.0], pos=[0.0, 0.0, 6.0], diffuse=[0.5] * 3
+    )
+    sky = {
+        "type": mj.mjtTexture.mjTEXTURE_SKYBOX,
+        "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT,
+        "width": 64,
+        "height": 384,
+    }
     spec.add_texture(name="sky", rgb1=[0.93, 0.95, 0.97], rgb2=[0.99, 0.99, 0.99], **sky)
 
 
@@ -256,7 +319,9 @@ def drawing_context(size: tuple[int, int]) -> Iterator[None]:
         except Exception as error:  # whatever a driver that is not there comes up with
             tried.append(f"{name}: {error}")
     else:
-        raise VkcError(f"nothing can be drawn without a screen; MuJoCo needs EGL or OSMesa ({'; '.join(tried)})")
+        raise VkcError(
+            f"nothing can be drawn without a screen; MuJoCo needs EGL or OSMesa ({'; '.join(tried)})"
+        )
     try:
         yield
     finally:

@@ -94,7 +94,12 @@ class Grips:
         touching: Collection[Hold] = (),
     ) -> None:
         self._touching = touching
-        self.physical, self.holds, self.schedule, self.pairs = physical, list(holds), list(schedule), pairs
+        self.physical, self.holds, self.schedule, self.pairs = (
+            physical,
+            list(holds),
+            list(schedule),
+            pairs,
+        )
         self.trajectory, self.physics, self._engine = trajectory, physics, engine()
         self.grips: list[Grip] = []
         self._active: dict[Hold, tuple[int, float]] = {}  # which of the grips, and when it ends
@@ -109,9 +114,14 @@ class Grips:
         while self.schedule and self.schedule[0][1] <= clock:
             hold, begin, end = self.schedule.pop(0)
             self._take(data, hold, clock)
-            self._active[hold], self._forces[hold] = (len(self.grips), end), deque(maxlen=self._length)
+            self._active[hold], self._forces[hold] = (
+                (len(self.grips), end),
+                deque(maxlen=self._length),
+            )
             times = self.trajectory.times
-            self.grips.append(Grip(str(hold), max(begin, float(times[0])), min(end, float(times[-1]))))
+            self.grips.append(
+                Grip(str(hold), max(begin, float(times[0])), min(end, float(times[-1])))
+            )
 
     def holding(self, hold: Hold) -> bool:
         """Return whether something is held now."""
@@ -125,14 +135,22 @@ class Grips:
         for hold, (number, _) in list(self._active.items()):
             rows = np.flatnonzero((kinds == self._equality) & (owners == self.holds.index(hold)))
             forces = self._forces[hold]
-            forces.append(np.asarray(data.efc_force)[rows] * [1.0, 1.0, 1.0, 0.5, 0.5, 0.5])  # of half angles, as quaternions are
+            forces.append(
+                np.asarray(data.efc_force)[rows] * [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
+            )  # of half angles, as quaternions are
             if len(forces) < self._length:
                 continue
             mean = np.mean(forces, axis=0)
             force, torque = float(np.linalg.norm(mean[:3])), float(np.linalg.norm(mean[3:]))
             grip = self.grips[number]
-            broken = clock if force > self.physics.grasp_force or torque > self.physics.grasp_torque else None
-            if clock >= grip.begin or broken is not None:  # before, the servos take up what is in the hand at the start
+            broken = (
+                clock
+                if force > self.physics.grasp_force or torque > self.physics.grasp_torque
+                else None
+            )
+            if (
+                clock >= grip.begin or broken is not None
+            ):  # before, the servos take up what is in the hand at the start
                 grip = replace(grip, force=max(force, grip.force), torque=max(torque, grip.torque))
             self.grips[number] = replace(grip, broken=broken)
             if broken is not None:
@@ -173,17 +191,28 @@ class Grips:
 
     def _freedoms(self, hold: Hold, clock: float) -> Floats:
         """Return where the plan has the freedoms of a grasp."""
-        names = self.physical.world.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
+        names = (
+            self.physical.world.scene.objects[hold.object]
+            .object.attachment(hold.attachment)
+            .coordinates
+        )
         values = dict(zip(self.trajectory.names, self.trajectory.at(clock).tolist(), strict=True))
         start = dict(zip(names, hold.at, strict=False))
-        return np.array([values.get(f"{hold.object}.{name}", start.get(name, 0.0)) for name in names])
+        return np.array(
+            [values.get(f"{hold.object}.{name}", start.get(name, 0.0)) for name in names]
+        )
 
     def _tool(self, data: Any, hold: Hold) -> Floats:
         """Return where what holds takes hold, in the world [m]."""
         tree = self.physical.world.model
-        frame = tree.frames[tree.getFrameId(hold.frame or self.physical.world.scene.robot.tool_frame)]
+        frame = tree.frames[
+            tree.getFrameId(hold.frame or self.physical.world.scene.robot.tool_frame)
+        ]
         body = self.physical.bodies[frame.parentJoint]
-        return np.asarray(data.xpos[body] + np.asarray(data.xmat[body]).reshape(3, 3) @ frame.placement.translation)
+        return np.asarray(
+            data.xpos[body]
+            + np.asarray(data.xmat[body]).reshape(3, 3) @ frame.placement.translation
+        )
 
 
 def latched(scene: Scene) -> list[tuple[str, float, str, float]]:
@@ -206,11 +235,18 @@ class Latches:
     """
 
     def __init__(
-        self, physical: PhysicalWorld, latches: Sequence[tuple[str, float, str, float]], first: int, physics: Physics
+        self,
+        physical: PhysicalWorld,
+        latches: Sequence[tuple[str, float, str, float]],
+        first: int,
+        physics: Physics,
     ) -> None:
-        columns: Mapping[str, int] = dict(zip(physical.world.coordinates.names, physical.columns.tolist(), strict=True))
+        columns: Mapping[str, int] = dict(
+            zip(physical.world.coordinates.names, physical.columns.tolist(), strict=True)
+        )
         self._latches = [
-            (columns[joint], at, columns[by], threshold - physics.latch_play) for joint, at, by, threshold in latches
+            (columns[joint], at, columns[by], threshold - physics.latch_play)
+            for joint, at, by, threshold in latches
         ]
         self._first = first
 

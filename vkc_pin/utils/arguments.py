@@ -1,7 +1,8 @@
 """Checks of what callers hand over: what is not of the right kind becomes an `InputError` that names the argument.
 
-Everything public looks at its arguments with these before it uses them. They ask for the kind of a value first, and
-nothing of a value of another kind: what it would answer to `len`, `float` or a comparison is anybody's guess.
+Everything public looks at its arguments with these before it uses them. They ask for the kind of a
+value first, and nothing of a value of another kind: what it would answer to `len`, `float` or a
+comparison is anybody's guess.
 """
 
 from __future__ import annotations
@@ -90,13 +91,23 @@ def quantity(value: Any, field: str) -> float:
 
 def whole(value: Any, field: str, *, low: int, high: int = 2**63 - 1) -> int:
     """Return a whole number from `low` to `high`. Raises `InputError` if it is none."""
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not low <= value <= high:
-        expected = f"a whole number of at least {low}" if high == 2**63 - 1 else f"a whole number from {low} to {high}"
+    if (
+        not isinstance(value, int | np.integer)
+        or isinstance(value, bool)
+        or not low <= value <= high
+    ):
+        expected = (
+            f"a whole number of at least {low}"
+            if high == 2**63 - 1
+            else f"a whole number from {low} to {high}"
+        )
         raise InputError("out of range", field=field, expected=expected, got=shown(value))
     return int(value)
 
 
-def numbers(value: Any, field: str, expected: str = "an array of numbers", *, problem: str = "not numbers") -> Floats:
+def numbers(
+    value: Any, field: str, expected: str = "an array of numbers", *, problem: str = "not numbers"
+) -> Floats:
     """Return a copy of an array of numbers, of any shape and not looked at further.
 
     Args:
@@ -110,7 +121,12 @@ def numbers(value: Any, field: str, expected: str = "an array of numbers", *, pr
     """
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError, OverflowError, RecursionError):  # lists of unequal lengths, or too deep
+    except (
+        TypeError,
+        ValueError,
+        OverflowError,
+        RecursionError,
+    ):  # lists of unequal lengths, or too deep
         raise InputError(problem, field=field, expected=expected, got=shown(value)) from None
     if array.dtype.kind not in "iuf" and array.size:
         raise InputError(problem, field=field, expected=expected, got=shown(value))
@@ -127,7 +143,13 @@ def finite(value: Any, field: str, file: str | Path | None = None) -> Floats:
     if not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
         got = array[tuple(where)]
-        raise InputError("not finite", file=file, field=f"{field}{where or ''}", expected="finite numbers", got=got)
+        raise InputError(
+            "not finite",
+            file=file,
+            field=f"{field}{where or ''}",
+            expected="finite numbers",
+            got=got,
+        )
     return array
 
 
@@ -150,7 +172,9 @@ def _utf8(value: str) -> bool:
 def flag(value: Any, field: str) -> bool:
     """Return True or False. Raises `InputError` if it is neither."""
     if not isinstance(value, bool | np.bool_):
-        raise InputError("neither true nor false", field=field, expected="True or False", got=shown(value))
+        raise InputError(
+            "neither true nor false", field=field, expected="True or False", got=shown(value)
+        )
     return bool(value)
 
 
@@ -167,22 +191,38 @@ def known(value: Any, choices: Collection[str], kind: str, field: str | None = N
     return name
 
 
-def instance(value: Any, kind: type[T] | tuple[type[T], ...], field: str, expected: str | None = None) -> T:
+def instance(
+    value: Any, kind: type[T] | tuple[type[T], ...], field: str, expected: str | None = None
+) -> T:
     """Return a value that is of some kind. Raises `InputError` if it is not."""
     if not isinstance(value, kind):
-        name = kind.__name__ if isinstance(kind, type) else " or ".join(one.__name__ for one in kind)
-        raise InputError("wrong kind of argument", field=field, expected=expected or f"a {name}", got=shown(value))
+        name = (
+            kind.__name__ if isinstance(kind, type) else " or ".join(one.__name__ for one in kind)
+        )
+        raise InputError(
+            "wrong kind of argument",
+            field=field,
+            expected=expected or f"a {name}",
+            got=shown(value),
+        )
     return value
 
 
 def mapping(value: Any, field: str, expected: str = "names, each with its value") -> dict[str, Any]:
     """Return a dictionary whose keys are texts. Raises `InputError` if it is none."""
     if not isinstance(value, Mapping):
-        raise InputError("wrong kind of argument", field=field, expected=f"a dictionary: {expected}", got=shown(value))
+        raise InputError(
+            "wrong kind of argument",
+            field=field,
+            expected=f"a dictionary: {expected}",
+            got=shown(value),
+        )
     return {text(name, f"{field}: a name in it"): entry for name, entry in value.items()}
 
 
-def items(value: Any, field: str, expected: str, kind: type[T] | tuple[type[T], ...] | None = None) -> tuple[T, ...]:
+def items(
+    value: Any, field: str, expected: str, kind: type[T] | tuple[type[T], ...] | None = None
+) -> tuple[T, ...]:
     """Return a list as a tuple, its entries of some kind if one is given.
 
     Args:
@@ -194,7 +234,9 @@ def items(value: Any, field: str, expected: str, kind: type[T] | tuple[type[T], 
     Raises:
         InputError: It is no list, or an entry is of another kind.
     """
-    listed = isinstance(value, Sequence | Iterator | KeysView | ValuesView) and not isinstance(value, str | bytes | bytearray)
+    listed = isinstance(value, Sequence | Iterator | KeysView | ValuesView) and not isinstance(
+        value, str | bytes | bytearray
+    )
     if not listed and not (isinstance(value, np.ndarray) and value.ndim):
         raise InputError("not a list", field=field, expected=expected, got=shown(value))
     found = tuple(itertools.islice(value, MOST + 1))
@@ -202,5 +244,10 @@ def items(value: Any, field: str, expected: str, kind: type[T] | tuple[type[T], 
         raise InputError("too many entries", field=field, expected=f"at most {MOST}", got="more")
     for place, entry in enumerate(found):
         if kind is not None and not isinstance(entry, kind):
-            raise InputError("wrong kind of entry", field=f"{field}[{place}]", expected=expected, got=shown(entry))
+            raise InputError(
+                "wrong kind of entry",
+                field=f"{field}[{place}]",
+                expected=expected,
+                got=shown(entry),
+            )
     return found

@@ -25,8 +25,8 @@ class SpentError(Exception):
 class Budget:
     """What one call may take. It runs from when it is made.
 
-    A unit of effort is a configuration that is looked at: where its frames are, or how far it is from collisions. Every iteration
-    of Ipopt looks at all waypoints.
+    A unit of effort is a configuration that is looked at: where its frames are, or how far it is
+    from collisions. Every iteration of Ipopt looks at all waypoints.
 
     Args:
         seconds: Time by the clock; None: any.
@@ -59,8 +59,8 @@ class Budget:
     def running(self) -> Iterator[Budget]:
         """Let all that this thread does count, and note the first Ctrl-C instead of raising; the second one raises.
 
-        CasADi swallows KeyboardInterrupt inside a solve and reports some failure instead. Signals reach the main thread only:
-        elsewhere nothing changes.
+        CasADi swallows KeyboardInterrupt inside a solve and reports some failure instead. Signals
+        reach the main thread only: elsewhere nothing changes.
         """
         token = _RUNNING.set(self)
 
@@ -84,7 +84,8 @@ def spend(units: int = 0) -> None:
     Whatever may take long calls this often: a hundredth of a second is a good measure.
 
     Args:
-        units: Of effort; 0: what the same call may do today and not tomorrow, like building what a cache has lost.
+        units: Of effort; 0: what the same call may do today and not tomorrow, like building what a
+            cache has lost.
 
     Raises:
         SpentError: It is at its end.

@@ -37,13 +37,13 @@ class CacheInfo:
 class Cache:
     """Keeps what was built, by key; what was used longest ago goes first.
 
-    What is kept depends on its key alone, so that it makes no difference to a result whether it was there. For one thread at a
-    time: what is kept may have buffers of its own.
+    What is kept depends on its key alone, so that it makes no difference to a result whether it was
+    there. For one thread at a time: what is kept may have buffers of its own.
 
     Args:
         entries: How many objects are kept at most.
-        nbytes: How much memory they take at most [bytes], by each object's own estimate `nbytes`; the one that was used last is
-            kept in any case.
+        nbytes: How much memory they take at most [bytes], by each object's own estimate `nbytes`;
+            the one that was used last is kept in any case.
 
     Attributes:
         building: Time spent on building so far [s].
@@ -84,7 +84,11 @@ class Cache:
 
     def drop(self, *beginning: Hashable) -> None:
         """Let go of what is kept under keys that begin like this."""
-        for key in [key for key in self._kept if isinstance(key, tuple) and key[: len(beginning)] == beginning]:
+        for key in [
+            key
+            for key in self._kept
+            if isinstance(key, tuple) and key[: len(beginning)] == beginning
+        ]:
             del self._kept[key]
 
     def trim(self) -> None:
@@ -98,10 +102,17 @@ class Cache:
 
     def info(self) -> CacheInfo:
         """Return how full it is."""
-        return CacheInfo(len(self._kept), sum(int(value.nbytes) for value in self._kept.values()), self._hits, self._misses)
+        return CacheInfo(
+            len(self._kept),
+            sum(int(value.nbytes) for value in self._kept.values()),
+            self._hits,
+            self._misses,
+        )
 
 
 def _give_back() -> None:
     """Give freed memory back to the system: glibc keeps what lies between blocks that are in use, ever more of it."""
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # other C libraries have no such call
+    with contextlib.suppress(
+        AttributeError, OSError, TypeError
+    ):  # other C libraries have no such call
         ctypes.CDLL(None).malloc_trim(0)

@@ -62,8 +62,10 @@ def record(key: bytes, build: Callable[[], Any]) -> Any:
     """Return plain data that is kept under a key, built if it is not there, or damaged, or if nothing can be kept.
 
     Args:
-        key: All that the data depends on, and first of all the name and the version of what builds it.
-        build: Makes it: lists, dictionaries, text and numbers, which come back equal to the last bit.
+        key: All that the data depends on, and first of all the name and the version of what builds
+            it.
+        build: Makes it: lists, dictionaries, text and numbers, which come back equal to the last
+            bit.
     """
     here = folder()
     path = None if here is None else here / f"{hashlib.sha256(key).hexdigest()[:40]}.json"

@@ -18,7 +18,9 @@ def handled(handler: Callable[[int, FrameType | None], object] | signal.Handlers
 
     Signals reach the main thread only.
     """
-    before = signal.getsignal(signal.SIGINT)  # None: whoever embeds Python handles it, and could not be put back
+    before = signal.getsignal(
+        signal.SIGINT
+    )  # None: whoever embeds Python handles it, and could not be put back
     if before is None or threading.current_thread() is not threading.main_thread():
         yield before
         return

@@ -30,7 +30,9 @@ def compiled_module(name: str) -> Any:
         ) from error
 
 
-def optional_package(name: str, extra: str, *, what: str, file: object = None, field: str | None = None) -> Any:
+def optional_package(
+    name: str, extra: str, *, what: str, file: object = None, field: str | None = None
+) -> Any:
     """Return a package, or a module of one, that only an extra of this package asks for.
 
     Args:

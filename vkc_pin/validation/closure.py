@@ -1,9 +1,9 @@
 """Bounds the drift of grasps along a motion, at every moment and not at samples alone.
 
 A position error e(t) between two moments t₀ and t₁ differs from its linear interpolation by at most
-(t₁ − t₀)²/8 · max |ë|. A bound of |ë| follows from the coordinates' velocities and accelerations, which are
-polynomials, and from the lever arms of the joints. Where that does not prove that the error is small enough,
-the interval is bisected.
+(t₁ − t₀)²/8 · max |ë|. A bound of |ë| follows from the coordinates' velocities and accelerations,
+which are polynomials, and from the lever arms of the joints. Where that does not prove that the
+error is small enough, the interval is bisected.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ class Drift(NamedTuple):
 
     Attributes:
         found: Largest position [m] and angle [rad] that was evaluated, shape (2,).
-        bound: `found` where every error is proven to be within the limit, up to `RESOLUTION`; else the bound that is
-            proven, shape (2,).
-        times: When the largest were evaluated or, where only the bound exceeds the limit, when that does, shape (2,) [s].
+        bound: `found` where every error is proven to be within the limit, up to `RESOLUTION`; else
+            the bound that is proven, shape (2,).
+        times: When the largest were evaluated or, where only the bound exceeds the limit, when that
+            does, shape (2,) [s].
     """
 
     found: Floats
@@ -46,8 +47,9 @@ class Drift(NamedTuple):
 class _Lever(NamedTuple):
     """How a coordinate of the trajectory moves a frame.
 
-    `column` is its place in the trajectory, `rate` what its joint moves per unit of it, `arm` the distance [m] of the frame's
-    origin from the joint's axis, or 1 for a joint that slides, and `turns` says whether the joint turns the frame.
+    `column` is its place in the trajectory, `rate` what its joint moves per unit of it, `arm` the
+    distance [m] of the frame's origin from the joint's axis, or 1 for a joint that slides, and
+    `turns` says whether the joint turns the frame.
     """
 
     column: int
@@ -56,7 +58,9 @@ class _Lever(NamedTuple):
     turns: bool
 
 
-def find_drift(samples: Samples, phase: PhaseSpan, hold: Hold, limits: tuple[float, float]) -> Drift:
+def find_drift(
+    samples: Samples, phase: PhaseSpan, hold: Hold, limits: tuple[float, float]
+) -> Drift:
     """Return how far a grasp of a phase drifts.
 
     Args:
@@ -68,7 +72,9 @@ def find_drift(samples: Samples, phase: PhaseSpan, hold: Hold, limits: tuple[flo
     rows = samples.rows(phase)
     times = samples.times[rows]
     errors = samples.grasp_errors(hold.object, hold.attachment, rows, hold.frame)
-    if samples.scene.objects[hold.object].object.free or samples.truncated:  # it moves rigidly with the hand
+    if (
+        samples.scene.objects[hold.object].object.free or samples.truncated
+    ):  # it moves rigidly with the hand
         return Drift(errors.max(axis=0), errors.max(axis=0), times[errors.argmax(axis=0)])
     hand, grasp = _hand_levers(samples, phase, hold), _grasp_levers(samples, hold)
 
@@ -96,14 +102,17 @@ def _maximize(
         times: Moments that divide the interval, shape (K,) [s].
         errors: Position and angle errors at these, shape (K, 2).
         evaluate: Returns the errors at increasing moments, shape (n,): shape (n, 2).
-        curvature: Returns bounds of the second derivatives of position and sine of the angle on intervals, shape (n, 2).
+        curvature: Returns bounds of the second derivatives of position and sine of the angle on
+            intervals, shape (n, 2).
         limits: Shape (2,).
     """
     begin, end, left, right = times[:-1], times[1:], errors[:-1], errors[1:]
     found, when = errors.max(axis=0), times[errors.argmax(axis=0)]
     budget = MOST
     while True:
-        bound = np.maximum(left, right) + curvature(begin, end) * ((end - begin) ** 2 / 8.0)[:, None]
+        bound = (
+            np.maximum(left, right) + curvature(begin, end) * ((end - begin) ** 2 / 8.0)[:, None]
+        )
         bound[:, 1] = np.arcsin(np.minimum(bound[:, 1], 1.0))
         proven = np.maximum(found + RESOLUTION, PROVEN_SHARE * limits)
         open_ = np.flatnonzero((bound > proven).any(axis=1) & (end - begin > 1e-12))
@@ -133,7 +142,9 @@ def _rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, 
     first, last = trajectory.velocity(begin), trajectory.velocity(end)
     at_begin = (6.0 * slope - 4.0 * first - 2.0 * last) / span
     at_end = (-6.0 * slope + 2.0 * first + 4.0 * last) / span
-    control = first + span * at_begin / 2.0  # of the velocity, a parabola in the hull of its control points
+    control = (
+        first + span * at_begin / 2.0
+    )  # of the velocity, a parabola in the hull of its control points
     speed = np.maximum.reduce([np.abs(first), np.abs(control), np.abs(last)])
     return speed, np.maximum(np.abs(at_begin), np.abs(at_end))
 
@@ -141,7 +152,8 @@ def _rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, 
 def _position_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats) -> Floats:
     """Return a bound of the acceleration of a frame's origin, shape (N,) [m/s²].
 
-    With joints counted from the world on, ∂²p/∂i∂j is at most the arm of the later joint of both, and 0 where the earlier slides.
+    With joints counted from the world on, ∂²p/∂i∂j is at most the arm of the later joint of both,
+    and 0 where the earlier slides.
 
     Args:
         chain: What moves it, from the world on.
@@ -160,7 +172,8 @@ def _position_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats
 def _rotation_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats) -> Floats:
     """Return a bound of the second derivative of the sine of the angle between two frames, as a vector along its axis.
 
-    The axial vector of a rotation R with R̈ = ([ω̇] + [ω]²) R grows by at most |ω̇| + |ω|², with |ω| ≤ Σ|v| and
+    The axial vector of a rotation R with R̈ = ([ω̇] + [ω]²) R grows by at most |ω̇| + |ω|², with
+    |ω| ≤ Σ|v| and
     |ω̇| ≤ Σ|a| + ½ (Σ|v|)².
 
     Args:
@@ -182,15 +195,26 @@ def _hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]
     tip = hand_frame(scene.robot, scene.objects[hold.object].object.attachments[hold.attachment])
     reach, backwards = float(np.linalg.norm(tip.translation)), list[_Lever]()
     frame, through = hold.frame, hold.by
-    while frame is not None and through is not None:  # a link of a free object, rigidly with what holds that but for freedoms
+    while (
+        frame is not None and through is not None
+    ):  # a link of a free object, rigidly with what holds that but for freedoms
         holder = through.frame or scene.robot.tool_frame
-        ends = zip(*(samples.placements(samples.rows(phase), name) for name in (frame, holder)), strict=True)
-        reach += max(float(np.linalg.norm(one.translation - other.translation)) for one, other in ends)
+        ends = zip(
+            *(samples.placements(samples.rows(phase), name) for name in (frame, holder)),
+            strict=True,
+        )
+        reach += max(
+            float(np.linalg.norm(one.translation - other.translation)) for one, other in ends
+        )
         attachment = scene.objects[through.object].object.attachments[through.attachment]
         for suffix, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True):
             turns = freedom.unit == "rad"
             arm = reach + float(np.linalg.norm(freedom.through)) if turns else 1.0
-            backwards.append(_Lever(samples.trajectory.names.index(f"{through.object}.{suffix}"), 1.0, arm, turns))
+            backwards.append(
+                _Lever(
+                    samples.trajectory.names.index(f"{through.object}.{suffix}"), 1.0, arm, turns
+                )
+            )
         frame, through = through.frame, through.by
     return [*_levers(samples, scene.robot.tool_frame, reach), *reversed(backwards)]
 
@@ -199,7 +223,9 @@ def _grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
     """Return what moves the frame at which an object is held, from the world on."""
     attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
     reach, backwards = abs(attachment.standoff), list[_Lever]()
-    for suffix, freedom in reversed(list(zip(attachment.coordinates, attachment.freedoms, strict=True))):
+    for suffix, freedom in reversed(
+        list(zip(attachment.coordinates, attachment.freedoms, strict=True))
+    ):
         column = samples.trajectory.names.index(f"{hold.object}.{suffix}")
         if freedom.unit == "rad":
             through = float(np.linalg.norm(freedom.through))
@@ -222,7 +248,9 @@ def _levers(samples: Samples, frame: str, reach: float) -> list[_Lever]:
         for move in reversed([move for move in world.coordinates.moves if move.joint == joint]):
             name, rate = world.coordinates.names[move.coordinate], abs(move.factor)
             if name in names:
-                backwards.append(_Lever(names.index(name), rate, 1.0 if move.slides else reach, not move.slides))
+                backwards.append(
+                    _Lever(names.index(name), rate, 1.0 if move.slides else reach, not move.slides)
+                )
             if move.slides and joint != 1:
                 travel = np.abs(move.factor * samples.z[:, move.coordinate] + move.offset)
                 reach += float(travel.max()) + LENGTH_STEP

@@ -48,7 +48,8 @@ class Window(NamedTuple):
         margin: What they must keep at these [m]; -inf: their distance says nothing.
         contact: Overlap that counts as contact [m].
         together: Whether they move as one, so that they need not be looked at between samples.
-        exempt: Whether the scene exempts them, as neighbours or as it says, rather than what the hand does.
+        exempt: Whether the scene exempts them, as neighbours or as it says, rather than what the
+            hand does.
     """
 
     pairs: Ints
@@ -60,7 +61,9 @@ class Window(NamedTuple):
     exempt: bool = False
 
 
-def windows(samples: Samples, solids: Solids, steps: Sequence[Step], options: Options) -> list[Window]:
+def windows(
+    samples: Samples, solids: Solids, steps: Sequence[Step], options: Options
+) -> list[Window]:
     """Return all pairs of a motion that may be close, and when.
 
     Args:
@@ -75,7 +78,8 @@ def windows(samples: Samples, solids: Solids, steps: Sequence[Step], options: Op
 def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
     """Yield where the robot does not stand still while its gripper closes or opens, and where that is not open as it should be.
 
-    On the way to what it grasps next, and while it holds it, it is as far open as the attachment says.
+    On the way to what it grasps next, and while it holds it, it is as far open as the attachment
+    says.
     """
     scene, trajectory, gripper = samples.scene, samples.trajectory, samples.scene.robot.gripper
     times, (low, high), before = trajectory.times, trajectory.ranges(), set(scene.holds)
@@ -85,7 +89,9 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
         opens = number > 0 and phase.opening != trajectory.phases[number - 1].opening
         if changed or opens:
             here = trajectory.positions[at, : trajectory.robot_size]
-            moves = np.maximum(high - here, here - low).max(axis=1) > MOTION_TOLERANCE  # between one waypoint and the next
+            moves = (
+                np.maximum(high - here, here - low).max(axis=1) > MOTION_TOLERANCE
+            )  # between one waypoint and the next
             moved = np.flatnonzero(moves)
             k = int(np.searchsorted(moved, at))
             begin = at if opens else moved[k - 1] + 1 if k else 0  # fingers move from here on
@@ -93,23 +99,48 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
             rest = float(times[end] - times[begin])
             if not rest >= options.grasp_time - _DWELL:
                 detail = f"the robot stands still for {rest:.2f} s, {options.grasp_time:g} s are asked for"
-                subject, amount = ", ".join(sorted(map(str, changed))) or "gripper", options.grasp_time - rest
-                yield Violation("dwell", subject, waypoint=at, time=float(times[at]), amount=amount, unit="s", detail=detail)
+                subject, amount = (
+                    ", ".join(sorted(map(str, changed))) or "gripper",
+                    options.grasp_time - rest,
+                )
+                yield Violation(
+                    "dwell",
+                    subject,
+                    waypoint=at,
+                    time=float(times[at]),
+                    amount=amount,
+                    unit="s",
+                    detail=detail,
+                )
         after = trajectory.phases[number + 1].holds if number + 1 < len(trajectory.phases) else ()
         hold = in_gripper(phase.holds) or in_gripper(after)
         if gripper is not None and hold is not None:
             asked = opening_for(scene, hold)
-            wide, right = (gripper.resting if opening is None else opening for opening in (phase.opening, asked))
+            wide, right = (
+                gripper.resting if opening is None else opening
+                for opening in (phase.opening, asked)
+            )
             if not abs(wide - right) <= EXACT:
-                detail = f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are asked for"
+                detail = (
+                    f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are asked for"
+                )
                 time, amount = float(times[at]), abs(wide - right)
-                yield Violation("opening", str(hold), waypoint=at, time=time, amount=amount, unit="m", detail=detail)
+                yield Violation(
+                    "opening",
+                    str(hold),
+                    waypoint=at,
+                    time=time,
+                    amount=amount,
+                    unit="m",
+                    detail=detail,
+                )
 
 
 def check_pushes(samples: Samples) -> Iterator[Violation]:
     """Yield where a hand that pushes goes back with what it pushes, which would stay where it is.
 
-    What counts is where the hand is, and how the link moves there: the link's point at the contact goes into the face, or stays.
+    What counts is where the hand is, and how the link moves there: the link's point at the contact
+    goes into the face, or stays.
     """
     scene, tool = samples.scene, samples.scene.robot.tool_frame
     for phase in samples.trajectory.phases:
@@ -118,7 +149,10 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
             if attachment.contact != "push":
                 continue
             rows = samples.rows(phase)
-            hands, links = samples.placements(rows, tool), samples.placements(rows, f"{hold.object}.{attachment.link}")
+            hands, links = (
+                samples.placements(rows, tool),
+                samples.placements(rows, f"{hold.object}.{attachment.link}"),
+            )
             foremost = hand_frame(scene.robot, attachment) * attachment.offset.inverse()
             gone = [0.0]
             for hand, link, after in zip(hands, links, links[1:], strict=False):
@@ -131,7 +165,15 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
                 row, amount = int(rows[worst]), float(back[worst] - CONTACT)
                 at, time = samples.waypoint(row), float(samples.times[row])
                 detail = f"goes back by {1e3 * back[worst]:.2f} mm where the hand only pushes"
-                yield Violation("push", str(hold), waypoint=at, time=time, amount=amount, unit="m", detail=detail)
+                yield Violation(
+                    "push",
+                    str(hold),
+                    waypoint=at,
+                    time=time,
+                    amount=amount,
+                    unit="m",
+                    detail=detail,
+                )
 
 
 class _Windows:
@@ -153,16 +195,30 @@ class _Windows:
             yield from self._hand(hold, first, last)
         yield from self._grasps([step for step in steps if isinstance(step, Grasp)])
         moved = set[str]()
-        for owner, first, last in sorted(self._runs(self._carried()), key=lambda run: -1 if run[1] is None else run[1]):
-            yield from self._beside(owner, first or 0, self._until(first or 0), new=owner not in moved)
+        for owner, first, last in sorted(
+            self._runs(self._carried()), key=lambda run: -1 if run[1] is None else run[1]
+        ):
+            yield from self._beside(
+                owner, first or 0, self._until(first or 0), new=owner not in moved
+            )
             for at in [last] if last is not None else []:
                 yield from self._beside(owner, at, self._since(at), begin=False)
             moved.add(owner)
         for phase, riding in zip(self.trajectory.phases, self.rides, strict=True):
             for owner, label in riding.items():
                 as_one = {other for other, on in riding.items() if on == label and other != owner}
-                mates = [k for k, one in enumerate(self.labels) if one == label or one.partition(".")[0] in as_one]
-                yield Window(self._pairs(self._shapes(owner), mates), phase.first, phase.last, -np.inf, together=True)
+                mates = [
+                    k
+                    for k, one in enumerate(self.labels)
+                    if one == label or one.partition(".")[0] in as_one
+                ]
+                yield Window(
+                    self._pairs(self._shapes(owner), mates),
+                    phase.first,
+                    phase.last,
+                    -np.inf,
+                    together=True,
+                )
         yield from self._touches([step for step in steps if isinstance(step, Touch)])
 
     def _allowed(self, one: Allowance) -> Iterator[Window]:
@@ -172,64 +228,107 @@ class _Windows:
         rows = self.samples.z[self.samples.waypoint_rows]
         holds = one.holds(self.samples.world.coordinates.names, rows)
         contact, together = CONTACT + max(0.0, -one.margin), one.margin == -np.inf
-        for begin, end in np.flatnonzero(np.diff(holds, prepend=False, append=False)).reshape(-1, 2).tolist():
+        for begin, end in (
+            np.flatnonzero(np.diff(holds, prepend=False, append=False)).reshape(-1, 2).tolist()
+        ):
             if len(pairs):
-                yield Window(pairs, begin, min(end, count) - 1, one.margin, contact, together, exempt=True)
+                yield Window(
+                    pairs, begin, min(end, count) - 1, one.margin, contact, together, exempt=True
+                )
 
     def _hand(self, hold: Hold, first: int | None, last: int | None) -> Iterator[Window]:
         """Yield what a hold that lasts between two waypoints, or from the start or up to the end, means for what holds."""
         begin, end = 0 if first is None else first, len(self.steps) if last is None else last
-        since, until = begin if first is None else self._since(begin), end if last is None else self._until(end)
+        since, until = (
+            begin if first is None else self._since(begin),
+            end if last is None else self._until(end),
+        )
         yield from self._near(hold, since, until)
         gripped = self._between(touching(self.scene, hold), {grasped(self.scene, hold)})
         if moves_as_one(self.scene, hold):
             yield Window(gripped, begin, end, 0.0, together=True)
         else:
-            yield Window(gripped, begin, end, hand_clearance(self.scene, hold, grasped(self.scene, hold), self.options))
+            yield Window(
+                gripped,
+                begin,
+                end,
+                hand_clearance(self.scene, hold, grasped(self.scene, hold), self.options),
+            )
 
     def _near(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
         """Yield what links that take hold, or have it, keep from all of the object meanwhile."""
         by_clearance: dict[float, set[str]] = {}
-        for link in (label for label in self.labels.tolist() if label.startswith(f"{hold.object}.")):
-            by_clearance.setdefault(hand_clearance(self.scene, hold, link, self.options), set()).add(link)
+        for link in (
+            label for label in self.labels.tolist() if label.startswith(f"{hold.object}.")
+        ):
+            by_clearance.setdefault(
+                hand_clearance(self.scene, hold, link, self.options), set()
+            ).add(link)
         for least, links in by_clearance.items():
-            yield Window(self._between(touching(self.scene, hold), links), first, last, least, 0.0 if least else CONTACT)
+            yield Window(
+                self._between(touching(self.scene, hold), links),
+                first,
+                last,
+                least,
+                0.0 if least else CONTACT,
+            )
 
     def _grasps(self, steps: Sequence[Grasp]) -> Iterator[Window]:
         """Yield what it means that the hand is at a grasp at the end of a phase, whether it holds on or not."""
         ends = np.array([phase.last for phase in self.trajectory.phases])
         for step in steps:
             thing = self.scene.objects[step.object].object
-            for name in [step.attachment] if step.attachment is not None else list(thing.attachments):
-                errors = self.samples.grasp_errors(step.object, name, self.samples.waypoint_rows[ends], step.by)
-                for at in ends[(errors <= (self.options.goal_position, self.options.goal_angle)).all(axis=1)].tolist():
-                    yield from self._near(self._grasped(step, name), self._since(at), self._until(at))
+            for name in (
+                [step.attachment] if step.attachment is not None else list(thing.attachments)
+            ):
+                errors = self.samples.grasp_errors(
+                    step.object, name, self.samples.waypoint_rows[ends], step.by
+                )
+                for at in ends[
+                    (errors <= (self.options.goal_position, self.options.goal_angle)).all(axis=1)
+                ].tolist():
+                    yield from self._near(
+                        self._grasped(step, name), self._since(at), self._until(at)
+                    )
 
     def _grasped(self, step: Grasp, attachment: str) -> Hold:
         """Return the hold that a step brings about; how what it is held through is held itself does not matter here."""
         owner, _, link = (step.by or "").partition(".")
-        through = Hold(owner, self.scene.objects[owner].object.attachment().name) if step.by else None
+        through = (
+            Hold(owner, self.scene.objects[owner].object.attachment().name) if step.by else None
+        )
         return Hold(step.object, attachment, through, link or None)
 
-    def _beside(self, owner: str, at: int, other: int, *, begin: bool = True, new: bool = False) -> Iterator[Window]:
+    def _beside(
+        self, owner: str, at: int, other: int, *, begin: bool = True, new: bool = False
+    ) -> Iterator[Window]:
         """Yield what a free object is next to where it begins or ends to be carried, at waypoint `at`.
 
-        Where it is lifted for the first time, or in the hand from the start (`new`), it may be as deep in something as it was.
+        Where it is lifted for the first time, or in the hand from the start (`new`), it may be as
+        deep in something as it was.
         """
         mine = self._shapes(owner)
-        pairs = self._pairs(mine, [k for k in range(self.robots, len(self.labels)) if k not in mine])
+        pairs = self._pairs(
+            mine, [k for k in range(self.robots, len(self.labels)) if k not in mine]
+        )
         placed, here = self.solids.at(self.q[[at]]), np.zeros(len(pairs), int)
         pairs = pairs[placed.bounds(here, pairs) < self.options.dist_safe]
         distances = placed.distances(here[: len(pairs)], pairs)
         first, last = (at, other) if begin else (other, at)
         yield Window(pairs[distances < self.options.dist_safe], first, last, 0.0)
         for k in np.flatnonzero(distances < -CONTACT).tolist() if new else ():
-            yield Window(pairs[[k]], first, last, float(distances[k]), CONTACT - float(distances[k]))
+            yield Window(
+                pairs[[k]], first, last, float(distances[k]), CONTACT - float(distances[k])
+            )
 
     def _touches(self, steps: Sequence[Touch]) -> Iterator[Window]:
         """Yield what is at the target of a touch, wherever a phase ends with that."""
         for step in steps:
-            target = step.target.translation if isinstance(step.target, pin.SE3) else np.array(step.target)
+            target = (
+                step.target.translation
+                if isinstance(step.target, pin.SE3)
+                else np.array(step.target)
+            )
             ends = [phase.last for phase in self.trajectory.phases]
             frames = self.samples.placements(self.samples.waypoint_rows[ends], step.frame)
             owner, links = step.frame.partition(".")[0], _links_of(self.scene, step.frame)
@@ -237,16 +336,25 @@ class _Windows:
             for at, frame in zip(ends, frames, strict=True):
                 if np.linalg.norm(frame.translation - target) <= self.options.dist_safe:
                     around = self.solids.at(self.q[[at]]).around(target, self.options.dist_safe)
-                    close = [k for k in around if k >= self.robots and self.labels[k].partition(".")[0] != owner]
+                    close = [
+                        k
+                        for k in around
+                        if k >= self.robots and self.labels[k].partition(".")[0] != owner
+                    ]
                     yield Window(self._pairs(mine, close), self._since(at), self._until(at), 0.0)
 
     def _carried(self) -> list[set[str]]:
         """Return the free objects that are held or ride, at the start and in every phase."""
         free = {name for name, placed in self.scene.objects.items() if placed.object.free}
         phases = zip(self.trajectory.phases, self.rides, strict=True)
-        return [free & self.scene.held.keys(), *(free & (phase.held.keys() | riding.keys()) for phase, riding in phases)]
+        return [
+            free & self.scene.held.keys(),
+            *(free & (phase.held.keys() | riding.keys()) for phase, riding in phases),
+        ]
 
-    def _runs(self, phases: Sequence[Collection[_T]]) -> Iterator[tuple[_T, int | None, int | None]]:
+    def _runs(
+        self, phases: Sequence[Collection[_T]]
+    ) -> Iterator[tuple[_T, int | None, int | None]]:
         """Yield what lasts, from and up to which waypoint: None is the start, where it has lasted already, and the end.
 
         Args:
@@ -263,10 +371,19 @@ class _Windows:
 
     def _between(self, ones: Collection[str], others: Collection[str]) -> Ints:
         """Return the pairs of shapes of some links with those of others, by their labels."""
-        return self._pairs(*([k for k, label in enumerate(self.labels) if label in links] for links in (ones, others)))
+        return self._pairs(
+            *(
+                [k for k, label in enumerate(self.labels) if label in links]
+                for links in (ones, others)
+            )
+        )
 
     def _shapes(self, owner: str) -> list[int]:
-        return [k for k, label in enumerate(self.labels) if label.partition(".")[0] == owner and k < self.solids.bodies]
+        return [
+            k
+            for k, label in enumerate(self.labels)
+            if label.partition(".")[0] == owner and k < self.solids.bodies
+        ]
 
     def _pairs(self, ones: Iterable[int], others: Collection[int]) -> Ints:
         return np.array([(min(i, j), max(i, j)) for i in ones for j in others], int).reshape(-1, 2)
@@ -276,7 +393,9 @@ class _Windows:
         times, moved, last = self.trajectory.times, 0, at
         while last < len(self.steps):
             moved += int(self.steps[last])
-            if times[last + 1] - times[at] > EASED_TIME + _STILL and moved > self.options.steps(EASED_TIME):
+            if times[last + 1] - times[at] > EASED_TIME + _STILL and moved > self.options.steps(
+                EASED_TIME
+            ):
                 break
             last += 1
         return last
@@ -286,7 +405,9 @@ class _Windows:
         times, moved, first = self.trajectory.times, 0, at
         while first > 0:
             moved += int(self.steps[first - 1])
-            if times[at] - times[first - 1] > EASED_TIME + _STILL and moved > self.options.steps(EASED_TIME):
+            if times[at] - times[first - 1] > EASED_TIME + _STILL and moved > self.options.steps(
+                EASED_TIME
+            ):
                 break
             first -= 1
         return first
@@ -298,4 +419,8 @@ def _links_of(scene: Scene, frame: str) -> set[str]:
         return {frame}
     robot = scene.robot
     joint = robot.model.frames[robot.model.getFrameId(frame)].parentJoint
-    return {robot.link_of(i) for i, shape in enumerate(robot.collision.geometryObjects) if shape.parentJoint == joint}
+    return {
+        robot.link_of(i)
+        for i, shape in enumerate(robot.collision.geometryObjects)
+        if shape.parentJoint == joint
+    }

@@ -1,7 +1,7 @@
 """How far a world's shapes are from each other at configurations, and how far they move along a motion, at most.
 
-There are lower bounds of distances from boxes, and coal's own. Nothing of it is the planner's, so that what its culling
-overlooked would be found here.
+There are lower bounds of distances from boxes, and coal's own. Nothing of it is the planner's, so
+that what its culling overlooked would be found here.
 """
 
 from __future__ import annotations
@@ -30,8 +30,10 @@ class Solids:
 
     Attributes:
         world: The world, with G shapes.
-        bodies: How many of these, the first, belong to the robot or an object; the others are obstacles.
-        center, half: Of a box around each in its own frame, centre and half extents, shape (G, 3) [m].
+        bodies: How many of these, the first, belong to the robot or an object; the others are
+            obstacles.
+        center, half: Of a box around each in its own frame, centre and half extents, shape (G, 3)
+            [m].
         obstacle_corners: See `corners`.
         asked: The shapes, to ask coal for distances.
     """
@@ -79,14 +81,22 @@ class Placed:
     def corners(self) -> tuple[Floats, Floats]:
         """Lower and upper corners of boxes along the world's axes around all shapes, shape (W, G, 3) each [m]."""
         bodies = self._solids.corners(self._where, slice(self._solids.bodies))
-        obstacles = (np.broadcast_to(part, (len(self._where), *part.shape)) for part in self._solids.obstacle_corners)
-        lower, upper = (np.concatenate(parts, axis=1) for parts in zip(bodies, obstacles, strict=True))
+        obstacles = (
+            np.broadcast_to(part, (len(self._where), *part.shape))
+            for part in self._solids.obstacle_corners
+        )
+        lower, upper = (
+            np.concatenate(parts, axis=1) for parts in zip(bodies, obstacles, strict=True)
+        )
         return lower, upper
 
     @cached_property
     def boxes(self) -> WorldBoxes:
         """The same boxes, to ask which of them come near each other."""
-        return WorldBoxes(*self._solids.corners(self._where, slice(self._solids.bodies)), *self._solids.obstacle_corners)
+        return WorldBoxes(
+            *self._solids.corners(self._where, slice(self._solids.bodies)),
+            *self._solids.obstacle_corners,
+        )
 
     def __len__(self) -> int:
         """Return W."""
@@ -99,9 +109,14 @@ class Placed:
         """
         lower, upper = self.corners
         first, second = pairs.T
-        gaps = np.maximum(lower[states, second] - upper[states, first], lower[states, first] - upper[states, second])
+        gaps = np.maximum(
+            lower[states, second] - upper[states, first],
+            lower[states, first] - upper[states, second],
+        )
         outside = np.maximum(gaps, 0.0)
-        return np.where(gaps.max(axis=1) > 0.0, np.sqrt(np.einsum("ni,ni->n", outside, outside)), -np.inf)
+        return np.where(
+            gaps.max(axis=1) > 0.0, np.sqrt(np.einsum("ni,ni->n", outside, outside)), -np.inf
+        )
 
     def distances(self, states: Ints, pairs: Ints) -> Floats:
         """Return coal's signed distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m]."""
@@ -135,9 +150,19 @@ class Placed:
         A point has a size here, 0.1 mm.
         """
         lower, upper = (corners[0] for corners in self.corners)
-        near = np.flatnonzero(((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)).tolist()
-        ball, here, shapes = coal.Sphere(POINT), pin.SE3(np.eye(3), point), self._solids.world.shapes
-        return [i for i in near if shape_distance(ball, here, shapes[i].geometry, self._placement(i)) < reach]
+        near = np.flatnonzero(
+            ((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)
+        ).tolist()
+        ball, here, shapes = (
+            coal.Sphere(POINT),
+            pin.SE3(np.eye(3), point),
+            self._solids.world.shapes,
+        )
+        return [
+            i
+            for i in near
+            if shape_distance(ball, here, shapes[i].geometry, self._placement(i)) < reach
+        ]
 
     def _placement(self, shape: int) -> pin.SE3:
         if shape >= self._solids.bodies:
@@ -149,8 +174,9 @@ class Placed:
 def travelled(solids: Solids, samples: Floats) -> Floats:
     """Return how far any point of each shape can have moved since the first sample, shape (S, G) [m].
 
-    A joint's rotation moves a point by at most the angle times its distance from the axis, and that is at most the sum of the
-    offsets of all joints between, and of the shape itself; a prismatic joint adds its travel.
+    A joint's rotation moves a point by at most the angle times its distance from the axis, and that
+    is at most the sum of the offsets of all joints between, and of the shape itself; a prismatic
+    joint adds its travel.
 
     Args:
         solids: The shapes, G of them.
@@ -165,7 +191,9 @@ def travelled(solids: Solids, samples: Floats) -> Floats:
         of_joint.setdefault(move.joint, []).append(move)
     found = np.zeros((len(samples), len(world.shapes)))
     for g, shape in enumerate(world.shapes[: solids.bodies]):
-        reach = float(np.linalg.norm(solids.half[g])) + float(np.linalg.norm(shape.placement.act(solids.center[g])))
+        reach = float(np.linalg.norm(solids.half[g])) + float(
+            np.linalg.norm(shape.placement.act(solids.center[g]))
+        )
         joint, moved = shape.parentJoint, np.zeros(len(steps))
         while joint:
             moves = of_joint[joint]

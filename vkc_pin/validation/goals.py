@@ -50,30 +50,43 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
                 samples.check_frame(step.by, f"{where}.by")
             if step.attachment is not None and step.attachment not in item.attachments:
                 kind = f"attachment of '{step.object}'"
-                raise UnknownNameError(kind, step.attachment, item.attachments, field=f"{where}.attachment")
+                raise UnknownNameError(
+                    kind, step.attachment, item.attachments, field=f"{where}.attachment"
+                )
             for joint in step.joints if isinstance(step, Actuate) else ():
                 if joint not in item.coordinates.names:
-                    raise UnknownNameError(f"joint of '{step.object}'", joint, item.coordinates.names, field=f"{where}.joints")
+                    raise UnknownNameError(
+                        f"joint of '{step.object}'",
+                        joint,
+                        item.coordinates.names,
+                        field=f"{where}.joints",
+                    )
         elif isinstance(step, Touch) and step.frame.partition(".")[0] in objects:
             samples.check_frame(step.frame, f"{where}.frame")
         elif isinstance(step, Reach | Touch):
             frames = [frame.name for frame in samples.scene.robot.model.frames]
             if step.frame is not None and step.frame not in frames:
-                raise UnknownNameError("frame of the robot", step.frame, frames, field=f"{where}.frame")
+                raise UnknownNameError(
+                    "frame of the robot", step.frame, frames, field=f"{where}.frame"
+                )
 
 
 def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> list[Violation]:
     """Check that every step is done, in their order: "goal" and "order".
 
-    There must be a phase for each step at whose end the step's goal holds, with everything in the hand that the steps have
-    put there, the last step's at the end of the motion; and in the phases that lead from one to the next, no object may move
-    but the one that the step actuates, and no free object of a step be carried when it is not to be in the hand.
+    There must be a phase for each step at whose end the step's goal holds, with everything in the
+    hand that the steps have put there, the last step's at the end of the motion; and in the phases
+    that lead from one to the next, no object may move but the one that the step actuates, and no
+    free object of a step be carried when it is not to be in the hand.
     """
     phases = samples.trajectory.phases
     ends = [0, *(phase.last for phase in phases)]  # a step may be done before anything begins
     hands = _in_hand(samples, steps)
     misses = [
-        [_misses(samples, step, k, options) + _dropped(samples, steps, hands, number, k) for k in range(len(ends))]
+        [
+            _misses(samples, step, k, options) + _dropped(samples, steps, hands, number, k)
+            for k in range(len(ends))
+        ]
         for number, step in enumerate(steps)
     ]
     found, reached = [], 0
@@ -81,32 +94,55 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
         candidates = [len(ends) - 1] if number == len(steps) - 1 else range(reached, len(ends))
         fit = next((k for k in candidates if not misses[number][k]), None)
         if fit is None:
-            best = min((k for k in candidates if k), key=lambda k: max(m.amount for m in misses[number][k]))
-            found += [_violation(samples, "goal", ends[best], miss) for miss in misses[number][best]]
+            best = min(
+                (k for k in candidates if k), key=lambda k: max(m.amount for m in misses[number][k])
+            )
+            found += [
+                _violation(samples, "goal", ends[best], miss) for miss in misses[number][best]
+            ]
         else:
             reached = fit
-    return found or _check_order(samples, steps, hands, [[not missing for missing in row] for row in misses])
+    return found or _check_order(
+        samples, steps, hands, [[not missing for missing in row] for row in misses]
+    )
 
 
 def _in_hand(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
     """Return which free objects the steps want in the hand before the first and after each of them."""
     objects = samples.scene.objects
-    held = {hold.object: hold.frame or "" for hold in samples.scene.holds if objects[hold.object].object.free}
+    held = {
+        hold.object: hold.frame or ""
+        for hold in samples.scene.holds
+        if objects[hold.object].object.free
+    }
     hands = [set(held)]
     for step in steps:
-        owner = step.frame.partition(".")[0] if isinstance(step, Touch) else getattr(step, "object", None)
-        if isinstance(step, Grasp | Touch) and owner is not None and owner in objects and objects[owner].object.free:
+        owner = (
+            step.frame.partition(".")[0]
+            if isinstance(step, Touch)
+            else getattr(step, "object", None)
+        )
+        if (
+            isinstance(step, Grasp | Touch)
+            and owner is not None
+            and owner in objects
+            and objects[owner].object.free
+        ):
             held.setdefault(owner, (step.by or "") if isinstance(step, Grasp) else "")
         if isinstance(step, Place | Release):
             gone = set(held) if owner is None else {owner}
-            while more := {name for name, by in held.items() if by.partition(".")[0] in gone} - gone:
+            while (
+                more := {name for name, by in held.items() if by.partition(".")[0] in gone} - gone
+            ):
                 gone |= more
             held = {name: by for name, by in held.items() if name not in gone}
         hands.append(set(held))
     return hands
 
 
-def _dropped(samples: Samples, steps: Sequence[Step], hands: list[set[str]], number: int, end: int) -> list[Miss]:
+def _dropped(
+    samples: Samples, steps: Sequence[Step], hands: list[set[str]], number: int, end: int
+) -> list[Miss]:
     """Return what should be in the hand when a step is done, after `end` phases, and is not."""
     phases = samples.trajectory.phases
     near = {owner for phase in phases[max(end - 1, 0) : end + 1] for owner in phase.held}
@@ -118,13 +154,16 @@ def _dropped(samples: Samples, steps: Sequence[Step], hands: list[set[str]], num
     return [Miss(name, 1.0, "holds", "is not in the hand") for name in sorted(wanted - near)]
 
 
-def _check_order(samples: Samples, steps: Sequence[Step], hands: list[set[str]], holds: list[list[bool]]) -> list[Violation]:
+def _check_order(
+    samples: Samples, steps: Sequence[Step], hands: list[set[str]], holds: list[list[bool]]
+) -> list[Violation]:
     """Check that nothing moves before its step's turn; `holds[i][k]` says whether step i holds at the start of phase k."""
     phases = samples.trajectory.phases
     named = set().union(*hands, *({step.object} for step in steps if isinstance(step, Place)))
     moved = [_moved(samples, k) | _carried(samples, k, named) for k in range(len(phases))]
     own = [
-        hands[i] | hands[i + 1] | ({step.object} if isinstance(step, Actuate | Place) else set()) for i, step in enumerate(steps)
+        hands[i] | hands[i + 1] | ({step.object} if isinstance(step, Actuate | Place) else set())
+        for i, step in enumerate(steps)
     ]
     turns = {0}  # which step may be the one that is being done
     for k in range(len(phases) + 1):
@@ -146,11 +185,20 @@ def _check_order(samples: Samples, steps: Sequence[Step], hands: list[set[str]],
         return []
     first = max(turns)
     detail = f"{type(steps[first]).__name__} is undone before the next step begins"
-    return [_violation(samples, "order", phases[-1].last, Miss(f"step {first + 1}", 1.0, "steps", detail))]
+    return [
+        _violation(
+            samples, "order", phases[-1].last, Miss(f"step {first + 1}", 1.0, "steps", detail)
+        )
+    ]
 
 
 def _violation(samples: Samples, constraint: str, waypoint: int, miss: Miss) -> Violation:
-    return Violation(constraint, waypoint=waypoint, time=float(samples.trajectory.times[waypoint]), **miss._asdict())
+    return Violation(
+        constraint,
+        waypoint=waypoint,
+        time=float(samples.trajectory.times[waypoint]),
+        **miss._asdict(),
+    )
 
 
 def _carried(samples: Samples, number: int, named: set[str]) -> dict[str, tuple[float, str]]:
@@ -194,12 +242,24 @@ def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Mi
     if isinstance(step, Actuate):
         for joint, goal in step.joints.items():
             name = f"{step.object}.{joint}"
-            value, unit = float(samples.z[row, samples.world.coordinates.index(name)]), samples.unit(name)
-            expect(name, abs(value - goal), unit, f"{value:.4f} {unit} instead of {goal:.4f} {unit}")
+            value, unit = (
+                float(samples.z[row, samples.world.coordinates.index(name)]),
+                samples.unit(name),
+            )
+            expect(
+                name, abs(value - goal), unit, f"{value:.4f} {unit} instead of {goal:.4f} {unit}"
+            )
     elif isinstance(step, Grasp):
         name, (distance, turn) = _grasp(samples, step, row)
-        expect(f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp")
-        expect(f"{step.object}.{name}", turn, "rad", f"the tool is turned {turn:.4f} rad from the grasp")
+        expect(
+            f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp"
+        )
+        expect(
+            f"{step.object}.{name}",
+            turn,
+            "rad",
+            f"the tool is turned {turn:.4f} rad from the grasp",
+        )
     elif isinstance(step, Reach | Touch | Place):
         frame, target, free = _target(samples, step)
         placement = samples.placements([row], frame)[0]
@@ -226,7 +286,11 @@ def _target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3
     if isinstance(step, Reach):
         return step.frame or samples.scene.robot.tool_frame, step.pose, ""
     goal = step.target if isinstance(step, Touch) else step.pose
-    frame = step.frame if isinstance(step, Touch) else f"{step.object}.{samples.scene.objects[step.object].object.base_link}"
+    frame = (
+        step.frame
+        if isinstance(step, Touch)
+        else f"{step.object}.{samples.scene.objects[step.object].object.base_link}"
+    )
     if isinstance(goal, pin.SE3):
         return frame, goal, ""
     if isinstance(step, Touch):
@@ -252,8 +316,14 @@ def _grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, f
     Without a name it is the one that is used, if there is one: held at the start or in some phase.
     """
     used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
-    names = [step.attachment] if step.attachment is not None else [held[step.object] for held in used if step.object in held]
+    names = (
+        [step.attachment]
+        if step.attachment is not None
+        else [held[step.object] for held in used if step.object in held]
+    )
     names = names or [samples.scene.objects[step.object].object.attachment().name]
-    errors = {name: samples.grasp_errors(step.object, name, np.array([row]), step.by)[0] for name in names}
+    errors = {
+        name: samples.grasp_errors(step.object, name, np.array([row]), step.by)[0] for name in names
+    }
     name = min(errors, key=lambda key: float(errors[key].max()))
     return name, (float(errors[name][0]), float(errors[name][1]))

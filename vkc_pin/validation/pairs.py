@@ -51,21 +51,37 @@ class PairTable:
     ) -> None:
         self.scene, self.world, self.solids = scene, solids.world, solids
         world, own_margin = self.world, dist_safe if self_distance is None else self_distance
-        samples, lasts = Samples(scene, trajectory) if samples is None else samples, [phase.last for phase in trajectory.phases]
-        self._moves = np.array([self._moved(samples.z[samples.rows(phase)]) for phase in trajectory.phases])
+        samples, lasts = (
+            Samples(scene, trajectory) if samples is None else samples,
+            [phase.last for phase in trajectory.phases],
+        )
+        self._moves = np.array(
+            [self._moved(samples.z[samples.rows(phase)]) for phase in trajectory.phases]
+        )
         self._phase = np.searchsorted(lasts, np.arange(len(trajectory.times)))  # the earlier of two
         labels, bodies = world.collision_labels, range(solids.bodies)
         owners = [label.partition(".")[0] if "." in label else "" for label in labels]
         robots = len(scene.robot.collision.geometryObjects)
-        self.group = ["robot" if i < robots else name if name in scene.objects else "" for i, name in enumerate(owners)]
-        self._robot_pairs = {frozenset(pair): own for pair, own in scene.robot.own_margins(own_margin).items()}
+        self.group = [
+            "robot" if i < robots else name if name in scene.objects else ""
+            for i, name in enumerate(owners)
+        ]
+        self._robot_pairs = {
+            frozenset(pair): own for pair, own in scene.robot.own_margins(own_margin).items()
+        }
         self._moving_once: Bools = np.asarray(self._moves.any(axis=0))
-        own = np.array([(i, j) for j in bodies for i in range(j) if self._counts(i, j)], int).reshape(-1, 2)
+        own = np.array(
+            [(i, j) for j in bodies for i in range(j) if self._counts(i, j)], int
+        ).reshape(-1, 2)
         self.pairs = np.concatenate([own, self._with_obstacles()])
         if not len(self.pairs):
-            raise InputError("no pair of geometries can collide", field="scene", expected="collision geometry")
+            raise InputError(
+                "no pair of geometries can collide", field="scene", expected="collision geometry"
+            )
         self.margins = np.full(len(self.pairs), float(dist_safe))
-        self.margins[: len(own)] = [self._robot_pairs.get(frozenset(pair), dist_safe) for pair in own.tolist()]
+        self.margins[: len(own)] = [
+            self._robot_pairs.get(frozenset(pair), dist_safe) for pair in own.tolist()
+        ]
         self._windows = _Windows(windows, self.pairs)
 
     def _moved(self, rows: Floats) -> Bools:
@@ -75,7 +91,9 @@ class PairTable:
         for joint in range(1, len(moved)):
             moved[joint] |= moved[world.model.parents[joint]]
         robots = len(self.scene.robot.collision.geometryObjects)
-        return np.array([i < robots or moved[shape.parentJoint] for i, shape in enumerate(world.shapes)])
+        return np.array(
+            [i < robots or moved[shape.parentJoint] for i, shape in enumerate(world.shapes)]
+        )
 
     def margins_at(self, pairs: Ints, waypoints: Ints) -> Floats:
         """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]; -inf: none."""
@@ -91,7 +109,10 @@ class PairTable:
 
     def exempt_at(self, pairs: Ints, waypoints: Ints) -> Bools:
         """Return whether the scene exempts pairs from their clearances at waypoints, both of shape (n,), shape (n,)."""
-        exempt, (k, which) = np.zeros(len(pairs), bool), self._windows.at(pairs, waypoints, waypoints)
+        exempt, (k, which) = (
+            np.zeros(len(pairs), bool),
+            self._windows.at(pairs, waypoints, waypoints),
+        )
         exempt[k[self._windows.exempt[which]]] = True
         return exempt
 
@@ -120,18 +141,29 @@ class PairTable:
         moving = [i for i in bodies if self._moving_once[i]]
         # Wheels stand on the floor, objects hang as their makers hung them.
         free = {name for name, placed in self.scene.objects.items() if placed.object.free}
-        above = [i for i in moving if self.group[i] in free or (self.group[i] == "robot" and joints[i] > 1)]
+        above = [
+            i
+            for i in moving
+            if self.group[i] in free or (self.group[i] == "robot" and joints[i] > 1)
+        ]
         obstacles = range(self.solids.bodies, len(labels))
         found = [np.zeros((0, 2), int)]
         for floor, ones in ((False, moving), (True, above)):
             others = [j for j in obstacles if (labels[j] == FLOOR) == floor]
-            found.append(np.column_stack([np.tile(np.array(ones, int), len(others)), np.repeat(others, len(ones))]))
+            found.append(
+                np.column_stack(
+                    [np.tile(np.array(ones, int), len(others)), np.repeat(others, len(ones))]
+                )
+            )
         return np.concatenate(found).astype(int)
 
-    def near(self, placed: Placed, first: Ints, last: Ints, moved: Floats, limit: float) -> tuple[Ints, Ints]:
+    def near(
+        self, placed: Placed, first: Ints, last: Ints, moved: Floats, limit: float
+    ) -> tuple[Ints, Ints]:
         """Return (k, pair) of all pairs but those that boxes prove to stay `limit` [m] apart in a stretch k.
 
-        Neither are those among them of which nothing moves then: what stands where it stood is as close as it was.
+        Neither are those among them of which nothing moves then: what stands where it stood is as
+        close as it was.
 
         Args:
             placed: The world at the waypoints.
@@ -140,7 +172,15 @@ class PairTable:
             moved: How far any point of each geometry moves in a stretch, shape (K, G) [m].
             limit: [m].
         """
-        return placed.boxes.near(first, last, self.pairs, moved=moved, moves=self._moves, phases=self._phase[last], limit=limit)
+        return placed.boxes.near(
+            first,
+            last,
+            self.pairs,
+            moved=moved,
+            moves=self._moves,
+            phases=self._phase[last],
+            limit=limit,
+        )
 
 
 class _Windows:
@@ -163,15 +203,24 @@ class _Windows:
         of_pair, self._which = found[np.lexsort((found[:, 1], found[:, 0]))].T
         self._count = np.bincount(of_pair, minlength=len(pairs))
         self._begin = np.cumsum(self._count) - self._count
-        self._first, self._last = (np.array([getattr(window, end) for window in windows], int) for end in ("first", "last"))
-        self.margin, self.contact = (np.array([getattr(w, name) for w in windows], float) for name in ("margin", "contact"))
-        self.together, self.exempt = (np.array([getattr(w, name) for w in windows], bool) for name in ("together", "exempt"))
+        self._first, self._last = (
+            np.array([getattr(window, end) for window in windows], int) for end in ("first", "last")
+        )
+        self.margin, self.contact = (
+            np.array([getattr(w, name) for w in windows], float) for name in ("margin", "contact")
+        )
+        self.together, self.exempt = (
+            np.array([getattr(w, name) for w in windows], bool) for name in ("together", "exempt")
+        )
 
     def at(self, pairs: Ints, first: Ints, last: Ints) -> tuple[Ints, Ints]:
         """Return (k, window) for each of some pairs and the windows that hold all the time from waypoint `first` to `last`."""
         some = np.flatnonzero(self._count[pairs])
         count = self._count[pairs[some]]
-        k, place = np.repeat(some, count), np.repeat(self._begin[pairs[some]] - np.cumsum(count) + count, count)
+        k, place = (
+            np.repeat(some, count),
+            np.repeat(self._begin[pairs[some]] - np.cumsum(count) + count, count),
+        )
         which = self._which[place + np.arange(len(k))]
         holds = (self._first[which] <= first[k]) & (last[k] <= self._last[which])
         return k[holds], which[holds]

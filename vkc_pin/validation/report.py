@@ -26,10 +26,11 @@ class Violation:
     """One constraint that does not hold.
 
     Attributes:
-        constraint: "start", "limit", "velocity", "acceleration", "jerk", "torque", "slip", "turning", "wheels", "dwell",
-            "closure", "latch", "unheld", "tips", "slide", "push", "opening", "goal", "order", "clearance", "penetration" or
-            "term", the user's own.
-        subject: The coordinate, object, goal, term or pair of links it is about, e.g. "elbow_joint", "forearm_link – sofa".
+        constraint: "start", "limit", "velocity", "acceleration", "jerk", "torque", "slip",
+            "turning", "wheels", "dwell", "closure", "latch", "unheld", "tips", "slide", "push",
+            "opening", "goal", "order", "clearance", "penetration" or "term", the user's own.
+        subject: The coordinate, object, goal, term or pair of links it is about, e.g.
+            "elbow_joint", "forearm_link – sofa".
         waypoint: Counted from 0; between two waypoints the earlier.
         time: [s].
         amount: By how much it is violated, in `unit`.
@@ -57,7 +58,8 @@ class Bound:
     Attributes:
         subject: The coordinate whose limit it is; empty for a rest.
         kind: "velocity", "acceleration", "jerk", "torque", or "rest", where nothing moves.
-        share: Of the duration, in which the motion is nearer to this limit than to any other, from 0 to 1.
+        share: Of the duration, in which the motion is nearer to this limit than to any other, from
+            0 to 1.
         begin: Of the longest stretch in which that is so [s].
         end: Of the same [s].
     """
@@ -98,17 +100,21 @@ class Report:
     """What `validation` says of a motion.
 
     Attributes:
-        violations: The worst of each constraint, subject and unit, in order of time; empty if the motion is right.
+        violations: The worst of each constraint, subject and unit, in order of time; empty if the
+            motion is right.
         clearance: Smallest distance of any pair anywhere along the motion [m].
         closure_error: Largest drift of a held object's base or of the grasp [m].
         closure_angle: The same for orientation [rad].
-        clearances: The smallest distance at the waypoints of each phase, and anywhere in the phase of the smallest of all [m].
+        clearances: The smallest distance at the waypoints of each phase, and anywhere in the phase
+            of the smallest of all [m].
         states: How many configurations were looked at.
         notes: What prevents the task as a whole, if planning failed; one line each.
-        torque: The largest torque of a joint of the arm, as a share of what its motor has; 0 if that is not known.
+        torque: The largest torque of a joint of the arm, as a share of what its motor has; 0 if
+            that is not known.
         bounds: What bounds the duration, the limit that does so for longest first.
         remarks: What was not looked at, as nobody states it: efforts, masses; one line each.
-        exemptions: Pairs that came closer than the clearance, or overlapped, and were exempt from it.
+        exemptions: Pairs that came closer than the clearance, or overlapped, and were exempt from
+            it.
     """
 
     violations: tuple[Violation, ...] = ()
@@ -137,20 +143,32 @@ class Report:
         return [
             head + f"{len(self.violations)} constraint(s) violated",
             *(f"  - {v}" for v in self.violations[:LISTED]),
-            *([f"  ... and {len(self.violations) - LISTED} more"] if len(self.violations) > LISTED else []),
+            *(
+                [f"  ... and {len(self.violations) - LISTED} more"]
+                if len(self.violations) > LISTED
+                else []
+            ),
             *(f"  because {note}" for note in self.notes),
         ]
 
     def measures(self) -> dict[str, float]:
         """Return what a motion is measured by: clearance and closure_error [m], torque [share of what a motor has]."""
-        return {"clearance": self.clearance, "closure_error": self.closure_error, "torque": self.torque}
+        return {
+            "clearance": self.clearance,
+            "closure_error": self.closure_error,
+            "torque": self.torque,
+        }
 
     def timing(self) -> list[str]:
         """Return what bounds the duration and what the motors do, as lines of text."""
         told = ", ".join(map(str, self.bounds[:TOLD]))
         return [
             *([f"bounded by  {told}"] if told else []),
-            *([f"torques     {100.0 * self.torque:.0f} % of what the motors have, at most"] if self.torque > 0.0 else []),
+            *(
+                [f"torques     {100.0 * self.torque:.0f} % of what the motors have, at most"]
+                if self.torque > 0.0
+                else []
+            ),
             *(f"unknown     {remark}" for remark in self.remarks),
             *(f"exempt      {exemption}" for exemption in self.exemptions),
         ]
@@ -159,7 +177,11 @@ class Report:
         """Return a line of text for each phase of the motion it is about: when, how much effort, and how close."""
         lines, nearest = [], self.clearances or (float("inf"),) * len(trajectory.phases)
         for part, close in zip(trajectory.parts(), nearest, strict=True):
-            first, last, effort = part.times[0], part.times[-1], (part.base_effort(), part.arm_effort())
+            first, last, effort = (
+                part.times[0],
+                part.times[-1],
+                (part.base_effort(), part.arm_effort()),
+            )
             gone = f"base {effort[0]:5.2f} m, arm {effort[1]:5.2f} rad, {1e3 * close:6.1f} mm"
             lines.append(f"{first:6.1f} to {last:6.1f} s: {gone}, {part.phases[0].name}")
         return lines
@@ -172,7 +194,11 @@ class Report:
         """Return what another report of the same motion says otherwise, one line each; distances to 10 µm, angles to 1e-5 rad."""
         lines = []
         if claimed.ok != self.ok:
-            lines.append("every constraint holds" if claimed.ok else f"{len(claimed.violations)} constraint(s) violated")
+            lines.append(
+                "every constraint holds"
+                if claimed.ok
+                else f"{len(claimed.violations)} constraint(s) violated"
+            )
         for name, unit in (("clearance", "m"), ("closure_error", "m"), ("closure_angle", "rad")):
             there, here = getattr(claimed, name), getattr(self, name)
             if there != here and not abs(there - here) <= SAME:
@@ -191,14 +217,26 @@ class Report:
             InputError: Something is missing from it, or of another kind.
         """
         fields = dict(mapping(data, "report"))
-        for name in ("clearance", "closure_error", "closure_angle"):  # infinite where nothing can collide
+        for name in (
+            "clearance",
+            "closure_error",
+            "closure_angle",
+        ):  # infinite where nothing can collide
             if name in fields:
                 fields[name] = _real(fields[name], name)
-        nearest: tuple[Any, ...] = items(fields.get("clearances", ()), "clearances", "a list of distances")
-        fields["clearances"] = tuple(_real(one, f"clearances[{k}]") for k, one in enumerate(nearest))
+        nearest: tuple[Any, ...] = items(
+            fields.get("clearances", ()), "clearances", "a list of distances"
+        )
+        fields["clearances"] = tuple(
+            _real(one, f"clearances[{k}]") for k, one in enumerate(nearest)
+        )
         fields["states"] = whole(fields.get("states", 0), "states", low=0)
-        listed: tuple[Any, ...] = items(fields.get("violations"), "violations", "a list of violations")
-        fields["violations"] = tuple(_violation(one, f"violations[{k}]") for k, one in enumerate(listed))
+        listed: tuple[Any, ...] = items(
+            fields.get("violations"), "violations", "a list of violations"
+        )
+        fields["violations"] = tuple(
+            _violation(one, f"violations[{k}]") for k, one in enumerate(listed)
+        )
         notes: tuple[Any, ...] = items(fields.get("notes"), "notes", "a list of texts")
         fields["notes"] = tuple(text(note, f"notes[{k}]") for k, note in enumerate(notes))
         fields["torque"] = number(fields.get("torque", 0.0), "torque", low=0.0)
@@ -206,12 +244,18 @@ class Report:
         fields["bounds"] = tuple(_bound(one, f"bounds[{k}]") for k, one in enumerate(bounds))
         remarks: tuple[Any, ...] = items(fields.get("remarks", ()), "remarks", "a list of texts")
         fields["remarks"] = tuple(text(remark, f"remarks[{k}]") for k, remark in enumerate(remarks))
-        exempt: tuple[Any, ...] = items(fields.get("exemptions", ()), "exemptions", "a list of exemptions")
-        fields["exemptions"] = tuple(_exemption(one, f"exemptions[{k}]") for k, one in enumerate(exempt))
+        exempt: tuple[Any, ...] = items(
+            fields.get("exemptions", ()), "exemptions", "a list of exemptions"
+        )
+        fields["exemptions"] = tuple(
+            _exemption(one, f"exemptions[{k}]") for k, one in enumerate(exempt)
+        )
         try:
             return cls(**fields)
         except TypeError as error:  # a field that there is not
-            raise InputError("not a report", expected="what Report.to_dict returns", got=str(error)) from None
+            raise InputError(
+                "not a report", expected="what Report.to_dict returns", got=str(error)
+            ) from None
 
 
 def _real(value: Any, field: str) -> float:
@@ -230,7 +274,9 @@ def _violation(data: Any, field: str) -> Violation:
     try:
         return Violation(**given)
     except TypeError as error:
-        raise InputError("not a violation", field=field, expected="what Report.to_dict returns", got=str(error)) from None
+        raise InputError(
+            "not a violation", field=field, expected="what Report.to_dict returns", got=str(error)
+        ) from None
 
 
 def _exemption(data: Any, field: str) -> Exemption:
@@ -242,7 +288,9 @@ def _exemption(data: Any, field: str) -> Exemption:
     try:
         return Exemption(**given)
     except TypeError as error:
-        raise InputError("not an exemption", field=field, expected="what Report.to_dict returns", got=str(error)) from None
+        raise InputError(
+            "not an exemption", field=field, expected="what Report.to_dict returns", got=str(error)
+        ) from None
 
 
 def _bound(data: Any, field: str) -> Bound:
@@ -255,7 +303,9 @@ def _bound(data: Any, field: str) -> Bound:
     try:
         return Bound(**given)
     except TypeError as error:
-        raise InputError("not a bound", field=field, expected="what Report.to_dict returns", got=str(error)) from None
+        raise InputError(
+            "not a bound", field=field, expected="what Report.to_dict returns", got=str(error)
+        ) from None
 
 
 @runtime_checkable

@@ -24,24 +24,38 @@ _LOOKS = 16  # moments on each cubic of a curve
 def check_rolling(samples: Samples) -> Iterator[Violation]:
     """Yield how a base on wheels slips, turns tighter than it can, and turns its wheels too fast, each where it does so most.
 
-    Along a curve its velocity tells, at moments close to each other on every cubic. Where there is none, nothing is said of
-    how the base gets from one waypoint to the next, and the arc that leads there is what counts: its chord points where the base
-    heads half-way.
+    Along a curve its velocity tells, at moments close to each other on every cubic. Where there is
+    none, nothing is said of how the base gets from one waypoint to the next, and the arc that leads
+    there is what counts: its chord points where the base heads half-way.
     """
     robot, motion = samples.scene.robot, samples.trajectory
     if robot.base not in ("differential", "ackermann"):
         return
     smooth = motion.curve is not None
-    unit, per, usual = ("m/s", "", SLIP_TOLERANCE) if smooth else ("m", " in a step", STEP_TOLERANCE)
+    unit, per, usual = (
+        ("m/s", "", SLIP_TOLERANCE) if smooth else ("m", " in a step", STEP_TOLERANCE)
+    )
     moments, along, aside, turn = _along(motion) if smooth else _steps(motion)
     spans = np.ones(len(moments)) if smooth else np.diff(motion.times)
     for kind, excess, tolerance, text in _excesses(robot, along, aside, turn, spans):
         worst = int(np.argmax(excess))
         amount, time = float(excess[worst]), float(moments[worst])
         if not amount <= (usual if tolerance is None else tolerance):
-            said, of = (f"{1e3 * amount:.2f} m{unit}{per}", unit) if tolerance is None else (f"{amount:.3f} m/s", "m/s")
+            said, of = (
+                (f"{1e3 * amount:.2f} m{unit}{per}", unit)
+                if tolerance is None
+                else (f"{amount:.3f} m/s", "m/s")
+            )
             at = min(int(np.searchsorted(motion.times, time, side="right")), len(motion.times)) - 1
-            yield Violation(kind, "base", waypoint=at, time=time, amount=amount, unit=of, detail=f"the base {text.format(said)}")
+            yield Violation(
+                kind,
+                "base",
+                waypoint=at,
+                time=time,
+                amount=amount,
+                unit=of,
+                detail=f"the base {text.format(said)}",
+            )
 
 
 def _excesses(
@@ -59,7 +73,12 @@ def _excesses(
     yield "slip", np.abs(aside), None, "slips sideways by {}"
     if robot.base == "ackermann":
         short = robot.turning_radius * np.abs(turn) - np.abs(along)
-        yield "turning", short, None, f"drives {{}} less than its turn takes at a radius of {robot.turning_radius:g} m"
+        yield (
+            "turning",
+            short,
+            None,
+            f"drives {{}} less than its turn takes at a radius of {robot.turning_radius:g} m",
+        )
     if robot.wheels is not None:
         rim = robot.wheels.rim
         fast = (np.abs(along) + robot.wheels.track / 2 * np.abs(turn)) / spans - rim
@@ -82,4 +101,8 @@ def _along(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
 def _seen(change: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
     """Return changes of (x, y, yaw), shape (K, 3), as a base with these headings sees them: along, aside, and its turn."""
     dx, dy, turn = change.T
-    return np.cos(heading) * dx + np.sin(heading) * dy, np.cos(heading) * dy - np.sin(heading) * dx, turn
+    return (
+        np.cos(heading) * dx + np.sin(heading) * dy,
+        np.cos(heading) * dy - np.sin(heading) * dx,
+        turn,
+    )

@@ -39,16 +39,20 @@ class Samples:
         scene, trajectory: What it was made of.
         world: The scene as one plain tree.
         free: Its free objects along the motion.
-        times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints, or knots of the curve.
+        times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints, or knots
+            of the curve.
         waypoint_rows: Which of these are the waypoints, shape (T,).
         z: Minimal coordinates of the world, shape (S, n).
         virtual: Coordinate → the freedom of a grasp that it is.
-        needed: How many configurations would have to be looked at; more than `MOST`: only the waypoints are.
+        needed: How many configurations would have to be looked at; more than `MOST`: only the
+            waypoints are.
         truncated: Whether it is sampled at its waypoints or knots alone, since it is too long.
 
     Raises:
-        UnknownNameError: The trajectory names a coordinate, object or attachment that the scene does not have.
-        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom, or one is beyond all measure.
+        UnknownNameError: The trajectory names a coordinate, object or attachment that the scene
+            does not have.
+        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom,
+            or one is beyond all measure.
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
@@ -71,12 +75,19 @@ class Samples:
         if len(far):
             where, expected = far[0].tolist(), f"numbers up to {_LARGEST:g}"
             got = self.trajectory.positions[tuple(where)]
-            raise InputError("out of range", field=f"trajectory.positions{where}", expected=expected, got=got)
+            raise InputError(
+                "out of range", field=f"trajectory.positions{where}", expected=expected, got=got
+            )
 
     def _check_names(self) -> None:
         names, robot = self.trajectory.names, self.scene.robot.coordinates.names
         if names[: len(robot)] != robot or self.trajectory.robot_size != len(robot):
-            raise InputError("not this robot's coordinates", field="trajectory.names", expected=robot, got=names[: len(robot)])
+            raise InputError(
+                "not this robot's coordinates",
+                field="trajectory.names",
+                expected=robot,
+                got=names[: len(robot)],
+            )
         known = [*self.world.coordinates.names, *self.virtual]
         for name in names:
             if name not in known:
@@ -85,27 +96,39 @@ class Samples:
             if phase.opening is not None:
                 self._check_opening(phase.opening, f"trajectory.phases[{number}].opening")
             for hold in phase.holds:
-                owner, attachment, field = hold.object, hold.attachment, f"trajectory.phases[{number}].held"
+                owner, attachment, field = (
+                    hold.object,
+                    hold.attachment,
+                    f"trajectory.phases[{number}].held",
+                )
                 if owner not in self.scene.objects:
                     raise UnknownNameError("object", owner, self.scene.objects, field=field)
                 attachments = self.scene.objects[owner].object.attachments
                 if attachment not in attachments:
-                    raise UnknownNameError(f"attachment of '{owner}'", attachment, attachments, field=field)
+                    raise UnknownNameError(
+                        f"attachment of '{owner}'", attachment, attachments, field=field
+                    )
                 if hold.frame is not None:
                     self.check_frame(hold.frame, field.replace("held", "by"))
                 for name in attachments[attachment].coordinates:
                     if f"{owner}.{name}" not in names:
                         problem = "this grasp's coordinate is missing"
-                        raise InputError(problem, field="trajectory.names", expected=f"{owner}.{name}")
+                        raise InputError(
+                            problem, field="trajectory.names", expected=f"{owner}.{name}"
+                        )
 
     def _check_opening(self, opening: float, field: str) -> None:
         gripper = self.scene.robot.gripper
         if gripper is None:
             expected = "a `gripper` in its robot.yaml"
-            raise InputError("the robot's gripper does not open", field=field, expected=expected, got=opening)
+            raise InputError(
+                "the robot's gripper does not open", field=field, expected=expected, got=opening
+            )
         if abs(gripper.nearest(opening) - opening) > EXACT:
             expected = f"{gripper.narrowest:.4g} to {gripper.widest:.4g} m"
-            raise InputError("the gripper cannot be so far open", field=field, expected=expected, got=opening)
+            raise InputError(
+                "the gripper cannot be so far open", field=field, expected=expected, got=opening
+            )
 
     def check_frame(self, frame: str, field: str) -> None:
         """Check that "<object>.<link>" exists. Raises `UnknownNameError` if it does not."""
@@ -114,7 +137,12 @@ class Samples:
             raise UnknownNameError("object", owner, self.scene.objects, field=field)
         item = self.scene.objects[owner].object
         if not item.free:
-            raise InputError("it stands fixed in the world", field=field, expected="a link of a free object", got=frame)
+            raise InputError(
+                "it stands fixed in the world",
+                field=field,
+                expected="a link of a free object",
+                got=frame,
+            )
         if link not in item.links:
             raise UnknownNameError(f"link of '{owner}'", link, item.links, field=field)
 
@@ -128,17 +156,35 @@ class Samples:
             edges, spans = curve.times, np.diff(curve.times)[:, None]
             speeds, accelerations = curve.speeds()
             steps, bends = speeds * spans, accelerations * spans**2 / 8.0
-        known = dict(zip(self.world.coordinates.names, self.world.coordinates.strides(LENGTH_STEP, ANGLE_STEP), strict=True))
-        units = np.array([known.get(n, LENGTH_STEP if self.unit(n) == "m" else ANGLE_STEP) for n in self.trajectory.names])
+        known = dict(
+            zip(
+                self.world.coordinates.names,
+                self.world.coordinates.strides(LENGTH_STEP, ANGLE_STEP),
+                strict=True,
+            )
+        )
+        units = np.array(
+            [
+                known.get(n, LENGTH_STEP if self.unit(n) == "m" else ANGLE_STEP)
+                for n in self.trajectory.names
+            ]
+        )
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
         bent = np.sqrt((bends / (BEND * units)).max(axis=1))
-        counts = np.maximum(1, np.ceil(np.maximum.reduce([planar, (steps / units).max(axis=1), bent]) - 1e-9))
+        counts = np.maximum(
+            1, np.ceil(np.maximum.reduce([planar, (steps / units).max(axis=1), bent]) - 1e-9)
+        )
         self.needed = float(counts.sum())
         self.truncated = self.needed > max(MOST, len(counts))
         counts = np.ones(len(counts), int) if self.truncated else counts.astype(int)
-        times = [np.linspace(a, b, n, endpoint=False) for (a, b), n in zip(itertools.pairwise(edges), counts, strict=True)]
+        times = [
+            np.linspace(a, b, n, endpoint=False)
+            for (a, b), n in zip(itertools.pairwise(edges), counts, strict=True)
+        ]
         rows = np.concatenate([[0], np.cumsum(counts)])
-        return np.concatenate([*times, edges[-1:]]), rows[np.searchsorted(edges, self.trajectory.times)]
+        return np.concatenate([*times, edges[-1:]]), rows[
+            np.searchsorted(edges, self.trajectory.times)
+        ]
 
     def unit(self, name: str) -> str:
         """Return a coordinate's unit, "m" or "rad"."""
@@ -155,14 +201,22 @@ class Samples:
             if i < 3 and robot.base == "fixed":  # wherever it stands
                 lower = upper = float(self.scene.start[i])
             if i < 2:
-                lower, upper = max(lower, self.scene.arena[2 * i]), min(upper, self.scene.arena[2 * i + 1])
+                lower, upper = (
+                    max(lower, self.scene.arena[2 * i]),
+                    min(upper, self.scene.arena[2 * i + 1]),
+                )
             return lower, upper, float(robot.velocity[i]), float(robot.acceleration[i])
         if name in self.virtual:
             return self.virtual[name].lower, self.virtual[name].upper, np.inf, np.inf
         owner, _, joint = name.partition(".")
         item = self.scene.objects[owner].object
         i = item.coordinates.index(joint)
-        return float(item.lower[i]), float(item.upper[i]), float(item.velocity[i]), float(item.acceleration[i])
+        return (
+            float(item.lower[i]),
+            float(item.upper[i]),
+            float(item.velocity[i]),
+            float(item.acceleration[i]),
+        )
 
     def waypoint(self, row: int) -> int:
         """Return the waypoint of a sample, between two the earlier."""
@@ -186,7 +240,9 @@ class Samples:
     def placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
         """Return the placements of a frame in the world at some samples."""
         turns, origins = self._frames(self.z[np.asarray(rows)], frame)
-        return [pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)]
+        return [
+            pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)
+        ]
 
     def _frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
         """Return rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames in the world.
@@ -196,8 +252,14 @@ class Samples:
             *names: The frames.
         """
         model, data = self.world.model, self.world.model.createData()
-        configurations, frames = self.world.coordinates.q(z), [model.getFrameId(name) for name in names]
-        turns, origins = np.empty((len(configurations), len(frames), 3, 3)), np.empty((len(configurations), len(frames), 3))
+        configurations, frames = (
+            self.world.coordinates.q(z),
+            [model.getFrameId(name) for name in names],
+        )
+        turns, origins = (
+            np.empty((len(configurations), len(frames), 3, 3)),
+            np.empty((len(configurations), len(frames), 3)),
+        )
         for k, q in enumerate(configurations):
             pin.forwardKinematics(model, data, q)
             for f, frame in enumerate(frames):
@@ -216,23 +278,36 @@ class Samples:
         """
         return self._grasp_errors(owner, name, self.times[rows], self.z[rows], by)
 
-    def grasp_errors_at(self, owner: str, name: str, times: Floats, by: str | None = None) -> Floats:
+    def grasp_errors_at(
+        self, owner: str, name: str, times: Floats, by: str | None = None
+    ) -> Floats:
         """Return the same at any moments, increasing, shape (K,) [s]."""
         z = self.world.positions(self.trajectory, times, self.free)
         return self._grasp_errors(owner, name, times, z, by)
 
-    def _grasp_errors(self, owner: str, name: str, times: Floats, z: Floats, by: str | None) -> Floats:
+    def _grasp_errors(
+        self, owner: str, name: str, times: Floats, z: Floats, by: str | None
+    ) -> Floats:
         attachment = self.scene.objects[owner].object.attachments[name]
         hand = hand_frame(self.scene.robot, attachment)
-        turns, origins = self._frames(z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}")
-        positions, own = self.trajectory.at(times), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
+        turns, origins = self._frames(
+            z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}"
+        )
+        positions, own = (
+            self.trajectory.at(times),
+            [f"{owner}.{suffix}" for suffix in attachment.coordinates],
+        )
         values = np.zeros((len(times), len(own)))
         for column, coordinate in enumerate(own):
             if coordinate in self.trajectory.names:
                 values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
-        known, which = np.unique(values, axis=0, return_inverse=True)  # most grasps stay as they are
+        known, which = np.unique(
+            values, axis=0, return_inverse=True
+        )  # most grasps stay as they are
         held = [attachment.tool(row) for row in known]
-        turn, origin = (np.array([getattr(part, side) for part in held]) for side in ("rotation", "translation"))
+        turn, origin = (
+            np.array([getattr(part, side) for part in held]) for side in ("rotation", "translation")
+        )
         which = which.reshape(-1)
         aimed = origins[:, 1] + np.einsum("kij,kj->ki", turns[:, 1], origin[which])
         off = origins[:, 0] + turns[:, 0] @ hand.translation - aimed

@@ -1,7 +1,8 @@
 """Looks along a motion for pairs that come close: at waypoints, and wherever between them two could.
 
-A pair is left out of a stretch between two waypoints only where it cannot come close: the distance of two bodies changes
-by at most what their relative motion is long. All stretches are looked at together, all their halves next, and so on.
+A pair is left out of a stretch between two waypoints only where it cannot come close: the distance
+of two bodies changes by at most what their relative motion is long. All stretches are looked at
+together, all their halves next, and so on.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ from vkc_pin.validation.pairs import PairTable
 __all__ = ["Hit", "sweep"]
 
 RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
-STILL = 1e-6  # [m] of relative motion between two samples that changes nothing, as of what stands where it was put
+# [m] of relative motion between two samples that changes nothing, as of what stands where it was
+# put
+STILL = 1e-6
 
 
 class Hit(NamedTuple):
     """A pair's distance [m] at one state: at sample `row`, or between it and the next.
 
-    `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact [m]. `usual` is the clearance
-    that the pair would have to keep were it not exempt, and 0 where it is not; `shapes` are its numbers in the world.
+    `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact
+    [m]. `usual` is the clearance that the pair would have to keep were it not exempt, and 0 where
+    it is not; `shapes` are its numbers in the world.
     """
 
     row: int
@@ -62,38 +66,56 @@ class _Sweep:
         apart = np.flatnonzero(margins > -np.inf)  # what moves as one is as close as it was
         closest = apart[_least(at[apart], distances[apart])]
         exempt = self._table.exempt_at(pairs, at) & (distances < self._table.margins[pairs])
-        chosen = np.union1d(closest, np.flatnonzero((distances < np.maximum(margins, 0.0)) | exempt))
-        yield from self._hits(waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True)
+        chosen = np.union1d(
+            closest, np.flatnonzero((distances < np.maximum(margins, 0.0)) | exempt)
+        )
+        yield from self._hits(
+            waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True
+        )
         smallest = max(
             RESOLUTION, float(distances[closest].min(initial=np.inf))
         )  # what cannot come closer than that changes nothing
         moved = travelled(self._solids, z)
         stretch, pairs = self._active(placed, np.diff(moved[waypoints], axis=0), smallest)
-        ends = placed.distances(np.concatenate([stretch, stretch + 1]), np.tile(self._table.pairs[pairs], (2, 1)))
+        ends = placed.distances(
+            np.concatenate([stretch, stretch + 1]), np.tile(self._table.pairs[pairs], (2, 1))
+        )
         before, after = np.split(ends, 2)
-        yield from self._between(z, Stretches(waypoints[stretch], waypoints[stretch + 1], pairs, before, after), moved, smallest)
+        yield from self._between(
+            z,
+            Stretches(waypoints[stretch], waypoints[stretch + 1], pairs, before, after),
+            moved,
+            smallest,
+        )
 
     def _between(self, z: Floats, todo: Stretches, moved: Floats, smallest: float) -> Iterator[Hit]:
         """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
 
-        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it is what it is at both ends;
-        an overlap is looked at all the same, to be told of wherever it is.
+        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it
+        is what it is at both ends; an overlap is looked at all the same, to be told of wherever it
+        is.
 
         Args:
             z: Sampled configurations of the world, shape (S, n).
-            todo: Where to look, of all stretches at once; those of the same samples are next to each other.
+            todo: Where to look, of all stretches at once; those of the same samples are next to
+                each other.
             moved: See `travelled`.
             smallest: [m].
         """
         while len(todo.pair):
             motion = self._motion(todo, moved)
-            todo = todo.select((todo.before + todo.after - motion < 2 * smallest) & ((motion > STILL) | (todo.before < 0)))
+            todo = todo.select(
+                (todo.before + todo.after - motion < 2 * smallest)
+                & ((motion > STILL) | (todo.before < 0))
+            )
             next_to = todo.high - todo.low == 1
             yield from self._slipping(z, todo.select(next_to), moved)
             todo = todo.select(~next_to)
             middle = (todo.low + todo.high) // 2
             rows, at = np.unique(middle, return_inverse=True)
-            distances = self._solids.at(self._solids.world.coordinates.q(z[rows])).distances(at, self._table.pairs[todo.pair])
+            distances = self._solids.at(self._solids.world.coordinates.q(z[rows])).distances(
+                at, self._table.pairs[todo.pair]
+            )
             told = np.union1d(_least(at, distances), np.flatnonzero(distances < 0))
             yield from self._hits(middle[told], todo.pair[told], distances[told])
             todo = Stretches(
@@ -107,7 +129,9 @@ class _Sweep:
     def _motion(self, todo: Stretches, moved: Floats) -> Floats:
         """Return how far any two points of pairs can move relative to each other in stretches, shape (n,) [m]."""
         first, second = self._table.pairs[todo.pair].T
-        return (moved[todo.high, first] - moved[todo.low, first]) + (moved[todo.high, second] - moved[todo.low, second])
+        return (moved[todo.high, first] - moved[todo.low, first]) + (
+            moved[todo.high, second] - moved[todo.low, second]
+        )
 
     def _slipping(self, z: Floats, todo: Stretches, moved: Floats) -> Iterator[Hit]:
         """Yield what overlaps between a sample and the next, at both of which it is free: nothing deeper than 1 mm can hide.
@@ -119,7 +143,9 @@ class _Sweep:
         """
         first, motion = self._stretch(todo.low), self._motion(todo, moved)
         overlap = self._table.contact_at(todo.pair, first, first + 1)
-        free = (np.minimum(todo.before, todo.after) >= -overlap) & (todo.before + todo.after < motion)
+        free = (np.minimum(todo.before, todo.after) >= -overlap) & (
+            todo.before + todo.after < motion
+        )
         free &= ~self._table.together_at(todo.pair, first, first + 1)
         for c in np.flatnonzero(free).tolist():
             row, k = todo.low[c], todo.pair[c]
@@ -129,7 +155,11 @@ class _Sweep:
                 if (width := (high - low) * motion[c]) <= 2 * RESOLUTION or before + after >= width:
                     continue
                 middle = (low + high) / 2
-                state = self._solids.at(self._solids.world.coordinates.q((1 - middle) * z[[row]] + middle * z[[row + 1]]))
+                state = self._solids.at(
+                    self._solids.world.coordinates.q(
+                        (1 - middle) * z[[row]] + middle * z[[row + 1]]
+                    )
+                )
                 found = state.distances(np.zeros(1, int), self._table.pairs[[k]])
                 yield from self._hits(np.array([row]), np.array([k]), found)
                 between = float(found[0])
@@ -142,10 +172,15 @@ class _Sweep:
         found, todo = list[tuple[Ints, Ints, Floats]](), np.arange(len(placed))
         reach = max(self._table.margins.max(), RESOLUTION)
         while len(todo):
-            at, pairs = self._table.near(placed, todo, todo, np.zeros((len(todo), len(self._table.group))), reach)
+            at, pairs = self._table.near(
+                placed, todo, todo, np.zeros((len(todo), len(self._table.group))), reach
+            )
             states = todo[at]
             distances = placed.distances(states, self._table.pairs[pairs])
-            least, apart = np.full(len(placed), np.inf), self._table.margins_at(pairs, states) > -np.inf
+            least, apart = (
+                np.full(len(placed), np.inf),
+                self._table.margins_at(pairs, states) > -np.inf,
+            )
             np.minimum.at(least, states[apart], distances[apart])
             done = ~(least > reach)  # all others are further apart
             kept = done[states]
@@ -158,20 +193,26 @@ class _Sweep:
     def _active(self, placed: Placed, moved: Floats, smallest: float) -> tuple[Ints, Ints]:
         """Return (t, pair) of all but those that boxes prove to stay `smallest` apart between waypoints t and t + 1 [m].
 
-        Where d(s) of `_between` is less, one of both distances is less than `smallest` and half the relative motion.
+        Where d(s) of `_between` is less, one of both distances is less than `smallest` and half the
+        relative motion.
 
         Args:
             placed: The world at the T waypoints.
-            moved: How far any point of each geometry moves from each to the next, shape (T − 1, G) [m].
+            moved: How far any point of each geometry moves from each to the next, shape (T − 1, G)
+                [m].
             smallest: [m].
         """
-        return self._table.near(placed, np.arange(len(moved)), np.arange(1, len(moved) + 1), moved, smallest)
+        return self._table.near(
+            placed, np.arange(len(moved)), np.arange(1, len(moved) + 1), moved, smallest
+        )
 
     def _stretch(self, rows: Ints) -> Ints:
         """Return the waypoints from which the stretches begin in which samples are, shape (n,)."""
         return np.searchsorted(self._waypoints, rows, side="right") - 1
 
-    def _hits(self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoint: bool = False) -> Iterator[Hit]:
+    def _hits(
+        self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoint: bool = False
+    ) -> Iterator[Hit]:
         """Yield the distances of pairs at samples, or between these and the next, all of shape (n,)."""
         at = self._stretch(rows)
         margins = self._table.margins_at(pairs, at)
@@ -179,8 +220,12 @@ class _Sweep:
         labels = self._solids.world.collision_labels
         usual = np.where(self._table.exempt_at(pairs, at), self._table.margins[pairs], 0.0)
         columns = (rows, self._table.pairs[pairs], distances, margins, contacts, usual)
-        for row, (i, j), distance, margin, contact, clearance in zip(*(c.tolist() for c in columns), strict=True):
-            yield Hit(row, labels[i], labels[j], distance, margin, contact, at_waypoint, clearance, (i, j))
+        for row, (i, j), distance, margin, contact, clearance in zip(
+            *(c.tolist() for c in columns), strict=True
+        ):
+            yield Hit(
+                row, labels[i], labels[j], distance, margin, contact, at_waypoint, clearance, (i, j)
+            )
 
 
 class Stretches(NamedTuple):
@@ -194,7 +239,13 @@ class Stretches(NamedTuple):
 
     def select(self, which: Bools) -> Stretches:
         """Return those of them."""
-        return Stretches(self.low[which], self.high[which], self.pair[which], self.before[which], self.after[which])
+        return Stretches(
+            self.low[which],
+            self.high[which],
+            self.pair[which],
+            self.before[which],
+            self.after[which],
+        )
 
 
 def _least(groups: Ints, values: Floats) -> Ints:

@@ -22,11 +22,13 @@ BETWEEN = 10.0  # times the tolerance at a waypoint
 def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
     """Return the worst violation of each constraint among `terms`, at a waypoint and between two.
 
-    A constraint holds at the waypoints of its phases after their first, which is where the phase before, or the start, has
-    brought everything; while the robot still stands there for its gripper, nothing is asked. Between two such waypoints the
-    coordinates are linear in time and expressions of frames are not. The program knows nothing of that, and what they are off
-    by is of second order in the step, so ten times the tolerance is allowed there. What is said of velocities is said
-    of the last step's time: between waypoints, of a time as long as the present step, so that nothing jumps at a waypoint.
+    A constraint holds at the waypoints of its phases after their first, which is where the phase
+    before, or the start, has brought everything; while the robot still stands there for its
+    gripper, nothing is asked. Between two such waypoints the coordinates are linear in time and
+    expressions of frames are not. The program knows nothing of that, and what they are off by is of
+    second order in the step, so ten times the tolerance is allowed there. What is said of
+    velocities is said of the last step's time: between waypoints, of a time as long as the present
+    step, so that nothing jumps at a waypoint.
     """
     found = []
     for term in (term for term in terms if isinstance(term, Constraint)):
@@ -42,17 +44,33 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
             mine = np.flatnonzero(np.isin(rows, which))
             if not len(mine):
                 continue
-            k, entry = (int(i) for i in np.unravel_index(np.argmax(excess[mine]), (len(mine), len(lower))))
+            k, entry = (
+                int(i) for i in np.unravel_index(np.argmax(excess[mine]), (len(mine), len(lower)))
+            )
             row, amount = int(rows[mine[k]]), float(excess[mine[k], entry])
             if amount <= tolerance:
                 continue
             value = float(values[mine[k], entry])
-            side = f"less than {lower[entry]:.6g}" if value < lower[entry] else f"more than {upper[entry]:.6g}"
+            side = (
+                f"less than {lower[entry]:.6g}"
+                if value < lower[entry]
+                else f"more than {upper[entry]:.6g}"
+            )
             name = f"entry {entry}: " if len(lower) > 1 else ""
             where = " between waypoints" if which is between else ""
             detail = f"{name}{value:.6g} is {side} by {amount:.3g}{where}"
             waypoint, time = samples.waypoint(row), float(samples.times[row])
-            found.append(Violation("term", term.name, waypoint=waypoint, time=time, amount=amount, unit="", detail=detail))
+            found.append(
+                Violation(
+                    "term",
+                    term.name,
+                    waypoint=waypoint,
+                    time=time,
+                    amount=amount,
+                    unit="",
+                    detail=detail,
+                )
+            )
     return found
 
 
@@ -63,25 +81,36 @@ def _rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
     for phase in trajectory.phases:
         if term.active(phase.name, phase.held):
             inside = slice(phase.first + 1, phase.last + 1)
-            left = np.abs(trajectory.positions[inside] - trajectory.positions[phase.first]).max(axis=1) > 0.0
+            left = (
+                np.abs(trajectory.positions[inside] - trajectory.positions[phase.first]).max(axis=1)
+                > 0.0
+            )
             asked[inside] = np.logical_or.accumulate(left) | asked[phase.first]
             asked[phase.last] |= phase.first > 0 or bool(left.any())
     at = samples.waypoint_rows[asked]
     edges = itertools.pairwise(samples.waypoint_rows.tolist())
-    inner = [np.arange(a + 1, b) for (a, b), both in zip(edges, asked[1:] & asked[:-1], strict=True) if both]
+    inner = [
+        np.arange(a + 1, b)
+        for (a, b), both in zip(edges, asked[1:] & asked[:-1], strict=True)
+        if both
+    ]
     return at, np.concatenate([np.zeros(0, int), *inner])
 
 
 def _inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
     """Return the inputs of a formula at some samples, shape (S, 2·half + 1)."""
-    ends = np.searchsorted(samples.waypoint_rows, rows)  # the waypoint in which the segment of a sample ends
+    ends = np.searchsorted(
+        samples.waypoint_rows, rows
+    )  # the waypoint in which the segment of a sample ends
     dt = np.diff(samples.trajectory.times, prepend=samples.trajectory.times[0] - 1.0)[ends]
     now = before = _half(samples, formula, samples.z[rows])
     if formula.moving:
         times = samples.times[rows] - dt
         order = np.argsort(times, kind="stable")
         earlier = np.empty((len(rows), samples.z.shape[1]))
-        earlier[order] = samples.world.positions(samples.trajectory, np.maximum(times[order], samples.trajectory.times[0]))
+        earlier[order] = samples.world.positions(
+            samples.trajectory, np.maximum(times[order], samples.trajectory.times[0])
+        )
         before = _half(samples, formula, earlier)
     return np.column_stack([now, before, dt])
 
@@ -96,7 +125,10 @@ def _half(samples: Samples, formula: Formula, z: Floats) -> Floats:
         pin.forwardKinematics(model, data, q)
         for k, frame in enumerate(frames):
             placement = pin.updateFramePlacement(model, data, frame)
-            row[12 * k : 12 * k + 9], row[12 * k + 9 : 12 * k + 12] = placement.rotation.T.ravel(), placement.translation
+            row[12 * k : 12 * k + 9], row[12 * k + 9 : 12 * k + 12] = (
+                placement.rotation.T.ravel(),
+                placement.translation,
+            )
     for k, name in enumerate(formula.coordinates, start=12 * len(frames)):
         found[:, k] = z[:, coordinates.index(name)]
     return found

@@ -1,7 +1,8 @@
 """The independent check of a motion, continuous in time.
 
-It knows nothing of the optimiser: numeric Pinocchio on the plain tree of robot and objects side by side (`world`), coal
-on every pair that could come close, at most 5 mm and 0.01 rad apart there, closer where something could slip through.
+It knows nothing of the optimiser: numeric Pinocchio on the plain tree of robot and objects side by
+side (`world`), coal on every pair that could come close, at most 5 mm and 0.01 rad apart there,
+closer where something could slip through.
 """
 
 from __future__ import annotations
@@ -37,13 +38,19 @@ __all__ = ["check_fits", "validate"]
 
 START_TOLERANCE = 1e-9  # [m] or [rad]
 LIMIT_TOLERANCE = 1e-5  # [m] or [rad]
-START_LIMIT_TOLERANCE = 1e-2  # [m] or [rad]: a start slightly outside its limits is where the robot is
+START_LIMIT_TOLERANCE = (
+    1e-2  # [m] or [rad]: a start slightly outside its limits is where the robot is
+)
 LATCH_TOLERANCE = 1e-4
 WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
 
 
 def validate(
-    scene: Scene, steps: Sequence[Step], trajectory: Trajectory, options: Options | None = None, terms: Sequence[Term] = ()
+    scene: Scene,
+    steps: Sequence[Step],
+    trajectory: Trajectory,
+    options: Options | None = None,
+    terms: Sequence[Term] = (),
 ) -> Report:
     """Check a motion against everything that was asked of it.
 
@@ -55,14 +62,17 @@ def validate(
         terms: The user's own constraints; costs are nothing to check.
 
     Returns:
-        Every violated constraint: start, limits, velocity, acceleration, jerk, torque, bases that slip,
+        Every violated constraint: start, limits, velocity, acceleration, jerk, torque, bases that
+            slip,
         turn tighter than they can or whose wheels turn too fast, closure, latches,
-        rests in which the gripper closes or opens, how far it is open, joints of objects that nobody holds, what tips on what it
-        stands on, hands that slide on what they clamp, pushes that would pull, goals and their order, clearance at waypoints and
-        penetration anywhere, and own constraints; or that it is longer than can be looked at.
+        rests in which the gripper closes or opens, how far it is open, joints of objects that
+        nobody holds, what tips on what it stands on, hands that slide on what they clamp, pushes
+        that would pull, goals and their order, clearance at waypoints and penetration anywhere, and
+        own constraints; or that it is longer than can be looked at.
 
     Raises:
-        InputError: The trajectory is none of this scene's robot and objects, or a step or term names what is not there.
+        InputError: The trajectory is none of this scene's robot and objects, or a step or term
+            names what is not there.
     """
     options = Options() if options is None else instance(options, Options, "options")
     return _Check(*check_fits(scene, steps, trajectory, terms), options).report()
@@ -72,13 +82,18 @@ def check_fits(
     scene: Scene, steps: Sequence[Step], trajectory: Trajectory, terms: Sequence[Term] = ()
 ) -> tuple[Samples, tuple[Step, ...], tuple[Term, ...]]:
     """Return what `validate` checks, for its arguments; raise what it raises. That takes a few milliseconds."""
-    samples, asked = Samples(instance(scene, Scene, "scene"), instance(trajectory, Trajectory, "trajectory")), as_list(steps)
+    samples, asked = (
+        Samples(instance(scene, Scene, "scene"), instance(trajectory, Trajectory, "trajectory")),
+        as_list(steps),
+    )
     check_steps(samples, asked)
     return samples, asked, traced(scene, terms)
 
 
 class _Check:
-    def __init__(self, samples: Samples, steps: Sequence[Step], terms: Sequence[Term], options: Options) -> None:
+    def __init__(
+        self, samples: Samples, steps: Sequence[Step], terms: Sequence[Term], options: Options
+    ) -> None:
         self.samples, self.steps, self.options, self.terms = samples, steps, options, terms
         self.scene, self.trajectory = samples.scene, samples.trajectory
         self.found: list[Violation] = []
@@ -94,10 +109,18 @@ class _Check:
         self.found += check_goals(self.samples, self.steps, self.options)
         self.found += check_terms(self.samples, self.terms)
         motors = Motors(self.samples)
-        self.found += [*check_gripper(self.samples, self.options), *check_pushes(self.samples), *motors.violations()]
+        self.found += [
+            *check_gripper(self.samples, self.options),
+            *check_pushes(self.samples),
+            *motors.violations(),
+        ]
         error, angle = self._closure()
         self._slides()
-        nearest = self._clearance() if self._within_reason() else np.full(len(self.trajectory.phases), np.inf)
+        nearest = (
+            self._clearance()
+            if self._within_reason()
+            else np.full(len(self.trajectory.phases), np.inf)
+        )
         worst: dict[tuple[str, str, str], Violation] = {}
         for violation in self.found:
             key = (violation.constraint, violation.subject, violation.unit)
@@ -106,7 +129,9 @@ class _Check:
         for violation in self.found:  # what overlaps is also too close
             if violation.constraint == "penetration":
                 worst.pop(("clearance", violation.subject, violation.unit), None)
-        ordered = tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
+        ordered = tuple(
+            sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit))
+        )
         close, facts = tuple(nearest.tolist()), motors.facts(self.options.jerk_time)
         return Report(
             ordered,
@@ -136,7 +161,15 @@ class _Check:
         if time is None:
             time = self.trajectory.times[at] if row is None else self.samples.times[row]
         self.found.append(
-            Violation(constraint, subject, waypoint=int(at), time=float(time), amount=float(amount), unit=unit, detail=detail)
+            Violation(
+                constraint,
+                subject,
+                waypoint=int(at),
+                time=float(time),
+                amount=float(amount),
+                unit=unit,
+                detail=detail,
+            )
         )
 
     def _within_reason(self) -> bool:
@@ -150,29 +183,54 @@ class _Check:
 
     def _start(self) -> None:
         """The motion begins where the robot and the objects are."""
-        known = dict(zip(self.samples.world.coordinates.names, self.samples.world.start, strict=True))
+        known = dict(
+            zip(self.samples.world.coordinates.names, self.samples.world.start, strict=True)
+        )
         for name, value in zip(self.trajectory.names, self.trajectory.positions[0], strict=True):
             right, unit = known.get(name, value), self.samples.unit(name)
             if not abs(value - right) <= START_TOLERANCE:
-                self._add("start", name, abs(value - right), unit, f"{value:.6g} {unit} instead of {right:.6g} {unit}")
+                self._add(
+                    "start",
+                    name,
+                    abs(value - right),
+                    unit,
+                    f"{value:.6g} {unit} instead of {right:.6g} {unit}",
+                )
 
     def _limits(self) -> None:
         """Every coordinate stays within its limits (eq. 4)."""
-        ranges = zip(self.trajectory.names, self.trajectory.positions[0], *(side.T for side in self._ranges), strict=True)
+        ranges = zip(
+            self.trajectory.names,
+            self.trajectory.positions[0],
+            *(side.T for side in self._ranges),
+            strict=True,
+        )
         for name, start, low, high in ranges:
             lower, upper, _, _ = self.samples.bounds(name)
             most = max(lower - start, start - upper)
             excess = np.maximum(lower - low, high - upper)
-            excess[0] -= most if 0.0 < most <= START_LIMIT_TOLERANCE else 0.0  # no further out than it begins
+            excess[0] -= (
+                most if 0.0 < most <= START_LIMIT_TOLERANCE else 0.0
+            )  # no further out than it begins
             worst = int(np.argmax(excess))
             if not excess[worst] <= LIMIT_TOLERANCE:
                 unit, value = (
                     self.samples.unit(name),
                     float(max(low[worst], high[worst], key=lambda v: max(lower - v, v - upper))),
                 )
-                out, ends = max(lower - value, value - upper), self.trajectory.column(name)[worst : worst + 2]
+                out, ends = (
+                    max(lower - value, value - upper),
+                    self.trajectory.column(name)[worst : worst + 2],
+                )
                 detail = f"{value:.4f} {unit} is outside {lower:.4f} to {upper:.4f} {unit} by {out:.4f} {unit}"
-                self._add("limit", name, out, unit, detail, waypoint=worst + int(np.argmin(np.abs(ends - value))))
+                self._add(
+                    "limit",
+                    name,
+                    out,
+                    unit,
+                    detail,
+                    waypoint=worst + int(np.argmin(np.abs(ends - value))),
+                )
 
     def _tips(self) -> None:
         """What something stands on stays level while it moves."""
@@ -184,7 +242,9 @@ class _Check:
                 worst = int(np.argmax(angles))
                 if not angles[worst] <= LEVEL:
                     detail = f"'{label}', on which it stands, tilts by {angles[worst]:.2f} rad, more than {LEVEL:g} rad"
-                    self._add("tips", owner, angles[worst] - LEVEL, "rad", detail, row=int(rows[worst]))
+                    self._add(
+                        "tips", owner, angles[worst] - LEVEL, "rad", detail, row=int(rows[worst])
+                    )
 
     def _unheld(self) -> None:
         """What no hand moves does not move."""
@@ -194,14 +254,18 @@ class _Check:
                 if i < self.trajectory.robot_size or name in driven or name in self.samples.virtual:
                     continue
                 owner = name.partition(".")[0]
-                why = "where it is held, nothing drives it" if owner in phase.held else f"nobody holds {owner}"
+                why = (
+                    "where it is held, nothing drives it"
+                    if owner in phase.held
+                    else f"nobody holds {owner}"
+                )
                 self._still(phase, "unheld", name, "moves by ", f" while {why}")
 
     def _latches(self) -> None:
         """A latched joint leaves where it is held only while the joint that releases it is far enough.
 
-        Between two samples both are linear in time, so the shortfall is largest where the joint starts to leave or where
-        the latch's reach ends.
+        Between two samples both are linear in time, so the shortfall is largest where the joint
+        starts to leave or where the latch's reach ends.
         """
         z, names = self.samples.z, self.samples.world.coordinates
         for owner, placed in self.scene.objects.items():
@@ -209,10 +273,16 @@ class _Check:
                 name, release = f"{owner}.{latch.joint}", f"{owner}.{latch.released_by}"
                 off = z[:, names.index(name)] - latch.held_at
                 before, after = np.abs(off[:-1]), np.abs(off[1:])
-                crossed = off[:-1] * off[1:] < 0  # goes through where it is held, and leaves on the other side
+                crossed = (
+                    off[:-1] * off[1:] < 0
+                )  # goes through where it is held, and leaves on the other side
                 begin = np.where(crossed, before / np.where(crossed, before + after, 1.0), 0.0)
                 reach = np.where(crossed, 0.0, before)
-                leaves = (after > reach + 1e-12) & (after > LATCH_TOLERANCE) & (reach <= latch.engaged_within)
+                leaves = (
+                    (after > reach + 1e-12)
+                    & (after > LATCH_TOLERANCE)
+                    & (reach <= latch.engaged_within)
+                )
                 share = (latch.engaged_within - reach) / np.where(leaves, after - reach, 1.0)
                 end = np.where(leaves, begin + np.clip(share, 0.0, 1.0) * (1 - begin), begin)
                 value, change = z[:-1, names.index(release)], np.diff(z[:, names.index(release)])
@@ -224,7 +294,9 @@ class _Check:
                         f"leaves {latch.held_at:g} while {latch.released_by} is at {lowest[row]:.3f}, "
                         f"{short[row]:.3f} short of {latch.threshold:g}"
                     )
-                    self._add("latch", name, short[row], self.samples.unit(release), detail, row=row)
+                    self._add(
+                        "latch", name, short[row], self.samples.unit(release), detail, row=row
+                    )
 
     def _closure(self) -> tuple[float, float]:
         """The hand stays where it holds an object (eq. 2); return the largest drift, [m] and [rad]."""
@@ -239,8 +311,19 @@ class _Check:
                     if not bound <= limit:
                         amount = found if found > limit else bound
                         detail = f"the grasp drifts by {1e3 * amount:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
-                        at = min(int(np.searchsorted(self.trajectory.times, time, side="right")) - 1, phase.last)
-                        self._add("closure", subject, amount - limit, unit, detail, waypoint=at, time=float(time))
+                        at = min(
+                            int(np.searchsorted(self.trajectory.times, time, side="right")) - 1,
+                            phase.last,
+                        )
+                        self._add(
+                            "closure",
+                            subject,
+                            amount - limit,
+                            unit,
+                            detail,
+                            waypoint=at,
+                            time=float(time),
+                        )
         return float(largest[0]), float(largest[1])
 
     def _slides(self) -> None:
@@ -260,34 +343,69 @@ class _Check:
         worst = int(np.argmax(moved))
         if not moved[worst] <= MOTION_TOLERANCE:
             at = phase.first + worst + 1
-            self._add(kind, name, moved[worst], unit, f"{before}{moved[worst]:.4f} {unit}{after}", waypoint=at)
+            self._add(
+                kind,
+                name,
+                moved[worst],
+                unit,
+                f"{before}{moved[worst]:.4f} {unit}{after}",
+                waypoint=at,
+            )
 
     def _clearance(self) -> Floats:
         """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return each phase's smallest distance [m].
 
-        What moves as one does not count. The start is where the robot is: it may be close to something, but not inside.
+        What moves as one does not count. The start is where the robot is: it may be close to
+        something, but not inside.
         """
-        samples, solids, lasts = self.samples, Solids(self.samples.world), [phase.last for phase in self.trajectory.phases]
+        samples, solids, lasts = (
+            self.samples,
+            Solids(self.samples.world),
+            [phase.last for phase in self.trajectory.phases],
+        )
         near = windows(samples, solids, self.steps, self.options)
         safe, own = self.options.dist_safe, self.options.self_distance
-        pairs = PairTable(self.scene, solids, self.trajectory, safe, own, windows=near, samples=samples)
+        pairs = PairTable(
+            self.scene, solids, self.trajectory, safe, own, windows=near, samples=samples
+        )
         nearest, exempt = np.full(len(lasts), np.inf), self._exempt_pairs()
         names = samples.world.coordinates.names
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
             state = samples.z[[hit.row]]
-            # Also on the way to the waypoint at which the exemption ends, or from that at which it begins.
-            tolerated = max((-one.margin for one in exempt.get(hit.shapes, ()) if one.holds(names, state)[0]), default=0.0)
+            # Also on the way to the waypoint at which the exemption ends, or from that at which it
+            # begins.
+            tolerated = max(
+                (-one.margin for one in exempt.get(hit.shapes, ()) if one.holds(names, state)[0]),
+                default=0.0,
+            )
             overlap = max(hit.contact, CONTACT + tolerated if tolerated > 0.0 else 0.0)
             if hit.margin > -np.inf and not tolerated > 0.0:
-                np.minimum.at(nearest, np.searchsorted(lasts, samples.waypoint(hit.row)), hit.distance)
+                np.minimum.at(
+                    nearest, np.searchsorted(lasts, samples.waypoint(hit.row)), hit.distance
+                )
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
-            short = (min(hit.margin, -tolerated) if tolerated > 0.0 else hit.margin) - WAYPOINT_TOLERANCE - hit.distance
+            short = (
+                (min(hit.margin, -tolerated) if tolerated > 0.0 else hit.margin)
+                - WAYPOINT_TOLERANCE
+                - hit.distance
+            )
             if hit.distance < -overlap:
-                self._add("penetration", subject, -hit.distance, "m", f"overlap by {millimetres:.1f} mm", row=hit.row)
+                self._add(
+                    "penetration",
+                    subject,
+                    -hit.distance,
+                    "m",
+                    f"overlap by {millimetres:.1f} mm",
+                    row=hit.row,
+                )
             elif hit.at_waypoint and hit.row > 0 and short > 0.0:
-                detail = f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
+                detail = (
+                    f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
+                )
                 self._add("clearance", subject, short, "m", detail, row=hit.row)
-            elif hit.distance < -CONTACT or (hit.at_waypoint and hit.row > 0 and hit.distance < hit.usual - WAYPOINT_TOLERANCE):
+            elif hit.distance < -CONTACT or (
+                hit.at_waypoint and hit.row > 0 and hit.distance < hit.usual - WAYPOINT_TOLERANCE
+            ):
                 self._note_exemption(hit, exempt.get(hit.shapes, ()))
         return nearest
 
@@ -308,5 +426,9 @@ class _Check:
         if allowed:
             one = allowed[0]
             stood = f"{abs(1e3 * one.distance):.1f} mm {'apart' if one.distance >= 0.0 else 'inside each other'}"
-            reason = "the scene allows it" if one.shapes is None else f"{one} stand {stood} as built"
-        self.exemptions[hit.first, hit.second] = Exemption(f"{hit.first} – {hit.second}", hit.distance, reason)
+            reason = (
+                "the scene allows it" if one.shapes is None else f"{one} stand {stood} as built"
+            )
+        self.exemptions[hit.first, hit.second] = Exemption(
+            f"{hit.first} – {hit.second}", hit.distance, reason
+        )

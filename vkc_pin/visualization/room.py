@@ -17,7 +17,10 @@ from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["Part", "Room", "drawn_parts", "is_wall"]
 
-_THIN, _HIGH = 0.25, 2.0  # [m]: an upright box at most this thick that reaches at least this high is a wall
+_THIN, _HIGH = (
+    0.25,
+    2.0,
+)  # [m]: an upright box at most this thick that reaches at least this high is a wall
 _BEYOND = 0.35  # [m]: a wall with more of the arena than this behind it divides a room
 _VEIL, _DIVIDER = 0.07, 0.32  # opacities
 _FLOOR_COLOUR = (0.90, 0.89, 0.87)
@@ -72,7 +75,9 @@ class Room:
             for k, (solid, colour) in enumerate(drawn):
                 name = f"{shape.name}/{k}" if len(drawn) > 1 else str(shape.name)
                 opacity = colour[3] if len(colour) > 3 else 1.0
-                parts.append(Part(name, solid.moved(shape.placement), colour, opacity, shadow=opacity >= 1.0))
+                parts.append(
+                    Part(name, solid.moved(shape.placement), colour, opacity, shadow=opacity >= 1.0)
+                )
         for shape in self._walls:
             parts += self._wall_parts(shape)
         return parts
@@ -82,7 +87,10 @@ class Room:
         drawn = []
         if self.scene.floor:
             x_min, x_max, y_min, y_max = self.scene.arena
-            xs, ys = (np.arange(np.ceil(low / 0.5) * 0.5, high, 0.5) for low, high in ((x_min, x_max), (y_min, y_max)))
+            xs, ys = (
+                np.arange(np.ceil(low / 0.5) * 0.5, high, 0.5)
+                for low, high in ((x_min, x_max), (y_min, y_max))
+            )
             ends = [[(x, y_min), (x, y_max)] for x in xs] + [[(x_min, y), (x_max, y)] for y in ys]
             flat = np.array(ends, float).reshape(-1, 2)
             drawn.append(("grid", np.column_stack([flat, np.full(len(flat), 0.002)]), 0.78))
@@ -97,7 +105,9 @@ class Room:
             *((wall, 0.6 if self._divides(wall) else 0.0) for wall in self._walls),
             *((one, 1.0) for one in self._furniture),
         ]
-        return [(*world_box(shape.geometry, shape.placement), opacity) for shape, opacity in opacities]
+        return [
+            (*world_box(shape.geometry, shape.placement), opacity) for shape, opacity in opacities
+        ]
 
     def _inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
         """Return the thin axis of a wall, in its own frame, and the sign of its side towards the middle of the arena."""
@@ -118,13 +128,18 @@ class Room:
 
         def part(name: str, opacity: float, sides: tuple[int, ...]) -> Part:
             solid = box_solid(-half, half, sides).moved(shape.placement)
-            return Part(f"walls/{shape.name}/{name}", solid, colour, opacity, shadow=False, one_sided=True)
+            return Part(
+                f"walls/{shape.name}/{name}", solid, colour, opacity, shadow=False, one_sided=True
+            )
 
         if self._divides(shape):
             return [part("sides", _DIVIDER, (0, 1, 2, 3, 5))]
         axis, sign = self._inside(shape)
         inside = 2 * axis + (sign > 0)
-        return [part("inside", 1.0, (inside,)), part("outside", _VEIL, tuple(s for s in range(4) if s != inside))]
+        return [
+            part("inside", 1.0, (inside,)),
+            part("outside", _VEIL, tuple(s for s in range(4) if s != inside)),
+        ]
 
 
 def drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
@@ -133,7 +148,10 @@ def drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...
     if shape.meshPath and Path(shape.meshPath).is_file():
         parts = load_parts(shape.meshPath, np.asarray(shape.meshScale).ravel(), detail=_DETAIL)
         own = bool(shape.overrideMaterial)
-        return [(shade(part.vertices, part.faces), colour if own else part.colour or colour) for part in parts]
+        return [
+            (shade(part.vertices, part.faces), colour if own else part.colour or colour)
+            for part in parts
+        ]
     return [(to_solid(shape.geometry), colour)]
 
 
@@ -144,7 +162,12 @@ def is_wall(shape: pin.GeometryObject) -> bool:
     half = np.asarray(shape.geometry.halfSide)
     top = shape.placement.translation[2] + half[2]
     upright = abs(shape.placement.rotation[2, 2]) > 0.999
-    return bool(upright and 2.0 * half[:2].min() <= _THIN and top >= _HIGH and half[:2].max() > 2.0 * half[:2].min())
+    return bool(
+        upright
+        and 2.0 * half[:2].min() <= _THIN
+        and top >= _HIGH
+        and half[:2].max() > 2.0 * half[:2].min()
+    )
 
 
 def _edges(shape: pin.GeometryObject) -> Floats:

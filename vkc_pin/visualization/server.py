@@ -1,6 +1,7 @@
 """A meshcat server that only this machine can reach; started as a process of its own by `visualization`.
 
-meshcat's own serves its web page to every interface. This file imports nothing of vkc_pin, so that it starts quickly.
+meshcat's own serves its web page to every interface. This file imports nothing of vkc_pin, so that
+it starts quickly.
 """
 
 import contextlib
@@ -23,8 +24,9 @@ class LoopbackBridge(ZMQWebSocketBridge):
     def make_app(self):  # type: ignore[no-untyped-def]
         """Return the web application, listening on the loopback interface only, to browsers that mean this machine.
 
-        Any page can have its own name lead to this machine, and would then be let in as the viewer's own. So a name that is not
-        this machine's is refused; tornado refuses web sockets of pages from anywhere else than the name that was asked for.
+        Any page can have its own name lead to this machine, and would then be let in as the
+        viewer's own. So a name that is not this machine's is refused; tornado refuses web sockets
+        of pages from anywhere else than the name that was asked for.
         """
         app = super().make_app()
         listen, find = app.listen, app.find_handler

@@ -36,18 +36,29 @@ class Ghost(g.Object):
     """A translucent body that does not show its inside: drawn into the depth buffer first, and then where it is in front."""
 
     def __init__(self, solid: Solid, colour: Sequence[float]) -> None:
-        flat = g.MeshLambertMaterial(color=hexadecimal(colour), opacity=_GHOST_OPACITY, transparent=True, side=2)
+        flat = g.MeshLambertMaterial(
+            color=hexadecimal(colour), opacity=_GHOST_OPACITY, transparent=True, side=2
+        )
         super().__init__(Triangles(solid), flat)
         self.depth = g.MeshBasicMaterial(transparent=True, side=2, colorWrite=False)
 
     def lower(self) -> dict[str, Any]:
         """Return it as three.js' own JSON."""
-        data: dict[str, Any] = {"metadata": {"version": 4.5, "type": "Object"}, "geometries": [], "materials": []}
+        data: dict[str, Any] = {
+            "metadata": {"version": 4.5, "type": "Object"},
+            "geometries": [],
+            "materials": [],
+        }
         self.geometry.lower_in_object(data)
         children = []
         for order, layer in enumerate((self.depth, self.material)):
             layer.lower_in_object(data)
-            mesh = {"type": "Mesh", "geometry": self.geometry.uuid, "material": layer.uuid, "renderOrder": order + 1}
+            mesh = {
+                "type": "Mesh",
+                "geometry": self.geometry.uuid,
+                "material": layer.uuid,
+                "renderOrder": order + 1,
+            }
             children.append({"uuid": f"{self.uuid}-{order}", **mesh})
         data["object"] = {"uuid": self.uuid, "type": "Group", "children": children}
         return data
@@ -59,14 +70,19 @@ class Sun(g.Object):
     Args:
         centre: The room's, shape (3,) [m].
         reach: Its radius [m].
-        camera: From the camera's target to the camera, shape (3,): the light comes from the left of there, and from above.
+        camera: From the camera's target to the camera, shape (3,): the light comes from the left of
+            there, and from above.
     """
 
     def __init__(self, centre: Floats, reach: float, camera: Floats) -> None:
         g.SceneElement.__init__(self)
-        towards = np.array([camera[0], camera[1], 0.0]) / max(1e-9, float(np.hypot(camera[0], camera[1])))
+        towards = np.array([camera[0], camera[1], 0.0]) / max(
+            1e-9, float(np.hypot(camera[0], camera[1]))
+        )
         left = np.array([towards[1], -towards[0], 0.0])
-        self.position = centre + 20.0 * (0.35 * towards + 0.40 * left + 0.85 * np.array([0.0, 0.0, 1.0]))
+        self.position = centre + 20.0 * (
+            0.35 * towards + 0.40 * left + 0.85 * np.array([0.0, 0.0, 1.0])
+        )
         self.reach = reach + 2.0
 
     def lower(self) -> dict[str, Any]:
@@ -82,7 +98,11 @@ class Sun(g.Object):
             "metadata": {"version": 4.5, "type": "Object"},
             "geometries": [],
             "materials": [],
-            "object": {**light, "matrix": matrix.T.ravel().tolist(), "shadow": {**shadow, "camera": camera}},
+            "object": {
+                **light,
+                "matrix": matrix.T.ravel().tolist(),
+                "shadow": {**shadow, "camera": camera},
+            },
         }
 
 
@@ -98,10 +118,14 @@ class Unshadow:
         return {"type": "set_property", "path": where, "property": "castShadow", "value": False}
 
 
-def material(colour: Sequence[float], opacity: float = 1.0, *, one_sided: bool = False) -> g.Material:
+def material(
+    colour: Sequence[float], opacity: float = 1.0, *, one_sided: bool = False
+) -> g.Material:
     """Return a slightly shiny material; what is translucent does not hide what is behind them."""
     options = {"shininess": 25, "specular": 0x1A1A1A, "side": 0 if one_sided else 2}
-    return g.MeshPhongMaterial(color=hexadecimal(colour), opacity=opacity, depthWrite=opacity >= 1.0, **options)
+    return g.MeshPhongMaterial(
+        color=hexadecimal(colour), opacity=opacity, depthWrite=opacity >= 1.0, **options
+    )
 
 
 def hexadecimal(colour: Sequence[float]) -> int:

@@ -39,7 +39,9 @@ class Solid:
         """Return it at `placement`."""
         rotation = np.asarray(placement.rotation)
         vertices = self.vertices @ rotation.T + np.asarray(placement.translation)
-        return Solid(vertices.astype(np.float32), self.faces, (self.normals @ rotation.T).astype(np.float32))
+        return Solid(
+            vertices.astype(np.float32), self.faces, (self.normals @ rotation.T).astype(np.float32)
+        )
 
 
 def to_solid(shape: coal.CollisionGeometry) -> Solid:
@@ -51,7 +53,9 @@ def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
     """Return triangles with normals. Vertices on an edge are doubled, so that each side has its own normal."""
     import trimesh
 
-    mesh = trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, faces, process=False), angle=_CREASE)
+    mesh = trimesh.graph.smooth_shade(
+        trimesh.Trimesh(vertices, faces, process=False), angle=_CREASE
+    )
     points = (np.round(np.asarray(mesh.vertices) / _GRAIN) * _GRAIN).astype(np.float32)
     normals = (np.round(np.asarray(mesh.vertex_normals) * 64.0) / 64.0).astype(np.float32)
     return Solid(points, np.asarray(mesh.faces, np.uint32), normals)
@@ -67,7 +71,11 @@ def merge_solids(solids: list[Solid]) -> Solid:
     """Return several solids as one."""
     offsets = np.cumsum([0, *(len(s.vertices) for s in solids)])
     faces = [s.faces + np.uint32(offset) for s, offset in zip(solids, offsets[:-1], strict=True)]
-    return Solid(np.concatenate([s.vertices for s in solids]), np.concatenate(faces), np.concatenate([s.normals for s in solids]))
+    return Solid(
+        np.concatenate([s.vertices for s in solids]),
+        np.concatenate(faces),
+        np.concatenate([s.normals for s in solids]),
+    )
 
 
 def box_solid(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:
@@ -111,11 +119,16 @@ def tube(points: Floats, radius: float) -> Solid | None:
         across[i] = side
     other = np.cross(along, across)
     angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
-    normals = np.cos(angle)[None, :, None] * across[:, None] + np.sin(angle)[None, :, None] * other[:, None]
+    normals = (
+        np.cos(angle)[None, :, None] * across[:, None]
+        + np.sin(angle)[None, :, None] * other[:, None]
+    )
     vertices = line[:, None] + radius * normals
     ring, k = np.meshgrid(np.arange(len(line) - 1) * _SIDES, np.arange(_SIDES), indexing="ij")
     a, b = ring + k, ring + (k + 1) % _SIDES
-    faces = np.concatenate([np.stack([a, b, b + _SIDES], axis=-1), np.stack([a, b + _SIDES, a + _SIDES], axis=-1)])
+    faces = np.concatenate(
+        [np.stack([a, b, b + _SIDES], axis=-1), np.stack([a, b + _SIDES, a + _SIDES], axis=-1)]
+    )
     return _solid(vertices.reshape(-1, 3), faces.reshape(-1, 3), normals.reshape(-1, 3))
 
 

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Recorder", "animate", "open_viewer", "render_page", "show", "to_html"]
 
-_server: tuple[subprocess.Popen[bytes], str, str] | None = None  # the process, its address for commands, and for browsers
+_server: tuple[subprocess.Popen[bytes], str, str] | None = (
+    None  # the process, its address for commands, and for browsers
+)
 
 
 def show(
@@ -44,17 +46,21 @@ def show(
 ) -> Any:
     """Show a plan's motion, or a scene.
 
-    In a notebook the result is an inline view, with play, pause and a time slider, that is part of the notebook and
-    survives saving it. Elsewhere a server that only this machine can reach shows it in the browser.
+    In a notebook the result is an inline view, with play, pause and a time slider, that is part of
+    the notebook and survives saving it. Elsewhere a server that only this machine can reach shows
+    it in the browser.
 
     Args:
         plan_or_scene: What to show.
-        open_browser: Whether to open a browser window; None opens one where there is a screen. Not used in a notebook.
+        open_browser: Whether to open a browser window; None opens one where there is a screen. Not
+            used in a notebook.
         height: Of the inline view [pixels].
-        frames: Frames to draw, by name, with their placements in the world: x red, y green, z blue. They stand still.
+        frames: Frames to draw, by name, with their placements in the world: x red, y green, z blue.
+            They stand still.
 
     Returns:
-        In a notebook an object that displays itself; elsewhere the `meshcat.Visualizer`. Its address is printed.
+        In a notebook an object that displays itself; elsewhere the `meshcat.Visualizer`. Its
+        address is printed.
 
     Raises:
         InputError: Neither a plan nor a scene, or something that cannot be drawn.
@@ -69,11 +75,15 @@ def show(
 
         page, name = html.escape(_page(scene, plan, frames)), html.escape(scene.name)
         style = f"width: 100%; height: {height}px; border: none"
-        return cast(Any, HTML)(f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>')
+        return cast(Any, HTML)(
+            f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>'
+        )
     viewer = open_viewer()
     _draw(viewer, scene, plan, frames=frames)
     sys.stdout.write(f"meshcat shows it at {viewer.url()}\n")
-    screen = sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    screen = sys.platform in ("darwin", "win32") or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
     if screen if open_browser is None else open_browser:
         import webbrowser
 
@@ -89,7 +99,8 @@ def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.V
         viewer: Where; what it shows at its path is replaced. None takes the one of `open_viewer`.
 
     Returns:
-        The viewer. Give its `jupyter_cell()` as a cell's result to see it in a notebook, or visit its `url()`.
+        The viewer. Give its `jupyter_cell()` as a cell's result to see it in a notebook, or visit
+        its `url()`.
 
     Raises:
         InputError: Not a plan, or something that cannot be drawn.
@@ -98,13 +109,17 @@ def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.V
 
     scene, known = _parts(plan)
     if known is None:
-        raise InputError("nothing moves in it", field="plan", expected="a Plan", got=type(plan).__name__)
+        raise InputError(
+            "nothing moves in it", field="plan", expected="a Plan", got=type(plan).__name__
+        )
     viewer = open_viewer() if viewer is None else instance(viewer, meshcat.Visualizer, "viewer")
     _draw(viewer, scene, known)
     return viewer
 
 
-def to_html(plan_or_scene: Judged | Scene, path: str | Path, *, frames: Mapping[str, pin.SE3] | None = None) -> Path:
+def to_html(
+    plan_or_scene: Judged | Scene, path: str | Path, *, frames: Mapping[str, pin.SE3] | None = None
+) -> Path:
     """Write one self-contained web page with the motion, or the scene; it loads nothing from elsewhere.
 
     The page plays the motion, with a time slider in seconds; `page.html#t=3.5` shows it at 3.5 s.
@@ -145,14 +160,21 @@ def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
     command = [sys.executable, "-P", "-u", str(Path(__file__).with_name("server.py"))]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=environment,
+        start_new_session=True,
     )
     atexit.register(process.kill)
     assert process.stdout is not None
     addresses = [process.stdout.readline().decode().strip().partition("=")[2] for _ in range(2)]
     if not all(addresses):
         process.kill()
-        raise VkcError("meshcat's server does not start; is a port from 6000 and one from 7000 on free?")
+        raise VkcError(
+            "meshcat's server does not start; is a port from 6000 and one from 7000 on free?"
+        )
     return process, addresses[0], addresses[1]
 
 
@@ -162,11 +184,18 @@ def _parts(plan_or_scene: Any) -> tuple[Scene, Judged | None]:
     if isinstance(plan_or_scene, Judged):
         return plan_or_scene.scene, plan_or_scene
     got = type(plan_or_scene).__name__
-    raise InputError("this cannot be shown", field="plan_or_scene", expected="a Plan or a Scene", got=got)
+    raise InputError(
+        "this cannot be shown", field="plan_or_scene", expected="a Plan or a Scene", got=got
+    )
 
 
 def _draw(
-    viewer: Any, scene: Scene, plan: Judged | None, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None
+    viewer: Any,
+    scene: Scene,
+    plan: Judged | None,
+    *,
+    play: bool = True,
+    frames: Mapping[str, pin.SE3] | None = None,
 ) -> None:
     from vkc_pin.visualization.drawing import Drawing
 
@@ -190,8 +219,14 @@ def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
     times = plan.trajectory.times - plan.trajectory.times[0]
     return {
         "duration": float(times[-1]),
-        "phases": [{"name": phase.name, "last": float(times[phase.last])} for phase in plan.trajectory.phases],
-        "notes": [{"text": f"{v.constraint}: {v.subject}", "time": v.time} for v in plan.validation.violations],
+        "phases": [
+            {"name": phase.name, "last": float(times[phase.last])}
+            for phase in plan.trajectory.phases
+        ],
+        "notes": [
+            {"text": f"{v.constraint}: {v.subject}", "time": v.time}
+            for v in plan.validation.violations
+        ],
         "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
     }
 
@@ -217,7 +252,8 @@ def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
     Args:
         recorder: What to draw.
         title: Of the page.
-        film: What the bar shows: "duration" [s], "phases" ("name", "last" [s]), "notes" ("text", "time" [s]), "headline".
+        film: What the bar shows: "duration" [s], "phases" ("name", "last" [s]), "notes" ("text",
+            "time" [s]), "headline".
     """
     import meshcat
     import umsgpack  # type: ignore[import-untyped]
@@ -229,7 +265,9 @@ def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
         "TITLE": html.escape(title),
         "FILM": json.dumps(film).replace("<", "\\u003c"),
         "VIEWER": _packed_file(viewer),
-        "COMMANDS": _packed(b"".join(struct.pack("<I", len(command)) + command for command in packed)),
+        "COMMANDS": _packed(
+            b"".join(struct.pack("<I", len(command)) + command for command in packed)
+        ),
     }
     return re.sub(r"%(TITLE|FILM|VIEWER|COMMANDS)%", lambda match: pieces[match[1]], template)
 

@@ -18,7 +18,9 @@ from vkc_pin.world.task.compiler import compile_task
 
 
 def test_kinds() -> None:
-    assert Counter(map(kind_of, range(NUMBER))) == dict(zip(KINDS, (10, 10, 10, 10, 20), strict=True))
+    assert Counter(map(kind_of, range(NUMBER))) == dict(
+        zip(KINDS, (10, 10, 10, 10, 20), strict=True)
+    )
 
 
 @pytest.mark.parametrize("number", [-1, 60, 1.0, True])
@@ -45,10 +47,16 @@ def test_fixed_starts_are_of_all_scenes() -> None:
 
 
 def test_starts_depend_on_task_seed_and_number() -> None:
-    starts = [started(*which).start[:3].tolist() for which in (("door", 1, 0), ("door", 1, 0), ("door", 1, 1), ("door", 2, 0))]
+    starts = [
+        started(*which).start[:3].tolist()
+        for which in (("door", 1, 0), ("door", 1, 0), ("door", 1, 1), ("door", 2, 0))
+    ]
     assert starts[0] == starts[1]
     assert len({tuple(start) for start in starts}) == 3
-    cups = [started("household_cup", 1, number).objects["cup"].placement.translation for number in (0, 1)]
+    cups = [
+        started("household_cup", 1, number).objects["cup"].placement.translation
+        for number in (0, 1)
+    ]
     assert not np.allclose(*cups)
 
 
@@ -63,11 +71,16 @@ def free(scene: vkc.Scene, at: pin.SE3, z: np.ndarray) -> None:
     geometry = robot.collision.geometryObjects
     for pair in robot.collision.collisionPairs:
         a, b = pair.first, pair.second
-        assert shape_distance(geometry[a].geometry, shapes.oMg[a], geometry[b].geometry, shapes.oMg[b]) >= poses.CLEAR
+        assert (
+            shape_distance(geometry[a].geometry, shapes.oMg[a], geometry[b].geometry, shapes.oMg[b])
+            >= poses.CLEAR
+        )
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_poses_are_those_of_configurations_that_touch_nothing(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_are_those_of_configurations_that_touch_nothing(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drawn: list[tuple[pin.SE3, np.ndarray]] = []
     draw = poses._drawn
     monkeypatch.setattr(poses, "_drawn", lambda *given: drawn.append(draw(*given)) or drawn[-1])  # type: ignore[func-returns-value]
@@ -92,7 +105,9 @@ def test_poses_that_cannot_be_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(poses, "_TRIES", 3)
     layout = random_layout(0)
     for find in (
-        lambda: poses.pose_over(layout, layout.scene(), layout.part("table_1"), np.random.default_rng(0)),
+        lambda: poses.pose_over(
+            layout, layout.scene(), layout.part("table_1"), np.random.default_rng(0)
+        ),
         lambda: poses.pose_among(layout, layout.scene(), np.random.default_rng(0)),
     ):
         with pytest.raises(vkc.InputError, match="no configuration"):

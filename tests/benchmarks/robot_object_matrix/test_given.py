@@ -27,7 +27,13 @@ DESK = """<robot name="desk">
 
 
 def test_what_texts_mean() -> None:
-    texts = ["default", "my_oven=kitchens/kitchen.xml#oven", "kitchens/kitchen.xml#sink top", "home/desk.yaml", "drawer"]
+    texts = [
+        "default",
+        "my_oven=kitchens/kitchen.xml#oven",
+        "kitchens/kitchen.xml#sink top",
+        "home/desk.yaml",
+        "drawer",
+    ]
     assert parsed(texts, "objects", ("oven_0", "door")) == [
         Given("oven_0", "oven_0"),
         Given("door", "door"),
@@ -36,10 +42,15 @@ def test_what_texts_mean() -> None:
         Given("desk", "home/desk.yaml"),
         Given("drawer", "drawer"),
     ]
-    assert [one.imported for one in parsed(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())] == [True, True, False, False]
+    assert [
+        one.imported for one in parsed(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())
+    ] == [True, True, False, False]
 
 
-@pytest.mark.parametrize("texts", [[], ["oven_0", "oven_0"], ["default", "oven_0"], ["a=oven_0", "a=oven_1"], [""], ["#link"]])
+@pytest.mark.parametrize(
+    "texts",
+    [[], ["oven_0", "oven_0"], ["default", "oven_0"], ["a=oven_0", "a=oven_1"], [""], ["#link"]],
+)
 def test_what_is_no_choice(texts: list[str]) -> None:
     with pytest.raises(vkc.InputError, match="objects: not a choice"):
         parsed(texts, "objects", ("oven_0",))
@@ -58,12 +69,16 @@ def test_a_file_is_imported_once_with_its_front_to_the_robot(tmp_path: Path) -> 
     np.testing.assert_allclose(drawn - shut, [-0.3, 0.0, 0.0], atol=1e-9)
     written = {file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()}
     assert ready_object(one, tmp_path / "objects") == made
-    assert {file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()} == written
+    assert {
+        file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()
+    } == written
     assert not list((tmp_path / "objects").glob(".*")), "nothing is left over"
 
 
 def test_what_cannot_be_imported_leaves_nothing(tmp_path: Path) -> None:
-    (tmp_path / "bad.urdf").write_text("<robot name='bad'><link name='a'/></robot>", encoding="utf-8")
+    (tmp_path / "bad.urdf").write_text(
+        "<robot name='bad'><link name='a'/></robot>", encoding="utf-8"
+    )
     with pytest.raises(vkc.InputError):
         ready_object(Given("bad", str(tmp_path / "bad.urdf")), tmp_path / "objects")
     assert not list((tmp_path / "objects").iterdir())

@@ -10,18 +10,35 @@ from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
 
 
 def record(robot: str, name: str, status: str = "success", **more: Any) -> dict[str, Any]:
-    own = {"planning_time": 1.0, "load_time": 0.5} if status not in ("unreachable", "error", "no hand") else {}
-    return {"robot": robot, "object": name, "success": status == "success", "status": status, **own, **more}
+    own = (
+        {"planning_time": 1.0, "load_time": 0.5}
+        if status not in ("unreachable", "error", "no hand")
+        else {}
+    )
+    return {
+        "robot": robot,
+        "object": name,
+        "success": status == "success",
+        "status": status,
+        **own,
+        **more,
+    }
 
 
 RECORDS = [
     *(record("one", "oven_0", planning_time=time) for time in (1.0, 3.0)),
-    *(record("one", "door", status, because=why) for status, why in (("success", ""), ("infeasible", "the shelf | the wall"))),
+    *(
+        record("one", "door", status, because=why)
+        for status, why in (("success", ""), ("infeasible", "the shelf | the wall"))
+    ),
     record("one", "valve_1", "unreachable", because="turn: nothing of it fits"),
     *(record("two", "oven_0", "not converged", because="") for _ in range(2)),
     record("two", "door", "error", violations=["InputError: no"]),
     record("two", "valve_1", "unreachable", because="turn: nothing of it fits"),
-    *(record("three", name, "no hand", because="touch_links: not known") for name in ("oven_0", "door", "valve_1")),
+    *(
+        record("three", name, "no hand", because="touch_links: not known")
+        for name in ("oven_0", "door", "valve_1")
+    ),
 ]
 
 
@@ -38,13 +55,27 @@ def test_report() -> None:
     assert "| two | door | error | 1 | InputError: no |" in text
     assert "| three | every object | no hand | 3 | touch_links: not known |" in text
     assert "| three | 3 | 0 | 0 (0%) | 0 (0%) | – | – | – |" in text
-    assert text.index("## What failed") < text.index("## What is out of reach") < text.index("| one | valve_1 | unreachable")
+    assert (
+        text.index("## What failed")
+        < text.index("## What is out of reach")
+        < text.index("| one | valve_1 | unreachable")
+    )
 
 
 def test_chart(tmp_path: Path) -> None:
     figure = chart(RECORDS, tmp_path / "success.png")
     axes, _ = figure.axes
-    assert [text.get_text() for text in axes.texts] == ["2/2", "0/2", "–", "1/2", "!", "–", "–", "–", "–"]
+    assert [text.get_text() for text in axes.texts] == [
+        "2/2",
+        "0/2",
+        "–",
+        "1/2",
+        "!",
+        "–",
+        "–",
+        "–",
+        "–",
+    ]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["oven_0", "door", "valve_1"]
     shown = axes.images[0].get_array()
     assert shown.tolist() == [[100.0, 0.0, None], [50.0, 0.0, None], [None, None, None]]

@@ -22,12 +22,15 @@ def test_poses_are_above_the_floor_and_the_seed_and_the_name_make_them(robot: vk
     poses = random_poses(robot, "one", 8)
     assert all(pose.translation[2] > vkc.Options().dist_safe for pose in poses)
     again, other, later = (
-        random_poses(robot, *given, seed=seed) for *given, seed in (("one", 8, 0), ("two", 8, 0), ("one", 8, 1))
+        random_poses(robot, *given, seed=seed)
+        for *given, seed in (("one", 8, 0), ("two", 8, 0), ("one", 8, 1))
     )
     assert all(a.isApprox(b, 0.0) for a, b in zip(poses, again, strict=True))
     for others in (other, later):
         assert not any(a.isApprox(b, 1e-3) for a in poses for b in others)
-    assert all(a.isApprox(b, 0.0) for a, b in zip(poses, random_poses(robot, "one", 3), strict=False)), "more of them begin alike"
+    assert all(
+        a.isApprox(b, 0.0) for a, b in zip(poses, random_poses(robot, "one", 3), strict=False)
+    ), "more of them begin alike"
 
 
 def test_configurations_that_are_not_free_are_none(robot: vkc.Robot) -> None:
@@ -56,7 +59,9 @@ def test_configurations_that_are_not_free_are_none(robot: vkc.Robot) -> None:
     assert 0 < sum(found) < len(found)
 
 
-def test_a_robot_that_is_never_free_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_that_is_never_free_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(reach, "_TRIES", 20)
     buried = vkc.load_robot(write_arms(tmp_path), tool_frame="hand", height=-3.0)
     with pytest.raises(vkc.VkcError, match="buried: only 0 of 40 random configurations"):
@@ -65,4 +70,8 @@ def test_a_robot_that_is_never_free_is_told(tmp_path: Path, monkeypatch: pytest.
 
 def _corners(shape: pin.GeometryObject) -> list[np.ndarray]:
     half = np.asarray(shape.geometry.halfSide)
-    return [half * np.array(signs) for signs in np.ndindex(2, 2, 2) for signs in [[2 * s - 1 for s in signs]]]
+    return [
+        half * np.array(signs)
+        for signs in np.ndindex(2, 2, 2)
+        for signs in [[2 * s - 1 for s in signs]]
+    ]

@@ -27,14 +27,30 @@ def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     box = "<link name='{}'><collision><geometry><box size='1 1 1'/></geometry></collision></link>"
     legless.write_text(f"<robot name='legless'>{box.format('a')}</robot>", encoding="utf-8")
     out = tmp_path / "out"
-    command = ["bench", "robots", "--goals", "2", "--robots", str(good), str(legless), "--quiet", "--out", str(out)]
+    command = [
+        "bench",
+        "robots",
+        "--goals",
+        "2",
+        "--robots",
+        str(good),
+        str(legless),
+        "--quiet",
+        "--out",
+        str(out),
+    ]
     assert main(command) == 0
     table = (out / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out
     records = json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
-    assert [(r["robot"], r["status"]) for r in records if not r["success"]] == [("legless", "not imported")]
+    assert [(r["robot"], r["status"]) for r in records if not r["success"]] == [
+        ("legless", "not imported")
+    ]
     reached = [r for r in records if r["robot"] == "robot"]
-    assert [(r["success"], r["violations"], r["number"]) for r in reached] == [(True, [], 0), (True, [], 1)]
+    assert [(r["success"], r["violations"], r["number"]) for r in reached] == [
+        (True, [], 0),
+        (True, [], 1),
+    ]
     assert all(r["base_effort"] + r["arm_effort"] > 0.1 for r in reached), "it has to move"
     assert reached[0]["home_room"] >= 0.03
     assert reached[0]["joints"] == 5
@@ -54,8 +70,22 @@ def test_what_fails_is_told_by_robot() -> None:
     facts = {"import_time": 4.0, "load_time": 0.5, "joints": 6, "pairs": 7, "home_room": -0.004}
     trials = [
         {"robot": "one", **facts, "success": True, "status": "success", "planning_time": 1.0},
-        {"robot": "one", **facts, "success": False, "status": "infeasible", "planning_time": 3.0, "violations": ["too deep"]},
-        {"robot": "two", **facts, "home_room": None, "success": False, "status": "hardly free", "because": "only 1 of 9"},
+        {
+            "robot": "one",
+            **facts,
+            "success": False,
+            "status": "infeasible",
+            "planning_time": 3.0,
+            "violations": ["too deep"],
+        },
+        {
+            "robot": "two",
+            **facts,
+            "home_room": None,
+            "success": False,
+            "status": "hardly free",
+            "because": "only 1 of 9",
+        },
     ]
     text = report({"meta": about, "trials": trials})
     assert "| one | 6 | 7 | 4.00 | 0.50 | -4 | 1/2 | 2.00 | 2.90 |" in text

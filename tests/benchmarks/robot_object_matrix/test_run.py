@@ -32,7 +32,18 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     )
     smooth = vkc.write_object({"urdf": urdf, "attachments": []}, tmp_path / "smooth.yaml")
     out = tmp_path / "out"
-    command = ["bench", "anything", "--starts", "1", "--robots", "husky_ur5e", "--objects", "drawers_0", str(smooth), "--quiet"]
+    command = [
+        "bench",
+        "anything",
+        "--starts",
+        "1",
+        "--robots",
+        "husky_ur5e",
+        "--objects",
+        "drawers_0",
+        str(smooth),
+        "--quiet",
+    ]
     assert main([*command, "--out", str(out)]) == 0
     table = (out / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out
@@ -40,7 +51,10 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "| smooth | – |" in table
     assert "nothing of it fits between the fingers" in table
     assert (out / "success.png").stat().st_size > 5000
-    records = {r["object"]: r for r in json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]}
+    records = {
+        r["object"]: r
+        for r in json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
+    }
     opened, other = records["drawers_0"], records["smooth"]
     assert (opened["success"], opened["violations"], opened["kind"]) == (True, [], "drawers")
     reach = (slide.upper - slide.lower)[slide.coordinates.index(opened["joint"])]
@@ -56,7 +70,9 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 def test_a_robot_whose_hand_nobody_described_is_imported(tmp_path: Path) -> None:
     file = write_arms(tmp_path / "given")
-    result = run(out=tmp_path / "out", starts=1, robots=[str(file)], objects=["drawers_0"], progress=False)
+    result = run(
+        out=tmp_path / "out", starts=1, robots=[str(file)], objects=["drawers_0"], progress=False
+    )
     (trial,) = result["trials"]
     made = tmp_path / "out" / "robots" / trial["robot"]
     assert vkc.load_robot(made).touch_links

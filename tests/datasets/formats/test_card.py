@@ -14,7 +14,14 @@ def test_what_a_card_says() -> None:
         "versions": {"pin": "4.1"},
         "recipe": "name: home\n",
     }
-    one = {"task": "drive-open", "robot": "panda", "kind": "oven", "room": "room_1", "scene": "s", "duration": 1800.0}
+    one = {
+        "task": "drive-open",
+        "robot": "panda",
+        "kind": "oven",
+        "room": "room_1",
+        "scene": "s",
+        "duration": 1800.0,
+    }
     failed = {"status": "infeasible", "reason": "the wall is in the way"}
     text = card(about, [one, {**one, "scene": "t"}], [failed, failed])
     _, head, body = text.split("---\n", 2)

@@ -22,12 +22,18 @@ def test_attempts_come_as_parts_of_a_shard(tmp_path: Path) -> None:
             key: same[key] for key in ("number", "way", "scene", "effort")
         }
         (tmp_path / f"{record['number']}.hdf5").write_bytes(data)
-    shard = write_shard(tmp_path / "shard.hdf5", [(tmp_path / f"{number}.hdf5", 0) for number in (1, 0)], tmp_path / "scenes")
+    shard = write_shard(
+        tmp_path / "shard.hdf5",
+        [(tmp_path / f"{number}.hdf5", 0) for number in (1, 0)],
+        tmp_path / "scenes",
+    )
     assert numbers_of(shard) == [1, 0]
     assert all(episode.validate().ok for episode in episodes_of(shard, tmp_path / "scenes"))
 
 
 def test_failures_have_nothing(tmp_path: Path) -> None:
-    document = load_recipe({**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}).document
+    document = load_recipe(
+        {**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}
+    ).document
     ((record, data),) = parts((document, [0], {}))
     assert (record["success"], data) == (False, b"")

@@ -12,7 +12,9 @@ from vkc_pin.world.models.shapes import world_box
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*things that can move stand in others")  # cups in their table, as in real homes
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*things that can move stand in others"
+)  # cups in their table, as in real homes
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +33,15 @@ def test_every_shape_of_the_file_is_somewhere(home: vkc.ImportedHome, tmp_path: 
     assert set(WALLS) < set(scene.obstacle_names)
     assert {"table", "sofa"} < set(scene.obstacle_names)
     assert not {"slab", "carpet"} & set(scene.obstacle_names)
-    colliding = sum(len(placed.object.collision.geometryObjects) for placed in scene.objects.values())
+    colliding = sum(
+        len(placed.object.collision.geometryObjects) for placed in scene.objects.values()
+    )
     assert colliding == home.shapes["objects"]  # none of them is a mesh
-    sofa = [shape for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label == "sofa"]
+    sofa = [
+        shape
+        for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True)
+        if label == "sofa"
+    ]
     assert len(sofa) == 2, "a concave mesh, whose hull would fill what is above the seat"
     assert len(scene.obstacles) == home.shapes["obstacles"] + 2  # with the floor
 
@@ -47,18 +55,31 @@ def test_everything_stands_where_the_file_has_it(home: vkc.ImportedHome) -> None
         document = {
             "robot": "husky_ur5e",
             "start": {"base": [0, 0, 0]},
-            "objects": [{"name": "it", "type": vkc.random_object(kind, seed), "position": [x, y, 0], "yaw": yaw}],
+            "objects": [
+                {
+                    "name": "it",
+                    "type": vkc.random_object(kind, seed),
+                    "position": [x, y, 0],
+                    "yaw": yaw,
+                }
+            ],
         }
         there = vkc.Scene.from_document(document)
         boxes = [
-            np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(one)])
+            np.array(
+                [world_box(shape.geometry, shape.placement) for shape in standing_geometry(one)]
+            )
             for one in (scene.objects[name], there.objects["it"])
         ]
         assert np.allclose(np.sort(boxes[0], axis=0), np.sort(boxes[1], axis=0), atol=1e-5), kind
         own, other = scene.objects[name].object, there.objects["it"].object
         assert np.allclose(own.upper - own.lower, other.upper - other.lower)
     assert scene.objects["cup_0"].placement.translation == pytest.approx([0.25, 0.2, 0.749])
-    assert [name for name, placed in scene.objects.items() if placed.object.free] == ["cup_0", "cup_1", "lump"]
+    assert [name for name, placed in scene.objects.items() if placed.object.free] == [
+        "cup_0",
+        "cup_1",
+        "lump",
+    ]
 
 
 def test_the_start_is_free_in_the_room_with_most(home: vkc.ImportedHome) -> None:
@@ -83,7 +104,11 @@ def test_what_no_hand_takes_is_said(home: vkc.ImportedHome) -> None:
 
 
 def test_its_things_are_opened_and_its_cups_taken(home: vkc.ImportedHome) -> None:
-    steps = {step.object: step for step in vkc.goals(home.scene) if isinstance(step, vkc.Actuate | vkc.Grasp)}
+    steps = {
+        step.object: step
+        for step in vkc.goals(home.scene)
+        if isinstance(step, vkc.Actuate | vkc.Grasp)
+    }
     for name in ("refrigerator_body", "drawers_case", "dishwasher_body", "door_frame", "cup_0"):
         plan = vkc.plan(home.scene, [steps[name]])
         assert plan.success, plan.report()
@@ -98,7 +123,10 @@ def test_a_home_of_mujoco(tmp_path: Path) -> None:
     done = vkc.import_home(tmp_path / "small.xml", tmp_path / "out")
     assert done.shapes == {"file": 9, "obstacles": 5, "objects": 4, "floor": 0}
     assert set(done.scene.obstacle_names) == {"north", "south", "east", "west", "board"}
-    assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {"cupboard": False, "mug": True}
+    assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {
+        "cupboard": False,
+        "mug": True,
+    }
     assert any("'ground'" in note and "plane" in note for note in done.notes)
     assert done.scene.objects["mug"].placement.translation == pytest.approx([0.0, 2.3, 0.7])
     steps = vkc.goals(done.scene)
@@ -119,7 +147,10 @@ def test_a_floor_that_is_higher_in_the_file(tmp_path: Path) -> None:
     done = vkc.import_home(tmp_path / "small.xml", tmp_path / "out", floor=2.8)
     assert done.shapes["floor"] == 1
     assert "cupboard" in done.scene.objects
-    low = min(world_box(shape.geometry, shape.placement)[0][2] for shape in standing_geometry(done.scene.objects["cupboard"]))
+    low = min(
+        world_box(shape.geometry, shape.placement)[0][2]
+        for shape in standing_geometry(done.scene.objects["cupboard"])
+    )
     assert low == pytest.approx(0.0, abs=1e-6)
 
 

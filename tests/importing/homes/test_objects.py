@@ -14,8 +14,18 @@ SETTINGS = {"stem": "can", "most": 2, "dist_safe": 0.02, "grasp_clearance": 0.00
 
 
 def _can(radius: float) -> Thing:
-    part = Part(name="", placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.06])), kind="cylinder", size=(radius, 0.12))
-    return Thing("can", Description(Path("home.urdf"), {"can": Link("can", (part,), (part,))}, {}), (1.0, 2.0, 0.7), free=True)
+    part = Part(
+        name="",
+        placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.06])),
+        kind="cylinder",
+        size=(radius, 0.12),
+    )
+    return Thing(
+        "can",
+        Description(Path("home.urdf"), {"can": Link("can", (part,), (part,))}, {}),
+        (1.0, 2.0, 0.7),
+        free=True,
+    )
 
 
 def test_what_is_carried_has_no_joint_and_is_held_above_what_it_stands_on(tmp_path: Path) -> None:
@@ -24,11 +34,19 @@ def test_what_is_carried_has_no_joint_and_is_held_above_what_it_stands_on(tmp_pa
     assert item.free
     assert item.coordinates.size == 0
     assert item.base_link == "can"
-    assert list(item.attachments) == [proposal.attachment.name for proposal in done.proposals.found] != []
+    assert (
+        list(item.attachments)
+        == [proposal.attachment.name for proposal in done.proposals.found]
+        != []
+    )
     for attachment in item.attachments.values():
         assert attachment.placement.translation[2] > 0.0
         assert attachment.firm
-    assert done.entry == {"name": "can", "type": "objects/can/can.yaml", "position": [1.0, 2.0, 0.7]}
+    assert done.entry == {
+        "name": "can",
+        "type": "objects/can/can.yaml",
+        "position": [1.0, 2.0, 0.7],
+    }
     assert done.report().startswith("can: carried by can_")
 
 

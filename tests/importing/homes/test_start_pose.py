@@ -18,7 +18,14 @@ def _halves(drawer_x: float, **more: object) -> vkc.Scene:
             "robot": "husky_ur5e",
             "start": {"base": [0.0, 0.0, 0.0]},
             "arena": {"x": [-6, 4], "y": [-2, 2]},
-            "obstacles": [{"name": "wall", "type": "box", "size": [0.1, 4.0, 2.0], "position": [0.0, 0.0, 1.0]}],
+            "obstacles": [
+                {
+                    "name": "wall",
+                    "type": "box",
+                    "size": [0.1, 4.0, 2.0],
+                    "position": [0.0, 0.0, 1.0],
+                }
+            ],
             "objects": [{"name": "drawer", "type": "drawer", "position": [drawer_x, 0.0, 0.0]}],
             **more,
         }
@@ -26,7 +33,9 @@ def _halves(drawer_x: float, **more: object) -> vkc.Scene:
 
 
 @pytest.mark.parametrize(("drawer_x", "side"), [(3.0, 1.0), (-2.0, -1.0)])
-def test_the_start_is_where_things_are_reached_not_where_most_floor_is(drawer_x: float, side: float) -> None:
+def test_the_start_is_where_things_are_reached_not_where_most_floor_is(
+    drawer_x: float, side: float
+) -> None:
     for seed in range(3):
         scene, reached = free_start(_halves(drawer_x), np.random.default_rng(seed))
         assert np.sign(scene.start[0]) == side
@@ -35,7 +44,9 @@ def test_the_start_is_where_things_are_reached_not_where_most_floor_is(drawer_x:
 
 
 def test_where_no_robot_fits_that_is_said() -> None:
-    full = [{"name": "block", "type": "box", "size": [10.0, 4.0, 2.0], "position": [-1.0, 0.0, 1.0]}]
+    full = [
+        {"name": "block", "type": "box", "size": [10.0, 4.0, 2.0], "position": [-1.0, 0.0, 1.0]}
+    ]
     with pytest.raises(vkc.InputError, match="floor"):
         free_start(_halves(3.0, obstacles=full), np.random.default_rng(0))
     with pytest.raises(vkc.InputError, match=r"home\.xml: robot, floor: no place") as caught:

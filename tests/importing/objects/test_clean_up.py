@@ -49,9 +49,23 @@ def test_a_handle_fixed_to_a_door_is_part_of_it_and_keeps_its_name() -> None:
     box = Part(name="", placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
     place = pin.SE3(np.eye(3), np.array([0.0, 0.5, 0.0]))
     joints = {
-        "door": Joint(name="hinge", kind="revolute", parent="case", child="door", placement=place, limits=(0.0, 1.0)),
+        "door": Joint(
+            name="hinge",
+            kind="revolute",
+            parent="case",
+            child="door",
+            placement=place,
+            limits=(0.0, 1.0),
+        ),
         "handle": Joint(name="weld", kind="fixed", parent="door", child="handle", placement=place),
-        "flap": Joint(name="stuck", kind="revolute", parent="handle", child="flap", placement=place, limits=(0.3, 0.3)),
+        "flap": Joint(
+            name="stuck",
+            kind="revolute",
+            parent="handle",
+            child="flap",
+            placement=place,
+            limits=(0.3, 0.3),
+        ),
     }
     links = {
         "case": Link("case", (), (box,)),
@@ -59,14 +73,23 @@ def test_a_handle_fixed_to_a_door_is_part_of_it_and_keeps_its_name() -> None:
         "handle": Link("handle", (), (box,)),
         "flap": Link("flap", (), (box,)),
     }
-    weights = {name: pin.Inertia(k + 1.0, np.array([0.1, 0.0, 0.0]), 0.01 * np.eye(3)) for k, name in enumerate(links)}
+    weights = {
+        name: pin.Inertia(k + 1.0, np.array([0.1, 0.0, 0.0]), 0.01 * np.eye(3))
+        for k, name in enumerate(links)
+    }
     links = {name: dataclasses.replace(link, inertia=weights[name]) for name, link in links.items()}
     found = tidied(Description(Path("f"), links, joints))
     assert set(found.links) == {"case", "door"}
     assert found.links["case"].inertia.mass == 1.0
     assert found.links["door"].inertia.mass == 2.0 + 3.0 + 4.0
-    middles = [weights["door"].lever, place.act(weights["handle"].lever), 2.0 * place.translation + weights["flap"].lever]
-    assert np.allclose(found.links["door"].inertia.lever, np.average(middles, axis=0, weights=[2.0, 3.0, 4.0]))
+    middles = [
+        weights["door"].lever,
+        place.act(weights["handle"].lever),
+        2.0 * place.translation + weights["flap"].lever,
+    ]
+    assert np.allclose(
+        found.links["door"].inertia.lever, np.average(middles, axis=0, weights=[2.0, 3.0, 4.0])
+    )
     assert [part.name for part in found.links["door"].collision] == ["", "handle", "flap"]
     turned = found.links["door"].collision[2].placement
     assert np.allclose(turned.translation, [0.0, 1.0, 0.0])
@@ -76,7 +99,9 @@ def test_a_handle_fixed_to_a_door_is_part_of_it_and_keeps_its_name() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(factor=st.floats(0.1, 10.0), slide=st.floats(0.0, 0.36))
-def test_scaling_scales_everything(factor: float, slide: float, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_scaling_scales_everything(
+    factor: float, slide: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     cabinet = read_object_urdf(partnet(tmp_path_factory.mktemp("p") / "x"))
     large = scaled(cabinet, factor)
     one = bounds(cabinet, surfaces(cabinet), {"joint_0": slide})
@@ -105,13 +130,20 @@ def test_limits_that_are_missing_open_outwards(cabinet: Description) -> None:
     limited = with_limits(found, meshes)
     low, high = limited.joints["link_1"].limits or (0.0, 0.0)
     assert sorted(map(abs, (low, high))) == pytest.approx([0.0, np.pi / 2])
-    shut, opened = (bounds(limited, surfaces(limited), {"joint_1": value}) for value in (0.0, low if abs(low) > high else high))
+    shut, opened = (
+        bounds(limited, surfaces(limited), {"joint_1": value})
+        for value in (0.0, low if abs(low) > high else high)
+    )
     front = shut[0][0] < opened[0][0] or shut[1][0] > opened[1][0]
     assert not front  # it comes out of the front, x after the file's own turn
     assert any("joint_1" in note and "1.57" in note for note in limited.notes)
     assert limited.joints["link_0"].limits == (0.0, 0.36)
-    little = dataclasses.replace(limited.joints["link_1"], limits=(0.0, 0.0274))  # 1.57, taken for degrees
-    noted = with_limits(dataclasses.replace(limited, joints={**limited.joints, "link_1": little}), surfaces(limited)).notes
+    little = dataclasses.replace(
+        limited.joints["link_1"], limits=(0.0, 0.0274)
+    )  # 1.57, taken for degrees
+    noted = with_limits(
+        dataclasses.replace(limited, joints={**limited.joints, "link_1": little}), surfaces(limited)
+    ).notes
     assert any("1.6° only" in note or "2° only" in note for note in noted)
 
 
@@ -128,7 +160,9 @@ def test_up_root_and_part_of_it(cabinet: Description) -> None:
 def test_names_without_dots_and_slashes_that_differ() -> None:
     links = {name: Link(name) for name in ("a/b", "a.b", "c d")}
     joints = {
-        name: Joint(name=f"j.{k % 1}", kind="fixed", parent="a/b", child=name, placement=pin.SE3.Identity())
+        name: Joint(
+            name=f"j.{k % 1}", kind="fixed", parent="a/b", child=name, placement=pin.SE3.Identity()
+        )
         for k, name in enumerate(("a.b", "c d"))
     }
     found = renamed(Description(Path("f"), links, joints))
@@ -144,11 +178,18 @@ def test_a_file_of_several_things_is_told_from_one_with_several_joints(tmp_path:
         return f'{link}<joint name="{name}_joint" type="{kind}">{ends}</joint>'
 
     def said(*parts: str) -> tuple[str, ...]:
-        (tmp_path / "it.urdf").write_text(f'<robot name="it"><link name="world"/>{"".join(parts)}</robot>')
+        (tmp_path / "it.urdf").write_text(
+            f'<robot name="it"><link name="world"/>{"".join(parts)}</robot>'
+        )
         return several(read_object_urdf(tmp_path / "it.urdf"))
 
     oven = box("oven", "world", "fixed") + box("door", "oven", "revolute")
-    (note,) = said(oven, box("chest", "world", "fixed"), box("lid", "chest", "revolute"), box("rack", "chest", "prismatic"))
+    (note,) = said(
+        oven,
+        box("chest", "world", "fixed"),
+        box("lid", "chest", "revolute"),
+        box("rack", "chest", "prismatic"),
+    )
     assert "'oven' (1 joint), 'chest' (2 joints)" in note
     assert said(oven) == said(oven, box("wall", "world", "fixed")) == ()
     assert said(box("upper", "world", "prismatic"), box("lower", "world", "prismatic")) == ()

@@ -21,7 +21,10 @@ def test_bodies_joints_and_shapes(tmp_path: Path) -> None:
     assert np.allclose(hinge.axis, [0.0, 0.0, -1.0])
     place = found.placements()["door"]
     assert np.allclose(place.translation, [0.75, -0.3, 0.4])
-    assert [(part.name, part.kind) for part in found.links["door"].collision] == [("leaf", "box"), ("handle", "capsule")]
+    assert [(part.name, part.kind) for part in found.links["door"].collision] == [
+        ("leaf", "box"),
+        ("handle", "capsule"),
+    ]
     assert found.links["door"].collision[1].size == pytest.approx((0.01, 0.3))
     assert [part.name for part in found.links["door"].visual] == ["leaf", "handle", "looks"]
     notes = " ".join(found.notes)
@@ -46,13 +49,17 @@ def test_meshes_are_where_the_file_has_them(tmp_path: Path) -> None:
 
 
 def test_what_mujoco_does_not_understand(tmp_path: Path) -> None:
-    (tmp_path / "t.xml").write_text('<mujoco><worldbody><geom type="bx" size="1 1 1"/></worldbody></mujoco>')
+    (tmp_path / "t.xml").write_text(
+        '<mujoco><worldbody><geom type="bx" size="1 1 1"/></worldbody></mujoco>'
+    )
     with pytest.raises(InputError, match=r"t\.xml"):
         read_object_mjcf(tmp_path / "t.xml")
 
 
 def test_what_joints_resist_with(tmp_path: Path) -> None:
-    (tmp_path / "t.xml").write_text(MJCF.replace('name="hinge"', 'name="hinge" damping="0.4" frictionloss="0.2"'))
+    (tmp_path / "t.xml").write_text(
+        MJCF.replace('name="hinge"', 'name="hinge" damping="0.4" frictionloss="0.2"')
+    )
     hinge = read_object_mjcf(tmp_path / "t.xml").joints["door"]
     assert (hinge.damping, hinge.friction) == (0.4, 0.2)
 

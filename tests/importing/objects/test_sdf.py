@@ -51,7 +51,9 @@ def test_a_joint_to_the_world_makes_that_the_root(tmp_path: Path) -> None:
         ('<link name="case">', '<link name="door"/><link name="case">', InputError),
     ],
 )
-def test_what_is_wrong_is_said_with_the_file(tmp_path: Path, old: str, new: str, error: type[InputError]) -> None:
+def test_what_is_wrong_is_said_with_the_file(
+    tmp_path: Path, old: str, new: str, error: type[InputError]
+) -> None:
     assert old in SDF
     with pytest.raises(error, match=r"t\.sdf"):
         read(tmp_path, SDF.replace(old, new))
@@ -71,7 +73,10 @@ def test_what_links_weigh(tmp_path: Path) -> None:
     moments = "<inertia><ixx>0.1</ixx><iyy>0.2</iyy><izz>0.25</izz></inertia>"
     stated = f"<inertial><pose>0 0 0.1 0 0 0</pose><mass>2</mass>{moments}</inertial>"
     place = SDF.index(">", SDF.index("<link")) + 1
-    for inertial, mass, half in ((stated, 2.0, False), ("<inertial><mass>2</mass></inertial>", 0.0, True)):
+    for inertial, mass, half in (
+        (stated, 2.0, False),
+        ("<inertial><mass>2</mass></inertial>", 0.0, True),
+    ):
         (tmp_path / "t.sdf").write_text(SDF[:place] + inertial + SDF[place:])
         found = read_object_sdf(tmp_path / "t.sdf")
         weights = [link.inertia for link in found.links.values()]

@@ -15,7 +15,9 @@ HAND = Hand("none", (), (), opening=0.086, tip=0.019, width=0.022)
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def found(geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None) -> tuple[list[Candidate], Thickness]:
+def found(
+    geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None
+) -> tuple[list[Candidate], Thickness]:
     seen = Thickness()
     piece = Piece.of(pin.GeometryObject("link_0", 0, 0, placement or pin.SE3.Identity(), geometry))
     return list(candidates(piece, HAND, 0.005, UP, seen)), seen
@@ -24,12 +26,17 @@ def found(geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None) ->
 def test_a_bar_is_taken_around_in_its_middle() -> None:
     grasps, _ = found(coal.Cylinder(0.01, 0.3), pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])))
     bars = [
-        grasp for grasp in grasps if grasp.kind == "bar" and np.linalg.norm(grasp.placement.translation - [0.1, 0.2, 0.3]) < 1e-6
+        grasp
+        for grasp in grasps
+        if grasp.kind == "bar"
+        and np.linalg.norm(grasp.placement.translation - [0.1, 0.2, 0.3]) < 1e-6
     ]
     assert len(bars) == 8  # from all sides
     for grasp in bars:
         assert grasp.thickness == pytest.approx(0.02, rel=0.02)
-        assert abs(grasp.placement.rotation[2, 1]) == pytest.approx(1.0)  # the bar is the tool's y axis
+        assert abs(grasp.placement.rotation[2, 1]) == pytest.approx(
+            1.0
+        )  # the bar is the tool's y axis
         assert grasp.span == pytest.approx((-0.15, 0.15))
         assert grasp.round == pytest.approx(1.6)
 
@@ -56,7 +63,9 @@ def test_a_block_is_too_thick() -> None:
 @settings(max_examples=30, deadline=None)
 @given(size=st.tuples(*[st.floats(0.005, 0.3)] * 3), yaw=st.floats(-3.0, 3.0))
 def test_every_grasp_fits_and_closes_upwards(size: tuple[float, float, float], yaw: float) -> None:
-    for grasp in found(coal.Box(*size), pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3)))[0]:
+    for grasp in found(coal.Box(*size), pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3)))[
+        0
+    ]:
         assert grasp.thickness <= HAND.opening - 2 * 0.005 + 1e-12
         tool = grasp.placement.rotation
         assert np.allclose(tool.T @ tool, np.eye(3), atol=1e-9)

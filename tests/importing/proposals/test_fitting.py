@@ -13,12 +13,16 @@ from vkc_pin.importing.proposals.fitting import Blocked, Fitting
 from vkc_pin.importing.proposals.hand import hand_of
 from vkc_pin.world.models.shapes import clearance
 
-FRONT = np.column_stack([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # approaches along x, closes along y
+FRONT = np.column_stack(
+    [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+)  # approaches along x, closes along y
 
 
 @pytest.fixture
 def fitting(tmp_path: Path) -> Fitting:
-    return Fitting(flap(tmp_path, BAR.format("")), hand_of(vkc.load_robot("husky_ur5e")), 0.02, 0.005)
+    return Fitting(
+        flap(tmp_path, BAR.format("")), hand_of(vkc.load_robot("husky_ur5e")), 0.02, 0.005
+    )
 
 
 def test_a_hand_around_a_bar_has_room(fitting: Fitting) -> None:
@@ -28,15 +32,22 @@ def test_a_hand_around_a_bar_has_room(fitting: Fitting) -> None:
 def test_what_is_in_the_way_is_named(fitting: Fitting) -> None:
     beside = pin.SE3(FRONT, np.array([-0.08, 0.535, 0.5]))
     assert fitting.blocked(beside, "flap") == Blocked("fingers", "flap")
-    assert fitting.blocked(pin.SE3(FRONT, np.array([0.0, 0.3, 0.5])), "case") == Blocked("others", "flap")
-    below = pin.SE3(np.column_stack([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([-0.3, 0.5, 0.15]))
+    assert fitting.blocked(pin.SE3(FRONT, np.array([0.0, 0.3, 0.5])), "case") == Blocked(
+        "others", "flap"
+    )
+    below = pin.SE3(
+        np.column_stack([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+        np.array([-0.3, 0.5, 0.15]),
+    )
     assert fitting.blocked(below, "flap") == Blocked("floor")
 
 
 def test_the_object_is_where_its_joints_are(fitting: Fitting) -> None:
     tool = pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5]))
     fitting.place(np.array([1.2]))
-    assert fitting.blocked(pin.SE3(FRONT, np.array([-0.14, 0.5, 0.5])), "case") is None  # the flap has gone
+    assert (
+        fitting.blocked(pin.SE3(FRONT, np.array([-0.14, 0.5, 0.5])), "case") is None
+    )  # the flap has gone
     hinge = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5]))
     turned = hinge * pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 1.2), np.zeros(3)) * hinge.inverse()
     assert fitting.blocked(turned * tool, "flap") is None
@@ -48,13 +59,19 @@ def test_clearance_is_that_of_coal(fitting: Fitting) -> None:
     data = fitting.item.model.createData()
     pin.forwardKinematics(fitting.item.model, data, fitting.item.coordinates.q(np.zeros(1)))
     groups = {
-        name: [(s.geometry, data.oMi[s.parentJoint] * s.placement) for s in shapes if s.name.startswith(name)]
+        name: [
+            (s.geometry, data.oMi[s.parentJoint] * s.placement)
+            for s in shapes
+            if s.name.startswith(name)
+        ]
         for name in ("case", "flap")
     }
 
     def free(x: float) -> bool:
         tool = pin.SE3(FRONT, np.array([x, 0.5, 0.5]))
-        touch, others = ([(shape, tool * where) for shape, where in group] for group in (hand.touch, hand.others))
+        touch, others = (
+            [(shape, tool * where) for shape, where in group] for group in (hand.touch, hand.others)
+        )
         found = (
             clearance(touch, groups["flap"]) >= 0.005
             and clearance([*touch, *others], groups["case"]) >= 0.02

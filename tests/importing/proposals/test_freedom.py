@@ -17,11 +17,27 @@ from vkc_pin.importing.proposals.sections import Piece
 
 def grip(folder: Path, **what: str) -> tuple[Grip, Opening, Fitting]:
     """Return the hand at the middle of the bar, from the front."""
-    fitting = Fitting(flap(folder, BAR.format(""), **what), hand_of(vkc.load_robot("husky_ur5e")), 0.02, 0.005)
-    pieces = {1: [Piece.of(shape) for shape in fitting.item.collision.geometryObjects if shape.parentJoint == 1]}
-    bar = next(piece for piece in pieces[1] if np.ptp(piece.vertices[:, 0]) < 0.03 and np.ptp(piece.vertices[:, 1]) < 0.03)
+    fitting = Fitting(
+        flap(folder, BAR.format(""), **what), hand_of(vkc.load_robot("husky_ur5e")), 0.02, 0.005
+    )
+    pieces = {
+        1: [
+            Piece.of(shape)
+            for shape in fitting.item.collision.geometryObjects
+            if shape.parentJoint == 1
+        ]
+    }
+    bar = next(
+        piece
+        for piece in pieces[1]
+        if np.ptp(piece.vertices[:, 0]) < 0.03 and np.ptp(piece.vertices[:, 1]) < 0.03
+    )
     grasps = candidates(bar, fitting.hand, 0.005, np.array([0.0, 0.0, 1.0]), Thickness())
-    front = next(g for g in grasps if g.placement.rotation[0, 2] > 0.99 and abs(g.placement.translation[2]) < 1e-6)
+    front = next(
+        g
+        for g in grasps
+        if g.placement.rotation[0, 2] > 0.99 and abs(g.placement.translation[2]) < 1e-6
+    )
     return Grip(fitting, front, 0.0), openings(fitting.item, pieces)[1], fitting
 
 
@@ -55,7 +71,11 @@ def test_what_stands_beside_it_ends_the_slide_and_the_way(tmp_path: Path) -> Non
 
 def test_what_stands_beside_it_ends_the_turn_also_where_it_is_free_behind(tmp_path: Path) -> None:
     post = '<collision><origin xyz="-0.2 0.66 0.5"/><geometry><box size="0.04 0.04 1.0"/></geometry></collision>'
-    (_, free), (_, turn) = (grip(tmp_path, **what)[0].freedoms()[1] for what in ({}, {"before": post}))
+    (_, free), (_, turn) = (
+        grip(tmp_path, **what)[0].freedoms()[1] for what in ({}, {"before": post})
+    )
     ends = sorted([-turn.lower, turn.upper])
-    assert ends[0] < 0.9 < ends[1] <= max(-free.lower, free.upper)  # the post is at 0.9 rad to one side
+    assert (
+        ends[0] < 0.9 < ends[1] <= max(-free.lower, free.upper)
+    )  # the post is at 0.9 rad to one side
     assert -free.lower > 0.9 < free.upper

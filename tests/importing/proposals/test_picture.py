@@ -16,7 +16,9 @@ def test_a_panel_for_every_attachment(tmp_path: Path) -> None:
     found = vkc.propose_attachments(flap(tmp_path, BAR.format("")))
     figure = plot_attachments(found, tmp_path / "attachments.png")
     assert len(figure.axes) == len(found.found)
-    assert [axes.get_title().split()[0] for axes in figure.axes] == [proposal.attachment.name for proposal in found.found]
+    assert [axes.get_title().split()[0] for axes in figure.axes] == [
+        proposal.attachment.name for proposal in found.found
+    ]
     pixels = np.asarray(Image.open(tmp_path / "attachments.png").convert("RGB"), int).reshape(-1, 3)
     blue = (pixels[:, 2] > pixels[:, 0] + 60).sum()  # the hand
     assert blue > 200 * len(found.found)

@@ -13,12 +13,18 @@ import vkc_pin as vkc
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> vkc.Proposals:
-    return vkc.propose_attachments(flap(tmp_path_factory.mktemp("flap"), BAR.format(' name="handle"')))
+    return vkc.propose_attachments(
+        flap(tmp_path_factory.mktemp("flap"), BAR.format(' name="handle"'))
+    )
 
 
 def test_descriptions_load_as_the_same_attachments(found: vkc.Proposals, tmp_path: Path) -> None:
     written = yaml.safe_dump([proposal.description() for proposal in found.found])
-    loaded = flap(tmp_path, BAR.format(""), attachments=yaml.safe_dump(yaml.safe_load(written), default_flow_style=True).strip())
+    loaded = flap(
+        tmp_path,
+        BAR.format(""),
+        attachments=yaml.safe_dump(yaml.safe_load(written), default_flow_style=True).strip(),
+    )
     assert list(loaded.attachments) == [proposal.attachment.name for proposal in found.found]
     for proposal in found.found:
         wanted, got = proposal.attachment, loaded.attachment(proposal.attachment.name)
@@ -39,7 +45,11 @@ def test_applied_gives_the_object_the_best_one_first(found: vkc.Proposals) -> No
 
 def test_a_line_names_few_of_the_joints_that_must_be_open(found: vkc.Proposals) -> None:
     first = found.found[0]
-    ends = {0: "1.5 rad", 2: "1.5 rad, while j0 is at 1, j1 is at 1", 5: "j2 is at 1 and 2 more joints are open"}
+    ends = {
+        0: "1.5 rad",
+        2: "1.5 rad, while j0 is at 1, j1 is at 1",
+        5: "j2 is at 1 and 2 more joints are open",
+    }
     for count, said in ends.items():
         one = dataclasses.replace(first, when={f"j{k}": 1.0 for k in range(count)})
         assert dataclasses.replace(found, found=(one,)).report().splitlines()[1].endswith(said)

@@ -32,7 +32,9 @@ HAND_WRITTEN = [
 
 
 @pytest.mark.parametrize(("name", "joint", "handle"), HAND_WRITTEN)
-def test_the_best_proposal_is_the_bar_that_somebody_chose(name: str, joint: str, handle: str) -> None:
+def test_the_best_proposal_is_the_bar_that_somebody_chose(
+    name: str, joint: str, handle: str
+) -> None:
     """On the same bar: beside the hand-written grasp by no more than the hand can slide, along the bar, closing across it."""
     item = vkc.load_object(name)
     best, wanted = vkc.propose_attachments(item).opening(joint)[0], item.attachment(handle)
@@ -117,11 +119,16 @@ def knob(z: float, turned: float = 0.0) -> str:
 
 def test_two_knobs_come_before_one_with_the_hand_turned(tmp_path: Path) -> None:
     """Turned, the hand has the better one nearly as well as before; but what keeps it from there does so in both cases."""
-    alone, two = (vkc.propose_attachments(flap(tmp_path, text), most=2).found for text in (knob(0.0), knob(0.0) + knob(0.25)))
+    alone, two = (
+        vkc.propose_attachments(flap(tmp_path, text), most=2).found
+        for text in (knob(0.0), knob(0.0) + knob(0.25))
+    )
     (first, turned), (same, other) = alone, two
     assert turned.score > 0.9 * first.score
     assert (same.score, other.score < turned.score) == (pytest.approx(first.score), True)
-    heights = [proposal.attachment.placement.translation[2] for proposal in (first, turned, same, other)]
+    heights = [
+        proposal.attachment.placement.translation[2] for proposal in (first, turned, same, other)
+    ]
     np.testing.assert_allclose(heights, [0.0, 0.0, 0.0, 0.25], atol=1e-6)
 
 
@@ -131,13 +138,22 @@ def test_a_hand_that_is_turned_a_little_is_not_proposed_again(tmp_path: Path) ->
     places = [proposal.attachment.placement for proposal in found if proposal.kind == "knob"]
     assert len(places) >= 2
     for one, other in itertools.combinations(places, 2):
-        same = one.rotation[:, 2] @ other.rotation[:, 2] > 0.5 and np.linalg.norm(one.translation - other.translation) < 0.03
+        same = (
+            one.rotation[:, 2] @ other.rotation[:, 2] > 0.5
+            and np.linalg.norm(one.translation - other.translation) < 0.03
+        )
         assert not same or abs(one.rotation[:, 1] @ other.rotation[:, 1]) < 0.5
 
 
 def test_posts_end_the_slide(tmp_path: Path) -> None:
-    free, held = (vkc.propose_attachments(flap(tmp_path, BAR.format("") + posts)).found[0] for posts in ("", POSTS))
-    lengths = [best.attachment.freedoms[0].upper - best.attachment.freedoms[0].lower for best in (free, held)]
+    free, held = (
+        vkc.propose_attachments(flap(tmp_path, BAR.format("") + posts)).found[0]
+        for posts in ("", POSTS)
+    )
+    lengths = [
+        best.attachment.freedoms[0].upper - best.attachment.freedoms[0].lower
+        for best in (free, held)
+    ]
     assert lengths[1] < lengths[0] - 0.02
 
 
@@ -169,7 +185,11 @@ def test_the_best_proposal_opens_it(name: str, tmp_path: Path) -> None:
     item = vkc.load_object(name)
     found = vkc.propose_attachments(item)
     file, joint = tmp_path / f"{name}.yaml", item.coordinates.names[0]
-    file.write_text(yaml.safe_dump({"urdf": str(item.urdf), "attachments": [p.description() for p in found.found]}))
+    file.write_text(
+        yaml.safe_dump(
+            {"urdf": str(item.urdf), "attachments": [p.description() for p in found.found]}
+        )
+    )
     scene = {
         "name": "alone",
         "robot": {"name": "husky_ur5e", "base": "omni"},
@@ -194,7 +214,9 @@ def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_pat
     assert best.description()["opening"] == 0.03
     assert "20 mm thick, fingers 30 mm apart" in found.report()
     fitting = Fitting(item, hand_of(robot.opened(best.attachment.opening)), 0.02, 0.005)
-    tool = item.link_placement("front", [0.0]) * best.attachment.tool(np.zeros(len(best.attachment.freedoms)))
+    tool = item.link_placement("front", [0.0]) * best.attachment.tool(
+        np.zeros(len(best.attachment.freedoms))
+    )
     assert fitting.blocked(tool, "front") is None
     assert Fitting(item, found.hand, 0.02, 0.005).blocked(tool, "front") is not None
     still = dataclasses.replace(robot, gripper=None)
@@ -203,4 +225,6 @@ def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_pat
 
 def test_fingers_that_have_room_stay_fully_open(tmp_path: Path) -> None:
     item, robot = vkc.load_object(cheeky_drawer(gap=0.15)), vkc.load_robot(write_gripper(tmp_path))
-    assert [one.attachment.opening for one in vkc.propose_attachments(item, robot).found][:1] == [None]
+    assert [one.attachment.opening for one in vkc.propose_attachments(item, robot).found][:1] == [
+        None
+    ]

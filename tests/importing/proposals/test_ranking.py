@@ -14,7 +14,9 @@ from vkc_pin.importing.proposals.candidates import Candidate
 from vkc_pin.importing.proposals.ranking import Opening, names_of_pieces, openings, worth
 from vkc_pin.importing.proposals.sections import Piece
 
-FRONT = np.column_stack([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # approaches along x, closes along y
+FRONT = np.column_stack(
+    [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+)  # approaches along x, closes along y
 
 
 def opening_of(name_or_path: str | Path) -> Opening:
@@ -40,18 +42,31 @@ def test_how_a_hinge_and_a_slide_open(tmp_path: Path) -> None:
 def test_leverage_side_pull_and_name_count(tmp_path: Path) -> None:
     flap(tmp_path, BAR.format(""))
     hinge = opening_of(tmp_path / "flap.yaml")
-    bar = Candidate(Piece("flap", "flap_1", np.zeros((0, 3)), np.zeros((0, 3), int)), "bar", pin.SE3.Identity(), 0.02, (0, 0), 0)
+    bar = Candidate(
+        Piece("flap", "flap_1", np.zeros((0, 3)), np.zeros((0, 3), int)),
+        "bar",
+        pin.SE3.Identity(),
+        0.02,
+        (0, 0),
+        0,
+    )
 
-    def at(*place: float, rotation: np.ndarray = FRONT, named: bool = False, grasp: Candidate = bar) -> float:
+    def at(
+        *place: float, rotation: np.ndarray = FRONT, named: bool = False, grasp: Candidate = bar
+    ) -> float:
         return worth(grasp, pin.SE3(rotation, np.array(place)), hinge, named=named)
 
     best = at(-0.08, 0.55, 0.5)
     assert best > at(-0.08, 0.3, 0.5) > at(-0.08, 0.05, 0.5) > 0.0  # leverage
     assert best > at(-0.08, 0.55, 0.85)  # in the middle of the flap's height
     behind = FRONT @ np.diag([-1.0, 1.0, -1.0])
-    assert best > at(-0.08, 0.55, 0.5, rotation=behind)  # the hand comes from where the flap goes to
+    assert best > at(
+        -0.08, 0.55, 0.5, rotation=behind
+    )  # the hand comes from where the flap goes to
     along = np.column_stack([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    assert best > 2.0 * at(-0.08, 0.55, 0.5, rotation=along)  # a bar along the pull slips through the fingers
+    assert best > 2.0 * at(
+        -0.08, 0.55, 0.5, rotation=along
+    )  # a bar along the pull slips through the fingers
     assert at(-0.08, 0.55, 0.5, named=True) > best
     assert best > at(-0.08, 0.55, 0.5, grasp=dataclasses.replace(bar, kind="edge"))
 
@@ -60,4 +75,9 @@ def test_what_is_called_a_handle() -> None:
     text = """<robot><link name="door"><collision/><collision name="Handle-3"/>
     <collision><geometry><mesh filename="meshes/knob_7.obj"/></geometry></collision></link>
     <link name="lever"><collision/></link></robot>"""
-    assert names_of_pieces(ElementTree.fromstring(text)) == {"door_0": False, "door_1": True, "door_2": True, "lever_0": True}
+    assert names_of_pieces(ElementTree.fromstring(text)) == {
+        "door_0": False,
+        "door_1": True,
+        "door_2": True,
+        "lever_0": True,
+    }

@@ -19,11 +19,15 @@ angles = st.floats(-3.0, 3.0)
 
 @settings(max_examples=40, deadline=None)
 @given(roll=angles, pitch=angles, yaw=angles)
-def test_the_axes_of_a_box_are_its_own_however_it_is_turned(roll: float, pitch: float, yaw: float) -> None:
+def test_the_axes_of_a_box_are_its_own_however_it_is_turned(
+    roll: float, pitch: float, yaw: float
+) -> None:
     rotation = pin.rpy.rpyToMatrix(roll, pitch, yaw)
     box = piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(rotation, np.array([1.0, 2.0, 3.0])))
     assert np.allclose(box.axes @ box.axes.T, np.eye(3), atol=1e-9)
-    assert np.allclose(np.ptp(box.extents, axis=1), [0.5, 0.2, 0.05], rtol=0.031)  # as thin as along any, within 3 %
+    assert np.allclose(
+        np.ptp(box.extents, axis=1), [0.5, 0.2, 0.05], rtol=0.031
+    )  # as thin as along any, within 3 %
 
 
 def test_a_round_bar_has_the_axes_of_its_frame() -> None:
@@ -43,7 +47,11 @@ def test_the_section_of_a_tilted_box_is_where_and_as_large_as_it_should_be() -> 
     assert box.section(0, float(box.extents[0, 1]) + 0.01) is None
 
 
-SQUARE = Section(np.zeros(3), np.eye(3)[:2], np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.01)
+SQUARE = Section(
+    np.zeros(3),
+    np.eye(3)[:2],
+    np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.01,
+)
 
 
 def test_fingers_slip_off_corners_and_hold_on_faces() -> None:

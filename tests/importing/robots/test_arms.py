@@ -7,7 +7,15 @@ from helpers.arm_urdf import write_arms
 from helpers.telescopes import write_telescope
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
+from vkc_pin.importing.robots.arms import (
+    Arm,
+    base_kind,
+    bodies,
+    choose,
+    find_arms,
+    own_base,
+    telescopes,
+)
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.models.robot_model import full_model
@@ -23,7 +31,10 @@ def test_both_arms_are_found_by_their_hands(tmp_path: Path) -> None:
     assert sorted(arm.name for arm in arms) == ["left", "right"]
     left = choose(arms, "Left", file, {})
     assert left.joints == tuple(f"left_arm_{k}_joint" for k in range(1, 6))
-    assert [finger.name for finger in left.fingers] == ["left_finger_a_joint", "left_finger_b_joint"]
+    assert [finger.name for finger in left.fingers] == [
+        "left_finger_a_joint",
+        "left_finger_b_joint",
+    ]
     assert left.palm.links == ["left_arm_5", "left_hand"]
     assert left.sure == "sure"
     with pytest.raises(vkc.UnknownNameError) as caught:
@@ -80,7 +91,8 @@ def test_arms_of_robots_that_others_described(pattern: str, joints: int, fingers
 
 
 @pytest.mark.parametrize(
-    "pattern", ["**/solo12.urdf", "**/go1.urdf", "**/anymal_b*/**/anymal.urdf", "**/allegro_right_hand.urdf"]
+    "pattern",
+    ["**/solo12.urdf", "**/go1.urdf", "**/anymal_b*/**/anymal.urdf", "**/allegro_right_hand.urdf"],
 )
 def test_legs_and_hands_alone_are_no_arms(pattern: str) -> None:
     file = read_urdf(robots(pattern))
@@ -100,11 +112,18 @@ def test_wheels_say_how_the_base_moves(tmp_path: Path) -> None:
     [
         ({}, [("out_1", "out_2", "out_3", "out_4")]),
         ({'name="out_3" type="prismatic"': 'name="out_3" type="revolute"'}, [("out_1", "out_2")]),
-        ({'<child link="segment_3"/><axis xyz="1 0 0"/>': '<child link="segment_3"/><axis xyz="-1 0 0"/>'}, [("out_1", "out_2")]),
+        (
+            {
+                '<child link="segment_3"/><axis xyz="1 0 0"/>': '<child link="segment_3"/><axis xyz="-1 0 0"/>'
+            },
+            [("out_1", "out_2")],
+        ),
         ({'upper="0.15"': 'upper="0.16"'}, [("out_2", "out_3", "out_4")]),
     ],
 )
-def test_segments_of_a_telescope(tmp_path: Path, changed: dict[str, str], groups: list[tuple[str, ...]]) -> None:
+def test_segments_of_a_telescope(
+    tmp_path: Path, changed: dict[str, str], groups: list[tuple[str, ...]]
+) -> None:
     """They slide alike, one on the other, and equally far; the lift before them slides elsewhere."""
     file = write_telescope(tmp_path).parent / "robot.urdf"
     text = file.read_text()

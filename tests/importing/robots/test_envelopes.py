@@ -17,7 +17,9 @@ def caged(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> P
     shape = f"<geometry><box size='{size}'/></geometry>"
     cage = f"<link name='cage'><collision>{shape}</collision>{f'<visual>{shape}</visual>' if visual else ''}</link>"
     joint = "<joint name='caging' type='fixed'><parent link='hand'/><child link='cage'/><origin xyz='0 0 0.1'/></joint>"
-    text = file.read_text(encoding="utf-8").replace('<link name="hand">', f'<link name="hand">{seen}')
+    text = file.read_text(encoding="utf-8").replace(
+        '<link name="hand">', f'<link name="hand">{seen}'
+    )
     file.write_text(text.replace("</robot>", f"{cage}{joint}</robot>"), encoding="utf-8")
     return file
 
@@ -30,7 +32,9 @@ def test_a_box_around_the_hand(tmp_path: Path) -> None:
     assert 0.75 <= found["cage"] < 1.0
 
 
-@pytest.mark.parametrize("given", [{"size": "0.02 0.02 0.02"}, {"visual": True}], ids=["small", "seen"])
+@pytest.mark.parametrize(
+    "given", [{"size": "0.02 0.02 0.02"}, {"visual": True}], ids=["small", "seen"]
+)
 def test_shapes_that_belong_to_the_hand(tmp_path: Path, given: dict[str, object]) -> None:
     robot = vkc.load_robot(caged(tmp_path, **given), pairs="all", tool_frame="hand")  # type: ignore[arg-type]
     assert envelopes(robot) == {}

@@ -21,7 +21,9 @@ def found(path: Path) -> tuple[Arm, object]:
 def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
     _, hand = found(write_arms(tmp_path))
     assert hand.link == "arm_5"
-    np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9)  # approach: where fingers point
+    np.testing.assert_allclose(
+        hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9
+    )  # approach: where fingers point
     np.testing.assert_allclose(np.abs(hand.tool.rotation[:, 0]), [0, 1, 0], atol=1e-9)  # closing
     assert np.linalg.det(hand.tool.rotation) == pytest.approx(1.0)
     np.testing.assert_allclose(hand.tool.translation[:2], 0.0, atol=2e-3)
@@ -38,7 +40,10 @@ def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
 def test_one_jaw_opens_from_the_hand(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8")
-    still = text.replace('<joint name="finger_b_joint" type="prismatic">', '<joint name="finger_b_joint" type="fixed">')
+    still = text.replace(
+        '<joint name="finger_b_joint" type="prismatic">',
+        '<joint name="finger_b_joint" type="fixed">',
+    )
     path.write_text(still, encoding="utf-8")
     arm, hand = found(path)
     assert [finger.name for finger in arm.fingers] == ["finger_a_joint"]
@@ -56,4 +61,6 @@ def test_a_flange_points_along_its_last_axis(tmp_path: Path) -> None:
     assert hand.open == {}
     assert hand.settings() == {}
     np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=0.2)
-    assert hand.tool.translation[2] == pytest.approx(0.2 + 0.14, abs=0.01)  # in front of all that is there
+    assert hand.tool.translation[2] == pytest.approx(
+        0.2 + 0.14, abs=0.01
+    )  # in front of all that is there

@@ -89,7 +89,9 @@ def test_limits_shapes_couplings_and_states_are_kept(file: Path, tmp_path: Path)
     assert len(fore.findall("visual")) == 1
     masses = sum(float(element.get("value", "0")) for element in made.root.iter("mass"))
     theirs = mujoco.MjModel.from_xml_path(str(file))
-    assert masses == pytest.approx(theirs.body_mass[theirs.body_rootid == theirs.body("foot").id].sum(), rel=1e-6)
+    assert masses == pytest.approx(
+        theirs.body_mass[theirs.body_rootid == theirs.body("foot").id].sum(), rel=1e-6
+    )
     assert any("table" in note for note in made.notes)
 
 
@@ -100,7 +102,11 @@ def test_what_mujoco_does_not_take_is_named(tmp_path: Path) -> None:
             "<mujoco><worldbody><body><joint type='hinge' axis='0 0 0'/></body></worldbody></mujoco>",
             "MuJoCo does not",
         ),
-        ("still.xml", "<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>", "nothing moves here"),
+        (
+            "still.xml",
+            "<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>",
+            "nothing moves here",
+        ),
     ):
         path = tmp_path / name
         path.write_text(text, encoding="utf-8")
@@ -111,7 +117,9 @@ def test_what_mujoco_does_not_take_is_named(tmp_path: Path) -> None:
 
 def coupled(*equalities: str) -> str:
     """Return an MJCF of three sliding joints one on the other, with couplings."""
-    joints = "".join(f'<body><joint name="j{k}" type="slide" range="0 1"/><geom size="0.01"/>' for k in range(3))
+    joints = "".join(
+        f'<body><joint name="j{k}" type="slide" range="0 1"/><geom size="0.01"/>' for k in range(3)
+    )
     return f"<mujoco><worldbody>{joints}{'</body>' * 3}</worldbody><equality>{''.join(equalities)}</equality></mujoco>"
 
 
@@ -123,18 +131,34 @@ def same(one: str, other: str, more: str = "") -> str:
     ("equalities", "follows", "noted"),
     [
         ((same("j1", "j0"), same("j2", "j1")), {"j1": "j0", "j2": "j1"}, ""),
-        ((same("j0", "j1"), same("j0", "j2")), {"j0": "j1", "j2": "j0"}, ""),  # of j0 both: the other way round
-        ((same("j0", "j1"), same("j1", "j0")), {"j0": "j1"}, "j1 follows j0; another coupling of it is left out"),
-        ((same("j1", "j0", 'polycoef="0 1 0.5 0 0"'),), {"j1": "j0"}, "j1 follows j0 along a curve"),
+        (
+            (same("j0", "j1"), same("j0", "j2")),
+            {"j0": "j1", "j2": "j0"},
+            "",
+        ),  # of j0 both: the other way round
+        (
+            (same("j0", "j1"), same("j1", "j0")),
+            {"j0": "j1"},
+            "j1 follows j0; another coupling of it is left out",
+        ),
+        (
+            (same("j1", "j0", 'polycoef="0 1 0.5 0 0"'),),
+            {"j1": "j0"},
+            "j1 follows j0 along a curve",
+        ),
         ((same("j1", "j0", 'active="false"'),), {}, ""),
     ],
 )
-def test_couplings_become_a_tree(tmp_path: Path, equalities: tuple[str, ...], follows: dict[str, str], noted: str) -> None:
+def test_couplings_become_a_tree(
+    tmp_path: Path, equalities: tuple[str, ...], follows: dict[str, str], noted: str
+) -> None:
     path = tmp_path / "arm.xml"
     path.write_text(coupled(*equalities))
     made = convert(path, tmp_path / "meshes")
     said = {joint.get("name"): joint.find("mimic") for joint in made.root.findall("joint")}
-    assert {name: mimic.get("joint") for name, mimic in said.items() if mimic is not None} == follows
+    assert {
+        name: mimic.get("joint") for name, mimic in said.items() if mimic is not None
+    } == follows
     assert any(noted in note for note in made.notes) == bool(noted)
 
 
@@ -142,7 +166,10 @@ def test_a_coupling_the_other_way_round_has_its_inverse(tmp_path: Path) -> None:
     """j0 = 0.1 + 2·j2 is j2 = -0.05 + 0.5·j0."""
     path = tmp_path / "arm.xml"
     path.write_text(coupled(same("j0", "j1"), same("j0", "j2", 'polycoef="0.1 2 0 0 0"')))
-    joints = {joint.get("name"): joint for joint in convert(path, tmp_path / "meshes").root.findall("joint")}
+    joints = {
+        joint.get("name"): joint
+        for joint in convert(path, tmp_path / "meshes").root.findall("joint")
+    }
     mimic = joints["j2"].find("mimic")
     assert mimic is not None
     assert mimic.attrib == {"joint": "j0", "multiplier": "0.5", "offset": "-0.05"}

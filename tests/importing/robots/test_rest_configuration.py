@@ -8,7 +8,13 @@ import pytest
 from helpers.arm_urdf import HEIGHT, write_arms
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.rest_configuration import HOME_ROOM, Clearances, find_home, never_apart, standing
+from vkc_pin.importing.robots.rest_configuration import (
+    HOME_ROOM,
+    Clearances,
+    find_home,
+    never_apart,
+    standing,
+)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +60,9 @@ def test_home_is_searched_for_where_none_is_named(robot: vkc.Robot) -> None:
 
 def test_pairs_that_stay_close_are_found(tmp_path: Path) -> None:
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
-    near = never_apart(robot, 0.035, samples=50)  # the first link turns about the vertical, 30 mm above the body
+    near = never_apart(
+        robot, 0.035, samples=50
+    )  # the first link turns about the vertical, 30 mm above the body
     assert near[("body", "arm_1")] == pytest.approx(0.03)
     assert ("body", "arm_5") not in near
     assert ("arm_1", "arm_2") not in near

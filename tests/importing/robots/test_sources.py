@@ -17,7 +17,9 @@ def read(file: Path, scratch: Path) -> Source:
 def test_what_a_urdf_does_not_have_is_left_out_and_what_is_missing_is_told(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8").replace(' effort="10"', "", 1)
-    path.write_text(text.replace("</robot>", "<gazebo/><transmission name='t'/></robot>"), encoding="utf-8")
+    path.write_text(
+        text.replace("</robot>", "<gazebo/><transmission name='t'/></robot>"), encoding="utf-8"
+    )
     source = read(path, tmp_path)
     assert source.kind == "URDF"
     assert "left out what a URDF does not have: <gazebo>, <transmission>" in source.notes

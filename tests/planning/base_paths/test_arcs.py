@@ -22,13 +22,17 @@ def rolled(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def equal(pose: np.ndarray, other: np.ndarray) -> bool:
     """Whether two poses are the same but for whole turns."""
-    return bool(np.allclose(pose[:2], other[:2], atol=1e-6) and np.cos(pose[2] - other[2]) > 1.0 - 1e-9)
+    return bool(
+        np.allclose(pose[:2], other[:2], atol=1e-6) and np.cos(pose[2] - other[2]) > 1.0 - 1e-9
+    )
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.5, 1.3])
 @settings(deadline=None)
 @given(PLACES, PLACES, st.integers(8, 60))
-def test_every_step_of_a_curve_rolls(radius: float, first: tuple[float, ...], last: tuple[float, ...], steps: int) -> None:
+def test_every_step_of_a_curve_rolls(
+    radius: float, first: tuple[float, ...], last: tuple[float, ...], steps: int
+) -> None:
     """Not sideways, in no turn tighter than the radius, and to where it is to lead, in steps of any length up to 0.7 rad."""
     a, b, curves = np.array(first), np.array(last), Curves(radius, TURNING)
     corners = curves.corners(a, b)
@@ -47,8 +51,12 @@ def test_every_step_of_a_curve_rolls(radius: float, first: tuple[float, ...], la
 
 
 @settings(deadline=None)
-@given(PLACES, st.floats(-2.0, 2.0), st.floats(-1.5, 1.5), st.floats(-0.5, 0.5), st.floats(0.0, 1.0))
-def test_the_nearest_arc(first: tuple[float, ...], dx: float, dy: float, turn: float, radius: float) -> None:
+@given(
+    PLACES, st.floats(-2.0, 2.0), st.floats(-1.5, 1.5), st.floats(-0.5, 0.5), st.floats(0.0, 1.0)
+)
+def test_the_nearest_arc(
+    first: tuple[float, ...], dx: float, dy: float, turn: float, radius: float
+) -> None:
     """It rolls; no other arc that is tried at random ends nearer to where it is to lead."""
     a, rng = np.array(first), np.random.default_rng(0)
     b = a + np.array([dx, dy, turn])
@@ -64,7 +72,11 @@ def test_the_nearest_arc(first: tuple[float, ...], dx: float, dy: float, turn: f
         heading = a[2] + other / 2
         there = dx * np.cos(heading) + dy * np.sin(heading)
         if abs(there) >= radius * abs(other):
-            assert error(found) <= error(a + np.array([there * np.cos(heading), there * np.sin(heading), other])) + 0.03
+            assert (
+                error(found)
+                <= error(a + np.array([there * np.cos(heading), there * np.sin(heading), other]))
+                + 0.03
+            )
 
 
 def test_an_arc_is_its_own_nearest() -> None:
@@ -72,12 +84,23 @@ def test_an_arc_is_its_own_nearest() -> None:
     first = rng.uniform(-3, 3, (200, 3))
     turn = rng.uniform(-0.7, 0.7, 200)
     chord = rng.uniform(0.75, 2.0, 200) * rng.choice([-1, 1], 200)
-    last = first + np.column_stack([chord * np.cos(first[:, 2] + turn / 2), chord * np.sin(first[:, 2] + turn / 2), turn])
-    np.testing.assert_allclose(nearest_arc(first, last, radius=1.0, turning=TURNING), last, atol=1e-9)
+    last = first + np.column_stack(
+        [chord * np.cos(first[:, 2] + turn / 2), chord * np.sin(first[:, 2] + turn / 2), turn]
+    )
+    np.testing.assert_allclose(
+        nearest_arc(first, last, radius=1.0, turning=TURNING), last, atol=1e-9
+    )
 
 
 @settings(deadline=None)
-@given(PLACES, st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-3.0, 3.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+@given(
+    PLACES,
+    st.floats(-2.0, 2.0),
+    st.floats(-2.0, 2.0),
+    st.floats(-3.0, 3.0),
+    st.floats(0.0, 1.0),
+    st.floats(0.0, 1.0),
+)
 def test_between_two_poses_the_twist_is_constant(
     first: tuple[float, ...], dx: float, dy: float, turn: float, one: float, two: float
 ) -> None:
@@ -86,7 +109,9 @@ def test_between_two_poses_the_twist_is_constant(
     b = a + np.array([dx, dy, turn])
     np.testing.assert_allclose(between(a, b, np.array([1.0])), b, atol=1e-9)
     p, q = between(a, b, np.array([one])), between(a, b, np.array([two]))
-    np.testing.assert_allclose(between(p, q, np.array([0.5])), between(a, b, np.array([(one + two) / 2])), atol=1e-6)
+    np.testing.assert_allclose(
+        between(p, q, np.array([0.5])), between(a, b, np.array([(one + two) / 2])), atol=1e-6
+    )
 
 
 def test_a_path_stops_at_its_corners() -> None:
@@ -103,12 +128,23 @@ def test_fewer_steps_than_corners_still_lead_there() -> None:
     path = spread_along(corners, 2, turning=TURNING)
     assert path.shape == (2, 3)
     np.testing.assert_allclose(path[-1], corners[-1], atol=1e-12)
-    np.testing.assert_array_equal(spread_along(corners[:1], 3, turning=TURNING), np.tile(corners[:1], (3, 1)))
+    np.testing.assert_array_equal(
+        spread_along(corners[:1], 3, turning=TURNING), np.tile(corners[:1], (3, 1))
+    )
 
 
 def test_a_car_follows_a_path_with_turns_in_place() -> None:
     """Around a wall that the shortest curve leads through; without the wall it takes that."""
-    path = np.array([[0.0, 0.0, 1.5], [0.0, 4.0, 1.5], [0.0, 4.0, 0.0], [4.0, 4.0, 0.0], [4.0, 4.0, -1.5], [4.0, 0.0, -1.5]])
+    path = np.array(
+        [
+            [0.0, 0.0, 1.5],
+            [0.0, 4.0, 1.5],
+            [0.0, 4.0, 0.0],
+            [4.0, 4.0, 0.0],
+            [4.0, 4.0, -1.5],
+            [4.0, 0.0, -1.5],
+        ]
+    )
     curves = Curves(0.6, TURNING)
 
     def free(pose: np.ndarray) -> bool:
@@ -123,5 +159,9 @@ def test_a_car_follows_a_path_with_turns_in_place() -> None:
     np.testing.assert_allclose(aside, 0.0, atol=1e-6)
     assert (np.abs(along) >= 0.6 * np.abs(turn) - 1e-6).all()
     assert np.abs(along).sum() < 1.3 * 12.0
-    np.testing.assert_allclose(curves.through(path, lambda _: True), curves.corners(path[0], path[-1]), atol=1e-9)
-    assert equal(curves.through(path, lambda _: False)[-1], path[-1]), "what nothing leads through is the solver's to push apart"
+    np.testing.assert_allclose(
+        curves.through(path, lambda _: True), curves.corners(path[0], path[-1]), atol=1e-9
+    )
+    assert equal(curves.through(path, lambda _: False)[-1], path[-1]), (
+        "what nothing leads through is the solver's to push apart"
+    )

@@ -17,7 +17,10 @@ def scene(seed: int) -> tuple[list[Shape], list[Shape], Body]:
     """Return some shapes on the base, what stands around, and the body of the former."""
     rng = np.random.default_rng(seed)
     shapes = [*chassis(), *arm()[:3], (wedge(), at(0.3, -0.1, 0.6, 0.4))]
-    standing = [*clutter(int(rng.integers(1000)), 8, reach=1.5), (wedge(), at(*rng.uniform(-1.5, 1.5, 2), 0.3, 1.0))]
+    standing = [
+        *clutter(int(rng.integers(1000)), 8, reach=1.5),
+        (wedge(), at(*rng.uniform(-1.5, 1.5, 2), 0.3, 1.0)),
+    ]
     return shapes, standing, Body(shapes, Standing(standing), MARGIN)
 
 
@@ -28,7 +31,9 @@ def test_a_drive_is_free_if_coal_finds_room_all_along(seed: int) -> None:
     rng = np.random.default_rng(seed + 1)
     a, yaw = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
     b = a + rng.uniform(0.0, 1.0) * rng.uniform(-1.0, 1.0, 2)
-    nearest = min(distance(shapes, standing, pose) for pose in between([*a, yaw], [*b, yaw], length=0.004))
+    nearest = min(
+        distance(shapes, standing, pose) for pose in between([*a, yaw], [*b, yaw], length=0.004)
+    )
     if body.driven(a, b, yaw):
         assert nearest >= MARGIN - BLINK
     else:
@@ -42,7 +47,10 @@ def test_a_turn_is_free_if_coal_finds_room_all_along(seed: int) -> None:
     rng = np.random.default_rng(seed + 1)
     place, start = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
     end = start + rng.uniform(-2.0, 2.0) * rng.uniform()
-    nearest = min(distance(shapes, standing, pose) for pose in between([*place, start], [*place, end], angle=0.004))
+    nearest = min(
+        distance(shapes, standing, pose)
+        for pose in between([*place, start], [*place, end], angle=0.004)
+    )
     if body.turned(place, start, end):
         assert nearest >= MARGIN - BLINK
     else:
@@ -88,7 +96,10 @@ def test_nothing_to_hit() -> None:
 
 def test_what_is_too_close_at_the_start_may_stay_so_close() -> None:
     box = (coal.Box(1.0, 1.0, 1.0), at(1.01, 0.0, 0.5))
-    near, far = (coal.Box(1.0, 1.0, 1.0), at(0.0, 0.845, 0.5)), (coal.Box(1.0, 1.0, 1.0), at(-3.0, 0.0, 0.5))
+    near, far = (
+        (coal.Box(1.0, 1.0, 1.0), at(0.0, 0.845, 0.5)),
+        (coal.Box(1.0, 1.0, 1.0), at(-3.0, 0.0, 0.5)),
+    )
     body = Body([(coal.Box(1.0, 0.67, 0.4), at(0.0, 0.0, 0.2))], Standing([box, near, far]), MARGIN)
     margins = body.leaving(np.zeros(2), 0.0)
     assert margins == pytest.approx([0.01, 0.01, MARGIN], abs=1e-5)
@@ -116,15 +127,21 @@ SHAPES = [
 def test_outlines_are_inside_and_outside(shape: coal.CollisionGeometry, seed: int) -> None:
     """Along any direction the shape itself, as coal has it, ends between what is inside and what is outside."""
     rng = np.random.default_rng(seed)
-    placement = pin.SE3(pin.Quaternion(rng.normal(size=4)).normalized().matrix(), rng.uniform(-1.0, 1.0, 3))
+    placement = pin.SE3(
+        pin.Quaternion(rng.normal(size=4)).normalized().matrix(), rng.uniform(-1.0, 1.0, 3)
+    )
     where = coal.Transform3s(placement.rotation, placement.translation)
-    (inner, nothing), (outer, radius) = (hull_points(shape, placement, outer=side) for side in (False, True))
+    (inner, nothing), (outer, radius) = (
+        hull_points(shape, placement, outer=side) for side in (False, True)
+    )
     assert nothing == 0.0
     for u in FAN[:: int(rng.integers(1, 8))]:
         normal = np.array([*u, 0.0])
         # How far the shape reaches along u, from its distance to a half-space far away.
         wall = coal.Halfspace(-normal, -10.0)
-        gap = coal.distance(shape, where, wall, coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult())
+        gap = coal.distance(
+            shape, where, wall, coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult()
+        )
         reach = 10.0 - gap
         assert (outer @ normal).max() + radius >= reach - 1e-6
         if len(inner):

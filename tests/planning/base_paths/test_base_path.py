@@ -5,7 +5,18 @@ import itertools
 import coal
 import numpy as np
 import pytest
-from helpers.base_scenes import BLINK, HALL, MARGIN, arm, at, between, chassis, clutter, distance, furniture
+from helpers.base_scenes import (
+    BLINK,
+    HALL,
+    MARGIN,
+    arm,
+    at,
+    between,
+    chassis,
+    clutter,
+    distance,
+    furniture,
+)
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -25,7 +36,10 @@ NEAR = 1.0
 def wall_with_a_gap(width: float, *, height: float = 1.0) -> list[Shape]:
     """A wall along x = 0 from one side of the hall to the other, with a gap around y = 0."""
     side = 5.5 - width / 2
-    return [(coal.Box(0.2, side, height), at(0.0, sign * (width + side) / 2, height / 2)) for sign in (-1, 1)]
+    return [
+        (coal.Box(0.2, side, height), at(0.0, sign * (width + side) / 2, height / 2))
+        for sign in (-1, 1)
+    ]
 
 
 def check(
@@ -40,7 +54,9 @@ def check(
     poses, goal = path.poses, goals[path.goal]
     np.testing.assert_array_equal(poses[0], start)
     np.testing.assert_array_equal(poses[-1][:2], goal[:2])
-    assert (poses[-1, 2] - goal[2]) / (2 * np.pi) == pytest.approx(round((poses[-1, 2] - goal[2]) / (2 * np.pi)), abs=1e-12)
+    assert (poses[-1, 2] - goal[2]) / (2 * np.pi) == pytest.approx(
+        round((poses[-1, 2] - goal[2]) / (2 * np.pi)), abs=1e-12
+    )
     cost = 0.0
     for a, b in itertools.pairwise(poses):
         way = b[:2] - a[:2]
@@ -52,7 +68,9 @@ def check(
                 cost += length * (1.0 if ahead > 0.0 else BACKWARDS)
             else:  # it slides, next to the start or the goal
                 assert length <= 0.6
-                assert any(np.array_equal(p[:2], place[:2]) for p in (a, b) for place in (start, goal))
+                assert any(
+                    np.array_equal(p[:2], place[:2]) for p in (a, b) for place in (start, goal)
+                )
                 cost += SIDEWAYS * length
         else:
             cost += TURNING * abs(b[2] - a[2])
@@ -64,7 +82,12 @@ def check(
 
 
 def find(
-    standing: list[Shape], start: list[float], goals: list[list[float]], *, base: list[Shape] | None = None, **options: object
+    standing: list[Shape],
+    start: list[float],
+    goals: list[list[float]],
+    *,
+    base: list[Shape] | None = None,
+    **options: object,
 ) -> BasePath | None:
     """Return the path of a bare base."""
     grid = BaseGrid(base or chassis(), [], standing, HALL, MARGIN)
@@ -95,7 +118,9 @@ def test_in_an_empty_hall_the_way_is_straight() -> None:
     assert path is not None
     ahead = np.arctan2(3.7, 6.1)
     np.testing.assert_allclose(
-        path.poses, [[-3.0, -2.0, 0.3], [-3.0, -2.0, ahead], [3.1, 1.7, ahead], [3.1, 1.7, -0.4]], atol=1e-9
+        path.poses,
+        [[-3.0, -2.0, 0.3], [-3.0, -2.0, ahead], [3.1, 1.7, ahead], [3.1, 1.7, -0.4]],
+        atol=1e-9,
     )
     assert path.cost == pytest.approx(np.hypot(6.1, 3.7) + TURNING * (2 * ahead + 0.1))
 
@@ -121,7 +146,10 @@ def test_sideways_where_there_is_no_room_to_turn() -> None:
 
 
 def test_to_turn_in_place_and_to_stay() -> None:
-    turned, stayed = find([], [0.0, 0.0, 3.0], [[0.0, 0.0, -3.0]]), find([], [0.0, 0.0, 3.0], [[0.0, 0.0, 3.0]])
+    turned, stayed = (
+        find([], [0.0, 0.0, 3.0], [[0.0, 0.0, -3.0]]),
+        find([], [0.0, 0.0, 3.0], [[0.0, 0.0, 3.0]]),
+    )
     assert turned is not None
     assert stayed is not None
     np.testing.assert_allclose(turned.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 2 * np.pi - 3.0]])
@@ -144,13 +172,19 @@ def test_a_gap_that_only_fits_lengthwise() -> None:
 
 
 def test_what_is_carried_does_not_fit_through_a_gap() -> None:
-    standing, start, goals = wall_with_a_gap(1.0), np.array([-2.5, 0.0, 0.0]), np.array([[2.5, 0.0, 0.0]])
+    standing, start, goals = (
+        wall_with_a_gap(1.0),
+        np.array([-2.5, 0.0, 0.0]),
+        np.array([[2.5, 0.0, 0.0]]),
+    )
     across: list[Shape] = [(coal.Box(0.05, 1.4, 0.05), at(0.4, 0.0, 0.8))]
     along_it: list[Shape] = [(coal.Box(1.4, 0.05, 0.05), at(0.4, 0.0, 0.8))]
     for carried, fits in (([], True), (along_it, True), (across, False)):
         path = shortest_path(BaseGrid(chassis(), carried, standing, HALL, MARGIN), start, goals)
         assert (path is not None) == fits
-    low = shortest_path(BaseGrid(chassis(), across, wall_with_a_gap(1.0, height=0.6), HALL, MARGIN), start, goals)
+    low = shortest_path(
+        BaseGrid(chassis(), across, wall_with_a_gap(1.0, height=0.6), HALL, MARGIN), start, goals
+    )
     assert low is not None  # it passes over
 
 
@@ -166,9 +200,18 @@ def test_near_start_and_goals_only_the_base_counts() -> None:
     assert path is not None
     check(path, start, goals, chassis(), rod, tables)
     between_them = [*tables, (coal.Box(0.4, 20.0, 0.1), at(0.0, 0.0, 0.85))]
-    assert shortest_path(BaseGrid(chassis(), rod, between_them, HALL, MARGIN, near=NEAR), start, goals) is None
-    assert shortest_path(BaseGrid(chassis(), rod, between_them, HALL, MARGIN, near=3.0), start, goals) is not None
-    assert shortest_path(BaseGrid(chassis(), rod, tables, HALL, MARGIN, near=0.0), start, goals) is None
+    assert (
+        shortest_path(BaseGrid(chassis(), rod, between_them, HALL, MARGIN, near=NEAR), start, goals)
+        is None
+    )
+    assert (
+        shortest_path(BaseGrid(chassis(), rod, between_them, HALL, MARGIN, near=3.0), start, goals)
+        is not None
+    )
+    assert (
+        shortest_path(BaseGrid(chassis(), rod, tables, HALL, MARGIN, near=0.0), start, goals)
+        is None
+    )
 
 
 def test_a_start_that_is_too_close_is_left() -> None:
@@ -177,7 +220,11 @@ def test_a_start_that_is_too_close_is_left() -> None:
     start, goals = [0.0, -0.05 - 0.335 - 0.01, 0.0], [[0.0, 1.5, 0.0]]
     path = find(wall, start, goals)
     assert path is not None
-    distances = [distance(chassis(), wall, pose) for a, b in itertools.pairwise(path.poses) for pose in between(a, b)]
+    distances = [
+        distance(chassis(), wall, pose)
+        for a, b in itertools.pairwise(path.poses)
+        for pose in between(a, b)
+    ]
     assert distances[0] == pytest.approx(0.01)
     assert min(distances) >= 0.01 - BLINK
     last = max(k for k, d in enumerate(distances) if d < MARGIN - BLINK)
@@ -190,17 +237,27 @@ def test_a_start_inside_an_obstacle_is_left() -> None:
     start, goals = [-0.8, 0.0, 0.0], [[3.0, 0.0, 0.0]]
     path = find(block, start, goals)
     assert path is not None
-    distances = np.array([distance(chassis(), block, p) for a, b in itertools.pairwise(path.poses) for p in between(a, b)])
+    distances = np.array(
+        [
+            distance(chassis(), block, p)
+            for a, b in itertools.pairwise(path.poses)
+            for p in between(a, b)
+        ]
+    )
     assert distances[0] < -0.1
     assert np.all(np.diff(np.flatnonzero(distances < MARGIN - BLINK)) == 1)  # it leaves once
-    leaves = np.concatenate([between(a, b) for a, b in itertools.pairwise(path.poses)])[distances < MARGIN - BLINK]
+    leaves = np.concatenate([between(a, b) for a, b in itertools.pairwise(path.poses)])[
+        distances < MARGIN - BLINK
+    ]
     assert leaves[:, 0].max() <= -0.8  # the short way out, not through
 
 
 def test_a_start_deep_inside_has_no_way() -> None:
     block: list[Shape] = [(coal.Box(6.0, 6.0, 1.0), at(0.0, 0.0, 0.5))]
     assert find(block, [0.0, 0.0, 0.0], [[4.0, 4.0, 0.0]]) is None
-    assert find([], [20.0, 0.0, 0.0], [[4.0, 4.0, 0.0]]) is not None  # outside the arena nothing is in the way
+    assert (
+        find([], [20.0, 0.0, 0.0], [[4.0, 4.0, 0.0]]) is not None
+    )  # outside the arena nothing is in the way
 
 
 def test_blocked_goals_are_passed_over() -> None:
@@ -210,12 +267,16 @@ def test_blocked_goals_are_passed_over() -> None:
     assert path is not None
     assert path.goal == 1
     assert find(block, start, [blocked]) is None
-    assert shortest_path(BaseGrid(chassis(), [], block, HALL, MARGIN), start, np.empty((0, 3))) is None
+    assert (
+        shortest_path(BaseGrid(chassis(), [], block, HALL, MARGIN), start, np.empty((0, 3))) is None
+    )
 
 
 def test_a_goal_may_cost_more() -> None:
     start, goals = [0.0, 0.0, 0.0], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
-    found = [find([], start, goals, costs=costs) for costs in (None, [0.0, 0.5], [1.5, 0.0], [1.5, 1.0])]
+    found = [
+        find([], start, goals, costs=costs) for costs in (None, [0.0, 0.5], [1.5, 0.0], [1.5, 1.0])
+    ]
     assert [path.goal for path in found if path is not None] == [0, 0, 1, 0]
     assert [path.cost for path in found if path is not None] == pytest.approx([1.0, 1.0, 2.0, 2.5])
 
@@ -231,7 +292,10 @@ def test_no_way_round_a_closed_room() -> None:
 def test_two_runs_are_equal() -> None:
     rng = np.random.default_rng(3)
     for _ in range(5):
-        start, goals = rng.uniform([-4, -4, -3], [4, 4, 3]), rng.uniform([-4, -4, -3], [4, 4, 3], size=(5, 3))
+        start, goals = (
+            rng.uniform([-4, -4, -3], [4, 4, 3]),
+            rng.uniform([-4, -4, -3], [4, 4, 3], size=(5, 3)),
+        )
         grid = BaseGrid(chassis(), arm(), [*furniture(), *clutter(1, 10)], HALL, MARGIN)
         again = BaseGrid(chassis(), arm(), [*furniture(), *clutter(1, 10)], HALL, MARGIN)
         shortest_path(again, goals[0], goals[1:])  # which leaves what it found out
@@ -263,7 +327,9 @@ def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
     np.testing.assert_array_equal(waypoints[-1], path.poses[-1])
     # Each is on the path, further along than the one before.
     change = np.diff(path.poses, axis=0)
-    passed = np.concatenate([[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + TURNING * np.abs(change[:, 2]))])
+    passed = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + TURNING * np.abs(change[:, 2]))]
+    )
     dense = np.linspace(0.0, passed[-1], 20_001)
     poses = np.column_stack([np.interp(dense, passed, column) for column in path.poses.T])
     nearest = [np.abs(poses - waypoint).max(axis=1).argmin() for waypoint in waypoints]
@@ -295,7 +361,9 @@ def test_turning_takes_waypoints() -> None:
         ([0.0, 0.0, 0.0], [[1.0, 0.0, 0.0]], [-1.0], "costs"),
     ],
 )
-def test_bad_input(start: list[float], goals: list[list[float]], costs: list[float] | None, field: str) -> None:
+def test_bad_input(
+    start: list[float], goals: list[list[float]], costs: list[float] | None, field: str
+) -> None:
     with pytest.raises(InputError) as raised:
         find([], start, goals, costs=costs)
     assert raised.value.field == field

@@ -9,7 +9,11 @@ from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.blocked_cells import Lattice, stuck
 from vkc_pin.planning.base_paths.grid import BaseGrid
 
-CARRIED = [*arm(), (wedge(), at(0.4, 0.4, 0.6, 0.4)), (coal.Box(0.05, 1.4, 0.05), at(0.3, 0.0, 0.8))]
+CARRIED = [
+    *arm(),
+    (wedge(), at(0.4, 0.4, 0.6, 0.4)),
+    (coal.Box(0.05, 1.4, 0.05), at(0.3, 0.0, 0.8)),
+]
 SCENES = {
     "furniture": furniture(),
     "clutter": [
@@ -28,7 +32,9 @@ def test_what_is_stuck_is_blocked_and_nearly_all_that_is_blocked(name: str) -> N
     blocked, known = np.zeros(2), np.zeros(2)
     for i, j, heading in rng.integers([100, 100, 16], size=(800, 3)).tolist():
         pose = [*grid.center(i, j), grid.yaws[heading]]
-        for body, (shapes, mask) in enumerate(((chassis(), grid.stuck), (CARRIED, grid.stuck_carrying))):
+        for body, (shapes, mask) in enumerate(
+            ((chassis(), grid.stuck), (CARRIED, grid.stuck_carrying))
+        ):
             hit = distance(shapes, standing, pose) < MARGIN
             assert hit or not mask[i, j, heading]
             blocked[body] += hit
@@ -53,7 +59,10 @@ def test_a_box_before_a_wall() -> None:
 def test_only_what_shares_heights_is_stuck() -> None:
     lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
     table: list[Shape] = [(coal.Box(5.0, 5.0, 0.05), at(0.5, 0.5, 0.775))]
-    low, high = [(coal.Box(0.5, 0.5, 0.4), at(0.0, 0.0, 0.2))], [(coal.Box(0.1, 0.1, 0.4), at(0.0, 0.0, 0.7))]
+    low, high = (
+        [(coal.Box(0.5, 0.5, 0.4), at(0.0, 0.0, 0.2))],
+        [(coal.Box(0.1, 0.1, 0.4), at(0.0, 0.0, 0.7))],
+    )
     base, carried = stuck(low, high, table, lattice, MARGIN)
     assert not base.any()
     assert carried.all()
@@ -64,7 +73,10 @@ def test_only_what_shares_heights_is_stuck() -> None:
 
 def test_shapes_of_unknown_inside_and_flat_ones_are_left_out() -> None:
     lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
-    odd: list[Shape] = [(coal.Ellipsoid(1.0, 1.0, 1.0), at(0.5, 0.5, 0.5)), (coal.Box(3.0, 3.0, 0.0), at(0.5, 0.5, 0.1))]
+    odd: list[Shape] = [
+        (coal.Ellipsoid(1.0, 1.0, 1.0), at(0.5, 0.5, 0.5)),
+        (coal.Box(3.0, 3.0, 0.0), at(0.5, 0.5, 0.1)),
+    ]
     base, _ = stuck([(coal.Box(0.5, 0.5, 0.4), at(0.0, 0.0, 0.2))], [], odd, lattice, MARGIN)
     assert not base.any()
     nothing, _ = stuck([], [], odd, lattice, MARGIN)

@@ -22,22 +22,33 @@ class Graph:
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
-        self.costs = self.rng.integers(1, 6, (HEADINGS, 4))  # small numbers, so that many paths are equal
+        self.costs = self.rng.integers(
+            1, 6, (HEADINGS, 4)
+        )  # small numbers, so that many paths are equal
         self.flags = np.where(
-            self.rng.random((CELLS, CELLS, HEADINGS)) < 0.2, self.rng.integers(0, 8, (CELLS, CELLS, HEADINGS)), 0
+            self.rng.random((CELLS, CELLS, HEADINGS)) < 0.2,
+            self.rng.integers(0, 8, (CELLS, CELLS, HEADINGS)),
+            0,
         )
-        self.begins, self.ends = (np.column_stack([self.rng.integers(0, NODES, n), self.rng.integers(1, 9, n)]) for n in (12, 20))
+        self.begins, self.ends = (
+            np.column_stack([self.rng.integers(0, NODES, n), self.rng.integers(1, 9, n)])
+            for n in (12, 20)
+        )
         self.moves = GRID.moves.astype(np.int64)
 
     def paths(self) -> Any:
-        return compiled_module(MODULE).Paths(self.flags.astype(np.uint8), self.moves, self.costs, self.begins, self.ends)
+        return compiled_module(MODULE).Paths(
+            self.flags.astype(np.uint8), self.moves, self.costs, self.begins, self.ends
+        )
 
     def target(self, node: int, kind: int) -> int:
         cell, heading = divmod(node, HEADINGS)
         if kind > 1:
             return cell * HEADINGS + (heading + (1, -1)[kind - 2]) % HEADINGS
         i, j = np.array(divmod(cell, CELLS)) + (1, -1)[kind] * self.moves[heading]
-        return int((i * CELLS + j) * HEADINGS + heading) if 0 <= i < CELLS and 0 <= j < CELLS else -1
+        return (
+            int((i * CELLS + j) * HEADINGS + heading) if 0 <= i < CELLS and 0 <= j < CELLS else -1
+        )
 
     def price(self, node: int, after: int) -> float:
         """Return what the cheapest move between two nodes costs, infinite if there is none."""
@@ -45,7 +56,11 @@ class Graph:
         for kind in range(4):
             first = node if kind in (0, 2) else after
             shut = flags[first] & (2 if kind < 2 else 4)
-            if self.target(node, kind) == after and not shut and not (flags[node] | flags[after]) & 1:
+            if (
+                self.target(node, kind) == after
+                and not shut
+                and not (flags[node] | flags[after]) & 1
+            ):
                 found = min(found, self.costs[node % HEADINGS, kind])
         return found
 

@@ -3,7 +3,18 @@ from __future__ import annotations
 import coal
 import numpy as np
 import pytest
-from helpers.base_scenes import BLINK, HALL, MARGIN, arm, at, between, chassis, clutter, distance, furniture
+from helpers.base_scenes import (
+    BLINK,
+    HALL,
+    MARGIN,
+    arm,
+    at,
+    between,
+    chassis,
+    clutter,
+    distance,
+    furniture,
+)
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -66,7 +77,9 @@ def test_moves_between_cells_are_free_all_along(grid: BaseGrid, reaching: bool) 
             (grid.forward(i, j, heading, reaching=reaching), [*there, yaw]),
             (grid.left(i, j, heading, reaching=reaching), [*here, turned]),
         ):
-            nearest = min(distance(shapes, STANDING, pose) for pose in between([*here, yaw], end, angle=0.01))
+            nearest = min(
+                distance(shapes, STANDING, pose) for pose in between([*here, yaw], end, angle=0.01)
+            )
             assert nearest >= MARGIN - BLINK if free else nearest < MARGIN + 0.01
             answers.append(free)
     assert 0.2 < np.mean(answers) < 0.9
@@ -108,14 +121,18 @@ def test_distances_around_a_wall() -> None:
     assert several[1, 80, 80] < 0.1
     many = np.random.default_rng(0).uniform(-3.0, 3.0, (7, 2))
     for threads in (2, 9):
-        np.testing.assert_array_equal(grid.distances_from(many, threads=threads), grid.distances_from(many))
+        np.testing.assert_array_equal(
+            grid.distances_from(many, threads=threads), grid.distances_from(many)
+        )
 
 
 def test_distances_from_where_the_base_cannot_be() -> None:
     block: list[Shape] = [(coal.Box(2.0, 2.0, 1.0), at(0.0, 0.0, 0.5))]
     grid = BaseGrid(chassis(), [], block, HALL, MARGIN)
     assert np.isfinite(grid.distances_from(np.array([(0.7, 0.0)]))).any()
-    everywhere = BaseGrid(chassis(), [], [(coal.Box(20.0, 20.0, 1.0), at(0.0, 0.0, 0.5))], HALL, MARGIN)
+    everywhere = BaseGrid(
+        chassis(), [], [(coal.Box(20.0, 20.0, 1.0), at(0.0, 0.0, 0.5))], HALL, MARGIN
+    )
     assert np.isinf(everywhere.distances_from(np.zeros((1, 2)))).all()
 
 
@@ -127,11 +144,24 @@ def test_moves_that_lead_nowhere_are_refused(grid: BaseGrid) -> None:
 
 
 def test_an_arena_that_is_not_square() -> None:
-    grid = BaseGrid(chassis(), [], [(coal.Box(0.5, 0.5, 1.0), at(4.0, 1.0, 0.5))], (0.0, 8.0, -1.0, 3.0), MARGIN, cells=40)
+    grid = BaseGrid(
+        chassis(),
+        [],
+        [(coal.Box(0.5, 0.5, 1.0), at(4.0, 1.0, 0.5))],
+        (0.0, 8.0, -1.0, 3.0),
+        MARGIN,
+        cells=40,
+    )
     assert grid.step == pytest.approx([0.2, 0.1])
-    for i, j, heading in np.random.default_rng(0).integers([40, 40, HEADINGS], size=(300, 3)).tolist():
+    for i, j, heading in (
+        np.random.default_rng(0).integers([40, 40, HEADINGS], size=(300, 3)).tolist()
+    ):
         free = (
-            distance(chassis(), [(coal.Box(0.5, 0.5, 1.0), at(4.0, 1.0, 0.5))], [*grid.center(i, j), grid.yaws[heading]])
+            distance(
+                chassis(),
+                [(coal.Box(0.5, 0.5, 1.0), at(4.0, 1.0, 0.5))],
+                [*grid.center(i, j), grid.yaws[heading]],
+            )
             >= MARGIN
         )
         assert grid.free(i, j, heading) == free
@@ -149,7 +179,9 @@ def test_an_arena_that_is_not_square() -> None:
         (HALL, 0.02, {"cells": 1}, "cells"),
     ],
 )
-def test_bad_input(arena: tuple[float, ...], margin: float, options: dict[str, float], field: str) -> None:
+def test_bad_input(
+    arena: tuple[float, ...], margin: float, options: dict[str, float], field: str
+) -> None:
     with pytest.raises(InputError) as raised:
         BaseGrid(chassis(), [], [], arena, margin, **options)  # type: ignore[arg-type]
     assert raised.value.field == field

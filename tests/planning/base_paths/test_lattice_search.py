@@ -21,7 +21,12 @@ CELLS, ROOM = 13, (-2.0, 2.0, -2.0, 2.0)
 ENTRY = 0.6  # [m] between start or goal and the cells from which the way over the grid goes on
 
 
-def reference(grid: BaseGrid, start: NDArray[np.float64], goals: NDArray[np.float64], extra: NDArray[np.float64]) -> float:
+def reference(
+    grid: BaseGrid,
+    start: NDArray[np.float64],
+    goals: NDArray[np.float64],
+    extra: NDArray[np.float64],
+) -> float:
     """Return the cost of the cheapest way over a graph of all states and free moves, built one by one; infinite: none."""
     count = grid.cells**2 * HEADINGS
     rows, columns, costs = [], [], []
@@ -49,13 +54,22 @@ def reference(grid: BaseGrid, start: NDArray[np.float64], goals: NDArray[np.floa
         ahead = np.arctan2(*(b - a)[::-1]) if np.hypot(*(b - a)) > 1e-9 else otherwise
         return float(ahead + np.pi * how if how < 2 else otherwise)
 
-    def way(a: NDArray[np.float64], b: NDArray[np.float64], before: float, yaw: float, after: float, how: int) -> float:
+    def way(
+        a: NDArray[np.float64],
+        b: NDArray[np.float64],
+        before: float,
+        yaw: float,
+        after: float,
+        how: int,
+    ) -> float:
         """Return what turning, driving and turning costs, infinite if it is not free."""
         length = np.hypot(*(b - a))
         yaw = before + wrapped(yaw - before)
         after = yaw + wrapped(after - yaw)
         free = grid.turned(a, before, yaw) and grid.driven(a, b, yaw) and grid.turned(b, yaw, after)
-        cost = length * (1.0, BACKWARDS, SIDEWAYS)[how] + TURNING * (abs(yaw - before) + abs(after - yaw))
+        cost = length * (1.0, BACKWARDS, SIDEWAYS)[how] + TURNING * (
+            abs(yaw - before) + abs(after - yaw)
+        )
         return float(cost) if free else np.inf
 
     first, last = count, count + 1
@@ -78,22 +92,41 @@ def reference(grid: BaseGrid, start: NDArray[np.float64], goals: NDArray[np.floa
                         edge(node(i, j, heading), last, cost + more)
     for goal, more in zip(goals, extra, strict=True):
         for how in range(3):
-            cost = way(start[:2], goal[:2], start[2], toward(start[:2], goal[:2], how, start[2]), goal[2], how)
+            cost = way(
+                start[:2],
+                goal[:2],
+                start[2],
+                toward(start[:2], goal[:2], how, start[2]),
+                goal[2],
+                how,
+            )
             if cost < np.inf and (how < 2 or np.hypot(*(goal - start)[:2]) <= ENTRY):
                 edge(first, last, cost + more)
-    order = np.argsort(costs, kind="stable")[::-1]  # of parallel edges the last, cheapest one counts
-    cheapest_of = dict(zip(zip(np.take(rows, order), np.take(columns, order), strict=True), np.take(costs, order), strict=True))
+    order = np.argsort(costs, kind="stable")[
+        ::-1
+    ]  # of parallel edges the last, cheapest one counts
+    cheapest_of = dict(
+        zip(
+            zip(np.take(rows, order), np.take(columns, order), strict=True),
+            np.take(costs, order),
+            strict=True,
+        )
+    )
     a, b = np.array(list(cheapest_of)).T
     graph = csr_array((list(cheapest_of.values()), (a, b)), shape=(count + 2, count + 2))
     return float(dijkstra(graph, indices=first)[last])
 
 
-def task(seed: int) -> tuple[BaseGrid, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def task(
+    seed: int,
+) -> tuple[BaseGrid, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return a small room with some obstacles, a start that is free, three goals, and what these cost."""
     rng = np.random.default_rng(seed)
     rod: list[Shape] = [(coal.Box(0.1, 0.8, 0.05), at(0.2, 0.0, 0.7))]
     standing = clutter(int(rng.integers(10_000)), 7, reach=1.8)
-    grid = BaseGrid(chassis(0.7, 0.4), rod if seed % 2 else [], standing, ROOM, MARGIN, cells=CELLS, near=0.0)
+    grid = BaseGrid(
+        chassis(0.7, 0.4), rod if seed % 2 else [], standing, ROOM, MARGIN, cells=CELLS, near=0.0
+    )
     poses = rng.uniform([-1.8, -1.8, -3.0], [1.8, 1.8, 3.0], size=(200, 3))
     start = next((pose for pose in poses if grid.clear(*pose)), poses[0])
     return grid, start, poses[100:103], rng.choice([0.0, 1.0], 3)
@@ -155,7 +188,15 @@ def test_what_other_searches_found_out_changes_nothing(seed: int) -> None:
 
 def test_start_and_goal_on_cells() -> None:
     """Ways of no length, and costs of nothing, at both ends."""
-    grid = BaseGrid(chassis(0.7, 0.4), [], [(coal.Box(0.2, 2.5, 1.0), at(0.0, -0.75, 0.5))], ROOM, MARGIN, cells=CELLS, near=0.0)
+    grid = BaseGrid(
+        chassis(0.7, 0.4),
+        [],
+        [(coal.Box(0.2, 2.5, 1.0), at(0.0, -0.75, 0.5))],
+        ROOM,
+        MARGIN,
+        cells=CELLS,
+        near=0.0,
+    )
     start = np.array([*grid.center(2, 2), grid.yaws[4]])
     goals = np.array([[*grid.center(10, 2), grid.yaws[12]]])
     found = cheapest(Ground(grid, start, goals), np.zeros(1))
@@ -169,10 +210,19 @@ def test_start_and_goal_on_cells() -> None:
 def test_a_way_that_is_far_longer_than_it_seems(monkeypatch: pytest.MonkeyPatch) -> None:
     """What blocks the short way is not known in advance: the search is wrong about it, learns, and looks further."""
     gate: list[Shape] = [(coal.Box(0.1, 1.4, 1.0), at(0.0, y, 0.5)) for y in (-1.3, 1.3)]
-    lid: list[Shape] = [(coal.Ellipsoid(0.1, 0.6, 0.1), at(0.0, 0.0, 0.3))]  # whose inside is not looked at
+    lid: list[Shape] = [
+        (coal.Ellipsoid(0.1, 0.6, 0.1), at(0.0, 0.0, 0.3))
+    ]  # whose inside is not looked at
     walls: list[Shape] = [(coal.Box(8.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-2.0, 2.0)]
     sides = [(coal.Box(0.1, 1.4, 1.0), at(0.0, 4.3, 0.5))]
-    grid = BaseGrid(chassis(0.7, 0.4), [], [*gate, *lid, *walls[:1], *sides], (-5.0, 5.0, -5.0, 5.0), MARGIN, cells=50)
+    grid = BaseGrid(
+        chassis(0.7, 0.4),
+        [],
+        [*gate, *lid, *walls[:1], *sides],
+        (-5.0, 5.0, -5.0, 5.0),
+        MARGIN,
+        cells=50,
+    )
     start, goals = np.array([-1.0, 0.0, 0.0]), np.array([[1.0, 0.0, 0.0]])
     found = cheapest(Ground(grid, start, goals), np.zeros(1))
     assert found is not None

@@ -9,14 +9,28 @@ from hypothesis import strategies as st
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import BaseGrid
-from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS, UNIT, Connections, Drive, Ground, wrapped
+from vkc_pin.planning.base_paths.motion_primitives import (
+    BACKWARDS,
+    SIDEWAYS,
+    UNIT,
+    Connections,
+    Drive,
+    Ground,
+    wrapped,
+)
 
 TURNING = 0.3  # [m/rad] where a grid is not told
 
 START = np.array([0.0, 0.0, 0.0])
 
 
-def ground(standing: list[Shape], goals: list[list[float]], *, carried: list[Shape] | None = None, near: float = 1.0) -> Ground:
+def ground(
+    standing: list[Shape],
+    goals: list[list[float]],
+    *,
+    carried: list[Shape] | None = None,
+    near: float = 1.0,
+) -> Ground:
     grid = BaseGrid(chassis(), carried or [], standing, HALL, MARGIN, near=near)
     return Ground(grid, START, np.array(goals))
 
@@ -28,7 +42,9 @@ def test_wrapped(angle: float) -> None:
     assert np.sin(wrapped(angle)) == pytest.approx(np.sin(angle), abs=1e-9)
 
 
-@pytest.mark.parametrize(("turned", "factor"), [(0.0, 1.0), (np.pi, BACKWARDS), (0.1, SIDEWAYS), (np.pi / 2, SIDEWAYS)])
+@pytest.mark.parametrize(
+    ("turned", "factor"), [(0.0, 1.0), (np.pi, BACKWARDS), (0.1, SIDEWAYS), (np.pi / 2, SIDEWAYS)]
+)
 def test_what_a_drive_costs(turned: float, factor: float) -> None:
     drive = Drive(np.zeros(2), np.array([4.0, 3.0]), np.arctan2(3.0, 4.0) + turned)
     assert drive.length == 5.0
@@ -63,7 +79,9 @@ def test_cells_near_start_and_goals() -> None:
 def test_ways_lead_to_the_cells_around() -> None:
     places = ground([], [[3.0, 3.0, 1.0]])
     starts, ends = places.starts(), places.ends(0)
-    assert len(np.unique(starts.cell)) == np.sum([np.hypot(*np.subtract(places.center(c), (0, 0))) <= 0.6 for c in range(10_000)])
+    assert len(np.unique(starts.cell)) == np.sum(
+        [np.hypot(*np.subtract(places.center(c), (0, 0))) <= 0.6 for c in range(10_000)]
+    )
     for ways, leaving in ((starts, True), (ends, False)):
         kinds = set()
         for k in range(len(ways.cell)):
@@ -73,8 +91,12 @@ def test_ways_lead_to_the_cells_around() -> None:
             expected = drive.cost + TURNING * (abs(drive.yaw - before) + abs(after - drive.yaw))
             assert ways.cost[k] * UNIT == pytest.approx(expected, abs=2 * UNIT)
             assert abs(wrapped(after - (heading if leaving else 1.0))) < 1e-9
-            np.testing.assert_array_equal(drive.a if leaving else drive.b, [0.0, 0.0] if leaving else [3.0, 3.0])
-            np.testing.assert_array_equal(drive.b if leaving else drive.a, places.center(ways.cell[k]))
+            np.testing.assert_array_equal(
+                drive.a if leaving else drive.b, [0.0, 0.0] if leaving else [3.0, 3.0]
+            )
+            np.testing.assert_array_equal(
+                drive.b if leaving else drive.a, places.center(ways.cell[k])
+            )
             kinds.add(round(drive.cost / drive.length, 6))
         assert kinds == {1.0, BACKWARDS, SIDEWAYS}
 
@@ -90,7 +112,11 @@ def test_ways_that_it_has_no_room_to_turn_to_are_left_out() -> None:
 
 def test_a_blocked_start() -> None:
     close, over = [(coal.Box(1.0, 1.0, 1.0), at(x, 0.0, 0.5)) for x in (1.01, 0.9)]
-    free, near, inside = ground([], [[3.0, 0.0, 0.0]]), ground([close], [[3.0, 0.0, 0.0]]), ground([over], [[-0.9, 0.0, 0.0]])
+    free, near, inside = (
+        ground([], [[3.0, 0.0, 0.0]]),
+        ground([close], [[3.0, 0.0, 0.0]]),
+        ground([over], [[-0.9, 0.0, 0.0]]),
+    )
     assert free.leaving is None
     assert near.leaving is not None
     assert near.leaving == pytest.approx([0.01], abs=1e-5)

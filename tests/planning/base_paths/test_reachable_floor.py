@@ -9,16 +9,24 @@ from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.reachable_floor import Cells, Discs, flooded, taken
 
 
-def box(size: tuple[float, float, float], at: tuple[float, float, float], yaw: float = 0.0) -> Shape:
+def box(
+    size: tuple[float, float, float], at: tuple[float, float, float], yaw: float = 0.0
+) -> Shape:
     return coal.Box(*size), pin.SE3(pin.utils.rotate("z", yaw), np.array(at))
 
 
-BASE = [box((1.0, 0.5, 0.2), (0.0, 0.0, 0.2)), box((0.8, 0.1, 0.3), (0.0, 0.29, 0.15)), box((0.8, 0.1, 0.3), (0.0, -0.29, 0.15))]
+BASE = [
+    box((1.0, 0.5, 0.2), (0.0, 0.0, 0.2)),
+    box((0.8, 0.1, 0.3), (0.0, 0.29, 0.15)),
+    box((0.8, 0.1, 0.3), (0.0, -0.29, 0.15)),
+]
 
 
 def test_the_disc_is_that_of_all_shapes_at_a_height_together() -> None:
     discs = Discs(BASE)
-    assert discs.radius(0.2) == pytest.approx(0.335)  # to the outer sides of the wheels, less what is taken off
+    assert discs.radius(0.2) == pytest.approx(
+        0.335
+    )  # to the outer sides of the wheels, less what is taken off
     assert discs.radius(0.299) == pytest.approx(0.335)
     assert discs.radius(0.05) <= 0.0  # between the wheels is nothing
     assert discs.radius(0.35) <= 0.0
@@ -31,8 +39,13 @@ def test_shapes_that_do_not_touch_cover_no_more_than_their_own() -> None:
 
 def test_what_is_above_or_below_the_base_keeps_nothing_away() -> None:
     discs = Discs(BASE)
-    assert discs.walls([box((1.0, 1.0, 0.1), (0.0, 0.0, 0.5)), box((1.0, 1.0, 0.04), (0.0, 0.0, 0.0))]) == []
-    (plate,) = discs.walls([box((1.0, 1.0, 0.01), (0.0, 0.0, 0.225))])  # thinner than what lies between the levels
+    assert (
+        discs.walls([box((1.0, 1.0, 0.1), (0.0, 0.0, 0.5)), box((1.0, 1.0, 0.04), (0.0, 0.0, 0.0))])
+        == []
+    )
+    (plate,) = discs.walls(
+        [box((1.0, 1.0, 0.01), (0.0, 0.0, 0.225))]
+    )  # thinner than what lies between the levels
     assert plate.radius == pytest.approx(0.335)
 
 
@@ -44,8 +57,16 @@ def test_no_base_and_no_obstacle() -> None:
 @pytest.mark.parametrize("seed", range(8))
 def test_wherever_a_cell_is_taken_the_base_hits_the_obstacle_at_every_heading(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    tilt = pin.SE3(pin.rpy.rpyToMatrix(*rng.uniform(-0.6, 0.6, 3)), np.array([0.1, -0.2, rng.uniform(0.1, 0.3)]))
-    shape = [coal.Box(*rng.uniform(0.1, 0.8, 3)), coal.Cylinder(0.3, 0.3), coal.Sphere(0.2), coal.Capsule(0.1, 0.4)][seed % 4]
+    tilt = pin.SE3(
+        pin.rpy.rpyToMatrix(*rng.uniform(-0.6, 0.6, 3)),
+        np.array([0.1, -0.2, rng.uniform(0.1, 0.3)]),
+    )
+    shape = [
+        coal.Box(*rng.uniform(0.1, 0.8, 3)),
+        coal.Cylinder(0.3, 0.3),
+        coal.Sphere(0.2),
+        coal.Capsule(0.1, 0.4),
+    ][seed % 4]
     cells, count = Cells.over(np.full(2, -1.5), np.full(2, 1.5), 0.05), 0
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     for wall in Discs(BASE).walls([(shape, tilt)]):
@@ -58,7 +79,9 @@ def test_wherever_a_cell_is_taken_the_base_hits_the_obstacle_at_every_heading(se
             for part, where in BASE:
                 result.clear()
                 there = pose * where
-                transforms = [coal.Transform3s(place.rotation, place.translation) for place in (there, tilt)]
+                transforms = [
+                    coal.Transform3s(place.rotation, place.translation) for place in (there, tilt)
+                ]
                 hit |= coal.collide(part, transforms[0], shape, transforms[1], request, result) > 0
             assert hit
             count += 1

@@ -29,7 +29,9 @@ def driven(pieces: list[tuple[float, float]]) -> np.ndarray:
 
 @settings(deadline=None)
 @given(GOALS, RADII)
-def test_pieces_are_arcs_of_the_radius_and_lines_that_lead_there(goal: tuple[float, float, float], radius: float) -> None:
+def test_pieces_are_arcs_of_the_radius_and_lines_that_lead_there(
+    goal: tuple[float, float, float], radius: float
+) -> None:
     pieces = shortest_words(np.array(goal), radius)
     assert len(pieces) <= 5
     for length, turn in pieces:
@@ -61,7 +63,10 @@ def test_no_other_word_is_shorter() -> None:
     rng = np.random.default_rng(0)
     for count, _ in itertools.product(range(1, 6), range(100)):
         pieces = [
-            (length, length * way) for length, way in zip(rng.uniform(-2, 2, count), rng.integers(-1, 2, count), strict=True)
+            (length, length * way)
+            for length, way in zip(
+                rng.uniform(-2, 2, count), rng.integers(-1, 2, count), strict=True
+            )
         ]
         where = np.zeros(3)
         for length, turn in pieces:
@@ -79,7 +84,10 @@ def test_no_other_word_is_shorter() -> None:
         ((-3.0, 0.0, 0.0), 3.0),  # straight back
         ((0.0, 2.0, np.pi), np.pi),  # half a circle
         ((1.0, 1.0, np.pi / 2), np.pi / 2),  # a quarter
-        ((0.0, 0.0, np.pi), np.pi),  # three arcs, of which the one in the middle goes the other way: 60 degrees each
+        (
+            (0.0, 0.0, np.pi),
+            np.pi,
+        ),  # three arcs, of which the one in the middle goes the other way: 60 degrees each
         ((0.0, 0.0, 0.0), 0.0),
     ],
 )

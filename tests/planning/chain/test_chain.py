@@ -9,10 +9,22 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import room
-from helpers.small_problems import CABINET_STATE, door_scene, full_scene, random_configurations, with_attachment, with_objects
+from helpers.small_problems import (
+    CABINET_STATE,
+    door_scene,
+    full_scene,
+    random_configurations,
+    with_attachment,
+    with_objects,
+)
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.planning.chain.chain import VIRTUAL_ACCELERATION, VIRTUAL_VELOCITY, VirtualKinematicChain, consolidate
+from vkc_pin.planning.chain.chain import (
+    VIRTUAL_ACCELERATION,
+    VIRTUAL_VELOCITY,
+    VirtualKinematicChain,
+    consolidate,
+)
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
@@ -53,7 +65,9 @@ def assert_same(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-10) -> No
     np.testing.assert_allclose(first.homogeneous, second.homogeneous, rtol=0.0, atol=tolerance)
 
 
-def virtual_motion(chain: VirtualKinematicChain, scene: Scene, name: str, grasp: str, z: np.ndarray) -> pin.SE3:
+def virtual_motion(
+    chain: VirtualKinematicChain, scene: Scene, name: str, grasp: str, z: np.ndarray
+) -> pin.SE3:
     """J(v) and the standoff after it, from their definition."""
     attachment = scene.objects[name].object.attachments[grasp]
 
@@ -67,11 +81,18 @@ def virtual_motion(chain: VirtualKinematicChain, scene: Scene, name: str, grasp:
             if freedom.kind == "prismatic":
                 moved = moved * pin.SE3(np.eye(3), freedom.axis * value(freedom.suffix))
             else:
-                there, spin = pin.SE3(np.eye(3), freedom.through), pin.AngleAxis(value(freedom.suffix), freedom.axis)
+                there, spin = (
+                    pin.SE3(np.eye(3), freedom.through),
+                    pin.AngleAxis(value(freedom.suffix), freedom.axis),
+                )
                 moved = moved * there * pin.SE3(spin.matrix(), np.zeros(3)) * there.inverse()
         turn, shift = moved.rotation, moved.translation
     if attachment.joint == "spherical":
-        turn = pin.utils.rotate("x", value("_x")) @ pin.utils.rotate("y", value("_y")) @ pin.utils.rotate("z", value("_z"))
+        turn = (
+            pin.utils.rotate("x", value("_x"))
+            @ pin.utils.rotate("y", value("_y"))
+            @ pin.utils.rotate("z", value("_z"))
+        )
     elif attachment.joint == "revolute":
         turn = pin.AngleAxis(value(""), attachment.freedoms[0].axis).matrix()
     elif attachment.joint == "prismatic":
@@ -82,7 +103,9 @@ def virtual_motion(chain: VirtualKinematicChain, scene: Scene, name: str, grasp:
     return pin.SE3(turn, shift - attachment.standoff * turn[:, 2])
 
 
-def object_state(chain: VirtualKinematicChain, scene: Scene, name: str, z: np.ndarray) -> np.ndarray:
+def object_state(
+    chain: VirtualKinematicChain, scene: Scene, name: str, z: np.ndarray
+) -> np.ndarray:
     """The object's own coordinates: those of the chain, and those it leaves as they are."""
     placed = scene.objects[name]
     values = [
@@ -103,17 +126,28 @@ def test_every_frame_and_shape_is_where_robot_and_object_have_it(grasps: dict[st
         for index, frame in enumerate(robot.model.frames):
             assert_same(of_chain[chain.model.getFrameId(frame.name)], of_robot[index])
         chain_shapes = shapes(chain.model, chain.collision, q)
-        for found, expected in zip(chain_shapes, shapes(robot.model, robot.collision, q_robot), strict=False):
+        for found, expected in zip(
+            chain_shapes, shapes(robot.model, robot.collision, q_robot), strict=False
+        ):
             assert_same(found, expected)
         tool = of_robot[robot.model.getFrameId(robot.tool_frame)]
         for name, grasp in grasps.items():
-            thing, attachment = scene.objects[name].object, scene.objects[name].object.attachments[grasp]
+            thing, attachment = (
+                scene.objects[name].object,
+                scene.objects[name].object.attachments[grasp],
+            )
             q_object = thing.coordinates.q(object_state(chain, scene, name, z))
             own = frames(thing.model, q_object)
             # The tool in the link is placement · J(v), so the object's base in the world is:
             link = own[thing.model.getFrameId(attachment.link, pin.FrameType.BODY)]
-            base = tool * (attachment.placement * virtual_motion(chain, scene, name, grasp, z)).inverse() * link.inverse()
-            bodies = [i for i, frame in enumerate(thing.model.frames) if frame.type == pin.FrameType.BODY]
+            base = (
+                tool
+                * (attachment.placement * virtual_motion(chain, scene, name, grasp, z)).inverse()
+                * link.inverse()
+            )
+            bodies = [
+                i for i, frame in enumerate(thing.model.frames) if frame.type == pin.FrameType.BODY
+            ]
             assert len(bodies) >= 2
             for index in bodies:
                 frame = f"{name}.{thing.model.frames[index].name}"
@@ -149,18 +183,28 @@ def test_where_the_closure_holds_the_objects_are_those_of_the_world(grasps: dict
         values = dict(zip(world.coordinates.names, world.start, strict=True)) | dict(
             zip(world.coordinates.names[:size], z[:size], strict=True)
         )
-        expected = frames(world.model, world.coordinates.q(np.array([values[name] for name in world.coordinates.names])))
+        expected = frames(
+            world.model,
+            world.coordinates.q(np.array([values[name] for name in world.coordinates.names])),
+        )
         of_chain = frames(closed.model, closed.coordinates.q(z))
         joints = closed.model.createData()
         pin.forwardKinematics(closed.model, joints, closed.coordinates.q(z))
         for name, grasp in grasps.items():
             closure = closed.closures[Hold(name, grasp)]
             assert_same(joints.oMi[closure.joint] * closure.local, closure.target)
-            compared = [i for i, frame in enumerate(closed.model.frames) if frame.name.startswith(f"{name}.")]
+            compared = [
+                i
+                for i, frame in enumerate(closed.model.frames)
+                if frame.name.startswith(f"{name}.")
+            ]
             assert compared
             for index in compared:
                 assert_same(
-                    of_chain[index], expected[world.model.getFrameId(closed.model.frames[index].name, pin.FrameType.BODY)]
+                    of_chain[index],
+                    expected[
+                        world.model.getFrameId(closed.model.frames[index].name, pin.FrameType.BODY)
+                    ],
                 )
 
 
@@ -188,17 +232,32 @@ def test_the_closures_target_is_the_base_link_in_the_world() -> None:
                 (-1.0, 2.0, 1.5, 3.0),
             ],
         ),
-        ({"door": "handle"}, ["door.knob", "door.hinge"], [(0.0, 0.8, 2.0, 4.0), (-1.57, 1.57, 1.0, 1.0)]),
+        (
+            {"door": "handle"},
+            ["door.knob", "door.hinge"],
+            [(0.0, 0.8, 2.0, 4.0), (-1.57, 1.57, 1.0, 1.0)],
+        ),
         (
             {"door": "handle_free"},
             ["door.handle_free", "door.knob", "door.hinge"],
-            [(-0.6, 0.6, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), (0.0, 0.8, 2.0, 4.0), (-1.57, 1.57, 1.0, 1.0)],
+            [
+                (-0.6, 0.6, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION),
+                (0.0, 0.8, 2.0, 4.0),
+                (-1.57, 1.57, 1.0, 1.0),
+            ],
         ),
         ({"drawer": "handle"}, ["drawer.slide"], [(0.0, 0.4, 0.5, 1.0)]),
         (
             {"cabinet": "ball"},
-            ["cabinet.ball_z", "cabinet.ball_y", "cabinet.ball_x", "cabinet.slide", "cabinet.swing"],
-            [(-0.7, 0.6, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION)] * 3 + [(0.0, 0.3, 0.4, 0.7), (-1.0, 2.0, 1.5, 3.0)],
+            [
+                "cabinet.ball_z",
+                "cabinet.ball_y",
+                "cabinet.ball_x",
+                "cabinet.slide",
+                "cabinet.swing",
+            ],
+            [(-0.7, 0.6, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION)] * 3
+            + [(0.0, 0.3, 0.4, 0.7), (-1.0, 2.0, 1.5, 3.0)],
         ),
         (
             {"drawer": "handle", "cabinet": "rail"},
@@ -221,7 +280,10 @@ def test_names_and_limits_follow_the_joints(
     assert chain.names == (*robot.coordinates.names, *added)
     assert chain.size == chain.coordinates.size == chain.model.nv == size + len(added)
     found = np.column_stack([chain.lower, chain.upper, chain.velocity, chain.acceleration])
-    np.testing.assert_array_equal(found[:size], np.column_stack([robot.lower, robot.upper, robot.velocity, robot.acceleration]))
+    np.testing.assert_array_equal(
+        found[:size],
+        np.column_stack([robot.lower, robot.upper, robot.velocity, robot.acceleration]),
+    )
     np.testing.assert_allclose(found[size:], limits, rtol=0.0, atol=1e-12)
     # The model says the same, joint by joint.
     np.testing.assert_allclose(chain.coordinates.lower[size:], chain.lower[size:])
@@ -248,21 +310,32 @@ def test_virtual_joints_are_named_by_object() -> None:
         ({"cabinet": "grip"}, {"cabinet": ["arm_0", "tray_0", "tray_1", "flap_0"]}),
         (
             {"door": "handle", "cabinet": "grip"},
-            {"door": ["panel_0", "lever_0", "lever_1"], "cabinet": ["arm_0", "tray_0", "tray_1", "flap_0"]},
+            {
+                "door": ["panel_0", "lever_0", "lever_1"],
+                "cabinet": ["arm_0", "tray_0", "tray_1", "flap_0"],
+            },
         ),
     ],
 )
-def test_geometry_is_the_robots_and_that_of_the_links_that_move(grasps: dict[str, str], held: dict[str, list[str]]) -> None:
+def test_geometry_is_the_robots_and_that_of_the_links_that_move(
+    grasps: dict[str, str], held: dict[str, list[str]]
+) -> None:
     scene = full_scene()
     chain, robot = consolidate(scene, grasps), scene.robot
     count = len(robot.collision.geometryObjects)
     found = chain.collision.geometryObjects
     assert len(found) == count + sum(len(names) for names in held.values())
-    assert [shape.name for shape in found[:count]] == [shape.name for shape in robot.collision.geometryObjects]
-    assert [shape.parentJoint for shape in found[:count]] == [shape.parentJoint for shape in robot.collision.geometryObjects]
+    assert [shape.name for shape in found[:count]] == [
+        shape.name for shape in robot.collision.geometryObjects
+    ]
+    assert [shape.parentJoint for shape in found[:count]] == [
+        shape.parentJoint for shape in robot.collision.geometryObjects
+    ]
     for name, names in held.items():
         indices = chain.held_geometries[Hold(name, grasps[name])]
-        assert sorted(found[i].name for i in indices) == sorted(f"{name}.{shape}" for shape in names)
+        assert sorted(found[i].name for i in indices) == sorted(
+            f"{name}.{shape}" for shape in names
+        )
         assert all(found[i].parentJoint >= robot.model.njoints - 1 for i in indices)
 
 
@@ -271,9 +344,19 @@ def test_side_branches_stay_as_they_are() -> None:
     assert not {"cabinet.flap_hinge", "cabinet.lid_hinge"} & set(chain.names)
     z = random_configurations(chain.lower, chain.upper, 1, np.random.default_rng(2))[0]
     at = frames(chain.model, chain.coordinates.q(z))
-    arm, flap, case, lid = (at[chain.model.getFrameId(f"cabinet.{link}")] for link in ("arm", "flap", "case", "lid"))
-    np.testing.assert_allclose((arm.inverse() * flap).rotation, pin.utils.rotate("x", CABINET_STATE["flap_hinge"]), atol=1e-12)
-    np.testing.assert_allclose((case.inverse() * lid).rotation, pin.utils.rotate("y", CABINET_STATE["lid_hinge"]), atol=1e-12)
+    arm, flap, case, lid = (
+        at[chain.model.getFrameId(f"cabinet.{link}")] for link in ("arm", "flap", "case", "lid")
+    )
+    np.testing.assert_allclose(
+        (arm.inverse() * flap).rotation,
+        pin.utils.rotate("x", CABINET_STATE["flap_hinge"]),
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(
+        (case.inverse() * lid).rotation,
+        pin.utils.rotate("y", CABINET_STATE["lid_hinge"]),
+        atol=1e-12,
+    )
 
 
 def test_joint_placements_of_many_configurations_are_pinocchios() -> None:
@@ -286,16 +369,28 @@ def test_joint_placements_of_many_configurations_are_pinocchios() -> None:
     for row, q in enumerate(chain.coordinates.q(z)):
         pin.forwardKinematics(chain.model, data, q)
         for joint in range(chain.model.njoints):
-            np.testing.assert_allclose(rotations[row, joint], data.oMi[joint].rotation, rtol=0.0, atol=1e-12)
-            np.testing.assert_allclose(translations[row, joint], data.oMi[joint].translation, rtol=0.0, atol=1e-12)
+            np.testing.assert_allclose(
+                rotations[row, joint], data.oMi[joint].rotation, rtol=0.0, atol=1e-12
+            )
+            np.testing.assert_allclose(
+                translations[row, joint], data.oMi[joint].translation, rtol=0.0, atol=1e-12
+            )
 
 
 def test_scene_and_robot_are_left_as_they_were() -> None:
     scene = door_scene()
-    before = (scene.robot.model.njoints, scene.robot.model.nframes, len(scene.robot.collision.geometryObjects))
+    before = (
+        scene.robot.model.njoints,
+        scene.robot.model.nframes,
+        len(scene.robot.collision.geometryObjects),
+    )
     pairs = len(scene.robot.collision.collisionPairs)
     consolidate(scene, {"door": "handle_free"})
-    after = (scene.robot.model.njoints, scene.robot.model.nframes, len(scene.robot.collision.geometryObjects))
+    after = (
+        scene.robot.model.njoints,
+        scene.robot.model.nframes,
+        len(scene.robot.collision.geometryObjects),
+    )
     assert (after, len(scene.robot.collision.collisionPairs)) == (before, pairs)
     assert before[0] > 3
 
@@ -326,10 +421,15 @@ def test_a_grasp_that_is_called_like_a_joint_is_refused() -> None:
         consolidate(twice, {"door": "hinge"})
 
 
-# --- free objects: carried, and what is held through them -------------------------------------------------------------
+# --- free objects: carried, and what is held through them
+# -------------------------------------------------------------
 
 STICK, END = Hold("stick", "grip"), Hold("stick", "end")
-BALL, PULLED, PUSHED = Hold("ball", "grip"), Hold("ball", "pull", STICK, "tip"), Hold("ball", "pull", END, "tip")
+BALL, PULLED, PUSHED = (
+    Hold("ball", "grip"),
+    Hold("ball", "pull", STICK, "tip"),
+    Hold("ball", "pull", END, "tip"),
+)
 CARRIED = [
     (STICK,),
     (END,),
@@ -339,7 +439,11 @@ CARRIED = [
     (STICK, END),  # two branches of one object
     (STICK, BALL, END, PULLED),
     (END, PUSHED, Hold("cabinet", "ball")),
-    (STICK, PULLED, Hold("cabinet", "sleeve", PULLED, "ball")),  # a chain of three, the last with joints
+    (
+        STICK,
+        PULLED,
+        Hold("cabinet", "sleeve", PULLED, "ball"),
+    ),  # a chain of three, the last with joints
 ]
 
 
@@ -347,19 +451,31 @@ CARRIED = [
 def carried_scene() -> Scene:
     """Return stick, ball, and a cabinet that can be carried away."""
     scene, case = room(objects=("stick", "ball")), full_scene().objects["cabinet"]
-    return with_objects(scene, {"cabinet": dataclasses.replace(case, object=dataclasses.replace(case.object, free=True))})
+    return with_objects(
+        scene,
+        {"cabinet": dataclasses.replace(case, object=dataclasses.replace(case.object, free=True))},
+    )
 
 
-def expected_frames(chain: VirtualKinematicChain, scene: Scene, hold: Hold, z: np.ndarray) -> tuple[pin.SE3, dict[str, pin.SE3]]:
+def expected_frames(
+    chain: VirtualKinematicChain, scene: Scene, hold: Hold, z: np.ndarray
+) -> tuple[pin.SE3, dict[str, pin.SE3]]:
     """Return where an object's base is, and each of its links, by multiplying: robot, grasp, object, and so on outwards."""
-    thing, grasp = scene.objects[hold.object].object, scene.objects[hold.object].object.attachments[hold.attachment]
+    thing, grasp = (
+        scene.objects[hold.object].object,
+        scene.objects[hold.object].object.attachments[hold.attachment],
+    )
     if hold.by is None:
         robot = scene.robot
-        holder = frames(robot.model, robot.coordinates.q(z[: robot.coordinates.size]))[robot.model.getFrameId(robot.tool_frame)]
+        holder = frames(robot.model, robot.coordinates.q(z[: robot.coordinates.size]))[
+            robot.model.getFrameId(robot.tool_frame)
+        ]
     else:
         holder = expected_frames(chain, scene, hold.by, z)[1][hold.link or ""]
     own = frames(thing.model, thing.coordinates.q(object_state(chain, scene, hold.object, z)))
-    links = {f.name: own[i] for i, f in enumerate(thing.model.frames) if f.type == pin.FrameType.BODY}
+    links = {
+        f.name: own[i] for i, f in enumerate(thing.model.frames) if f.type == pin.FrameType.BODY
+    }
     motion = virtual_motion(chain, scene, hold.object, hold.attachment, z)
     base = holder * (links[grasp.link] * grasp.placement * motion).inverse()
     return base, {link: base * placement for link, placement in links.items()}
@@ -369,7 +485,13 @@ def expected_frames(chain: VirtualKinematicChain, scene: Scene, hold: Hold, z: n
 def test_what_is_carried_is_where_the_hand_and_the_grasp_have_it(holds: tuple[Hold, ...]) -> None:
     scene = carried_scene()
     chain = consolidate(scene, holds)
-    assert tuple(chain.closures) == tuple(chain.held_geometries) == tuple(chain.virtual) == tuple(chain.prefixes) == holds
+    assert (
+        tuple(chain.closures)
+        == tuple(chain.held_geometries)
+        == tuple(chain.virtual)
+        == tuple(chain.prefixes)
+        == holds
+    )
     for z in random_configurations(chain.lower, chain.upper, 6, np.random.default_rng(4)):
         q = chain.coordinates.q(z)
         of_chain, of_shapes = frames(chain.model, q), shapes(chain.model, chain.collision, q)
@@ -381,14 +503,18 @@ def test_what_is_carried_is_where_the_hand_and_the_grasp_have_it(holds: tuple[Ho
             for link, placement in links.items():
                 joint, local = chain.frame(link, hold)
                 assert_same(data.oMi[joint] * local, placement)
-                assert_same(of_chain[chain.model.getFrameId(chain.prefixes[hold] + link)], placement)
+                assert_same(
+                    of_chain[chain.model.getFrameId(chain.prefixes[hold] + link)], placement
+                )
             closure = chain.closures[hold]
             assert_same(data.oMi[closure.joint] * closure.local, base)
             assert_same(closure.target, placed.placement)
             state = object_state(chain, scene, hold.object, z)
             there = standing_geometry(dataclasses.replace(placed, placement=base, state=state))
             indices = chain.held_geometries[hold]
-            assert [chain.collision.geometryObjects[i].name.rpartition(".")[2] for i in indices] == [s.name for s in there]
+            assert [
+                chain.collision.geometryObjects[i].name.rpartition(".")[2] for i in indices
+            ] == [s.name for s in there]
             for index, shape in zip(indices, there, strict=True):
                 assert_same(of_shapes[index], shape.placement)
                 assert chain.collision.geometryObjects[index].parentJoint > 1
@@ -439,7 +565,10 @@ def test_one_attachment_held_in_two_ways_is_refused() -> None:
 
 
 def test_holds_and_mappings_make_the_same_chain() -> None:
-    first, second = consolidate(carried_scene(), {"stick": "grip", "ball": "grip"}), consolidate(carried_scene(), [STICK, BALL])
+    first, second = (
+        consolidate(carried_scene(), {"stick": "grip", "ball": "grip"}),
+        consolidate(carried_scene(), [STICK, BALL]),
+    )
     assert first.names == second.names
     assert first.model == second.model
     assert tuple(first.closures) == (STICK, BALL)

@@ -41,7 +41,12 @@ def pairing(*allowances: Allowance, **fields: Any) -> Any:
     ],
 )
 def test_what_is_kept_from_what_is_held(
-    one: str, link: str, as_one: bool, clearance: float, expected: float, monkeypatch: pytest.MonkeyPatch
+    one: str,
+    link: str,
+    as_one: bool,
+    clearance: float,
+    expected: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "touching", lambda scene, hold: ("hand",))
     monkeypatch.setattr(module, "grasped", lambda scene, hold: "lever")
@@ -61,7 +66,9 @@ WITHIN = np.array([5]), np.array([-0.1]), np.array([0.4])
 def allowed(*allowances: Allowance, within: Any = WITHIN) -> Any:
     """Return the pairs with their margins, and where some may be close: (pairs, margin) each."""
     made = pairing(*allowances)
-    made._within = lambda phase, ranges: within if ranges else (np.zeros(0, int), np.zeros(0), np.zeros(0))
+    made._within = lambda phase, ranges: (
+        within if ranges else (np.zeros(0, int), np.zeros(0), np.zeros(0))
+    )
     table, near = made._allowed(None, np.array(TABLE), LABELS, LABELS)
     for place in near:
         assert place[2:] == within
@@ -76,11 +83,18 @@ def test_what_a_scene_allows_keeps_what_it_says() -> None:
         kept, near = allowed(Allowance(*pair, 0.003, 0.003))
         assert near == []
         assert kept == [
-            [*row[:2], 0.003 if sorted(LABELS[int(k)] for k in row[:2]) == ["side", "tray"] else row[2]] for row in rows
+            [
+                *row[:2],
+                0.003 if sorted(LABELS[int(k)] for k in row[:2]) == ["side", "tray"] else row[2],
+            ]
+            for row in rows
         ]
         kept, _ = allowed(Allowance(*pair, 0.015, 0.015))
         assert [row[2] for row in kept] == [0.02, 0.015, 0.01, 0.02, 0.02, 0.02]
-    assert allowed(Allowance("side", "cup", 0.0, 0.0), Allowance("cup", "tray", 0.0, 0.0)) == (rows, [])
+    assert allowed(Allowance("side", "cup", 0.0, 0.0), Allowance("cup", "tray", 0.0, 0.0)) == (
+        rows,
+        [],
+    )
 
 
 def test_what_may_overlap_is_no_pair_any_more() -> None:
@@ -93,7 +107,9 @@ def test_what_may_overlap_is_no_pair_any_more() -> None:
     ("margin", "distance", "expected"),
     [(0.0, 0.008, 0.004), (0.0, -0.003, 0.0), (-0.003, -0.002, -0.003), (-np.inf, 0.01, -np.inf)],
 )
-def test_neighbours_keep_half_of_what_they_have_where_they_are(margin: float, distance: float, expected: float) -> None:
+def test_neighbours_keep_half_of_what_they_have_where_they_are(
+    margin: float, distance: float, expected: float
+) -> None:
     """Rows are those of the table without what is no pair."""
     gone = Allowance("tray", "side", -np.inf, -np.inf)
     kept, near = allowed(gone, Allowance("tray", "lid", margin, distance, SLIDE))
@@ -102,13 +118,19 @@ def test_neighbours_keep_half_of_what_they_have_where_they_are(margin: float, di
     assert allowed(Allowance("side", "tray", margin, distance, SLIDE))[1] == [([1, 2], expected)]
     assert allowed(Allowance("arm", "side", margin, distance, SLIDE))[1] == []  # they are no pair
     assert allowed(gone, Allowance("tray", "side", margin, distance, SLIDE))[1] == []
-    assert allowed(Allowance("tray", "lid", margin, distance, SLIDE), within=None)[1] == []  # never where that holds
+    assert (
+        allowed(Allowance("tray", "lid", margin, distance, SLIDE), within=None)[1] == []
+    )  # never where that holds
 
 
 def within(ranges: dict[str, tuple[float, float]], before: dict[str, float]) -> Any:
-    chain = SimpleNamespace(names=("base_x", "door.hinge", "drawer.slide"), index=("base_x", "door.hinge", "drawer.slide").index)
+    chain = SimpleNamespace(
+        names=("base_x", "door.hinge", "drawer.slide"),
+        index=("base_x", "door.hinge", "drawer.slide").index,
+    )
     placed = SimpleNamespace(
-        state=[0.25, 0.5], object=SimpleNamespace(coordinates=SimpleNamespace(index=("left", "right").index))
+        state=[0.25, 0.5],
+        object=SimpleNamespace(coordinates=SimpleNamespace(index=("left", "right").index)),
     )
     made = pairing(chain=chain, scene=SimpleNamespace(objects={"cupboard": placed}))
     return made._within(SimpleNamespace(before=before), ranges)
@@ -155,7 +177,11 @@ def test_only_what_is_above_the_floor_can_hit_it() -> None:
 
 def test_links_of_an_object_that_can_meet() -> None:
     own = {frozenset(("door", "rack"))}
-    made = pairing(scene=SimpleNamespace(objects={"washer": SimpleNamespace(object=SimpleNamespace(own_pairs=own))}))
+    made = pairing(
+        scene=SimpleNamespace(
+            objects={"washer": SimpleNamespace(object=SimpleNamespace(own_pairs=own))}
+        )
+    )
     assert made._own_pair("washer", "washer.rack", "washer.door")
     assert not made._own_pair("washer", "washer.rack", "washer.case")
 
@@ -177,7 +203,9 @@ def test_boxes_around_shapes_and_where_they_are() -> None:
 def test_contacts_in_numbers() -> None:
     distance, margin = np.array([0.01, 0.03, -0.02, 0.5]), np.array([0.02, 0.02, 0.005, 0.0])
     vectors = np.zeros((4, 3))
-    found = Contacts(np.array([0, 2, 2, 3]), np.array([[0, 1]] * 4), distance, margin, vectors, vectors, vectors)
+    found = Contacts(
+        np.array([0, 2, 2, 3]), np.array([[0, 1]] * 4), distance, margin, vectors, vectors, vectors
+    )
     assert found.violation() == pytest.approx(0.025)
     assert found.shortfall(5).tolist() == pytest.approx([0.01, 0.0, 0.025, 0.0, 0.0])
     assert found.clearance() == -0.02
@@ -185,6 +213,18 @@ def test_contacts_in_numbers() -> None:
     free = found.select(np.array([3]))
     assert (free.violation(), free.clearance()) == (0.0, 0.5)
     none = no_contacts()
-    assert (none.violation(), none.clearance(), none.shortfall(2).tolist()) == (0.0, np.inf, [0.0, 0.0])
-    assert [array.shape for array in none.arrays()] == [(0,), (0, 2), (0,), (0,), (0, 3), (0, 3), (0, 3)]
+    assert (none.violation(), none.clearance(), none.shortfall(2).tolist()) == (
+        0.0,
+        np.inf,
+        [0.0, 0.0],
+    )
+    assert [array.shape for array in none.arrays()] == [
+        (0,),
+        (0, 2),
+        (0,),
+        (0,),
+        (0, 3),
+        (0, 3),
+        (0, 3),
+    ]
     assert {array.dtype.kind for array in none.arrays()[:2]} == {"i"}

@@ -44,7 +44,9 @@ MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance
 @cache
 def door_problem() -> TrajectoryProblem:
     """Return the problem of opening the door and driving away: reach, turn, move, go to."""
-    return program_of(door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT)
+    return program_of(
+        door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT
+    )
 
 
 def waypoint_in(problem: TrajectoryProblem, phase: str) -> int:
@@ -53,11 +55,15 @@ def waypoint_in(problem: TrajectoryProblem, phase: str) -> int:
     return int(problem.ends[number])
 
 
-def pairs(problem: TrajectoryProblem, phase: int, *, waypoint: int | None = None) -> dict[tuple[str, str], list[float]]:
+def pairs(
+    problem: TrajectoryProblem, phase: int, *, waypoint: int | None = None
+) -> dict[tuple[str, str], list[float]]:
     """Return (link, link or obstacle) → the margins of the pairs between them, at a waypoint or where nothing is eased."""
     part = problem.contacts.phases[phase]
     every = np.arange(len(part.pairs))
-    margins = part.margins if waypoint is None else part.margins_at(every, np.full(len(every), waypoint))
+    margins = (
+        part.margins if waypoint is None else part.margins_at(every, np.full(len(every), waypoint))
+    )
     found = collections.defaultdict(list)
     for (first, second), margin in zip(part.pairs, margins, strict=True):
         found[part.labels[first], part.labels[second]].append(float(margin))
@@ -138,7 +144,9 @@ def test_only_what_does_not_stand_on_the_floor_can_hit_it(phase: int) -> None:
     problem = door_problem()
     robot = problem.scene.robot
     meets_floor = {first for first, second in pairs(problem, phase) if second == FLOOR}
-    driving = {link_name(shape.name) for shape in robot.collision.geometryObjects if shape.parentJoint == 1}
+    driving = {
+        link_name(shape.name) for shape in robot.collision.geometryObjects if shape.parentJoint == 1
+    }
     assert meets_floor == set(robot.links) - driving
     assert driving
 
@@ -148,10 +156,16 @@ def test_the_hand_may_hold_what_it_grasps_and_nothing_else_may_touch_it() -> Non
     hand = set(problem.scene.robot.touch_links)
     for phase in (1, 2):
         found = pairs(problem, phase)
-        assert {first for first, second in found if second == "door.lever"} == set(problem.scene.robot.links) - hand
-        assert {first for first, second in found if second == "door.panel"} == set(problem.scene.robot.links)
+        assert {first for first, second in found if second == "door.lever"} == set(
+            problem.scene.robot.links
+        ) - hand
+        assert {first for first, second in found if second == "door.panel"} == set(
+            problem.scene.robot.links
+        )
         for (first, second), margins in found.items():
-            assert set(margins) == {CLOSE if first in hand and second.startswith("door.") else MARGIN}
+            assert set(margins) == {
+                CLOSE if first in hand and second.startswith("door.") else MARGIN
+            }
 
 
 def test_the_hand_comes_closer_to_what_it_will_grasp_or_has_let_go_of() -> None:
@@ -161,22 +175,34 @@ def test_the_hand_comes_closer_to_what_it_will_grasp_or_has_let_go_of() -> None:
     near, begins = problem.options.steps(EASED_TIME), problem.contacts.first_waypoint
     for phase, at, away in ((0, begins[1], -1), (3, begins[3], 1)):
         for steps, close in ((0, CLOSE), (near, CLOSE), (near + 1, MARGIN)):
-            for (first, second), margins in pairs(problem, phase, waypoint=int(at + away * steps)).items():
-                assert set(margins) == {close if first in hand and second.startswith("door.") else MARGIN}
+            for (first, second), margins in pairs(
+                problem, phase, waypoint=int(at + away * steps)
+            ).items():
+                assert set(margins) == {
+                    close if first in hand and second.startswith("door.") else MARGIN
+                }
 
 
-@pytest.mark.parametrize(("own", "expected"), [(None, CLOSE), (0.002, 0.002), (0.0, 0.0), (0.1, MARGIN)])
-def test_an_attachment_says_how_close_the_hand_may_come_to_its_object(own: float | None, expected: float) -> None:
+@pytest.mark.parametrize(
+    ("own", "expected"), [(None, CLOSE), (0.002, 0.002), (0.0, 0.0), (0.1, MARGIN)]
+)
+def test_an_attachment_says_how_close_the_hand_may_come_to_its_object(
+    own: float | None, expected: float
+) -> None:
     """Never further than everything else keeps, and not closer to what is no part of the object."""
     scene = door_scene()
     placed = scene.objects["door"]
     handle = dataclasses.replace(placed.object.attachments["handle"], name="near", clearance=own)
     steps = [Actuate("door", {"hinge": 1.2}, "near"), GoTo(0.0, 0.0)]
-    problem = program_of(with_objects(scene, {"door": with_attachment(placed, handle)}), steps, options=SHORT)
+    problem = program_of(
+        with_objects(scene, {"door": with_attachment(placed, handle)}), steps, options=SHORT
+    )
     hand, begins = set(scene.robot.touch_links), problem.contacts.first_waypoint
     for phase, at in ((0, begins[1]), (1, begins[2]), (3, begins[3])):
         for (first, second), margins in pairs(problem, phase, waypoint=int(at)).items():
-            assert set(margins) == {expected if first in hand and second.startswith("door.") else MARGIN}
+            assert set(margins) == {
+                expected if first in hand and second.startswith("door.") else MARGIN
+            }
 
 
 def test_a_held_object_is_not_paired_with_itself_but_with_the_room() -> None:
@@ -198,10 +224,20 @@ def test_objects_stand_where_the_phases_before_left_them() -> None:
         for index, label in enumerate(part.labels):
             if label.startswith("door.") and part.joint[index] == 0:
                 shape = part.shapes[index]
-                original = next(s for s in placed.object.collision.geometryObjects if f"door.{s.name}" == shape.name)
+                original = next(
+                    s
+                    for s in placed.object.collision.geometryObjects
+                    if f"door.{s.name}" == shape.name
+                )
                 frame = placed.object.model.frames[original.parentFrame]
-                expected = moved.link_placement(frame.name) * frame.placement.inverse() * original.placement
-                np.testing.assert_allclose(shape.placement.homogeneous, expected.homogeneous, rtol=0.0, atol=1e-12)
+                expected = (
+                    moved.link_placement(frame.name)
+                    * frame.placement.inverse()
+                    * original.placement
+                )
+                np.testing.assert_allclose(
+                    shape.placement.homogeneous, expected.homogeneous, rtol=0.0, atol=1e-12
+                )
 
 
 def test_a_held_object_can_hit_other_objects_and_its_own_other_branches_stand() -> None:
@@ -210,11 +246,19 @@ def test_a_held_object_can_hit_other_objects_and_its_own_other_branches_stand() 
     n, found = Counted.of(scene), pairs(problem, 1)
     assert problem.task.phases[1].held == (Hold("cabinet", "grip"),)
     held = {"cabinet.arm": 1, "cabinet.tray": 2, "cabinet.flap": 1}
-    others = {"door.frame": 3, "door.panel": 1, "door.lever": 2, "drawer.cabinet": 5, "drawer.tray": 8}
+    others = {
+        "door.frame": 3,
+        "door.panel": 1,
+        "door.lever": 2,
+        "drawer.cabinet": 5,
+        "drawer.tray": 8,
+    }
     for link, count in held.items():
         for other, times in others.items():
             assert len(found[link, other]) == count * times
-        assert not any((link, other) in found for other in (*held, "cabinet.case", "cabinet.lid", FLOOR))
+        assert not any(
+            (link, other) in found for other in (*held, "cabinet.case", "cabinet.lid", FLOOR)
+        )
     # Case and lid stand in the world: the robot can hit them, and they hit nothing.
     part, robot = problem.contacts.phases[1], set(scene.robot.links)
     for link in ("cabinet.case", "cabinet.lid"):
@@ -224,28 +268,45 @@ def test_a_held_object_can_hit_other_objects_and_its_own_other_branches_stand() 
     held_count, other_count = sum(held.values()), sum(others.values())
     # The hand holds the knob, which has no shape: nothing is left out.
     assert len(part.pairs) == (
-        n.own + n.robot * held_count + (n.robot + held_count) * (other_count + n.obstacles) + n.robot * 2 + n.planned
+        n.own
+        + n.robot * held_count
+        + (n.robot + held_count) * (other_count + n.obstacles)
+        + n.robot * 2
+        + n.planned
     )
     assert cabinet().attachments["grip"].link == "knob"
 
 
 def test_links_of_a_held_object_keep_apart_where_its_description_says_that_they_can_meet() -> None:
     """Those that the hand moves from each other, and from what of the object stands."""
-    scene, meeting = full_scene(), frozenset({frozenset({"arm", "flap"}), frozenset({"tray", "lid"})})
+    scene, meeting = (
+        full_scene(),
+        frozenset({frozenset({"arm", "flap"}), frozenset({"tray", "lid"})}),
+    )
     placed = scene.objects["cabinet"]
-    placed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, own_pairs=meeting))
+    placed = dataclasses.replace(
+        placed, object=dataclasses.replace(placed.object, own_pairs=meeting)
+    )
     steps = [Actuate("cabinet", {"swing": 0.5})]
     found = pairs(program_of(with_objects(scene, {"cabinet": placed}), steps, options=SHORT), 1)
-    own = {key: margins for key, margins in found.items() if all(label.startswith("cabinet.") for label in key)}
+    own = {
+        key: margins
+        for key, margins in found.items()
+        if all(label.startswith("cabinet.") for label in key)
+    }
     assert {frozenset(link.removeprefix("cabinet.") for link in key) for key in own} == meeting
     assert all(set(margins) == {MARGIN} for margins in own.values())
 
 
 def test_two_objects_one_after_the_other() -> None:
-    problem = program_of(full_scene(), [Grasp("door"), Actuate("drawer", {"slide": 0.2})], options=SHORT)
+    problem = program_of(
+        full_scene(), [Grasp("door"), Actuate("drawer", {"slide": 0.2})], options=SHORT
+    )
     phases = problem.task.phases
     assert [phase.held for phase in phases] == [(), (), (Hold("drawer", "handle"),)]
-    for number, standing in enumerate([{"door", "drawer", "cabinet"}, {"door", "drawer", "cabinet"}, {"door", "cabinet"}]):
+    for number, standing in enumerate(
+        [{"door", "drawer", "cabinet"}, {"door", "drawer", "cabinet"}, {"door", "cabinet"}]
+    ):
         part = problem.contacts.phases[number]
         paired = set(part.pairs.ravel().tolist())
         for hold, indices in problem.chain.held_geometries.items():
@@ -253,7 +314,9 @@ def test_two_objects_one_after_the_other() -> None:
             assert (set(indices) <= paired) == (hold.object not in standing)
             assert set(indices).isdisjoint(paired) == (hold.object in standing)
     hand = problem.scene.robot.touch_links
-    first, last = (pairs(problem, 1, waypoint=int(at)) for at in problem.contacts.first_waypoint[1:3])
+    first, last = (
+        pairs(problem, 1, waypoint=int(at)) for at in problem.contacts.first_waypoint[1:3]
+    )
     assert set(last[hand[0], "drawer.tray"]) == {CLOSE}
     assert set(first[hand[0], "door.lever"]) == {CLOSE}  # where it comes from
 
@@ -266,7 +329,8 @@ def test_a_scene_in_which_nothing_can_collide_is_refused() -> None:
         program_of(empty, [GoTo(0.0, 0.0)], options=SHORT)
 
 
-# --- distances ------------------------------------------------------------------------------------------------------
+# --- distances
+# ------------------------------------------------------------------------------------------------------
 
 
 def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.ndarray:
@@ -288,7 +352,9 @@ def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.n
 def sampled(phase: int) -> tuple[np.ndarray, np.ndarray]:
     """Return random configurations of the door problem and the distances of all pairs there."""
     problem = door_problem()
-    z = random_configurations(problem.chain.lower, problem.chain.upper, 120, np.random.default_rng(phase))
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, 120, np.random.default_rng(phase)
+    )
     return z, all_distances(problem, phase, z)
 
 
@@ -297,7 +363,9 @@ def sampled(phase: int) -> tuple[np.ndarray, np.ndarray]:
 def test_culling_never_drops_a_pair_within_reach(phase: int, reach: float) -> None:
     problem = door_problem()
     z, distances = sampled(phase)
-    at, which, bounds = problem.contacts.phases[phase].boxes.near(reach, *problem.chain.joint_placements(z))
+    at, which, bounds = problem.contacts.phases[phase].boxes.near(
+        reach, *problem.chain.joint_placements(z)
+    )
     kept = np.zeros(distances.shape, bool)
     kept[at, which] = True
     near = distances < reach
@@ -325,8 +393,12 @@ def test_all_pairs_within_reach_are_found_with_their_distances(phase: int) -> No
     sure = np.abs(distances - reach) > 1e-5
     np.testing.assert_array_equal(found[sure], (distances < reach)[sure])
     assert np.all(contacts.distance < reach)
-    np.testing.assert_allclose(contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL)
-    np.testing.assert_array_equal(contacts.margin, part.margins_at(which, waypoints[contacts.waypoint]))
+    np.testing.assert_allclose(
+        contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL
+    )
+    np.testing.assert_array_equal(
+        contacts.margin, part.margins_at(which, waypoints[contacts.waypoint])
+    )
     # d = n·(b − a), and n is a unit vector.
     np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1.0, atol=1e-9)
     along = np.einsum("ci,ci->c", contacts.normal, contacts.second - contacts.first)
@@ -348,11 +420,15 @@ def test_many_configurations_at_once_are_as_one_by_one() -> None:
         np.testing.assert_array_equal(together.pair[here], alone.pair)
         np.testing.assert_array_equal(together.margin[here], alone.margin)
         np.testing.assert_allclose(together.distance[here], alone.distance, rtol=0.0, atol=COAL)
-        np.testing.assert_allclose(together.normal[here], alone.normal, rtol=0.0, atol=np.sqrt(COAL))
+        np.testing.assert_allclose(
+            together.normal[here], alone.normal, rtol=0.0, atol=np.sqrt(COAL)
+        )
         assert not alone.waypoint.any()
 
 
-def test_contacts_do_not_depend_on_how_many_configurations_are_looked_at_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_contacts_do_not_depend_on_how_many_configurations_are_looked_at_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problem = door_problem()
     z, _ = sampled(2)
     waypoints = problem.ends[np.arange(len(z)) % 4]
@@ -376,7 +452,9 @@ def test_contacts_are_sorted_by_what_they_lack() -> None:
     nearest = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=3)
     for row in range(len(z)):
         some, worst = nearest.waypoint == row, np.flatnonzero(every.waypoint == row)[:3]
-        np.testing.assert_allclose(lack[worst], (nearest.distance - nearest.margin)[some], rtol=0.0, atol=COAL)
+        np.testing.assert_allclose(
+            lack[worst], (nearest.distance - nearest.margin)[some], rtol=0.0, atol=COAL
+        )
 
 
 def test_nothing_within_reach_gives_nothing() -> None:
@@ -419,28 +497,37 @@ def test_a_boundary_between_phases_belongs_to_the_earlier() -> None:
         assert ends[phase] < waypoint <= ends[phase + 1] or (waypoint == 0 and phase == 0)
 
 
-# --- witness planes -------------------------------------------------------------------------------------------------
+# --- witness planes
+# -------------------------------------------------------------------------------------------------
 
 
 def stacked_placements(model: pin.Model, data: pin.Data, q: np.ndarray) -> np.ndarray:
     """vec(M) of numeric Pinocchio: per joint the columns of its rotation, then its translation."""
     pin.forwardKinematics(model, data, q)
-    return np.concatenate([np.r_[data.oMi[j].rotation.T.ravel(), data.oMi[j].translation] for j in range(1, model.njoints)])
+    return np.concatenate(
+        [
+            np.r_[data.oMi[j].rotation.T.ravel(), data.oMi[j].translation]
+            for j in range(1, model.njoints)
+        ]
+    )
 
 
 @pytest.mark.parametrize("phase", [0, 2])
 def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> None:
     """Of each plane at a random configuration, against coal's distances around it, coordinate by coordinate.
 
-    A distance has one derivative only where its witness points are unique; elsewhere, and where it bends within the step,
-    the two one-sided differences differ, and the plane's slope must lie between them. Nothing is skipped. Separated, the
-    tolerance is what remains of coal's own (1e-8 in distance over a step of 1e-4); in penetration coal stops at 1e-6.
+    A distance has one derivative only where its witness points are unique; elsewhere, and where it
+    bends within the step, the two one-sided differences differ, and the plane's slope must lie
+    between them. Nothing is skipped. Separated, the tolerance is what remains of coal's own (1e-8
+    in distance over a step of 1e-4); in penetration coal stops at 1e-6.
     """
     problem, step, slots = door_problem(), 1e-4, 40
     chain, part = problem.chain, problem.contacts.phases[phase]
     z, _ = sampled(phase)
     z = z[:40]
-    contacts = problem.contacts.evaluate(z, np.full(len(z), problem.ends[phase]), reach=0.25, nearest=slots)
+    contacts = problem.contacts.evaluate(
+        z, np.full(len(z), problem.ends[phase]), reach=0.25, nearest=slots
+    )
     planes, offsets = problem.contacts.planes(z, contacts, slots=slots)
     number = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
     geometry = all_pairs(part)
@@ -453,7 +540,9 @@ def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> No
         return np.array([pin.computeDistance(geometry, placed, k).min_distance for k in which])
 
     kinds = [type(shape.geometry).__name__ for shape in part.shapes]
-    errors: dict[tuple[str, str], list[float]] = {(a, b): [] for a in ("flat", "round") for b in ("apart", "deep")}
+    errors: dict[tuple[str, str], list[float]] = {
+        (a, b): [] for a in ("flat", "round") for b in ("apart", "deep")
+    }
     sorts = collections.Counter()
     robots = len(problem.scene.robot.collision.geometryObjects)
     for row, configuration in enumerate(z):
@@ -462,7 +551,9 @@ def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> No
         rows, count = planes[row, : len(here)], len(here)
         placements = stacked_placements(chain.model, data, chain.coordinates.q(configuration))
         value = rows @ placements - offsets[row, :count]
-        np.testing.assert_allclose(value, contacts.distance[here] - contacts.margin[here], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            value, contacts.distance[here] - contacts.margin[here], rtol=0.0, atol=1e-9
+        )
         assert not planes[row, count:].any()
         assert np.all(offsets[row, count:] == -1.0)
         centre = distances(configuration, which)
@@ -471,18 +562,28 @@ def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> No
             change = np.zeros(chain.size)
             change[i] = step
             ahead, behind = (
-                stacked_placements(chain.model, data, chain.coordinates.q(configuration + s * change)) for s in (1, -1)
+                stacked_placements(
+                    chain.model, data, chain.coordinates.q(configuration + s * change)
+                )
+                for s in (1, -1)
             )
             slope = rows @ (ahead - behind) / (2 * step)
             right = (distances(configuration + change, which) - centre) / step
             left = (centre - distances(configuration - change, which)) / step
             outside = np.maximum(np.minimum(left, right) - slope, slope - np.maximum(left, right))
             worst = np.maximum(worst, outside)
-        for error, (first, second), distance in zip(worst, contacts.pair[here], contacts.distance[here], strict=True):
+        for error, (first, second), distance in zip(
+            worst, contacts.pair[here], contacts.distance[here], strict=True
+        ):
             shape = "round" if CURVED & {kinds[first], kinds[second]} else "flat"
             errors[shape, "apart" if distance > 0 else "deep"].append(error)
             sorts["own" if second < robots else "hand" if first < robots else "object"] += 1
-    limits = {("flat", "apart"): 1e-4, ("flat", "deep"): 1e-3, ("round", "apart"): 1e-3, ("round", "deep"): 1e-2}
+    limits = {
+        ("flat", "apart"): 1e-4,
+        ("flat", "deep"): 1e-3,
+        ("round", "apart"): 1e-3,
+        ("round", "deep"): 1e-2,
+    }
     for kind, found in errors.items():
         assert len(found) > 10, kind
         assert max(found) < limits[kind], kind
@@ -505,7 +606,9 @@ def test_more_contacts_than_slots_keep_the_worst() -> None:
 
 
 @pytest.mark.parametrize(
-    "steps", [[Reach(pin.SE3.Identity())], [GoTo(0.0, 0.0)], [Grasp("door", "handle_free")]], ids=["reach", "go", "grasp"]
+    "steps",
+    [[Reach(pin.SE3.Identity())], [GoTo(0.0, 0.0)], [Grasp("door", "handle_free")]],
+    ids=["reach", "go", "grasp"],
 )
 def test_margins_follow_the_options(steps: list[Step]) -> None:
     options = Options(dist_safe=0.05, self_distance=0.03, grasp_clearance=0.01, reach_waypoints=2)
@@ -564,11 +667,17 @@ def test_neighbours_may_be_close_as_long_as_both_are_where_they_are() -> None:
     assert near.columns.tolist() == [shut.chain.index("near.slide")]
     assert (near.lower[0], near.upper[0]) == pytest.approx(allowance.ranges["near.slide"])
     opened = side_by_side().with_state("near", {"slide": 0.3})
-    shutting = program_of(opened, [Actuate("near", {"slide": 0.0})], options=SHORT)  # it comes back to where it is one
-    assert shutting.contacts.phases[shutting.contacts.phase_of(waypoint_in(shutting, "move"))].neighbours
+    shutting = program_of(
+        opened, [Actuate("near", {"slide": 0.0})], options=SHORT
+    )  # it comes back to where it is one
+    assert shutting.contacts.phases[
+        shutting.contacts.phase_of(waypoint_in(shutting, "move"))
+    ].neighbours
     end = allowance.ranges["next.slide"][1]
     for out, beside in ((end - 1e-4, True), (end + 1e-4, False)):
-        problem = program_of(side_by_side(out=out), [Actuate("near", {"slide": 0.3})], options=SHORT)
+        problem = program_of(
+            side_by_side(out=out), [Actuate("near", {"slide": 0.3})], options=SHORT
+        )
         part = problem.contacts.phases[problem.contacts.phase_of(waypoint_in(problem, "move"))]
         assert bool(part.neighbours) == beside
 
@@ -577,16 +686,24 @@ def test_what_a_scene_allows_is_no_pair_or_keeps_what_it_says() -> None:
     document = side_by_side().document
     for said, margin in (({"margin": 0.007}, 0.007), ({}, None)):
         allowed = Scene.from_document(
-            {**document, "allow": [{"pair": ["near.tray", "next.tray"], **said}]}, side_by_side().folder
+            {**document, "allow": [{"pair": ["near.tray", "next.tray"], **said}]},
+            side_by_side().folder,
         )
         problem = program_of(allowed, [Actuate("near", {"slide": 0.3})], options=SHORT)
         number = problem.contacts.phase_of(waypoint_in(problem, "move"))
-        own = {pair: keep for pair, keep in pairs(problem, number).items() if set(pair) == {"near.tray", "next.tray"}}
+        own = {
+            pair: keep
+            for pair, keep in pairs(problem, number).items()
+            if set(pair) == {"near.tray", "next.tray"}
+        }
         if margin is None:
             assert not own
         else:
             assert {keep for every in own.values() for keep in every} == {margin}
         others = {
-            keep for pair, every in pairs(problem, number).items() if set(pair) != {"near.tray", "next.tray"} for keep in every
+            keep
+            for pair, every in pairs(problem, number).items()
+            if set(pair) != {"near.tray", "next.tray"}
+            for keep in every
         }
         assert min(others) >= min(MARGIN, CLOSE)

@@ -37,13 +37,26 @@ def placing() -> TrajectoryProblem:
 @cache
 def fetching() -> TrajectoryProblem:
     """Return the problem of taking the ball with the stick, and letting go of it where the motion wants, then of the stick."""
-    steps = [Grasp("stick"), Grasp("ball", "pull", "stick.tip"), Reach(POSE), Release("ball"), GoTo(0.0, 0.0)]
-    return program_of(scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT)
+    steps = [
+        Grasp("stick"),
+        Grasp("ball", "pull", "stick.tip"),
+        Reach(POSE),
+        Release("ball"),
+        GoTo(0.0, 0.0),
+    ]
+    return program_of(
+        scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT
+    )
 
 
-def margins(problem: TrajectoryProblem, phase: int, *, at: str = "") -> dict[tuple[str, str], set[float]]:
+def margins(
+    problem: TrajectoryProblem, phase: int, *, at: str = ""
+) -> dict[tuple[str, str], set[float]]:
     """Return (link, link or obstacle) → the margins of pairs between them, at "first" or "last" or where nothing is eased."""
-    part, every = problem.contacts.phases[phase], np.arange(len(problem.contacts.phases[phase].pairs))
+    part, every = (
+        problem.contacts.phases[phase],
+        np.arange(len(problem.contacts.phases[phase].pairs)),
+    )
     found: dict[tuple[str, str], set[float]] = {}
     waypoint = problem.contacts.first_waypoint[phase + (at == "last")]
     asked = part.margins_at(every, np.full(len(every), waypoint)) if at else part.margins
@@ -68,7 +81,12 @@ def test_what_is_carried_hits_everything_but_itself_and_the_hand() -> None:
     robot = scene().robot
     for label in ("stick.stick", "stick.tip"):
         hand = set(robot.touch_links) if label == "stick.stick" else set()
-        assert partners(placing(), 1, label) == (set(robot.links) - hand) | {"ball.ball", "table", "stand", FLOOR}
+        assert partners(placing(), 1, label) == (set(robot.links) - hand) | {
+            "ball.ball",
+            "table",
+            "stand",
+            FLOOR,
+        }
     for (first, second), found in margins(placing(), 1).items():
         assert found == {CLOSE if first in robot.touch_links and second == "stick.tip" else MARGIN}
 
@@ -84,7 +102,9 @@ def test_a_tip_touches_what_it_will_hold_and_holds_it() -> None:
     before, held = margins(fetching(), 1, at="last"), margins(fetching(), 2)
     assert before["stick.tip", "ball.ball"] == {0.0}
     assert before["stick.stick", "ball.ball"] == {MARGIN}
-    assert before[scene().robot.touch_links[0], "ball.ball"] == {MARGIN}  # the hand is not what takes it
+    assert before[scene().robot.touch_links[0], "ball.ball"] == {
+        MARGIN
+    }  # the hand is not what takes it
     assert ("stick.tip", "ball.ball") not in held
     assert held["stick.stick", "ball.ball"] == {MARGIN}
     robots = set(scene().robot.links)
@@ -104,7 +124,10 @@ def test_a_placed_thing_stands_where_it_was_put(phase: int) -> None:
         for shape in standing:
             expected = where * scene().objects[name].placement.inverse() * shape.placement
             np.testing.assert_allclose(
-                shapes[f"{name}.{shape.name}"].placement.homogeneous, expected.homogeneous, rtol=0.0, atol=1e-12
+                shapes[f"{name}.{shape.name}"].placement.homogeneous,
+                expected.homogeneous,
+                rtol=0.0,
+                atol=1e-12,
             )
 
 
@@ -122,7 +145,9 @@ def test_what_is_let_go_of_somewhere_stands_there(seed: int) -> None:
     problem = fetching()
     names = [phase.name for phase in problem.task.phases]
     assert names[3:] == ["go to", "place stick", "go to"]
-    z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed))
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
+    )
     contacts = problem.contacts.settled(z)
     left = {"ball": (problem.ends[2], (3, 4, 5)), "stick": (problem.ends[4], (5,))}
     for name, (end, later) in left.items():
@@ -130,24 +155,34 @@ def test_what_is_let_go_of_somewhere_stands_there(seed: int) -> None:
         there = standing_geometry(dataclasses.replace(scene().objects[name], placement=where))
         for number in later:
             part = contacts.phases[number]
-            index = {str(shape.name): i for i, shape in enumerate(part.shapes) if part.joint[i] == 0}
+            index = {
+                str(shape.name): i for i, shape in enumerate(part.shapes) if part.joint[i] == 0
+            }
             for shape in there:
                 i = index[f"{name}.{shape.name}"]
                 expected = shape.placement.homogeneous
-                np.testing.assert_allclose(part.shapes[i].placement.homogeneous, expected, rtol=0.0, atol=1e-9)
+                np.testing.assert_allclose(
+                    part.shapes[i].placement.homogeneous, expected, rtol=0.0, atol=1e-9
+                )
                 np.testing.assert_allclose(part.rotation[i], expected[:3, :3], rtol=0.0, atol=1e-9)
-                np.testing.assert_allclose(part.translation[i], expected[:3, 3], rtol=0.0, atol=1e-9)
+                np.testing.assert_allclose(
+                    part.translation[i], expected[:3, 3], rtol=0.0, atol=1e-9
+                )
 
 
 def test_it_stands_where_the_task_says_until_a_motion_is_asked_about() -> None:
     """And afterwards again: no answer depends on which motion was asked about before."""
     problem = fetching()
-    z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4))
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4)
+    )
     waypoints = np.arange(1, problem.segments + 1)
     before = problem.contacts.evaluate(z, waypoints, reach=0.3)
     settled = problem.evaluate_contacts(z, reach=0.3)
     after = problem.contacts.evaluate(z, waypoints, reach=0.3)
-    assert len(before.pair) != len(settled.pair) or not np.array_equal(before.distance, settled.distance)
+    assert len(before.pair) != len(settled.pair) or not np.array_equal(
+        before.distance, settled.distance
+    )
     for one, other in zip(before.arrays(), after.arrays(), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -155,7 +190,9 @@ def test_it_stands_where_the_task_says_until_a_motion_is_asked_about() -> None:
 def test_it_stands_where_the_motion_that_is_asked_about_leaves_it() -> None:
     """Not where one before it did."""
     problem = fetching()
-    z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4))
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4)
+    )
     first, other, again = (problem.evaluate_contacts(rows, reach=0.1) for rows in (z, z[::-1], z))
     assert not np.array_equal(first.pair, other.pair)
     np.testing.assert_array_equal(first.pair, again.pair)
@@ -165,24 +202,36 @@ def test_it_stands_where_the_motion_that_is_asked_about_leaves_it() -> None:
 def test_distances_to_what_was_left_are_those_of_a_scene_in_which_it_stands_there() -> None:
     """As seen by a problem of the last phase alone, in a scene where everything is where the motion put it."""
     problem = fetching()
-    z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(5), arena=1.0)
+    z = random_configurations(
+        problem.chain.lower,
+        problem.chain.upper,
+        problem.segments,
+        np.random.default_rng(5),
+        arena=1.0,
+    )
     contacts = problem.evaluate_contacts(z, reach=0.3)
     stands = scene()
     for name, end in (("ball", problem.ends[2]), ("stick", problem.ends[4])):
         stands = stands.with_placement(name, expected_placement(problem, name, z[end - 1]))
     alone = program_of(stands, [GoTo(1.0, 0.0)], options=SHORT)
     rows = np.arange(problem.ends[4], problem.ends[5])
-    seen = alone.contacts.evaluate(z[rows][:, : alone.chain.size], np.ones(len(rows), int), reach=0.3)
+    seen = alone.contacts.evaluate(
+        z[rows][:, : alone.chain.size], np.ones(len(rows), int), reach=0.3
+    )
     labels, own = problem.contacts.phases[5].labels, alone.contacts.phases[0].labels
 
     def table_of(found, labels, offset):  # type: ignore[no-untyped-def]
         return sorted(
             (int(row) - offset, labels[a], labels[b], round(float(distance), 5))
-            for row, (a, b), distance in zip(found.waypoint, found.pair, found.distance, strict=True)
+            for row, (a, b), distance in zip(
+                found.waypoint, found.pair, found.distance, strict=True
+            )
             if int(row) >= offset
         )
 
     first, second = table_of(contacts, labels, int(rows[0])), table_of(seen, own, 0)
     assert [entry[:3] for entry in first] == [entry[:3] for entry in second]
-    np.testing.assert_allclose([entry[3] for entry in first], [entry[3] for entry in second], rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(
+        [entry[3] for entry in first], [entry[3] for entry in second], rtol=0.0, atol=2e-5
+    )
     assert any("ball.ball" in entry for entry in first)

@@ -8,7 +8,18 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import STICK, TOP, above, box, lifted, moved_base, reaching, room, table, tool_at
+from helpers.carrying import (
+    STICK,
+    TOP,
+    above,
+    box,
+    lifted,
+    moved_base,
+    reaching,
+    room,
+    table,
+    tool_at,
+)
 from helpers.riding import cup, plates, scene_of
 from helpers.small_problems import SHORT, program_of
 
@@ -47,7 +58,9 @@ def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarra
     return found
 
 
-def only_near(row: np.ndarray, margin: float, *, begin: bool = False, end: bool = False, within: float = 1e-6) -> None:
+def only_near(
+    row: np.ndarray, margin: float, *, begin: bool = False, end: bool = False, within: float = 1e-6
+) -> None:
     """Assert that a margin holds near the begin or the end, and dist_safe elsewhere."""
     expected = np.full(N + 1, LONG.dist_safe)
     if begin:
@@ -64,7 +77,9 @@ def test_nothing_is_eased_without_need() -> None:
     assert [margins(far, phase) for phase in (0, 1)] == [{}, {}]  # further than dist_safe anyway
 
 
-def test_what_is_lifted_may_be_close_to_what_it_lay_on_and_what_is_lowered_to_what_it_will() -> None:
+def test_what_is_lifted_may_be_close_to_what_it_lay_on_and_what_is_lowered_to_what_it_will() -> (
+    None
+):
     p = problem(room(table(gap=GAP)), Place("stick", ASIDE), GoTo(0.0, 1.0))
     assert [phase.name for phase in p.task.phases] == ["reach stick.grip", "place stick", "go to"]
     assert margins(p, 0) == {}
@@ -80,10 +95,19 @@ def test_the_margin_is_half_the_distance_of_that_shape() -> None:
     p = problem(room(table(gap=GAP), wall), Place("stick", ASIDE))
     part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
     eased = {
-        (part.shapes[i].name, part.labels[j]): [*part.eased[k]] for k, (i, j) in enumerate(part.pairs.tolist()) if k in part.eased
+        (part.shapes[i].name, part.labels[j]): [*part.eased[k]]
+        for k, (i, j) in enumerate(part.pairs.tolist())
+        if k in part.eased
     }
-    assert set(eased) >= {("stick.stick_1", "table"), ("stick.stick_2", "table"), ("stick.tip_1", "wall")}
-    assert not {name for name, label in eased if label == "table"} - {"stick.stick_1", "stick.stick_2"}
+    assert set(eased) >= {
+        ("stick.stick_1", "table"),
+        ("stick.stick_2", "table"),
+        ("stick.tip_1", "wall"),
+    }
+    assert not {name for name, label in eased if label == "table"} - {
+        "stick.stick_1",
+        "stick.stick_2",
+    }
     ((begin, end, margin),) = eased["stick.tip_1", "wall"]  # at the other end the wall is far away
     assert (begin, end) == (first, first + NEAR)
     assert margin == pytest.approx(EASED_SHARE * 0.01, abs=1e-6)
@@ -92,11 +116,19 @@ def test_the_margin_is_half_the_distance_of_that_shape() -> None:
 def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> None:
     """Twice as many waypoints, half as far apart in time: the same seconds at either end."""
     steps, spans = [Place("stick", ASIDE)], []
-    for options in (LONG, dataclasses.replace(LONG, dt=LONG.dt / 2, reach_waypoints=2 * LONG.reach_waypoints)):
+    for options in (
+        LONG,
+        dataclasses.replace(LONG, dt=LONG.dt / 2, reach_waypoints=2 * LONG.reach_waypoints),
+    ):
         p = program_of(room(table(gap=GAP)), steps, options=options)
         first = int(p.contacts.first_waypoint[1])
         moments = [moment for eased in p.contacts.phases[1].eased.values() for moment in eased]
-        spans.append({((begin - first) * options.dt, (end - first) * options.dt) for begin, end, _ in moments})
+        spans.append(
+            {
+                ((begin - first) * options.dt, (end - first) * options.dt)
+                for begin, end, _ in moments
+            }
+        )
     assert spans[0] == spans[1] == {(0.0, EASED_TIME), (N * LONG.dt - EASED_TIME, N * LONG.dt)}
 
 
@@ -104,7 +136,9 @@ def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> 
 def test_what_rests_on_or_in_something_may_be_as_close_as_that(gap: float) -> None:
     p = problem(room(table(gap=gap)), Place("stick", ASIDE))
     found = margins(p, 1)["stick.stick", "table"]
-    np.testing.assert_allclose(found[: NEAR + 1], gap, rtol=0.0, atol=1e-6)  # it stands there, but may not be put there
+    np.testing.assert_allclose(
+        found[: NEAR + 1], gap, rtol=0.0, atol=1e-6
+    )  # it stands there, but may not be put there
     only_near(np.append(np.zeros(NEAR + 1), found[NEAR + 1 :]), 0.0, begin=True, end=True)
 
 
@@ -120,12 +154,19 @@ def test_what_is_put_down_elsewhere_is_eased_there_alone() -> None:
 
 def test_taken_again_it_is_eased_where_it_was_put() -> None:
     p = problem(room(table(gap=GAP)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
-    assert [phase.name for phase in p.task.phases] == ["reach stick.grip", "place stick", "reach stick.grip", "go to"]
+    assert [phase.name for phase in p.task.phases] == [
+        "reach stick.grip",
+        "place stick",
+        "reach stick.grip",
+        "go to",
+    ]
     only_near(margins(p, 3)["stick.stick", "table"], EASED_SHARE * GAP, begin=True)
 
 
 @pytest.mark.parametrize(("gap", "margin"), [(GAP, EASED_SHARE * GAP), (0.0, 0.0), (-1e-3, -1e-3)])
-def test_what_is_in_the_hand_at_the_start_may_leave_what_it_lies_on(gap: float, margin: float) -> None:
+def test_what_is_in_the_hand_at_the_start_may_leave_what_it_lies_on(
+    gap: float, margin: float
+) -> None:
     """So a step that is planned on its own begins as well as in the middle of a chore."""
     scene, row = room(table(gap=gap)), reaching(tool_at(STICK), above(STICK))
     held = scene.with_start(base=row[:3], arm=row[3:]).with_held({"stick": "grip"})
@@ -152,10 +193,18 @@ def test_what_rides_is_eased_from_what_is_beside_it_where_the_ride_begins_alone(
     assert row[-1] == LONG.dist_safe
 
 
-def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_that_is_lifted() -> None:
+def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_that_is_lifted() -> (
+    None
+):
     """A cup on a tray, a centimetre in front of a wall; where the tray is put down there is none."""
-    things = [{"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]}, cup(at=(0.82, 0.05, 0.72))]
-    p = problem(scene_of(things, [box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]), Place("tray", (-0.5, -1.5, 0.7)))
+    things = [
+        {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
+        cup(at=(0.82, 0.05, 0.72)),
+    ]
+    p = problem(
+        scene_of(things, [box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]),
+        Place("tray", (-0.5, -1.5, 0.7)),
+    )
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.rides)
     only_near(margins(p, number)["cup.cup", "wall"], EASED_SHARE * 0.01, begin=True, within=1e-4)
 
@@ -163,7 +212,9 @@ def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_t
 def test_in_a_short_phase_both_ends_must_be_possible() -> None:
     """It is lifted and lowered within a few waypoints, and lies on the table in the end, though above it at first."""
     options = dataclasses.replace(SHORT, reach_waypoints=NEAR)
-    p = program_of(room(table(gap=GAP)), [Place("stick", lifted(STICK, [0.0, 0.5, -GAP]))], options=options)
+    p = program_of(
+        room(table(gap=GAP)), [Place("stick", lifted(STICK, [0.0, 0.5, -GAP]))], options=options
+    )
     np.testing.assert_allclose(margins(p, 1)["stick.stick", "table"], np.zeros(NEAR + 1), atol=1e-6)
 
 
@@ -178,17 +229,23 @@ def test_the_floor_too() -> None:
 def tip_at_a_wall(gap: float, *steps: Step) -> tuple[TrajectoryProblem, np.ndarray]:
     """Return the problem of touching a point `gap` before a wall, and then what `steps` say; and the point."""
     point = np.array([0.8, 0.7, 0.75])
-    scene = room(box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))).with_held({"stick": "grip"})
+    scene = room(box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))).with_held(
+        {"stick": "grip"}
+    )
     return problem(scene, Touch("stick.tip", point), *steps), point
 
 
 @pytest.mark.parametrize(("gap", "margin"), [(0.0, 0.0), (0.006, 0.003), (-0.01, 0.0)])
-def test_a_tip_may_be_close_to_what_is_at_its_target_before_and_after(gap: float, margin: float) -> None:
+def test_a_tip_may_be_close_to_what_is_at_its_target_before_and_after(
+    gap: float, margin: float
+) -> None:
     p, _ = tip_at_a_wall(gap, GoTo(0.0, 0.0), GoTo(0.0, 1.0))
     for phase, where in ((0, {"end": True}), (1, {"begin": True})):
         found = margins(p, phase)
         assert set(found) == {("stick.tip", "wall")}
-        only_near(found["stick.tip", "wall"], margin, **where, within=6e-5)  # a point has a size here, 0.1 mm
+        only_near(
+            found["stick.tip", "wall"], margin, **where, within=6e-5
+        )  # a point has a size here, 0.1 mm
     assert margins(p, 2) == {}
 
 
@@ -231,6 +288,8 @@ def test_a_motion_that_lifts_and_lowers_keeps_its_margins() -> None:
         contacts.waypoint, contacts.pair, contacts.distance, contacts.margin, strict=True
     ):
         if waypoint >= N and {labels[pair[0]], labels[pair[1]]} == {"stick.stick", "table"}:
-            lies[int(waypoint) + 1] = min(lies.get(int(waypoint) + 1, (np.inf, 0.0)), (float(distance), float(margin)))
+            lies[int(waypoint) + 1] = min(
+                lies.get(int(waypoint) + 1, (np.inf, 0.0)), (float(distance), float(margin))
+            )
     assert lies[2 * N] == (pytest.approx(GAP, abs=1e-6), pytest.approx(EASED_SHARE * GAP, abs=1e-7))
     assert all(distance >= margin for distance, margin in lies.values())

@@ -35,8 +35,12 @@ class Placed:
         return SimpleNamespace(free=self.free)
 
 
-def moments(phases: list[Any], number: int, monkeypatch: Any, holds: tuple[Hold, ...] = ()) -> list[tuple[Any, ...]]:
-    objects: dict[str, Any] = {name: Placed(name) for name in ("stick", "tray", "cup")} | {"plate": Placed("plate", False)}
+def moments(
+    phases: list[Any], number: int, monkeypatch: Any, holds: tuple[Hold, ...] = ()
+) -> list[tuple[Any, ...]]:
+    objects: dict[str, Any] = {name: Placed(name) for name in ("stick", "tray", "cup")} | {
+        "plate": Placed("plate", False)
+    }
     scene: Any = SimpleNamespace(objects=objects, holds=holds)
     rides = {ride for phase in phases for ride in phase.rides}
     chain: Any = SimpleNamespace(
@@ -49,9 +53,14 @@ def moments(phases: list[Any], number: int, monkeypatch: Any, holds: tuple[Hold,
         return on
 
     monkeypatch.setattr(module, "_ridden", ridden)
-    monkeypatch.setattr(module, "_with", lambda placed, state: dataclasses.replace(placed, placement=str(state)))
+    monkeypatch.setattr(
+        module, "_with", lambda placed, state: dataclasses.replace(placed, placement=str(state))
+    )
     task: Any = SimpleNamespace(phases=phases)
-    return [(shapes, placed.placement, begins) for shapes, placed, begins in _moments(scene, chain, task, number)]
+    return [
+        (shapes, placed.placement, begins)
+        for shapes, placed, begins in _moments(scene, chain, task, number)
+    ]
 
 
 def phase(held: tuple[Hold, ...] = (), rides: tuple[Ride, ...] = (), **fields: Any) -> Any:
@@ -76,7 +85,9 @@ def test_what_is_in_the_hand_at_the_start_begins_there(monkeypatch: Any) -> None
 def test_what_is_lifted_begins_and_what_is_lowered_ends(monkeypatch: Any) -> None:
     """With what rides on it, and that alone."""
     on_tray, on_stick = Ride("cup", TRAY), Ride("cup", STICK)
-    now = phase((STICK, TRAY), (on_tray,), lifted={TRAY: "here"}, lowered={STICK: "there", PLATE: "nowhere"})
+    now = phase(
+        (STICK, TRAY), (on_tray,), lifted={TRAY: "here"}, lowered={STICK: "there", PLATE: "nowhere"}
+    )
     assert moments([phase(), now], 1, monkeypatch) == [
         ("tray", "here", True),
         ("cup", "on here", True),
@@ -109,5 +120,13 @@ def test_what_rides_on_what_stands_fixed_begins_and_ends_with_the_phase(monkeypa
 def test_only_an_objects_own_coordinates_are_its_state() -> None:
     given: list[Any] = []
     placed: Any = SimpleNamespace(name="plate", with_state=given.append)
-    module._with(placed, {"plate.slide": 0.5, "plates.slide": 0.1, "door.hinge": 1.0, "plate.turn": np.float64(0.25)})
+    module._with(
+        placed,
+        {
+            "plate.slide": 0.5,
+            "plates.slide": 0.1,
+            "door.hinge": 1.0,
+            "plate.turn": np.float64(0.25),
+        },
+    )
     assert given == [{"slide": 0.5, "turn": 0.25}]

@@ -24,7 +24,11 @@ def solver_and_frame(chain: VirtualKinematicChain) -> tuple[PoseSolver, int, pin
     name = chain.robot.tool_frame
     if chain.closures:
         (closure,) = chain.closures.values()
-        return PoseSolver(chain.model, PoseRow(closure.joint, closure.local, ())), closure.joint, closure.local
+        return (
+            PoseSolver(chain.model, PoseRow(closure.joint, closure.local, ())),
+            closure.joint,
+            closure.local,
+        )
     frame = chain.model.frames[chain.model.getFrameId(name)]
     return (
         PoseSolver(chain.model, PoseRow(frame.parentJoint, pin.SE3(frame.placement), ())),
@@ -39,12 +43,17 @@ def placement(chain: VirtualKinematicChain, joint: int, local: pin.SE3, z: np.nd
     return data.oMi[joint] * local
 
 
-def errors(chain: VirtualKinematicChain, joint: int, local: pin.SE3, z: np.ndarray, target: pin.SE3) -> np.ndarray:
+def errors(
+    chain: VirtualKinematicChain, joint: int, local: pin.SE3, z: np.ndarray, target: pin.SE3
+) -> np.ndarray:
     """Return distance [m] or angle [rad] to the target, whichever is larger, shape (B,)."""
     found = [placement(chain, joint, local, row) for row in z]
     return np.array(
         [
-            max(np.linalg.norm(p.translation - target.translation), np.linalg.norm(pin.log3(target.rotation.T @ p.rotation)))
+            max(
+                np.linalg.norm(p.translation - target.translation),
+                np.linalg.norm(pin.log3(target.rotation.T @ p.rotation)),
+            )
             for p in found
         ]
     )
@@ -71,7 +80,10 @@ def test_residual_and_jacobian(chain: VirtualKinematicChain) -> None:
         expected = np.r_[at.translation - target.translation, 2 * np.sin(angle / 2) * turn / angle]
         np.testing.assert_allclose(residual[row], expected, rtol=0.0, atol=1e-8)
         change = 1e-6 * np.eye(chain.size)
-        ahead, behind = solver.evaluate(z[row] + change, target)[0], solver.evaluate(z[row] - change, target)[0]
+        ahead, behind = (
+            solver.evaluate(z[row] + change, target)[0],
+            solver.evaluate(z[row] - change, target)[0],
+        )
         np.testing.assert_allclose(jacobian[row], (ahead - behind).T / 2e-6, rtol=0.0, atol=1e-6)
 
 
@@ -84,7 +96,9 @@ def test_solutions_reach_the_pose_within_limits(chain: VirtualKinematicChain) ->
     for row in targets:
         target = placement(chain, joint, local, row)
         seeds = np.clip(row + rng.uniform(-0.5, 0.5, (40, chain.size)), chain.lower, chain.upper)
-        z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25)
+        z, found = solver.solve(
+            seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25
+        )
         assert z.shape == seeds.shape
         assert found.shape == (40,)
         assert np.all(z >= lower)
@@ -112,7 +126,11 @@ def test_what_cannot_be_reached_is_said() -> None:
     lower, upper = limits(chain)
     seeds = random_configurations(chain.lower, chain.upper, 30, np.random.default_rng(3))
     z, found = solver.solve(
-        seeds, pin.SE3(np.eye(3), np.array([0.0, 0.0, 9.0])), lower=lower, upper=upper, weights=np.ones(chain.size)
+        seeds,
+        pin.SE3(np.eye(3), np.array([0.0, 0.0, 9.0])),
+        lower=lower,
+        upper=upper,
+        weights=np.ones(chain.size),
     )
     assert not found.any()
     assert np.all(np.isfinite(z))
@@ -129,12 +147,21 @@ def test_equal_limits_keep_coordinates_where_they_are() -> None:
     seeds = goal + rng.uniform(-0.3, 0.3, (40, chain.size))
     lower, upper = limits(chain)
     lower[5] = upper[5] = goal[5]
-    z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25)
+    z, found = solver.solve(
+        seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25
+    )
     assert found.mean() > 0.8
     assert np.all(z[:, 5] == goal[5])
     rows_lower, rows_upper = np.tile(limits(chain)[0], (40, 1)), np.tile(limits(chain)[1], (40, 1))
     rows_lower[:, 2] = rows_upper[:, 2] = seeds[:, 2]
-    z, found = solver.solve(seeds, target, lower=rows_lower, upper=rows_upper, weights=np.ones(chain.size), iterations=25)
+    z, found = solver.solve(
+        seeds,
+        target,
+        lower=rows_lower,
+        upper=rows_upper,
+        weights=np.ones(chain.size),
+        iterations=25,
+    )
     assert found.mean() > 0.8
     np.testing.assert_array_equal(z[:, 2], seeds[:, 2])
     assert np.all(errors(chain, joint, local, z[found], target) < 3e-6)
@@ -152,7 +179,9 @@ def test_a_limit_in_the_way_is_respected_and_got_round() -> None:
     farthest = []
     for edge in (3.0, -0.2):  # how far the base may come
         upper[0] = edge
-        z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=40)
+        z, found = solver.solve(
+            seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=40
+        )
         assert found.mean() > 0.8
         farthest.append(z[found, 0].max())
     assert farthest[0] > -0.15
@@ -170,7 +199,9 @@ def test_what_is_dear_to_move_moves_less() -> None:
     for weight in (0.1, 100.0):
         weights = np.ones(chain.size)
         weights[:3] = weight
-        z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=weights, iterations=30)
+        z, found = solver.solve(
+            seeds, target, lower=lower, upper=upper, weights=weights, iterations=30
+        )
         assert found.mean() > 0.8
         travel.append(np.abs(z - seeds)[found, :3].sum(axis=1).mean())
     assert travel[1] < 0.3 * travel[0]
@@ -186,11 +217,14 @@ def test_half_a_turn_away_is_not_taken_for_there(axis: int) -> None:
     residual, _ = solver.evaluate(start[None], target)
     assert np.linalg.norm(residual[0, 3:]) > 0.5
     lower, upper = limits(chain)
-    z, found = solver.solve(start[None], target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=60)
+    z, found = solver.solve(
+        start[None], target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=60
+    )
     assert found.all() == (errors(chain, joint, local, z, target) < 3e-6).all()
 
 
-# --- points, and what stands upright ----------------------------------------------------------------------------------
+# --- points, and what stands upright
+# ----------------------------------------------------------------------------------
 
 
 def tilt(placement: pin.SE3, target: pin.SE3) -> float:
@@ -200,7 +234,9 @@ def tilt(placement: pin.SE3, target: pin.SE3) -> float:
 
 
 @pytest.mark.parametrize(("kind", "rows"), [("point", 3), ("upright", 5)])
-def test_residuals_and_jacobians_of_other_goals(chain: VirtualKinematicChain, kind: str, rows: int) -> None:
+def test_residuals_and_jacobians_of_other_goals(
+    chain: VirtualKinematicChain, kind: str, rows: int
+) -> None:
     _, joint, local = solver_and_frame(chain)
     solver = PoseSolver(chain.model, PoseRow(joint, local, (), kind))
     z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(7))
@@ -212,16 +248,25 @@ def test_residuals_and_jacobians_of_other_goals(chain: VirtualKinematicChain, ki
     np.testing.assert_allclose(residual[0], 0.0, atol=1e-9)
     for row in range(10):
         at = placement(chain, joint, local, z[row])
-        np.testing.assert_allclose(residual[row, :3], at.translation - target.translation, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            residual[row, :3], at.translation - target.translation, rtol=0.0, atol=1e-9
+        )
         if kind == "upright":
-            assert np.linalg.norm(residual[row, 3:]) == pytest.approx(2 * np.sin(tilt(at, target) / 2), abs=1e-7)
+            assert np.linalg.norm(residual[row, 3:]) == pytest.approx(
+                2 * np.sin(tilt(at, target) / 2), abs=1e-7
+            )
         change = 1e-6 * np.eye(chain.size)
-        ahead, behind = solver.evaluate(z[row] + change, target)[0], solver.evaluate(z[row] - change, target)[0]
+        ahead, behind = (
+            solver.evaluate(z[row] + change, target)[0],
+            solver.evaluate(z[row] - change, target)[0],
+        )
         np.testing.assert_allclose(jacobian[row], (ahead - behind).T / 2e-6, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["point", "upright"])
-def test_other_goals_are_reached_within_limits_at_what_orientation_they_leave(chain: VirtualKinematicChain, kind: str) -> None:
+def test_other_goals_are_reached_within_limits_at_what_orientation_they_leave(
+    chain: VirtualKinematicChain, kind: str
+) -> None:
     _, joint, local = solver_and_frame(chain)
     solver, (lower, upper) = PoseSolver(chain.model, PoseRow(joint, local, (), kind)), limits(chain)
     rng = np.random.default_rng(8)
@@ -230,7 +275,9 @@ def test_other_goals_are_reached_within_limits_at_what_orientation_they_leave(ch
     for row in targets:
         target = placement(chain, joint, local, row)
         seeds = np.clip(row + rng.uniform(-0.7, 0.7, (30, chain.size)), chain.lower, chain.upper)
-        z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25)
+        z, found = solver.solve(
+            seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25
+        )
         assert np.all((z >= lower) & (z <= upper))
         for at in (placement(chain, joint, local, row) for row in z[found]):
             assert np.linalg.norm(at.translation - target.translation) < 3e-6
@@ -246,16 +293,23 @@ def test_what_hangs_upside_down_is_turned_upright() -> None:
     """A hand that points up is to point down: the gradient of a plain tilt vanishes there."""
     chain = consolidate(door_scene(), {})
     _, joint, local = solver_and_frame(chain)
-    solver, (lower, upper) = PoseSolver(chain.model, PoseRow(joint, local, (), "upright")), limits(chain)
+    solver, (lower, upper) = (
+        PoseSolver(chain.model, PoseRow(joint, local, (), "upright")),
+        limits(chain),
+    )
     start = np.concatenate([[0.0, 0.0, 0.0], chain.robot.home])
     here = placement(chain, joint, local, start)
     for axis in np.eye(3)[:2]:
         target = pin.SE3(pin.exp3(np.pi * axis) @ here.rotation, here.translation)
         assert tilt(here, target) == pytest.approx(np.pi, abs=1e-6)
-        seeds = start + np.vstack([np.zeros(chain.size), np.random.default_rng(9).uniform(-0.3, 0.3, (40, chain.size))])
+        seeds = start + np.vstack(
+            [np.zeros(chain.size), np.random.default_rng(9).uniform(-0.3, 0.3, (40, chain.size))]
+        )
         residual, _ = solver.evaluate(seeds[:1], target)
         assert np.linalg.norm(residual[0, 3:]) > 1.0
-        z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=60)
+        z, found = solver.solve(
+            seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=60
+        )
         assert found[0]
         assert found.mean() > 0.5
         for row in z[found]:
@@ -264,7 +318,8 @@ def test_what_hangs_upside_down_is_turned_upright() -> None:
             assert np.linalg.norm(at.translation - target.translation) < 3e-6
 
 
-# --- short of a place, along a direction that another joint has -------------------------------------------------------
+# --- short of a place, along a direction that another joint has
+# -------------------------------------------------------
 
 
 def test_residuals_and_jacobians_with_a_shift(chain: VirtualKinematicChain) -> None:
@@ -277,14 +332,30 @@ def test_residuals_and_jacobians_with_a_shift(chain: VirtualKinematicChain) -> N
         solver = PoseSolver(chain.model, PoseRow(joint, local, (), kind, (hand, vector)))
         plain = PoseSolver(chain.model, PoseRow(joint, local, (), kind))
         residual, jacobian = solver.evaluate(z, target)
-        shifted = np.array([placement(chain, hand, pin.SE3.Identity(), row).rotation @ np.array(vector) for row in z])
-        np.testing.assert_allclose(residual[:, :3], plain.evaluate(z, target)[0][:, :3] + shifted, rtol=0.0, atol=1e-9)
-        np.testing.assert_allclose(residual[:, 3:], plain.evaluate(z, target)[0][:, 3:], rtol=0.0, atol=1e-9)
+        shifted = np.array(
+            [
+                placement(chain, hand, pin.SE3.Identity(), row).rotation @ np.array(vector)
+                for row in z
+            ]
+        )
+        np.testing.assert_allclose(
+            residual[:, :3], plain.evaluate(z, target)[0][:, :3] + shifted, rtol=0.0, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            residual[:, 3:], plain.evaluate(z, target)[0][:, 3:], rtol=0.0, atol=1e-9
+        )
         change = 1e-6 * np.eye(chain.size)
         for row in range(10):
-            ahead, behind = solver.evaluate(z[row] + change, target)[0], solver.evaluate(z[row] - change, target)[0]
-            np.testing.assert_allclose(jacobian[row, :3], (ahead - behind).T[:3] / 2e-6, rtol=0.0, atol=1e-6)
-        np.testing.assert_allclose(jacobian[:, 3:], plain.evaluate(z, target)[1][:, 3:], rtol=0.0, atol=1e-9)
+            ahead, behind = (
+                solver.evaluate(z[row] + change, target)[0],
+                solver.evaluate(z[row] - change, target)[0],
+            )
+            np.testing.assert_allclose(
+                jacobian[row, :3], (ahead - behind).T[:3] / 2e-6, rtol=0.0, atol=1e-6
+            )
+        np.testing.assert_allclose(
+            jacobian[:, 3:], plain.evaluate(z, target)[1][:, 3:], rtol=0.0, atol=1e-9
+        )
 
 
 def test_a_hand_that_is_short_of_its_goal_along_its_approach() -> None:
@@ -293,10 +364,14 @@ def test_a_hand_that_is_short_of_its_goal_along_its_approach() -> None:
     goal = np.concatenate([[0.5, -0.3, 0.4], chain.robot.home])
     target = placement(chain, joint, local, goal)
     vector = 0.08 * local.rotation[:, 2]
-    solver = PoseSolver(chain.model, PoseRow(joint, local, (), "pose", (joint, tuple(vector.tolist()))))
+    solver = PoseSolver(
+        chain.model, PoseRow(joint, local, (), "pose", (joint, tuple(vector.tolist())))
+    )
     seeds = goal + np.random.default_rng(11).uniform(-0.3, 0.3, (40, chain.size))
     lower, upper = limits(chain)
-    z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25)
+    z, found = solver.solve(
+        seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25
+    )
     assert found.mean() > 0.8
     back = target * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.08]))
     assert np.all(errors(chain, joint, local, z[found], back) < 3e-6)

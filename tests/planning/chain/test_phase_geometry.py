@@ -24,10 +24,21 @@ def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9
     shapes = []
     for k in range(moving + standing):
         size = rng.uniform(0.02, 0.4, 3)
-        solid = [coal.Box(*size), coal.Sphere(size[0] / 2), coal.Cylinder(size[0] / 2, size[1])][int(rng.integers(3))]
+        solid = [coal.Box(*size), coal.Sphere(size[0] / 2), coal.Cylinder(size[0] / 2, size[1])][
+            int(rng.integers(3))
+        ]
         joint = 1 + int(rng.integers(JOINTS)) if k < moving else 0
-        shapes.append(pin.GeometryObject(f"s{k}", joint, 0, random_placement(rng, 0.3 if joint else 1.5), solid))
-    every = [(a, b) for a in range(moving) for b in range(a + 1, len(shapes)) if shapes[a].parentJoint != shapes[b].parentJoint]
+        shapes.append(
+            pin.GeometryObject(
+                f"s{k}", joint, 0, random_placement(rng, 0.3 if joint else 1.5), solid
+            )
+        )
+    every = [
+        (a, b)
+        for a in range(moving)
+        for b in range(a + 1, len(shapes))
+        if shapes[a].parentJoint != shapes[b].parentJoint
+    ]
     pairs = np.array([pair for pair in every if rng.random() < 0.66]).reshape(-1, 2)
     boxes = [bounding_box(shape) for shape in shapes]
     return PhaseGeometry(
@@ -45,19 +56,28 @@ def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9
 
 def random_joints(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return placements of the universe and the joints, shapes (count, J + 1, 3, 3) and (count, J + 1, 3)."""
-    rotations = np.array([[np.eye(3), *(pin.exp3(rng.normal(size=3)) for _ in range(JOINTS))] for _ in range(count)])
+    rotations = np.array(
+        [[np.eye(3), *(pin.exp3(rng.normal(size=3)) for _ in range(JOINTS))] for _ in range(count)]
+    )
     translations = rng.uniform(-1.5, 1.5, (count, JOINTS + 1, 3))
     translations[:, 0] = 0.0
     return rotations, translations
 
 
-def all_distances(part: PhaseGeometry, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
+def all_distances(
+    part: PhaseGeometry, rotations: np.ndarray, translations: np.ndarray
+) -> np.ndarray:
     """Return coal's distance of every pair at every configuration, shape (W, P)."""
     out = np.empty((len(rotations), len(part.pairs)))
     for w in range(len(rotations)):
-        at = [pin.SE3(rotations[w, s.parentJoint], translations[w, s.parentJoint]) * s.placement for s in part.shapes]
+        at = [
+            pin.SE3(rotations[w, s.parentJoint], translations[w, s.parentJoint]) * s.placement
+            for s in part.shapes
+        ]
         for k, (a, b) in enumerate(part.pairs.tolist()):
-            out[w, k] = shape_distance(part.shapes[a].geometry, at[a], part.shapes[b].geometry, at[b])
+            out[w, k] = shape_distance(
+                part.shapes[a].geometry, at[a], part.shapes[b].geometry, at[b]
+            )
     return out
 
 
@@ -98,7 +118,9 @@ def test_what_is_placed_elsewhere(seed: int) -> None:
     at, pairs, _ = moved.boxes.near(0.1, *joints)
     for geometry, placement in where.items():
         assert moved.shapes[geometry].placement.isApprox(placement)
-        assert not part.shapes[geometry].placement.isApprox(placement), "the first one stays as it is"
+        assert not part.shapes[geometry].placement.isApprox(placement), (
+            "the first one stays as it is"
+        )
     close = np.argwhere(all_distances(moved, *joints) < 0.1 - COAL).tolist()
     assert {tuple(pair) for pair in close} <= set(zip(at.tolist(), pairs.tolist(), strict=True))
 
@@ -120,7 +142,9 @@ def test_what_stands_around_a_box(seed: int) -> None:
     listed = part.pairs.tolist()
     for first in range(7):
         numbers = part.pairs_of(first, np.arange(7, 16)).tolist()
-        assert [listed[k] for k in numbers] == [[first, b] for b in range(7, 16) if [first, b] in listed]
+        assert [listed[k] for k in numbers] == [
+            [first, b] for b in range(7, 16) if [first, b] in listed
+        ]
 
 
 def test_margins_are_eased_between_waypoints() -> None:

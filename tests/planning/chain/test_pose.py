@@ -8,7 +8,16 @@ import pinocchio as pin
 import pytest
 from helpers.memory import growth
 
-from vkc_pin.planning.chain.pose import AWAY, ROW_BOUNDS, PoseRow, away_from, pose_residual, pose_rows, receded, target_vector
+from vkc_pin.planning.chain.pose import (
+    AWAY,
+    ROW_BOUNDS,
+    PoseRow,
+    away_from,
+    pose_residual,
+    pose_rows,
+    receded,
+    target_vector,
+)
 
 _R, _p, _target = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("W", 12)
 RESIDUAL = ca.Function("residual", [_R, _p, _target], [pose_residual("pose", _R, _p, _target)])
@@ -18,11 +27,17 @@ _turn = ca.SX.sym("w", 3)
 _cross = ca.skew(_turn)
 # R·exp([w]) to second order: its derivatives at w = 0 are those along the manifold.
 _turned = _R @ (ca.SX.eye(3) + _cross + _cross @ _cross / 2)
-SLOPE = ca.Function("slope", [_R, _p, _target, _turn], [ca.jacobian(pose_residual("pose", _turned, _p, _target), _turn)])
+SLOPE = ca.Function(
+    "slope",
+    [_R, _p, _target, _turn],
+    [ca.jacobian(pose_residual("pose", _turned, _p, _target), _turn)],
+)
 
 
 def residual(placement: pin.SE3, target: pin.SE3) -> np.ndarray:
-    return np.asarray(RESIDUAL(placement.rotation, placement.translation, target_vector(target))).ravel()
+    return np.asarray(
+        RESIDUAL(placement.rotation, placement.translation, target_vector(target))
+    ).ravel()
 
 
 def random_axis(rng: np.random.Generator) -> np.ndarray:
@@ -43,7 +58,10 @@ def test_target_vector_is_the_rotation_by_columns_then_the_translation() -> None
     np.testing.assert_array_equal(vector[9:], target.translation)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-3, 0.5, 1.5, np.pi / 2, 2.5, 3.0, np.pi - 0.05, np.pi - 0.01, np.pi - 2e-3])
+@pytest.mark.parametrize(
+    "angle",
+    [0.0, 1e-8, 1e-3, 0.5, 1.5, np.pi / 2, 2.5, 3.0, np.pi - 0.05, np.pi - 0.01, np.pi - 2e-3],
+)
 def test_it_is_the_distance_and_the_chord_of_the_angle_about_the_axis(angle: float) -> None:
     rng, target = np.random.default_rng(0), pin.SE3.Random()
     for _ in range(20):
@@ -54,28 +72,45 @@ def test_it_is_the_distance_and_the_chord_of_the_angle_about_the_axis(angle: flo
         np.testing.assert_allclose(found[:3], shift, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(found[3:], 2 * np.sin(angle / 2) * axis, rtol=0.0, atol=1e-9)
         log = pin.log3(target.rotation.T @ placement.rotation)
-        assert np.linalg.norm(found[3:]) == pytest.approx(2 * np.sin(np.linalg.norm(log) / 2), abs=1e-9)
+        assert np.linalg.norm(found[3:]) == pytest.approx(
+            2 * np.sin(np.linalg.norm(log) / 2), abs=1e-9
+        )
         if angle > 1e-6:
-            np.testing.assert_allclose(found[3:] / np.linalg.norm(found[3:]), log / np.linalg.norm(log), atol=1e-6)
+            np.testing.assert_allclose(
+                found[3:] / np.linalg.norm(found[3:]), log / np.linalg.norm(log), atol=1e-6
+            )
 
 
 def test_it_grows_with_the_angle_up_to_half_a_turn() -> None:
     target, axis = pin.SE3.Random(), random_axis(np.random.default_rng(1))
-    norms = [np.linalg.norm(residual(turned(target, angle, axis), target)[3:]) for angle in np.linspace(0.0, np.pi - 2e-3, 400)]
+    norms = [
+        np.linalg.norm(residual(turned(target, angle, axis), target)[3:])
+        for angle in np.linspace(0.0, np.pi - 2e-3, 400)
+    ]
     assert np.all(np.diff(norms) > 0)
     assert norms[-1] == pytest.approx(2.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("away", [0.0, 1e-12, 1e-9, 1e-6, 1e-5, 3e-5, 1e-4, 5e-4, 1e-3, 2e-3])
-@pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3), None], ids=["x", "y", "z", "-x", "-y", "-z", "random"])
+@pytest.mark.parametrize(
+    "axis", [*np.eye(3), *-np.eye(3), None], ids=["x", "y", "z", "-x", "-y", "-z", "random"]
+)
 def test_half_a_turn_is_no_solution(away: float, axis: np.ndarray | None) -> None:
     """½ vee(E − Eᵀ) vanishes there: a planner built on it converged to a pose turned half round."""
     rng = np.random.default_rng(2)
     for sign in (-1.0, 1.0):
         about = random_axis(rng) if axis is None else axis
-        placement, target = turned(pin.SE3.Identity(), np.pi + sign * away, about), pin.SE3.Identity()
+        placement, target = (
+            turned(pin.SE3.Identity(), np.pi + sign * away, about),
+            pin.SE3.Identity(),
+        )
         error = placement.rotation
-        naive = np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]) / 2
+        naive = (
+            np.array(
+                [error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]
+            )
+            / 2
+        )
         assert np.linalg.norm(naive) < 3e-3
         assert np.linalg.norm(residual(placement, target)[3:]) > (0.1 if axis is None else 0.5)
 
@@ -86,7 +121,9 @@ def test_within_a_thousandth_of_half_a_turn_it_is_twice_the_axis() -> None:
         for angle in (np.pi, np.pi - 5e-4):
             target = pin.SE3.Random()
             found = residual(turned(target, angle, axis), target)[3:]
-            np.testing.assert_allclose(found * np.sign(found @ axis), 2.0 * axis, rtol=0.0, atol=0.02)
+            np.testing.assert_allclose(
+                found * np.sign(found @ axis), 2.0 * axis, rtol=0.0, atol=0.02
+            )
 
 
 @pytest.mark.parametrize("axis", np.eye(3), ids="xyz")
@@ -106,19 +143,27 @@ def test_newton_steps_lead_away_from_half_a_turn(axis: np.ndarray) -> None:
 def test_its_slope_is_that_of_finite_differences(angle: float) -> None:
     rng, target = np.random.default_rng(3), pin.SE3.Random()
     placement = turned(target, angle, random_axis(rng))
-    slope = np.asarray(SLOPE(placement.rotation, placement.translation, target_vector(target), np.zeros(3)))
+    slope = np.asarray(
+        SLOPE(placement.rotation, placement.translation, target_vector(target), np.zeros(3))
+    )
     for k in range(3):
         change = 1e-5 * np.eye(3)[k]
-        ahead, behind = (residual(placement * pin.SE3(pin.exp3(s * change), np.zeros(3)), target) for s in (1.0, -1.0))
+        ahead, behind = (
+            residual(placement * pin.SE3(pin.exp3(s * change), np.zeros(3)), target)
+            for s in (1.0, -1.0)
+        )
         np.testing.assert_allclose(slope[:, k], (ahead - behind) / 2e-5, rtol=0.0, atol=1e-7)
 
 
-# --- rows of the program --------------------------------------------------------------------------------------------
+# --- rows of the program
+# --------------------------------------------------------------------------------------------
 
 
 def missing(placement: pin.SE3, target: pin.SE3) -> float:
     """Return by how much the worst row is outside its bounds."""
-    value = np.asarray(ROWS(placement.rotation, placement.translation, target_vector(target))).ravel()
+    value = np.asarray(
+        ROWS(placement.rotation, placement.translation, target_vector(target))
+    ).ravel()
     assert value.shape == POSE_LOWER.shape == POSE_UPPER.shape
     return float(np.maximum(POSE_LOWER - value, value - POSE_UPPER).max())
 
@@ -131,7 +176,9 @@ def test_rows_hold_at_the_target_and_nowhere_else(angle: float) -> None:
         if angle == 0.0:
             assert missing(placement, target) < 1e-12
         elif angle < np.pi / 2:  # every row of the vector is bound from both sides
-            vector = np.asarray(ROWS(placement.rotation, placement.translation, target_vector(target))).ravel()[3:6]
+            vector = np.asarray(
+                ROWS(placement.rotation, placement.translation, target_vector(target))
+            ).ravel()[3:6]
             assert np.abs(vector).max() >= np.sin(angle) / np.sqrt(3) - 1e-9
         else:
             assert missing(placement, target) >= -2.0 * np.cos(angle) - 1e-9  # the trace
@@ -146,31 +193,47 @@ def test_rows_are_position_half_vee_and_trace() -> None:
         placement = turned(target, angle, axis)
         placement.translation = target.translation + shift
         expected = np.r_[shift, np.sin(angle) * axis, 1.0 + 2.0 * np.cos(angle)]
-        found = np.asarray(ROWS(placement.rotation, placement.translation, target_vector(target))).ravel()
+        found = np.asarray(
+            ROWS(placement.rotation, placement.translation, target_vector(target))
+        ).ravel()
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
 
 
 def test_rows_are_linear_in_the_placement() -> None:
     """So that they cost the program nothing in second derivatives."""
     everything = ca.vertcat(ca.vec(_R), _p)
-    assert ca.jacobian(ca.jacobian(pose_rows("pose", _R, _p, _target), everything), everything).nnz() == 0
+    assert (
+        ca.jacobian(ca.jacobian(pose_rows("pose", _R, _p, _target), everything), everything).nnz()
+        == 0
+    )
 
 
-# --- points, and what stands upright ----------------------------------------------------------------------------------
+# --- points, and what stands upright
+# ----------------------------------------------------------------------------------
 
 KINDS = ("pose", "point", "upright", "level")
-RESIDUALS = {kind: ca.Function("residual", [_R, _p, _target], [pose_residual(kind, _R, _p, _target)]) for kind in KINDS}
-ALL_ROWS = {kind: ca.Function("rows", [_R, _p, _target], [pose_rows(kind, _R, _p, _target)]) for kind in KINDS}
+RESIDUALS = {
+    kind: ca.Function("residual", [_R, _p, _target], [pose_residual(kind, _R, _p, _target)])
+    for kind in KINDS
+}
+ALL_ROWS = {
+    kind: ca.Function("rows", [_R, _p, _target], [pose_rows(kind, _R, _p, _target)])
+    for kind in KINDS
+}
 SLOPES = {
     kind: ca.Function(
-        "slope", [_R, _p, _target, _turn], [ca.jacobian(pose_residual(kind, _turned, _p, _target), ca.vertcat(_p, _turn))]
+        "slope",
+        [_R, _p, _target, _turn],
+        [ca.jacobian(pose_residual(kind, _turned, _p, _target), ca.vertcat(_p, _turn))],
     )
     for kind in KINDS
 }
 
 
 def value(function: ca.Function, placement: pin.SE3, target: pin.SE3) -> np.ndarray:
-    return np.asarray(function(placement.rotation, placement.translation, target_vector(target))).ravel()
+    return np.asarray(
+        function(placement.rotation, placement.translation, target_vector(target))
+    ).ravel()
 
 
 def outside(kind: str, placement: pin.SE3, target: pin.SE3) -> float:
@@ -191,8 +254,12 @@ def tilted(target: pin.SE3, heading: float, tilt: float, about: float) -> pin.SE
 @pytest.mark.parametrize("kind", ["point", "upright", "level"])
 def test_shapes(kind: str) -> None:
     placement = pin.SE3.Random()
-    assert value(RESIDUALS[kind], placement, placement).shape == ({"point": 3, "upright": 5, "level": 2}[kind],)
-    assert value(ALL_ROWS[kind], placement, placement).shape == ({"point": 3, "upright": 6, "level": 3}[kind],)
+    assert value(RESIDUALS[kind], placement, placement).shape == (
+        {"point": 3, "upright": 5, "level": 2}[kind],
+    )
+    assert value(ALL_ROWS[kind], placement, placement).shape == (
+        {"point": 3, "upright": 6, "level": 3}[kind],
+    )
     assert set(ROW_BOUNDS) == set(KINDS)
 
 
@@ -209,7 +276,9 @@ def test_a_point_is_reached_at_any_orientation() -> None:
         assert outside("point", there, target) > 1e-3 / np.sqrt(3) - 1e-12
 
 
-@pytest.mark.parametrize("tilt", [0.0, 1e-7, 1e-3, 0.5, np.pi / 2, 2.5, 3.0, np.pi - 0.01, np.pi - 2e-3])
+@pytest.mark.parametrize(
+    "tilt", [0.0, 1e-7, 1e-3, 0.5, np.pi / 2, 2.5, 3.0, np.pi - 0.01, np.pi - 2e-3]
+)
 def test_upright_is_the_distance_and_the_chord_of_the_tilt(tilt: float) -> None:
     """Whatever the heading. The tilt is the angle between the body's vertical and the world's."""
     rng = np.random.default_rng(7)
@@ -217,8 +286,12 @@ def test_upright_is_the_distance_and_the_chord_of_the_tilt(tilt: float) -> None:
         target, shift = pin.SE3.Random(), rng.normal(size=3)
         placement = tilted(target, rng.uniform(-np.pi, np.pi), tilt, rng.uniform(-np.pi, np.pi))
         placement.translation = target.translation + shift
-        vertical = target.rotation.T @ np.array([0.0, 0.0, 1.0])  # in the body, when it stands as the target does
-        assert np.arccos(np.clip((placement.rotation @ vertical)[2], -1.0, 1.0)) == pytest.approx(tilt, abs=1e-6)
+        vertical = target.rotation.T @ np.array(
+            [0.0, 0.0, 1.0]
+        )  # in the body, when it stands as the target does
+        assert np.arccos(np.clip((placement.rotation @ vertical)[2], -1.0, 1.0)) == pytest.approx(
+            tilt, abs=1e-6
+        )
         found = value(RESIDUALS["upright"], placement, target)
         np.testing.assert_allclose(found[:3], shift, rtol=0.0, atol=1e-12)
         assert np.linalg.norm(found[3:]) == pytest.approx(2 * np.sin(tilt / 2), abs=1e-8)
@@ -242,7 +315,9 @@ def test_residual_and_rows_vanish_if_and_only_if_the_goal_holds(kind: str, off: 
             placement = tilted(target, rng.uniform(-np.pi, np.pi), off, rng.uniform(-np.pi, np.pi))
             placement.translation += (kind == "level") * rng.normal(size=3)
         else:
-            placement = pin.SE3(pin.SE3.Random().rotation, target.translation + off * random_axis(rng))
+            placement = pin.SE3(
+                pin.SE3.Random().rotation, target.translation + off * random_axis(rng)
+            )
         size = np.linalg.norm(value(RESIDUALS[kind], placement, target))
         if off == 0.0:
             assert size < 1e-9
@@ -269,7 +344,9 @@ def test_newton_steps_set_upright_what_stands_on_its_head(about: float) -> None:
     for _ in range(15):
         at = (placement.rotation, placement.translation, target_vector(target))
         slope = np.asarray(SLOPES["upright"](*at, np.zeros(3)))[3:, 3:]
-        step = -np.linalg.lstsq(slope, value(RESIDUALS["upright"], placement, target)[3:], rcond=1e-6)[0]
+        step = -np.linalg.lstsq(
+            slope, value(RESIDUALS["upright"], placement, target)[3:], rcond=1e-6
+        )[0]
         step *= min(1.0, 0.5 / max(np.linalg.norm(step), 1e-12))
         placement = placement * pin.SE3(pin.exp3(step), np.zeros(3))
     assert np.linalg.norm(value(RESIDUALS["upright"], placement, target)) < 1e-9
@@ -282,21 +359,31 @@ def test_slopes_of_every_kind_are_those_of_finite_differences(kind: str, tilt: f
     rng, target = np.random.default_rng(9), pin.SE3.Random()
     placement = tilted(target, 0.6, tilt, 0.9)
     placement.translation = target.translation + rng.normal(size=3)
-    slope = np.asarray(SLOPES[kind](placement.rotation, placement.translation, target_vector(target), np.zeros(3)))
+    slope = np.asarray(
+        SLOPES[kind](placement.rotation, placement.translation, target_vector(target), np.zeros(3))
+    )
     for k in range(6):
         change = 1e-5 * np.eye(6)[k]
 
         def beside(sign: float, change: np.ndarray = change) -> np.ndarray:
-            there = pin.SE3(placement.rotation @ pin.exp3(sign * change[3:]), placement.translation + sign * change[:3])
+            there = pin.SE3(
+                placement.rotation @ pin.exp3(sign * change[3:]),
+                placement.translation + sign * change[:3],
+            )
             return value(RESIDUALS[kind], there, target)
 
-        np.testing.assert_allclose(slope[:, k], (beside(1.0) - beside(-1.0)) / 2e-5, rtol=0.0, atol=1e-7)
+        np.testing.assert_allclose(
+            slope[:, k], (beside(1.0) - beside(-1.0)) / 2e-5, rtol=0.0, atol=1e-7
+        )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_rows_of_every_kind_are_linear_in_the_placement(kind: str) -> None:
     everything = ca.vertcat(ca.vec(_R), _p)
-    assert ca.jacobian(ca.jacobian(pose_rows(kind, _R, _p, _target), everything), everything).nnz() == 0
+    assert (
+        ca.jacobian(ca.jacobian(pose_rows(kind, _R, _p, _target), everything), everything).nnz()
+        == 0
+    )
 
 
 def test_what_is_bound_to_a_value_and_what_only_from_below() -> None:
@@ -309,11 +396,26 @@ def test_what_is_bound_to_a_value_and_what_only_from_below() -> None:
         assert len(lower) == fixed + (kind != "point")
 
 
-# --- targets that recede ------------------------------------------------------------------------------------------------
+# --- targets that recede
+# ------------------------------------------------------------------------------------------------
 
 _away, _share = ca.SX.sym("D", AWAY), ca.SX.sym("e")
 RECEDED = ca.Function("receded", [_target, _away, _share], [receded(_target, _away, _share)])
-TURNS = [0.0, 1e-9, 1e-6, 1e-3, 0.5, np.pi / 2, 2.5, np.pi - 0.01, np.pi - 1e-3, np.pi - 1e-4, np.pi - 1e-6, np.pi - 1e-9, np.pi]
+TURNS = [
+    0.0,
+    1e-9,
+    1e-6,
+    1e-3,
+    0.5,
+    np.pi / 2,
+    2.5,
+    np.pi - 0.01,
+    np.pi - 1e-3,
+    np.pi - 1e-4,
+    np.pi - 1e-6,
+    np.pi - 1e-9,
+    np.pi,
+]
 SHARES = [0.0, 1e-3, 0.25, 0.5, 0.9, 1.0]
 
 
@@ -330,7 +432,9 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def away_of(kind: str, target: pin.SE3, *placements: pin.SE3) -> np.ndarray:
-    rotations, translations = (np.array([getattr(p, part) for p in placements]) for part in ("rotation", "translation"))
+    rotations, translations = (
+        np.array([getattr(p, part) for p in placements]) for part in ("rotation", "translation")
+    )
     found = away_from(kind, rotations, translations, target)
     assert found.shape == (len(placements), AWAY)
     assert np.isfinite(found).all()
@@ -355,9 +459,13 @@ def some_placement(kind: str, target: pin.SE3, angle: float, rng: np.random.Gene
     return pin.SE3(placement.rotation, target.translation + rng.normal(size=3))
 
 
-@pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3), None], ids=["x", "y", "z", "-x", "-y", "-z", "random"])
+@pytest.mark.parametrize(
+    "axis", [*np.eye(3), *-np.eye(3), None], ids=["x", "y", "z", "-x", "-y", "-z", "random"]
+)
 @pytest.mark.parametrize("angle", TURNS)
-def test_how_far_a_pose_is_away_is_its_offset_and_its_logarithm(angle: float, axis: np.ndarray | None) -> None:
+def test_how_far_a_pose_is_away_is_its_offset_and_its_logarithm(
+    angle: float, axis: np.ndarray | None
+) -> None:
     rng, target = np.random.default_rng(10), pin.SE3.Random()
     for _ in range(10):
         about, shift = random_axis(rng) if axis is None else axis, rng.normal(size=3)
@@ -369,7 +477,12 @@ def test_how_far_a_pose_is_away_is_its_offset_and_its_logarithm(angle: float, ax
         log = pin.log3(target.rotation.T @ placement.rotation)
         if angle < np.pi - 1e-3:
             np.testing.assert_allclose(found[6] * found[3:6], log, rtol=0.0, atol=1e-8)
-        np.testing.assert_allclose(pin.exp3(found[6] * found[3:6]), target.rotation.T @ placement.rotation, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            pin.exp3(found[6] * found[3:6]),
+            target.rotation.T @ placement.rotation,
+            rtol=0.0,
+            atol=1e-9,
+        )
 
 
 @pytest.mark.parametrize("angle", TURNS)
@@ -380,18 +493,24 @@ def test_how_far_something_upright_is_away_is_its_offset_and_its_tilt(angle: flo
         target = pin.SE3.Random()
         placement = some_placement("upright", target, angle, rng)
         (found,) = away_of("upright", target, placement)
-        np.testing.assert_allclose(found[:3], placement.translation - target.translation, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(
+            found[:3], placement.translation - target.translation, rtol=0.0, atol=1e-12
+        )
         assert found[6] == pytest.approx(angle, abs=1e-9)
         if angle > 1e-6:  # where it is all but upright the axis is anything
             assert (target.rotation @ found[3:6])[2] == pytest.approx(0.0, abs=1e-9)
         back = target.rotation @ pin.exp3(found[6] * found[3:6])  # the frame, but for its heading
-        np.testing.assert_allclose(back.T @ vertical, placement.rotation.T @ vertical, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            back.T @ vertical, placement.rotation.T @ vertical, rtol=0.0, atol=1e-9
+        )
 
 
 def test_how_far_a_point_is_away_is_its_offset() -> None:
     target, placements = pin.SE3.Random(), [pin.SE3.Random() for _ in range(5)]
     found = away_of("point", target, *placements)
-    np.testing.assert_allclose(found[:, :3], [p.translation - target.translation for p in placements], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(
+        found[:, :3], [p.translation - target.translation for p in placements], rtol=0.0, atol=1e-15
+    )
     np.testing.assert_array_equal(found[:, 6], np.zeros(5))
 
 
@@ -402,7 +521,10 @@ def test_how_far_many_are_away_is_how_far_each_is(kind: str) -> None:
     each = np.array([away_of(kind, target, placement)[0] for placement in placements])
     found = away_of(kind, target, *placements)
     np.testing.assert_allclose(found[:, [0, 1, 2, 6]], each[:, [0, 1, 2, 6]], rtol=0.0, atol=1e-12)
-    axes, axis = np.sin(found[:, 6:]) * found[:, 3:6], np.sin(each[:, 6:]) * each[:, 3:6]  # at 0 and π there may be any
+    axes, axis = (
+        np.sin(found[:, 6:]) * found[:, 3:6],
+        np.sin(each[:, 6:]) * each[:, 3:6],
+    )  # at 0 and π there may be any
     np.testing.assert_allclose(axes, axis, rtol=0.0, atol=1e-12)
     assert away_from(kind, np.zeros((0, 3, 3)), np.zeros((0, 3)), target).shape == (0, AWAY)
 
@@ -414,8 +536,13 @@ def test_how_far_they_are_away_agrees_with_the_residual(kind: str, angle: float)
     for _ in range(10):
         target = pin.SE3.Random()
         placement = some_placement(kind, target, angle, rng)
-        (found,), residual = away_of(kind, target, placement), value(RESIDUALS[kind], placement, target)
-        offset, turn = ([0.0, 0.0, 0.0], residual) if kind == "level" else (residual[:3], residual[3:])
+        (found,), residual = (
+            away_of(kind, target, placement),
+            value(RESIDUALS[kind], placement, target),
+        )
+        offset, turn = (
+            ([0.0, 0.0, 0.0], residual) if kind == "level" else (residual[:3], residual[3:])
+        )
         np.testing.assert_allclose(found[:3], offset, rtol=0.0, atol=1e-12)
         size = 0.0 if kind == "point" else np.linalg.norm(turn)
         assert 2.0 * np.sin(found[6] / 2.0) == pytest.approx(size, abs=1e-8)
@@ -423,7 +550,9 @@ def test_how_far_they_are_away_agrees_with_the_residual(kind: str, angle: float)
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("angle", TURNS)
-def test_a_target_that_is_all_the_way_back_holds_where_the_frame_is(kind: str, angle: float) -> None:
+def test_a_target_that_is_all_the_way_back_holds_where_the_frame_is(
+    kind: str, angle: float
+) -> None:
     rng, vertical = np.random.default_rng(14), np.array([0.0, 0.0, 1.0])
     for _ in range(10):
         target = pin.SE3.Random()
@@ -435,7 +564,9 @@ def test_a_target_that_is_all_the_way_back_holds_where_the_frame_is(kind: str, a
         if kind == "pose":
             np.testing.assert_allclose(back.rotation, placement.rotation, rtol=0.0, atol=1e-9)
         elif kind in ("upright", "level"):
-            np.testing.assert_allclose(back.rotation.T @ vertical, placement.rotation.T @ vertical, rtol=0.0, atol=1e-9)
+            np.testing.assert_allclose(
+                back.rotation.T @ vertical, placement.rotation.T @ vertical, rtol=0.0, atol=1e-9
+            )
         else:
             np.testing.assert_allclose(back.rotation, target.rotation, rtol=0.0, atol=1e-12)
         assert outside(kind, placement, back) < 1e-9
@@ -457,12 +588,20 @@ def test_on_the_way_a_target_goes_straight_and_turns_evenly(kind: str, angle: fl
         for share, there in zip(SHARES, way, strict=True):
             expected = (1.0 - share) * target.translation + share * placement.translation
             np.testing.assert_allclose(there.translation, expected, rtol=0.0, atol=1e-12)
-            np.testing.assert_allclose(there.rotation.T @ there.rotation, np.eye(3), rtol=0.0, atol=1e-12)
+            np.testing.assert_allclose(
+                there.rotation.T @ there.rotation, np.eye(3), rtol=0.0, atol=1e-12
+            )
             assert np.linalg.det(there.rotation) > 0.0
-            assert angle_between(target.rotation, there.rotation) == pytest.approx(share * angle, abs=1e-9)
-            assert angle_between(there.rotation, way[-1].rotation) == pytest.approx((1.0 - share) * angle, abs=1e-9)
+            assert angle_between(target.rotation, there.rotation) == pytest.approx(
+                share * angle, abs=1e-9
+            )
+            assert angle_between(there.rotation, way[-1].rotation) == pytest.approx(
+                (1.0 - share) * angle, abs=1e-9
+            )
         if angle < np.pi - 1e-3 and kind == "pose":
-            halfway = target.rotation @ pin.exp3(0.5 * pin.log3(target.rotation.T @ placement.rotation))
+            halfway = target.rotation @ pin.exp3(
+                0.5 * pin.log3(target.rotation.T @ placement.rotation)
+            )
             np.testing.assert_allclose(way[3].rotation, halfway, rtol=0.0, atol=1e-8)
 
 
@@ -472,18 +611,24 @@ def test_slopes_of_rows_with_a_target_that_recedes(kind: str, angle: float) -> N
     """By finite differences of the share; a half turn is no worse than any other."""
     rng, target = np.random.default_rng(16), pin.SE3.Random()
     rows = pose_rows(kind, _R, _p, receded(_target, _away, _share))
-    function = ca.Function("rows", [_R, _p, _target, _away, _share], [rows, ca.jacobian(rows, _share)])
+    function = ca.Function(
+        "rows", [_R, _p, _target, _away, _share], [rows, ca.jacobian(rows, _share)]
+    )
     placement = some_placement(kind, target, angle, rng)
     (away,) = away_of(kind, target, placement)
     for share in SHARES:
         given = (placement.rotation, placement.translation, target_vector(target), away)
         slope = np.asarray(function(*given, share)[1]).ravel()
-        ahead, behind = (np.asarray(function(*given, share + sign * 1e-5)[0]).ravel() for sign in (1.0, -1.0))
+        ahead, behind = (
+            np.asarray(function(*given, share + sign * 1e-5)[0]).ravel() for sign in (1.0, -1.0)
+        )
         np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("shift", [None, (2, (0.1, -0.2, 0.3))], ids=["plain", "shifted"])
-def test_frames_are_placed_in_numbers_as_in_symbols(shift: tuple[int, tuple[float, float, float]] | None) -> None:
+def test_frames_are_placed_in_numbers_as_in_symbols(
+    shift: tuple[int, tuple[float, float, float]] | None,
+) -> None:
     row = PoseRow(3, pin.SE3.Random(), (1,), "pose", shift)
     joints = [[pin.SE3.Identity(), *(pin.SE3.Random() for _ in range(4))] for _ in range(6)]
     found = row.placed(
@@ -492,18 +637,24 @@ def test_frames_are_placed_in_numbers_as_in_symbols(shift: tuple[int, tuple[floa
     )
     assert [part.shape for part in found] == [(6, 3, 3), (6, 3)]
     for k, each in enumerate(joints):
-        rotation, translation = row.placement(ca.DM(np.column_stack([target_vector(joint) for joint in each[1:]])))
+        rotation, translation = row.placement(
+            ca.DM(np.column_stack([target_vector(joint) for joint in each[1:]]))
+        )
         expected = each[3] * row.local
         offset = np.zeros(3) if shift is None else each[shift[0]].rotation @ np.array(shift[1])
         np.testing.assert_allclose(found[0][k], expected.rotation, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(found[1][k], expected.translation + offset, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(np.asarray(rotation), found[0][k], rtol=0.0, atol=1e-12)
-        np.testing.assert_allclose(np.asarray(translation).ravel(), found[1][k], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(
+            np.asarray(translation).ravel(), found[1][k], rtol=0.0, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("kind", ["upright", "level"])
 @pytest.mark.parametrize("heading", [0.0, 1.0])
-def test_what_is_upright_has_nothing_to_turn_and_what_stands_on_its_head_half_a_turn(kind: str, heading: float) -> None:
+def test_what_is_upright_has_nothing_to_turn_and_what_stands_on_its_head_half_a_turn(
+    kind: str, heading: float
+) -> None:
     target = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, heading), np.zeros(3))
     rotations = np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])])
     found = away_from(kind, rotations, np.zeros((2, 3)), target)

@@ -26,11 +26,22 @@ def test_nothing_is_wrong_with_the_demo() -> None:
 def test_goals_beyond_limits_of_every_kind() -> None:
     drawer = problem(vkc.load_scene("drawer"), vkc.Actuate("drawer", {"slide": 0.6}))
     (violation,) = impossible(drawer)
-    assert (violation.constraint, violation.subject, violation.unit) == ("goal", "drawer.slide", "m")
+    assert (violation.constraint, violation.subject, violation.unit) == (
+        "goal",
+        "drawer.slide",
+        "m",
+    )
     assert violation.amount == pytest.approx(0.2)
     assert violation.waypoint == drawer.segments
-    first, second = impossible(problem(door_scene(), vkc.Actuate("door", {"hinge": -2.0}), vkc.GoTo(0.0, 3.0)))
-    assert (first.subject, first.unit, second.subject, second.unit) == ("door.hinge", "rad", "base_y", "m")
+    first, second = impossible(
+        problem(door_scene(), vkc.Actuate("door", {"hinge": -2.0}), vkc.GoTo(0.0, 3.0))
+    )
+    assert (first.subject, first.unit, second.subject, second.unit) == (
+        "door.hinge",
+        "rad",
+        "base_y",
+        "m",
+    )
     assert (first.amount, second.amount) == (pytest.approx(0.43), pytest.approx(0.9))
     assert first.waypoint < second.waypoint
 
@@ -44,14 +55,19 @@ def test_a_goal_at_the_limit_is_fine() -> None:
 def test_a_start_that_touches() -> None:
     scene = hall(obstacles=[{**CRATE, "position": [0.7, 0.0, 0.2]}])
     (violation, *_) = impossible(problem(scene, vkc.GoTo(-1.0, 0.0)))
-    assert (violation.constraint, violation.subject, violation.waypoint) == ("start", "base_link – crate", 0)
+    assert (violation.constraint, violation.subject, violation.waypoint) == (
+        "start",
+        "base_link – crate",
+        0,
+    )
     assert violation.amount == pytest.approx(0.495 + 0.3 - 0.7, abs=1e-6)
 
 
 def test_links_in_pieces_are_told_once() -> None:
     """The deepest of their pairs; here many pieces of the base stand in two blocks of one URDF."""
     wall = "".join(
-        f'<collision><origin xyz="0 {y} 0.4"/><geometry><box size="0.2 0.5 0.8"/></geometry></collision>' for y in (0, 0.3)
+        f'<collision><origin xyz="0 {y} 0.4"/><geometry><box size="0.2 0.5 0.8"/></geometry></collision>'
+        for y in (0, 0.3)
     )
     urdf = f'<robot name="wall"><link name="wall">{wall}</link></robot>'
     item = {"name": "wall", "type": {"urdf": urdf, "attachments": []}, "position": [0.4, 0.0, 0.0]}
@@ -67,7 +83,9 @@ def test_what_the_hand_holds_at_the_start_may_lie_on_something(gap: float) -> No
     down = reaching(tool_at(STICK), above(STICK))
     held = room(table(gap=gap)).with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
     assert impossible(problem(held, vkc.GoTo(0.0, 1.0))) == []
-    inside = box("table", [0.5, 2.4, 0.02], [0.8, 0.0, TOP - 0.01 + 0.002])  # the arm, which holds nothing there, in a block
+    inside = box(
+        "table", [0.5, 2.4, 0.02], [0.8, 0.0, TOP - 0.01 + 0.002]
+    )  # the arm, which holds nothing there, in a block
     block = room(inside, box("block", [0.2, 0.2, 0.2], [float(down[0]), float(down[1]), 0.3]))
     start = block.with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
     assert {v.constraint for v in impossible(problem(start, vkc.GoTo(0.0, 1.0)))} == {"start"}

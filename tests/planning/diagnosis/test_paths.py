@@ -11,12 +11,23 @@ from vkc_pin.benchmarks.problems.impossible import KINDS
 from vkc_pin.planning.diagnosis.paths import ways
 from vkc_pin.validation.report import Report, Violation
 
-HIT = Report((Violation("penetration", "forearm_link – beam", waypoint=3, amount=0.1, unit="m", detail="overlap"),))
+HIT = Report(
+    (
+        Violation(
+            "penetration", "forearm_link – beam", waypoint=3, amount=0.1, unit="m", detail="overlap"
+        ),
+    )
+)
 
 
 def across(bottom: float, *, report: Report = HIT, blocked: tuple[str, ...] = ()) -> list[str]:
     """Return what is said of a drive under a beam."""
-    beam = {"name": "beam", "type": "box", "size": [0.2, 14.0, 1.5], "position": [1.8, 0.0, bottom + 0.75]}
+    beam = {
+        "name": "beam",
+        "type": "box",
+        "size": [0.2, 14.0, 1.5],
+        "position": [1.8, 0.0, bottom + 0.75],
+    }
     own = program_of(hall(obstacles=[beam]), [vkc.GoTo(3.6, 0.0, 0.0)], options=SHORT)
     z = np.linspace(own.start, own.start + np.eye(len(own.start))[0] * 3.6, own.segments + 1)[1:]
     return ways(own, z, report, blocked, 0).lines
@@ -24,28 +35,40 @@ def across(bottom: float, *, report: Report = HIT, blocked: tuple[str, ...] = ()
 
 def test_no_way_even_with_the_arm_folded() -> None:
     (line,) = across(0.5)
-    assert line == "go to: found no way for the base from (0.00, 0.00) to (3.60, 0.00), and none with the arm folded"
+    assert (
+        line
+        == "go to: found no way for the base from (0.00, 0.00) to (3.60, 0.00), and none with the arm folded"
+    )
 
 
 def test_a_way_for_the_base_but_none_for_the_arm() -> None:
     (line,) = across(2.0)
-    assert line == "go to: found a way for the base from (0.00, 0.00) to (3.60, 0.00), but none for the arm at the goal"
+    assert (
+        line
+        == "go to: found a way for the base from (0.00, 0.00) to (3.60, 0.00), but none for the arm at the goal"
+    )
 
 
 def test_what_hits_nothing_is_not_asked_about() -> None:
     assert across(0.5, report=Report()) == []
-    assert across(2.0, report=Report(), blocked=("go to: found no way for the base from here to there",)) == [
-        "go to: found no way for the base from here to there"
-    ]
+    assert across(
+        2.0, report=Report(), blocked=("go to: found no way for the base from here to there",)
+    ) == ["go to: found no way for the base from here to there"]
 
 
 def test_a_door_that_is_pushed_from_the_far_side_and_leaves_no_room_to_get_there() -> None:
     """Open by 1.2 rad the narrow door leaves too little room; every grasp that is found is behind it."""
     scene = vkc.load_scene("household").with_state("door", {"hinge": 1.2})
-    plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 0.0}, "push_back")], options=vkc.Options(max_restarts=1))
+    plan = vkc.plan(
+        scene,
+        [vkc.Actuate("door", {"hinge": 0.0}, "push_back")],
+        options=vkc.Options(max_restarts=1),
+    )
     assert plan.status == "infeasible"
     (note,) = plan.validation.notes
-    assert note.startswith("reach door.push_back: found no way for the base from (1.50, -1.00) to any of ")
+    assert note.startswith(
+        "reach door.push_back: found no way for the base from (1.50, -1.00) to any of "
+    )
     assert note.endswith(" places from which the goal was reached, and none with the arm folded")
     wide = scene.with_state("door", {"hinge": 1.52})
     assert vkc.plan(wide, [vkc.Grasp("door", "push_back")]).success
@@ -58,8 +81,17 @@ def test_no_way_later_on_says_nothing_of_the_whole() -> None:
     for steps, cut_off in (([two], True), ([one, two], False)):
         own = program_of(hall(obstacles=[beam]), steps, options=SHORT)
         z = np.tile(own.start, (own.segments, 1))
-        z[:, 0] = np.interp(np.arange(own.segments) + 1.0, [0, *own.ends], [0.0, 0.5, 3.6][-1 - len(own.ends) :])
-        hit = Violation("penetration", "forearm_link – beam", waypoint=own.segments, amount=0.1, unit="m", detail="overlap")
+        z[:, 0] = np.interp(
+            np.arange(own.segments) + 1.0, [0, *own.ends], [0.0, 0.5, 3.6][-1 - len(own.ends) :]
+        )
+        hit = Violation(
+            "penetration",
+            "forearm_link – beam",
+            waypoint=own.segments,
+            amount=0.1,
+            unit="m",
+            detail="overlap",
+        )
         found = ways(own, z, Report((hit,)), (), 0)
         assert found.cut_off == cut_off
         assert "and none with the arm folded" in found.lines[-1]

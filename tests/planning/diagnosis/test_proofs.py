@@ -20,7 +20,13 @@ FAR = vkc.Reach((4.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0))
 
 
 def box(name: str, size: Sequence[float], at: Sequence[float], yaw: float = 0.0) -> dict[str, Any]:
-    return {"name": name, "type": "box", "size": list(size), "position": list(at), "rpy": [0.0, 0.0, yaw]}
+    return {
+        "name": name,
+        "type": "box",
+        "size": list(size),
+        "position": list(at),
+        "rpy": [0.0, 0.0, yaw],
+    }
 
 
 def problem(obstacles: Sequence[dict[str, Any]], *steps: Any) -> vkc.TrajectoryProblem:
@@ -29,20 +35,30 @@ def problem(obstacles: Sequence[dict[str, Any]], *steps: Any) -> vkc.TrajectoryP
 
 def gap(width: float) -> list[dict[str, Any]]:
     length = 6.0 - width / 2
-    return [box(name, (0.1, length, 1.0), (1.2, side * (width + length) / 2, 0.5)) for name, side in (("left", 1), ("right", -1))]
+    return [
+        box(name, (0.1, length, 1.0), (1.2, side * (width + length) / 2, 0.5))
+        for name, side in (("left", 1), ("right", -1))
+    ]
 
 
 def ring(x: float, y: float, half: float = 1.0) -> list[dict[str, Any]]:
     sides = {"north": (0, 1), "south": (0, -1), "east": (1, 0), "west": (-1, 0)}
     return [
-        box(name, (0.1 if u else 2 * half, 0.1 if v else 2 * half, 1.0), (x + half * u, y + half * v, 0.5))
+        box(
+            name,
+            (0.1 if u else 2 * half, 0.1 if v else 2 * half, 1.0),
+            (x + half * u, y + half * v, 0.5),
+        )
         for name, (u, v) in sides.items()
     ]
 
 
 @pytest.mark.parametrize("step", [vkc.GoTo(3.0, 0.0), vkc.GoTo(3.0, 2.0, 1.0), FAR], ids=str)
 def test_a_closed_wall(step: Any) -> None:
-    clutter = [box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2)), box("shelf", (0.4, 2.0, 1.0), (5.0, 3.0, 0.5))]
+    clutter = [
+        box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2)),
+        box("shelf", (0.4, 2.0, 1.0), (5.0, 3.0, 0.5)),
+    ]
     (line,) = proofs(problem([box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5)), *clutter], step))
     assert "no way for the base, " + PROVEN in line
     assert line.endswith("cut off by fence")
@@ -67,12 +83,20 @@ def test_a_gap_through_which_the_base_fits_proves_nothing(width: float) -> None:
 
 def test_over_a_wall_that_the_arm_reaches_across() -> None:
     assert (
-        proofs(problem([box("fence", (0.1, 12.0, 0.6), (1.2, 0.0, 0.3))], vkc.Reach((1.8, 0.0, 1.0, 0.0, np.pi / 2, 0.0)))) == []
+        proofs(
+            problem(
+                [box("fence", (0.1, 12.0, 0.6), (1.2, 0.0, 0.3))],
+                vkc.Reach((1.8, 0.0, 1.0, 0.0, np.pi / 2, 0.0)),
+            )
+        )
+        == []
     )
 
 
 def test_a_wall_that_the_base_passes_under() -> None:
-    assert proofs(problem([box("beam", (0.1, 12.0, 0.3), (1.2, 0.0, 1.5))], vkc.GoTo(3.0, 0.0))) == []
+    assert (
+        proofs(problem([box("beam", (0.1, 12.0, 0.3), (1.2, 0.0, 1.5))], vkc.GoTo(3.0, 0.0))) == []
+    )
 
 
 @pytest.mark.parametrize("height", [0.42, 0.47])
@@ -80,7 +104,10 @@ def test_a_wall_that_the_base_passes_under_but_not_the_foot_of_the_arm(height: f
     beam = box("beam", (0.1, 13.0, 1.0), (1.2, 0.0, 0.5 + height))
     (line,) = proofs(problem([beam], vkc.GoTo(3.0, 0.0)))
     assert line.endswith("cut off by beam")
-    shorter = {**beam, "size": [0.1, 12.0, 1.0]}  # the base passes under it at the arena's edge, the foot beside it
+    shorter = {
+        **beam,
+        "size": [0.1, 12.0, 1.0],
+    }  # the base passes under it at the arena's edge, the foot beside it
     assert proofs(problem([shorter], vkc.GoTo(3.0, 0.0))) == []
 
 
@@ -95,7 +122,9 @@ def test_too_high() -> None:
     assert line.startswith("reach with tool: out of reach, " + PROVEN)
 
 
-@pytest.mark.parametrize("obstacles", [[], [box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2))]], ids=["empty", "crate"])
+@pytest.mark.parametrize(
+    "obstacles", [[], [box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2))]], ids=["empty", "crate"]
+)
 def test_outside_the_arena(obstacles: list[dict[str, Any]]) -> None:
     (line,) = proofs(problem(obstacles, vkc.Reach((8.0, 0.0, 0.8, np.pi / 2, 0.0, 0.0))))
     assert line.endswith("proven: the goal is in reach from outside the arena alone")
@@ -135,15 +164,23 @@ def test_where_a_path_was_found_nothing_is_proven(seed: int) -> None:
     z = own.start.copy()
     z[:3] = 0.0
     moving, standing = grid_shapes(own, 0, z)
-    grid = BaseGrid([shape for joint, shape in moving if joint <= 1], [], standing, own.scene.arena, 0.0)
+    grid = BaseGrid(
+        [shape for joint, shape in moving if joint <= 1], [], standing, own.scene.arena, 0.0
+    )
     goals = np.array([(x, y, yaw) for yaw in np.linspace(0.0, 2 * np.pi, 16, endpoint=False)])
     if shortest_path(grid, own.start[:3].tolist(), goals) is not None:
         assert proofs(own) == []
 
 
-@pytest.mark.parametrize("name", ["door", "drawer", "corridor_door", "aisle_drawer", "gap_table", "household", "fetch"])
+@pytest.mark.parametrize(
+    "name", ["door", "drawer", "corridor_door", "aisle_drawer", "gap_table", "household", "fetch"]
+)
 def test_nothing_is_proven_of_the_scenes_that_come_along(name: str) -> None:
     scene = vkc.load_scene(name)
-    fixed = [n for n, placed in scene.objects.items() if not placed.object.free and placed.object.attachments]
+    fixed = [
+        n
+        for n, placed in scene.objects.items()
+        if not placed.object.free and placed.object.attachments
+    ]
     for thing in fixed[:3]:
         assert proofs(program_of(scene, [vkc.Grasp(thing)], options=SHORT)) == []

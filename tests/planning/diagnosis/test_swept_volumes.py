@@ -43,10 +43,18 @@ def problem(
         box = {"name": "post", "type": "box", "size": list(size), "position": list(at)}
         document = {**document, "obstacles": [*document["obstacles"], box]}
     else:
-        document = {**document, "objects": [*document["objects"], {"name": "post", "type": object_type, "position": list(at)}]}
+        document = {
+            **document,
+            "objects": [
+                *document["objects"],
+                {"name": "post", "type": object_type, "position": list(at)},
+            ],
+        }
     scene = Scene.from_document({**document, "allow": list(allow)}, scene.folder)
     options = Options(reach_waypoints=4, turn_waypoints=3, move_waypoints=6)
-    return TrajectoryProblem(scene, compile_task(scene, [Actuate("door", {"hinge": hinge})], options), options)
+    return TrajectoryProblem(
+        scene, compile_task(scene, [Actuate("door", {"hinge": hinge})], options), options
+    )
 
 
 def test_what_stands_where_the_leaf_goes_is_named() -> None:
@@ -65,14 +73,18 @@ def test_what_stands_where_the_leaf_goes_is_named() -> None:
         (1.5, POST, 1.45),  # it begins beyond
     ],
 )
-def test_what_stands_elsewhere_proves_nothing(hinge: float, at: Sequence[float], state: float) -> None:
+def test_what_stands_elsewhere_proves_nothing(
+    hinge: float, at: Sequence[float], state: float
+) -> None:
     assert swept(problem(hinge, at, state=state)) == []
 
 
 def test_what_can_be_carried_away_proves_nothing() -> None:
     assert swept(problem(1.3, (3.2, 0.14, 0.4), object_type="ball")) == []
     assert swept(problem(1.3, (3.2, 0.14, 0.0), object_type="cabinet")) != []  # its case stays
-    assert swept(problem(1.3, (3.2, 0.14, 0.0), object_type={"urdf": BAR, "attachments": []})) == []  # it slides out of the way
+    assert (
+        swept(problem(1.3, (3.2, 0.14, 0.0), object_type={"urdf": BAR, "attachments": []})) == []
+    )  # it slides out of the way
 
 
 def around_the_hinge(angle: float, at: np.ndarray) -> np.ndarray:
@@ -97,19 +109,28 @@ def test_a_lever_that_may_be_turned_out_of_the_way_proves_nothing() -> None:
     bar = placed.link_placement("lever") * placed.object.attachments["handle"].placement
     there = around_the_hinge(0.1, bar.translation)  # the leaf turns away from it
     assert swept(problem(1.3, there, size=(0.02, 0.02, 0.02))) == []
-    inside = around_the_hinge(0.6, (placed.link_placement("panel") * placed.object.attachments["push"].placement).translation)
+    inside = around_the_hinge(
+        0.6,
+        (placed.link_placement("panel") * placed.object.attachments["push"].placement).translation,
+    )
     assert swept(problem(1.3, inside, size=(0.02, 0.02, 0.02))) != []
 
 
 @pytest.mark.parametrize(("deep", "proven"), [(0.0005, False), (0.004, True)])
-def test_an_overlap_that_validation_might_overlook_proves_nothing(deep: float, proven: bool) -> None:
+def test_an_overlap_that_validation_might_overlook_proves_nothing(
+    deep: float, proven: bool
+) -> None:
     """A slab above the floor, which the leaf's lower edge grazes from where it begins to where it is to go."""
     placed = door_scene().objects["door"].with_state({"hinge": 0.6})
     boxes = [
-        world_box(shape.geometry, shape.placement) for shape in standing_geometry(placed) if link_name(shape.name) == "panel"
+        world_box(shape.geometry, shape.placement)
+        for shape in standing_geometry(placed)
+        if link_name(shape.name) == "panel"
     ]
     low = min(lower[2] for lower, _ in boxes)
-    middle = around_the_hinge(0.6, (placed.placement * pin.SE3.Identity()).act(np.array([0.0, -0.5, 0.0])))
+    middle = around_the_hinge(
+        0.6, (placed.placement * pin.SE3.Identity()).act(np.array([0.0, -0.5, 0.0]))
+    )
     slab = [*middle[:2], low + deep - 0.05]
     assert bool(swept(problem(1.3, slab, size=(0.1, 0.1, 0.1)))) == proven
 

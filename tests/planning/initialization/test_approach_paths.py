@@ -31,7 +31,9 @@ def approach(*, stands: bool) -> Approach:
 
 def back(z: np.ndarray, near: np.ndarray) -> np.ndarray:
     """Return how the tool at `near` is moved from where it is at `z`, in its own frame: [m] and the cosine of the turn."""
-    hand, there = (dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near))
+    hand, there = (
+        dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near)
+    )
     off = hand.inverse() * there
     return np.array([*off.translation, (np.trace(off.rotation) - 1.0) / 2.0])
 
@@ -52,7 +54,11 @@ def test_the_base_drives_where_the_arm_alone_cannot_do_it(monkeypatch: pytest.Mo
         monkeypatch.setattr(problem, "options", dataclasses.replace(FEW, approach=metres))
         (near,) = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]))
         alone = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]), drives=False)
-        hand, there = (dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near))
-        np.testing.assert_allclose(there.translation - hand.translation, [0.0, -metres, 0.0], atol=1e-3)
+        hand, there = (
+            dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near)
+        )
+        np.testing.assert_allclose(
+            there.translation - hand.translation, [0.0, -metres, 0.0], atol=1e-3
+        )
         assert (len(alone) == 0) == bool(np.abs(near - z)[:3].max() > 0.0)
     assert len(alone) == 0, "it reaches a metre further: choose more"

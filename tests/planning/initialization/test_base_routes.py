@@ -50,14 +50,17 @@ def test_the_seed_drives_the_way_and_the_heading_follows_it() -> None:
     assert problem.evaluate_contacts(seed.z, reach=0.02).violation() < 0.02
 
 
-# --- narrow places -------------------------------------------------------------------------------------------------------
+# --- narrow places
+# -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("width", [NARROW, TIGHT])
 def test_with_the_arm_folded_there_is_a_way_through_a_narrow_gate(width: float) -> None:
     problem = gated(width)
     routes, start, goal = Routes(problem), problem.start[:3], np.array(GOAL)
-    home, folded = (routes.distances(0, start[None], goal[None], folded=each)[0] for each in (False, True))
+    home, folded = (
+        routes.distances(0, start[None], goal[None], folded=each)[0] for each in (False, True)
+    )
     straight = np.hypot(*(goal - start)[:2])
     assert np.isinf(home)
     assert straight <= folded < 1.1 * straight
@@ -103,7 +106,10 @@ def test_a_guide_leads_to_what_is_a_little_too_close_to_something() -> None:
     """What is sent there by inverse kinematics often is."""
     problem = walled(1.6)
     routes, start = Routes(problem), problem.start[:3]
-    near, inside = np.array([1.39, 1.0, 0.0]), np.array([1.5, 1.0, 0.0])  # the wall begins at 1.9, the base is 0.5 m long before
+    near, inside = (
+        np.array([1.39, 1.0, 0.0]),
+        np.array([1.5, 1.0, 0.0]),
+    )  # the wall begins at 1.9, the base is 0.5 m long before
     assert problem.options.dist_safe > 0.01
     assert routes.path(0, start, near, 40) is None
     guide = routes.guide(0, start, near, 40)
@@ -144,7 +150,9 @@ def test_starts_share_distances_where_they_are_alike_and_nowhere_else() -> None:
     assert np.abs(np.diff(np.sort(together))).min() > 1e-3
     beside = starts + np.array([0.04, -0.04, 0.0])
     routes = Routes(problem)
-    shared = [routes.distances(0, each, np.tile(goal, (len(starts), 1))) for each in (starts, beside)]
+    shared = [
+        routes.distances(0, each, np.tile(goal, (len(starts), 1))) for each in (starts, beside)
+    ]
     np.testing.assert_array_equal(shared[0], shared[1])
     own = Routes(problem).distances(0, beside, np.tile(goal, (len(starts), 1)))
     assert np.abs(own - shared[1]).max() < np.hypot(ALIKE, ALIKE)

@@ -8,7 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.gates import walled
-from helpers.small_problems import door_scene, hand_off_the_handle, program_of, with_attachment, with_objects
+from helpers.small_problems import (
+    door_scene,
+    hand_off_the_handle,
+    program_of,
+    with_attachment,
+    with_objects,
+)
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import beam_search as module
@@ -36,7 +42,9 @@ def beam(seed: int = 0, *, around: bool = False, routes: bool = False) -> Beam:
 @DIRECTIONS
 @pytest.mark.parametrize("thorough", [False, True], ids=["quick", "thorough"])
 @pytest.mark.parametrize("around", [False, True], ids=["alone", "driving before and after"])
-def test_knots_are_in_order_of_time_and_hold_the_closure(thorough: bool, backwards: bool, around: bool) -> None:
+def test_knots_are_in_order_of_time_and_hold_the_closure(
+    thorough: bool, backwards: bool, around: bool
+) -> None:
     p, search = problem(around=around), beam(around=around)
     found = search.search(thorough=thorough, backwards=backwards)
     assert found.at[0] == 0
@@ -51,7 +59,8 @@ def test_knots_are_in_order_of_time_and_hold_the_closure(thorough: bool, backwar
     assert np.all(found.paths[:, 1:] <= p.upper[rows] + 1e-9)
     hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
     np.testing.assert_allclose(
-        found.paths[:, 1:, [hinge, knob]], np.tile(search.knots.objects[rows][:, [hinge, knob]], (len(found.cost), 1, 1))
+        found.paths[:, 1:, [hinge, knob]],
+        np.tile(search.knots.objects[rows][:, [hinge, knob]], (len(found.cost), 1, 1)),
     )
     reach, _, move = (int(end) for end in p.ends[1 if around else 0 :][:3])
     held = [k for k, waypoint in enumerate(found.at) if reach <= waypoint <= move]
@@ -68,27 +77,36 @@ def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool) -> 
     """Whichever way it was looked for: the ways are those from start to end."""
     search = beam(1, around=around)
     found = search.search(thorough=True, backwards=backwards)
-    steps = np.abs(np.diff(found.paths, axis=1)) * np.sqrt(problem(around=around).effort.metric / 0.025)
+    steps = np.abs(np.diff(found.paths, axis=1)) * np.sqrt(
+        problem(around=around).effort.metric / 0.025
+    )
     way = np.linalg.norm(steps[..., :2], axis=2).sum(axis=1) + steps[..., 2:].sum(axis=(1, 2))
     np.testing.assert_allclose(found.cost, way + found.trouble, rtol=1e-9)
     trouble = np.zeros(len(found.cost))
     for k, waypoint in enumerate(found.at[1:], start=1):
         at = np.full(len(trouble), waypoint)
-        short = problem(around=around).contacts.evaluate(found.paths[:, k], at, reach=0.1).shortfall(len(trouble))
+        short = (
+            problem(around=around)
+            .contacts.evaluate(found.paths[:, k], at, reach=0.1)
+            .shortfall(len(trouble))
+        )
         trouble += np.where(short > 0.0, 10.0 + 300.0 * short, 0.0)
     reached = found.trouble < 1e3
     assert reached.any()
     np.testing.assert_allclose(found.trouble[reached], trouble[reached], rtol=0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("steps", [[vkc.Grasp("door")], [vkc.GoTo(-1.0, 0.0), OPEN]], ids=["grasp", "drive and open"])
+@pytest.mark.parametrize(
+    "steps", [[vkc.Grasp("door")], [vkc.GoTo(-1.0, 0.0), OPEN]], ids=["grasp", "drive and open"]
+)
 def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step]) -> None:
     p = program_of(door_scene(), steps, options=FEW)
     search = Beam(Knots(p, np.random.default_rng(1)))
     found = search.search(thorough=False)
     short = search.shortened(found)
     assert (short.cost <= found.cost).all()
-    # What is held already binds the base to where it is grasped; there all together would have to move.
+    # What is held already binds the base to where it is grasped; there all together would have to
+    # move.
     assert (short.cost / found.cost).min() < (0.97 if len(steps) == 1 else 1.0)
     ways = np.abs(np.diff(short.paths, axis=1)) * np.sqrt(p.effort.metric / 0.025)
     way = np.linalg.norm(ways[..., :2], axis=2).sum(axis=1) + ways[..., 2:].sum(axis=(1, 2))
@@ -97,18 +115,27 @@ def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step]) -> 
     assert found.at[moved] == p.ends[len(steps) - 1]  # where the base is sent it stays
     hinge, knob = (p.chain.index(name) for name in ("door.hinge", "door.knob"))
     for row, trouble in zip(short.paths[:, moved], short.trouble, strict=True):
-        assert trouble >= 1e3 or hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+        assert (
+            trouble >= 1e3 or hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+        )
         assert (row >= p.chain.lower - 1e-9).all()
         assert (row <= p.chain.upper + 1e-9).all()
 
 
-def test_shortened_paths_know_what_is_wrong_where_they_lead_now(monkeypatch: pytest.MonkeyPatch) -> None:
-    search = Beam(Knots(program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)), careful=True)
+def test_shortened_paths_know_what_is_wrong_where_they_lead_now(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    search = Beam(
+        Knots(program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)),
+        careful=True,
+    )
     found = search.search(thorough=False)
     monkeypatch.setattr(search, "_bad", lambda z, *_: np.abs(z[:, 0]))
     short = search.shortened(found)
     assert np.count_nonzero(short.trouble != found.trouble) > len(found.cost) / 2
-    np.testing.assert_allclose(short.trouble - found.trouble, np.abs(short.paths[:, -1, 0]) - np.abs(found.paths[:, -1, 0]))
+    np.testing.assert_allclose(
+        short.trouble - found.trouble, np.abs(short.paths[:, -1, 0]) - np.abs(found.paths[:, -1, 0])
+    )
 
 
 def test_of_paths_that_end_alike_the_cheapest_is_kept() -> None:
@@ -117,7 +144,11 @@ def test_of_paths_that_end_alike_the_cheapest_is_kept() -> None:
     assert Beam._kept(total, z, 6, 10).tolist() == [5, 1, 2, 4]
     assert Beam._kept(total, z, 6, 3).tolist() == [5, 1, 2]
     assert Beam._kept(total, z, 5, 10).tolist() == [5, 1, 2, 4]
-    assert Beam._kept(total, z, 2, 4).tolist() == [5, 1, 2]  # two of four are shortened: no more of them
+    assert Beam._kept(total, z, 2, 4).tolist() == [
+        5,
+        1,
+        2,
+    ]  # two of four are shortened: no more of them
 
 
 def test_headings_are_kept_apart_if_asked_for() -> None:
@@ -133,19 +164,28 @@ def test_headings_are_kept_apart_if_asked_for() -> None:
 def test_no_two_paths_of_a_search_end_alike() -> None:
     found = beam(1).search(thorough=True)
     ends = found.paths[:, -1]
-    assert all(np.abs(ends[k + 1 :] - end).max(axis=1, initial=0.0).min(initial=1.0) > 0.1 for k, end in enumerate(ends))
+    assert all(
+        np.abs(ends[k + 1 :] - end).max(axis=1, initial=0.0).min(initial=1.0) > 0.1
+        for k, end in enumerate(ends)
+    )
 
 
-def test_ways_to_what_is_grasped_are_short_when_they_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ways_to_what_is_grasped_are_short_when_they_are_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The best that a search returns for a grasp alone becomes hardly cheaper when it is shortened again."""
-    search = Beam(Knots(program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)))
+    search = Beam(
+        Knots(program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1))
+    )
     found = search.search(thorough=False)
     assert found.cost.min() < 1.02 * search.shortened(found).cost.min()
     with monkeypatch.context() as patch:
         patch.setattr(module, "_SHORTENINGS", 0)
         drawn = Beam(Knots(search.problem, np.random.default_rng(1))).search(thorough=False)
     assert found.cost.min() < drawn.cost.min()
-    careful = Beam(Knots(search.problem, np.random.default_rng(1)), careful=True).search(thorough=False)
+    careful = Beam(Knots(search.problem, np.random.default_rng(1)), careful=True).search(
+        thorough=False
+    )
     assert careful.cost.min() > found.cost.min(), "what is short may be what trees do not lead to"
 
 
@@ -158,7 +198,10 @@ def test_the_same_random_numbers_find_the_same(backwards: bool) -> None:
 
 def test_without_a_grasp_backwards_is_forwards() -> None:
     gone = walled(1.6)
-    one, other = (Beam(Knots(gone, np.random.default_rng(0))).search(thorough=True, backwards=back) for back in (False, True))
+    one, other = (
+        Beam(Knots(gone, np.random.default_rng(0))).search(thorough=True, backwards=back)
+        for back in (False, True)
+    )
     np.testing.assert_array_equal(one.paths, other.paths)
     assert one.at == other.at == [0, gone.segments]
 
@@ -174,17 +217,24 @@ def test_forwards_a_firm_hand_keeps_what_it_has_chosen() -> None:
 def gripping(*, firm: bool) -> vkc.TrajectoryProblem:
     """Return the problem of opening the door with a hand that may tilt, or that only chooses how far it does."""
     scene = door_scene()
-    tilting = dataclasses.replace(scene.objects["door"].object.attachment("handle_free"), name="tilted", firm=firm)
+    tilting = dataclasses.replace(
+        scene.objects["door"].object.attachment("handle_free"), name="tilted", firm=firm
+    )
     scene = with_objects(scene, {"door": with_attachment(scene.objects["door"], tilting)})
     return program_of(scene, [dataclasses.replace(OPEN, attachment="tilted")], options=FEW)
 
 
 @pytest.mark.parametrize("firm", [False, True])
-def test_a_hand_that_chooses_and_does_not_give_way_does_so_before_it_moves_anything(firm: bool) -> None:
+def test_a_hand_that_chooses_and_does_not_give_way_does_so_before_it_moves_anything(
+    firm: bool,
+) -> None:
     """For it backwards is forwards; for one that gives way it is not."""
     p = gripping(firm=firm)
     assert bool(p.choices) == firm
-    one, other = (Beam(Knots(p, np.random.default_rng(0))).search(thorough=True, backwards=back) for back in (False, True))
+    one, other = (
+        Beam(Knots(p, np.random.default_rng(0))).search(thorough=True, backwards=back)
+        for back in (False, True)
+    )
     assert np.array_equal(one.paths, other.paths) == firm
 
 
@@ -198,7 +248,8 @@ def clamped(*, backwards: bool) -> None:
     assert np.ptp(chosen) > 0.01, "it is the same in all paths"
 
 
-# --- what is tolerable ---------------------------------------------------------------------------------------------------
+# --- what is tolerable
+# ---------------------------------------------------------------------------------------------------
 
 
 def going(jump: float, when: int, *, trouble: float = 0.0) -> Found:
@@ -225,10 +276,13 @@ def test_the_base_does_not_jump_while_something_is_held() -> None:
         assert not beam(routes=True).tolerable(going(0.6, when))
         assert not beam(routes=True).tolerable(going(-0.6, when))
         assert beam().tolerable(going(0.6, when)), "without ways of the base nobody asks"
-    assert beam(routes=True).tolerable(going(3.0, reach)), "on the way to the handle it may be anywhere"
+    assert beam(routes=True).tolerable(going(3.0, reach)), (
+        "on the way to the handle it may be anywhere"
+    )
 
 
-# --- careful -------------------------------------------------------------------------------------------------------------
+# --- careful
+# -------------------------------------------------------------------------------------------------------------
 
 
 def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> None:
@@ -243,9 +297,14 @@ def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> No
 
 
 @pytest.mark.parametrize("careful", [False, True])
-def test_a_careful_search_counts_what_is_hit_before_a_grasp(careful: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_careful_search_counts_what_is_hit_before_a_grasp(
+    careful: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of four grasps one is blocked, one has a blocked way, one has none; and at other waypoints nothing changes."""
-    search, grasp = Beam(Knots(problem(), np.random.default_rng(0)), careful=careful), int(problem().ends[0])
+    search, grasp = (
+        Beam(Knots(problem(), np.random.default_rng(0)), careful=careful),
+        int(problem().ends[0]),
+    )
     before = search.approaches[grasp]
     depths = {grasp: np.array([0.01, 0.0, 0.0, 0.0]), before: np.array([0.02, 0.0, 0.0])}
     z, found = np.tile(problem().start, (4, 1)), np.ones(4, bool)
@@ -260,20 +319,32 @@ def test_a_careful_search_counts_what_is_hit_before_a_grasp(careful: bool, monke
     monkeypatch.setattr(search.knots, "knot", knot)
     bad = search._bad(z, found, grasp)
     collision = [module._COLLISION + module._DEPTH * depth for depth in (0.01, 0.02)]
-    np.testing.assert_allclose(bad, [collision[0], collision[1], module._NOT_FOUND, 0.0] if careful else [collision[0], 0, 0, 0])
+    np.testing.assert_allclose(
+        bad,
+        [collision[0], collision[1], module._NOT_FOUND, 0.0]
+        if careful
+        else [collision[0], 0, 0, 0],
+    )
     depths[int(problem().ends[1])] = np.zeros(4)
     np.testing.assert_array_equal(search._bad(z, found, int(problem().ends[1])), np.zeros(4))
 
 
 def test_before_a_careful_grasp_nothing_is_hit() -> None:
     """At the narrow door, open into the bedroom: a hand that has room at the lever may have none on the way to it."""
-    scene = vkc.load_scene("household").with_state("door", {"hinge": 1.52}).with_start(base=(1.5, -0.5, 1.57))
+    scene = (
+        vkc.load_scene("household")
+        .with_state("door", {"hinge": 1.52})
+        .with_start(base=(1.5, -0.5, 1.57))
+    )
     p = program_of(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})])
     grasp, routes, shares = int(p.ends[0]), Routes(p), []
     for careful in (False, True):
         search = Beam(Knots(p, np.random.default_rng(0)), routes, careful=careful)
         found = search.search(thorough=True, backwards=True)
-        before, held = search.approaches[grasp], found.paths[found.trouble == 0.0, found.at.index(grasp)]
+        before, held = (
+            search.approaches[grasp],
+            found.paths[found.trouble == 0.0, found.at.index(grasp)],
+        )
         assert len(held), "every path is blocked"
         near, reached = search.knots.knot(held, before, "track")
         hit = p.contacts.evaluate(near, np.full(len(near), before), reach=0.1).shortfall(len(near))
@@ -286,7 +357,10 @@ def test_a_task_that_ends_with_a_grasp_of_which_the_hand_chooses_where() -> None
     scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(0))
     problem = program_of(scene, [vkc.Grasp("stick")])
     assert {grasp for _, grasp, _ in problem.choices} == {problem.segments}
-    one, other = (Beam(Knots(problem, np.random.default_rng(0))).search(thorough=True, backwards=back) for back in (False, True))
+    one, other = (
+        Beam(Knots(problem, np.random.default_rng(0))).search(thorough=True, backwards=back)
+        for back in (False, True)
+    )
     assert one is not None
     assert other is not None
     assert one.at == other.at == [0, problem.segments]

@@ -27,7 +27,11 @@ def test_a_way_costs_what_the_program_makes_it_cost_in_radians_of_the_arm() -> N
     moved[0, :2] += [0.3, 0.4]
     assert search._path_cost(start, moved, 0)[0] == pytest.approx(0.5 * metre, rel=1e-12)
     lever = search.problem.chain.robot.lever
-    assert search.knots.weights[:3].tolist() == [1 / lever, 1 / lever, 1.0]  # inverse kinematics, and the baselines
+    assert search.knots.weights[:3].tolist() == [
+        1 / lever,
+        1 / lever,
+        1.0,
+    ]  # inverse kinematics, and the baselines
 
 
 class Ways:
@@ -45,7 +49,9 @@ def test_a_way_around_costs_as_much_as_it_is_long() -> None:
     start = search.problem.start[None]
     moved = start.copy()
     moved[0, :2] += [0.3, 0.4]
-    assert search._path_cost(start, moved, 0)[0] == pytest.approx(2 * 0.5 / np.sqrt(0.025), rel=1e-12)
+    assert search._path_cost(start, moved, 0)[0] == pytest.approx(
+        2 * 0.5 / np.sqrt(0.025), rel=1e-12
+    )
 
 
 def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
@@ -53,7 +59,9 @@ def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
     search, draws = beam(), list[str]()
     knot = search.knots.knot
 
-    def counted(before: NDArray[np.float64], waypoint: int, how: str) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def counted(
+        before: NDArray[np.float64], waypoint: int, how: str
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         draws.append(how)
         z, _ = knot(before, waypoint, how)
         return z, np.ones(len(z), bool)
@@ -64,15 +72,30 @@ def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
     monkeypatch.setattr(search.knots, "knot", counted)
     monkeypatch.setattr(search.knots, "depth", depth)
     grasp = int(search.problem.ends[0])
-    search._continue(search.problem.start[None, None], np.zeros(1), grasp, 0, _Mode(thorough=False, backwards=False))
+    search._continue(
+        search.problem.start[None, None],
+        np.zeros(1),
+        grasp,
+        0,
+        _Mode(thorough=False, backwards=False),
+    )
     return draws.count("scatter")
 
 
 @pytest.mark.parametrize(
     ("holding", "free", "pushed"),
-    [(False, 0, True), (False, 59, True), (False, 60, False), (True, 0, True), (True, 23, True), (True, 24, False)],
+    [
+        (False, 0, True),
+        (False, 59, True),
+        (False, 60, False),
+        (True, 0, True),
+        (True, 23, True),
+        (True, 24, False),
+    ],
 )
-def test_where_some_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, holding: bool, free: int, pushed: bool) -> None:
+def test_where_some_are_free_none_are_pushed(
+    monkeypatch: pytest.MonkeyPatch, holding: bool, free: int, pushed: bool
+) -> None:
     """While something is held a few are enough: there are many such knots."""
     search, called = beam(), list[int]()
 
@@ -90,5 +113,7 @@ def test_where_some_are_free_none_are_pushed(monkeypatch: pytest.MonkeyPatch, ho
 
 
 @pytest.mark.parametrize(("share", "least", "most"), [(1.0, 1, 2), (0.25, 3, 4), (0.0, 6, 6)])
-def test_grasps_are_drawn_until_enough_are_free(monkeypatch: pytest.MonkeyPatch, share: float, least: int, most: int) -> None:
+def test_grasps_are_drawn_until_enough_are_free(
+    monkeypatch: pytest.MonkeyPatch, share: float, least: int, most: int
+) -> None:
     assert least <= scattered(monkeypatch, share) <= most

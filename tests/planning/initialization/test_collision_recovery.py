@@ -18,7 +18,9 @@ from vkc_pin.planning.initialization.collision_recovery import clear_out
 from vkc_pin.planning.initialization.keyframes import Knots, Known
 
 
-def drawn(steps: list[vkc.Grasp | vkc.Actuate | vkc.Touch], scene: vkc.Scene) -> tuple[vkc.TrajectoryProblem, Knots]:
+def drawn(
+    steps: list[vkc.Grasp | vkc.Actuate | vkc.Touch], scene: vkc.Scene
+) -> tuple[vkc.TrajectoryProblem, Knots]:
     problem = program_of(scene, steps)
     return problem, Knots(problem, np.random.default_rng(0))
 
@@ -30,7 +32,11 @@ def test_points_move_as_finite_differences_say(seed: int, coupled: bool, tmp_pat
 
     Or a drawer, held by a robot whose joints follow others.
     """
-    held, scene = ({"drawer": "grip"}, coupled_scene(tmp_path)) if coupled else ({"door": "handle_free"}, door_scene())
+    held, scene = (
+        ({"drawer": "grip"}, coupled_scene(tmp_path))
+        if coupled
+        else ({"door": "handle_free"}, door_scene())
+    )
     chain = vkc.consolidate(scene, held)
     rng, step = np.random.default_rng(seed), 1e-6
     z = rng.uniform(-1.0, 1.0, (2, chain.size))
@@ -66,7 +72,9 @@ def test_what_is_pushed_is_further_out_and_still_there() -> None:
     pushed = knots.clear(z, waypoint)
     after = knots.depth(pushed, waypoint)
     assert np.count_nonzero(after <= 0.0) >= np.count_nonzero(before <= 0.0) + 5
-    residual, _ = problem.transcription.pose_solvers[0].evaluate(pushed[after <= 0.0], problem.targets[0])
+    residual, _ = problem.transcription.pose_solvers[0].evaluate(
+        pushed[after <= 0.0], problem.targets[0]
+    )
     assert np.abs(residual).max() < 1e-3
     assert np.all(pushed >= problem.lower[-1] - 1e-12)
     assert np.all(pushed <= problem.upper[-1] + 1e-12)
@@ -96,7 +104,10 @@ class Scattered:
     def cleared(self, **changes: Any) -> np.ndarray:
         """Return what they are cleared to, with other arguments than usual."""
         solver, target = self.knots.solver(0)
-        lower, upper = (np.tile(limits[-1], (len(self.z), 1)) for limits in (self.problem.lower, self.problem.upper))
+        lower, upper = (
+            np.tile(limits[-1], (len(self.z), 1))
+            for limits in (self.problem.lower, self.problem.upper)
+        )
         fields = {"lower": lower, "upper": upper, "weights": self.knots.weights, **changes}
         return clear_out(self.problem, self.z, self.problem.segments, solver, target, **fields)
 
@@ -104,7 +115,9 @@ class Scattered:
         """Return which of them need not be moved, shape (B,)."""
         solver, target = self.knots.solver(0)
         residual, _ = solver.evaluate(self.z, target)
-        return (self.knots.depth(self.z, self.problem.segments) <= 0.0) & (np.abs(residual).max(axis=1) < 1e-4)
+        return (self.knots.depth(self.z, self.problem.segments) <= 0.0) & (
+            np.abs(residual).max(axis=1) < 1e-4
+        )
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +130,9 @@ def scattered() -> Scattered:
 
 @pytest.fixture(scope="module")
 def cleared(scattered: Scattered) -> Scattered:
-    return dataclasses.replace(scattered, z=scattered.knots.clear(scattered.z, scattered.problem.segments))
+    return dataclasses.replace(
+        scattered, z=scattered.knots.clear(scattered.z, scattered.problem.segments)
+    )
 
 
 def test_what_is_free_is_not_touched(cleared: Scattered) -> None:
@@ -158,11 +173,16 @@ def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.M
     even = np.ones(scattered.problem.chain.size)
     heavy = even.copy()
     heavy[:3] = 100.0
-    moved = [np.abs(scattered.cleared(weights=weights) - scattered.z)[:, :3].sum() for weights in (even, heavy)]
+    moved = [
+        np.abs(scattered.cleared(weights=weights) - scattered.z)[:, :3].sum()
+        for weights in (even, heavy)
+    ]
     assert moved[1] < 0.5 * moved[0]
 
 
-def test_searches_that_share_what_they_know_find_what_they_would_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_searches_that_share_what_they_know_find_what_they_would_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problem = program_of(door_scene(), [vkc.Grasp("door", "handle_free")])
     known, waypoint = Known(), int(problem.ends[0])
     before = np.tile(problem.start, (8, 1))
@@ -178,7 +198,10 @@ def test_searches_that_share_what_they_know_find_what_they_would_alone(monkeypat
             knots.rng.random(3),
         ]
 
-    alone, first = found(Knots(problem, np.random.default_rng(0))), found(Knots(problem, np.random.default_rng(0), known))
+    alone, first = (
+        found(Knots(problem, np.random.default_rng(0))),
+        found(Knots(problem, np.random.default_rng(0), known)),
+    )
 
     def refuse(*_args: Any, **_kwargs: Any) -> None:
         raise AssertionError("asked again")

@@ -46,15 +46,24 @@ def blocked() -> vkc.TrajectoryProblem:
     robot = door_scene().robot
     _, places = p.chain.joint_placements(straight[len(straight) // 2][None])
     elbow = p.chain.model.getJointId(str(robot.model.names[4]))
-    ball = {"name": "ball", "type": "sphere", "radius": RADIUS, "position": places[0, elbow].round(4).tolist()}
+    ball = {
+        "name": "ball",
+        "type": "sphere",
+        "radius": RADIUS,
+        "position": places[0, elbow].round(4).tolist(),
+    }
     document = door_scene().document
-    scene = Scene.from_document({**document, "obstacles": [*document.get("obstacles", []), ball]}, door_scene().folder)
+    scene = Scene.from_document(
+        {**document, "obstacles": [*document.get("obstacles", []), ball]}, door_scene().folder
+    )
     return program_of(scene, [OPEN], options=FEW)
 
 
 def search(seed: int, *, tries: int = TRIES) -> np.ndarray | None:
     _, through, straight = free_door()
-    return held_path(Knots(blocked(), np.random.default_rng(seed)), MOVE, through, len(straight), tries)
+    return held_path(
+        Knots(blocked(), np.random.default_rng(seed)), MOVE, through, len(straight), tries
+    )
 
 
 def overlap(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
@@ -108,7 +117,9 @@ def test_a_budget_ends_the_search() -> None:
 
 
 def finder(p: vkc.TrajectoryProblem, seed: int = 0) -> held._Search:
-    return held._Search(Knots(p, np.random.default_rng(seed)), MOVE, p.segments - int(p.ends[MOVE - 1]))
+    return held._Search(
+        Knots(p, np.random.default_rng(seed)), MOVE, p.segments - int(p.ends[MOVE - 1])
+    )
 
 
 def test_between_two_waypoints_the_door_is_between_them() -> None:
@@ -117,10 +128,19 @@ def test_between_two_waypoints_the_door_is_between_them() -> None:
     at = np.array([own.begin, own.begin + 7.0, own.begin + 7.25, own.begin + 8.0, own.end])
     z, closed = own.close(np.tile(through[2], (5, 1)), at)
     angles = own.knots.objects[:, hinge]
-    whole = [0.0, angles[own.begin + 6], angles[own.begin + 6] * 0.75 + angles[own.begin + 7] * 0.25, angles[own.begin + 7], 1.2]
+    whole = [
+        0.0,
+        angles[own.begin + 6],
+        angles[own.begin + 6] * 0.75 + angles[own.begin + 7] * 0.25,
+        angles[own.begin + 7],
+        1.2,
+    ]
     np.testing.assert_allclose(z[:, hinge], whole, atol=1e-12)
     for row in z[closed]:
-        assert hand_off_the_handle(door_scene(), row, row[hinge], row[p.chain.index("door.knob")]) < 1e-3
+        assert (
+            hand_off_the_handle(door_scene(), row, row[hinge], row[p.chain.index("door.knob")])
+            < 1e-3
+        )
     assert closed[1:4].any()
 
 
@@ -141,7 +161,9 @@ def test_a_path_becomes_no_longer_and_keeps_its_ends() -> None:
 
 
 @pytest.mark.parametrize("out", [False, True])
-def test_a_path_that_cannot_be_closed_somewhere_gives_no_waypoints(out: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_that_cannot_be_closed_somewhere_gives_no_waypoints(
+    out: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The base has to stand where no arm reaches the handle from."""
     _, through, _ = free_door()
     own = finder(blocked(), 5)

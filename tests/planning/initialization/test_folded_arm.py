@@ -48,11 +48,15 @@ def reach(load: str, z: np.ndarray, *, base: bool = False) -> tuple[np.ndarray, 
     lows, highs = [], []
     for shape, where in zip(chain.collision.geometryObjects, placed.oMg, strict=True):
         if shape.parentJoint == 1 if base else shape.parentJoint > 1:
-            points = np.asarray(shape.geometry.points()) if hasattr(shape.geometry, "points") else None
+            points = (
+                np.asarray(shape.geometry.points()) if hasattr(shape.geometry, "points") else None
+            )
             if points is None:
                 shape.geometry.computeLocalAABB()
                 box = shape.geometry.aabb_local
-                points = np.array(np.meshgrid(*zip(box.min_, box.max_, strict=True))).reshape(3, -1).T
+                points = (
+                    np.array(np.meshgrid(*zip(box.min_, box.max_, strict=True))).reshape(3, -1).T
+                )
             points = points @ where.rotation.T + where.translation
             lows.append(points.min(axis=0))
             highs.append(points.max(axis=0))
@@ -81,8 +85,11 @@ def test_they_keep_within_limits_and_away_from_themselves(load: str, number: int
     data, shapes = robot.model.createData(), robot.collision.createData()
     q = robot.coordinates.q(z[: robot.coordinates.size])
     pin.computeDistances(robot.model, data, robot.collision, shapes, q)
-    assert min(result.min_distance for result in shapes.distanceResults) > p.options.dist_safe - 1e-4
-    # What is carried, too: of the pairs that move in the last phase none comes too close where nothing stands.
+    assert (
+        min(result.min_distance for result in shapes.distanceResults) > p.options.dist_safe - 1e-4
+    )
+    # What is carried, too: of the pairs that move in the last phase none comes too close where
+    # nothing stands.
     z[:2] = 50.0
     last = np.array([p.segments])
     assert p.contacts.evaluate(z[None], last, reach=p.options.dist_safe).violation() == 0.0
@@ -99,12 +106,17 @@ def test_what_stands_does_not_count() -> None:
 
 def test_it_is_the_same_every_time() -> None:
     p = problem("stick")
-    np.testing.assert_array_equal(folded_arms(p, 1, resting("stick")), folded_arms(p, 1, resting("stick")))
+    np.testing.assert_array_equal(
+        folded_arms(p, 1, resting("stick")), folded_arms(p, 1, resting("stick"))
+    )
 
 
 def test_where_nothing_is_free_the_arm_stays_at_home(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(folding, "depth", lambda _, z, *__, **___: np.ones(len(z)))
-    np.testing.assert_array_equal(folded_arms(problem("nothing"), 0, resting("nothing")), [problem("nothing").chain.robot.home])
+    np.testing.assert_array_equal(
+        folded_arms(problem("nothing"), 0, resting("nothing")),
+        [problem("nothing").chain.robot.home],
+    )
 
 
 @pytest.mark.parametrize("load", TASKS)
@@ -113,7 +125,10 @@ def test_the_others_reach_no_further_over_the_floor_than_the_first_or_the_base(l
     p = problem(load)
     arms = folded_arms(p, len(p.task.phases) - 1, resting(load))
     assert len(arms) > 10
-    own, first = (np.max(np.abs(reach(load, with_arm(load, arms[0]), base=base)), axis=0) for base in (True, False))
+    own, first = (
+        np.max(np.abs(reach(load, with_arm(load, arms[0]), base=base)), axis=0)
+        for base in (True, False)
+    )
     room = np.maximum(own, first)[:2] + 0.03
     for arm in arms[1:]:
         assert np.all(np.max(np.abs(reach(load, with_arm(load, arm))), axis=0)[:2] <= room)
@@ -136,4 +151,6 @@ def test_the_nearest_is_that_by_way_of_which_it_is_least_far() -> None:
         for wound in (arms, arms + 2.0 * np.pi, arms - 2.0 * np.pi):
             inside = np.all((wound >= p.chain.lower[3:9]) & (wound <= p.chain.upper[3:9]), axis=1)
             ways = (np.abs(wound - first) + np.abs(wound - last)) @ metric
-            assert (np.abs(near - first) + np.abs(near - last)) @ metric <= ways[inside].min(initial=np.inf) + 1e-9
+            assert (np.abs(near - first) + np.abs(near - last)) @ metric <= ways[inside].min(
+                initial=np.inf
+            ) + 1e-9

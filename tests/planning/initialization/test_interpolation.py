@@ -49,13 +49,25 @@ def trees(p: vkc.TrajectoryProblem, seed: int = 0) -> RrtPaths:
 class Say:
     """Ways as a function of first and last says; remembers what it was asked for."""
 
-    def __init__(self, way: Callable[[np.ndarray, np.ndarray, int], np.ndarray | None], *, careful: bool = False) -> None:
+    def __init__(
+        self,
+        way: Callable[[np.ndarray, np.ndarray, int], np.ndarray | None],
+        *,
+        careful: bool = False,
+    ) -> None:
         self.careful, self.made = careful, way
         self.asked: list[tuple[int, np.ndarray, np.ndarray, int, bool]] = []
         self.turns: list[bool] = []  # whether headings may end whole turns further
 
     def path(
-        self, phase: int, first: np.ndarray, last: np.ndarray, steps: int, *, turns: bool, reaches: bool
+        self,
+        phase: int,
+        first: np.ndarray,
+        last: np.ndarray,
+        steps: int,
+        *,
+        turns: bool,
+        reaches: bool,
     ) -> np.ndarray | None:
         self.asked.append((phase, first.copy(), last.copy(), steps, reaches))
         self.turns.append(turns)
@@ -68,7 +80,9 @@ def turning(by: float, columns: int = 3) -> Callable[[np.ndarray, np.ndarray, in
     def way(first: np.ndarray, last: np.ndarray, steps: int) -> np.ndarray:
         end = last.copy()
         end[2] += by
-        return np.asarray((first + np.outer(np.arange(1, steps + 1) / steps, end - first))[:, :columns])
+        return np.asarray(
+            (first + np.outer(np.arange(1, steps + 1) / steps, end - first))[:, :columns]
+        )
 
     return way
 
@@ -81,7 +95,8 @@ def holds_the_handle(z: np.ndarray) -> None:
     assert z[-1, hinge] == pytest.approx(1.2)
 
 
-# --- straight ------------------------------------------------------------------------------------------------------------
+# --- straight
+# ------------------------------------------------------------------------------------------------------------
 
 
 def test_straight_through_the_knots_and_closed_where_it_is_held() -> None:
@@ -109,7 +124,8 @@ def test_where_nothing_is_on_the_way_the_profile_is_smooth() -> None:
     np.testing.assert_allclose(z[:, :3], np.outer(smooth(p.segments), [2.0, 1.0, 0.5]), atol=1e-12)
 
 
-# --- along what somebody says --------------------------------------------------------------------------------------------
+# --- along what somebody says
+# --------------------------------------------------------------------------------------------
 
 
 def test_a_way_is_asked_for_where_nothing_is_held_and_between_straight_ways() -> None:
@@ -123,7 +139,8 @@ def test_a_way_is_asked_for_where_nothing_is_held_and_between_straight_ways() ->
     assert steps == int(p.ends[0]) - FEW.steps(FEW.approach_time)
     np.testing.assert_allclose(z[:steps, :3], turning(0.0)(first, last, steps), atol=1e-9)
     hand, ahead = (
-        dataclasses.replace(door_scene(), start=row[:ROBOT]).tool_placement() for row in (last, knots[at_.index(int(p.ends[0]))])
+        dataclasses.replace(door_scene(), start=row[:ROBOT]).tool_placement()
+        for row in (last, knots[at_.index(int(p.ends[0]))])
     )
     np.testing.assert_allclose(hand.actInv(ahead.translation), [0.0, 0.0, FEW.approach], atol=1e-3)
     holds_the_handle(z)
@@ -137,7 +154,9 @@ def test_what_follows_goes_on_from_a_way_that_ends_with_whole_turns(turns: int) 
     assert plain is not None
     assert wound is not None
     reach = int(p.ends[0])
-    np.testing.assert_allclose(wound[reach - 1 :, 2] - plain[reach - 1 :, 2], turns * 2 * np.pi, atol=1e-3)
+    np.testing.assert_allclose(
+        wound[reach - 1 :, 2] - plain[reach - 1 :, 2], turns * 2 * np.pi, atol=1e-3
+    )
     others = [k for k in range(p.chain.size) if k != 2]
     np.testing.assert_allclose(wound[:, others], plain[:, others], atol=1e-3)
     assert np.abs(np.diff(wound[reach - 1 :, 2])).max() < 0.5
@@ -145,14 +164,18 @@ def test_what_follows_goes_on_from_a_way_that_ends_with_whole_turns(turns: int) 
 
 
 @pytest.mark.parametrize(("yaw", "turns"), [(0.5, False), (None, True)])
-def test_a_way_may_end_whole_turns_further_unless_the_goal_says_how_far_to_turn(yaw: float | None, turns: bool) -> None:
+def test_a_way_may_end_whole_turns_further_unless_the_goal_says_how_far_to_turn(
+    yaw: float | None, turns: bool
+) -> None:
     """What the way says is taken as it is: whoever finds it knows where there is room to turn."""
     p = program_of(hall(), [vkc.GoTo(2.0, 1.0, yaw)])
     ways = Say(turning(0.0))
     z = joiner(p, ways).join(np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments])
     assert ways.turns == [turns]
     assert z is not None
-    np.testing.assert_allclose(z[:, :3], np.outer(np.arange(1, p.segments + 1) / p.segments, [2.0, 1.0, 0.5]), atol=1e-9)
+    np.testing.assert_allclose(
+        z[:, :3], np.outer(np.arange(1, p.segments + 1) / p.segments, [2.0, 1.0, 0.5]), atol=1e-9
+    )
 
 
 def test_after_a_phase_whose_arm_ends_elsewhere_the_next_begins_there() -> None:
@@ -178,11 +201,15 @@ def test_after_a_phase_whose_arm_ends_elsewhere_the_next_begins_there() -> None:
 def test_where_there_is_no_way_it_is_said_once_for_each_phase() -> None:
     p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5), vkc.GoTo(0.0, 1.0, 0.5)])
     allowed: list[Any] = [None]
-    ways = Say(lambda first, last, steps: turning(0.0)(first, last, steps) if allowed.pop(0) else None)
+    ways = Say(
+        lambda first, last, steps: turning(0.0)(first, last, steps) if allowed.pop(0) else None
+    )
     join = joiner(p, ways)
 
     def through(x: float) -> np.ndarray | None:
-        return join.join(np.array([p.start, at(p, (x, 1.0, 0.5)), at(p, (0.0, 1.0, 0.5))]), [0, *p.ends.tolist()])
+        return join.join(
+            np.array([p.start, at(p, (x, 1.0, 0.5)), at(p, (0.0, 1.0, 0.5))]), [0, *p.ends.tolist()]
+        )
 
     assert through(2.0) is None
     assert join.blocked == ["go to: found no way for the base from (0.00, 0.00) to (2.00, 1.00)"]
@@ -198,16 +225,24 @@ def test_phases_that_are_called_differently_have_a_line_each() -> None:
     both = program_of(door_scene(), [vkc.GoTo(0.0, 0.0), OPEN], options=FEW)
     found = Beam(Knots(both, np.random.default_rng(0))).search(thorough=False)
     allowed: list[Any] = [None, True, None]
-    join = joiner(both, Say(lambda first, last, steps: turning(0.0)(first, last, steps) if allowed.pop(0) else None))
+    join = joiner(
+        both,
+        Say(
+            lambda first, last, steps: turning(0.0)(first, last, steps) if allowed.pop(0) else None
+        ),
+    )
     for _ in range(2):
         assert join.join(found.paths[0], found.at) is None
     assert [line.split(":")[0] for line in join.blocked] == ["go to", "reach door.handle"]
 
 
-# --- what is hit on the way in -------------------------------------------------------------------------------------------
+# --- what is hit on the way in
+# -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("careful", "depth", "kept"), [(False, 0.015, True), (True, 0.015, False), (True, 0.005, True)])
+@pytest.mark.parametrize(
+    ("careful", "depth", "kept"), [(False, 0.015, True), (True, 0.015, False), (True, 0.005, True)]
+)
 def test_a_careful_way_leaves_out_what_hits_something(
     careful: bool, depth: float, kept: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -230,7 +265,9 @@ def test_a_careful_way_leaves_out_what_hits_something(
     made = ways.made(p.start, last, steps)
     assert made is not None
     np.testing.assert_allclose(z[: steps - 1, :ROBOT], made[:-1, :ROBOT], atol=1e-9)
-    np.testing.assert_allclose(z[steps - 1, :ROBOT], made[-1, :ROBOT], atol=1e-4)  # a knot is rough, what it is closed to exact
+    np.testing.assert_allclose(
+        z[steps - 1, :ROBOT], made[-1, :ROBOT], atol=1e-4
+    )  # a knot is rough, what it is closed to exact
 
 
 def test_only_trees_are_careful() -> None:
@@ -239,7 +276,8 @@ def test_only_trees_are_careful() -> None:
     assert not DrivenPaths(Routes(p)).careful
 
 
-# --- around, and with base and arm ---------------------------------------------------------------------------------------
+# --- around, and with base and arm
+# ---------------------------------------------------------------------------------------
 
 
 def test_around_is_the_way_of_the_base_with_a_straight_arm() -> None:
@@ -252,7 +290,9 @@ def test_around_is_the_way_of_the_base_with_a_straight_arm() -> None:
     assert expected is not None
     assert abs(expected[-1, 2]) < 1e-9, "no whole turns here"
     np.testing.assert_allclose(z[:, :3], expected, atol=1e-9)
-    np.testing.assert_allclose(z[:, 3:], p.start[3:] + np.outer(smooth(p.segments), np.full(6, 0.2)), atol=1e-9)
+    np.testing.assert_allclose(
+        z[:, 3:], p.start[3:] + np.outer(smooth(p.segments), np.full(6, 0.2)), atol=1e-9
+    )
 
 
 class Winding:
@@ -304,7 +344,9 @@ def test_with_what_is_to_be_reached_the_arm_of_a_tree_ends_there() -> None:
         assert way.shape == (30, ROBOT)
         np.testing.assert_allclose(way[-1, :3], GOAL, atol=1e-9)  # there is no reason to turn round
         near = grown.routes.nearest_folded_arm(0, p.start[3:], end[3:])
-        allowed = [end[3:], p.start[3:], p.chain.robot.home, grown.routes.folded_arm(0), near][: 1 if reaches else None]
+        allowed = [end[3:], p.start[3:], p.chain.robot.home, grown.routes.folded_arm(0), near][
+            : 1 if reaches else None
+        ]
         assert min(np.abs(way[-1, 3:] - arm).max() for arm in allowed) < 1e-9
 
 
@@ -332,12 +374,20 @@ def test_trees_find_nothing_where_there_is_nothing() -> None:
     assert len(join.blocked) == 1
 
 
-def test_trees_that_failed_try_less_until_they_succeed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trees_that_failed_try_less_until_they_succeed_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """In each phase on its own."""
     p = gated(NARROW)
-    ways, tries, found = trees(p), list[int](), iter([False, False, False, False, False, True, False, False])
+    ways, tries, found = (
+        trees(p),
+        list[int](),
+        iter([False, False, False, False, False, True, False, False]),
+    )
 
-    def connect(*_: Any, poses: np.ndarray, tries: int, asked: list[int] = tries, **__: Any) -> np.ndarray | None:
+    def connect(
+        *_: Any, poses: np.ndarray, tries: int, asked: list[int] = tries, **__: Any
+    ) -> np.ndarray | None:
         asked.append(tries)
         return np.tile(p.start[:ROBOT], (2, 1)) if next(found) else None
 
@@ -348,7 +398,16 @@ def test_trees_that_failed_try_less_until_they_succeed_again(monkeypatch: pytest
             monkeypatch.setattr(ways.routes, name, lambda *_: p.start[3:ROBOT])
         way = ways.path(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
         assert (way is not None) == (number == 5)
-    assert tries == [TRIES, TRIES // 2, TRIES, TRIES // 4, TRIES // 8, TRIES // 16, TRIES, TRIES // 2]
+    assert tries == [
+        TRIES,
+        TRIES // 2,
+        TRIES,
+        TRIES // 4,
+        TRIES // 8,
+        TRIES // 16,
+        TRIES,
+        TRIES // 2,
+    ]
 
 
 def test_trees_that_failed_where_something_is_held_try_less_too_but_where_none_grew_nothing_failed(
@@ -369,7 +428,9 @@ def test_trees_that_failed_where_something_is_held_try_less_too_but_where_none_g
     assert tries == [TRIES, TRIES // 2, TRIES // 4, TRIES]
 
 
-def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robot_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robot_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A door that opens in the second half of its time alone, and another posture in the end, from which the next phase leads."""
     p = program_of(door_scene(), [OPEN, vkc.GoTo(-1.0, 0.5)], options=FEW)
     own = Knots(p, np.random.default_rng(0))
@@ -381,18 +442,26 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
     assert np.abs(other - knots[at_])[:3].max() > 0.05, "they all end in the same place"
     asked, firsts = list[tuple[int, int]](), list[np.ndarray]()
 
-    def path(_: RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray) -> np.ndarray | None:
+    def path(
+        _: RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray
+    ) -> np.ndarray | None:
         asked.append((phase, len(straight)))
         if phase < 2:
             return None
         late = straight.copy()
-        late[:, hinge] = np.interp(np.arange(1, len(late) + 1), [len(late) / 2, len(late)], [0.0, 1.2])
+        late[:, hinge] = np.interp(
+            np.arange(1, len(late) + 1), [len(late) / 2, len(late)], [0.0, 1.2]
+        )
         late[-1] = other
         return late
 
-    def way(self: RrtPaths, phase: int, first: np.ndarray, last: np.ndarray, steps: int, **_: Any) -> np.ndarray:
+    def way(
+        self: RrtPaths, phase: int, first: np.ndarray, last: np.ndarray, steps: int, **_: Any
+    ) -> np.ndarray:
         firsts.append(first.copy())
-        return np.asarray(first + np.outer(np.arange(1, steps + 1) / steps, last - first))[:, :ROBOT]
+        return np.asarray(first + np.outer(np.arange(1, steps + 1) / steps, last - first))[
+            :, :ROBOT
+        ]
 
     monkeypatch.setattr(RrtPaths, "held", path)
     monkeypatch.setattr(RrtPaths, "path", way)
@@ -401,11 +470,17 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
     assert asked == [(1, begin - int(p.ends[0])), (2, move - begin)]
     np.testing.assert_allclose(z[begin + (move - begin) // 2 - 1, hinge], 0.0, atol=1e-9)
     for row in z[int(p.ends[0]) - 1 : move]:
-        assert hand_off_the_handle(door_scene(), row, row[hinge], row[p.chain.index("door.knob")]) < 1e-3
+        assert (
+            hand_off_the_handle(door_scene(), row, row[hinge], row[p.chain.index("door.knob")])
+            < 1e-3
+        )
     assert z[move - 1, hinge] == pytest.approx(1.2)
     np.testing.assert_allclose(z[move - 1], other, atol=1e-3)
     there = Approach(own).after(other, p.task.phases[3], p.task.phases[2])
-    np.testing.assert_allclose(firsts[-1], there[0] if len(there) and own.depth(there, p.contacts.inside(3))[0] < 0.01 else other)
+    np.testing.assert_allclose(
+        firsts[-1],
+        there[0] if len(there) and own.depth(there, p.contacts.inside(3))[0] < 0.01 else other,
+    )
 
 
 def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -413,8 +488,16 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
         raise AssertionError("a base that cannot drive needs no way")
 
     monkeypatch.setattr(Routes, "guide", never)
-    beam = {"name": "beam", "type": "cylinder", "radius": 0.05, "length": 1.2, "position": [0.37, 0.25, 1.7]}
-    p = program_of(hall(base="fixed", obstacles=[beam]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))])
+    beam = {
+        "name": "beam",
+        "type": "cylinder",
+        "radius": 0.05,
+        "length": 1.2,
+        "position": [0.37, 0.25, 1.7],
+    }
+    p = program_of(
+        hall(base="fixed", obstacles=[beam]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))]
+    )
     first, last = p.start.copy(), p.start.copy()
     first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
     way = trees(p).path(0, first, last, 60, turns=False, reaches=True)
@@ -422,7 +505,9 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_array_equal(way[:, :3], np.tile(first[:3], (60, 1)))
     np.testing.assert_allclose(way[-1], last, atol=1e-12)
     straight = first + np.outer(smooth(60), last - first)
-    hit, grazed = (p.contacts.evaluate(z, np.ones(60, int), reach=0.1).violation() for z in (straight, way))
+    hit, grazed = (
+        p.contacts.evaluate(z, np.ones(60, int), reach=0.1).violation() for z in (straight, way)
+    )
     assert hit > 0.05
     assert grazed < p.options.dist_safe + 0.02
 

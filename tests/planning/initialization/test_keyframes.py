@@ -8,7 +8,15 @@ import pytest
 from helpers.small_problems import SHORT, all_pairs, door_scene, hand_off_the_handle
 
 import vkc_pin as vkc
-from vkc_pin.planning.initialization.keyframes import SCATTER, Knots, Known, depth, follow_objects, scatter, smooth
+from vkc_pin.planning.initialization.keyframes import (
+    SCATTER,
+    Knots,
+    Known,
+    depth,
+    follow_objects,
+    scatter,
+    smooth,
+)
 
 OPEN = vkc.Actuate("door", {"hinge": 1.2})
 
@@ -50,18 +58,25 @@ def test_objects_run_to_their_goals_phase_by_phase(problem: vkc.TrajectoryProble
 
 
 @pytest.mark.parametrize("how", ["scatter", "track", "shake"])
-def test_the_hand_is_at_the_handle_wherever_that_is(problem: vkc.TrajectoryProblem, how: str) -> None:
+def test_the_hand_is_at_the_handle_wherever_that_is(
+    problem: vkc.TrajectoryProblem, how: str
+) -> None:
     search = knots(problem)
     grasp = int(problem.ends[0])
     first, found = search.knot(np.tile(problem.start, (64, 1)), grasp, "scatter")
     assert found.sum() > 10
     for waypoint in (grasp, grasp + 1, problem.segments):
         z, found = search.knot(first, waypoint, how)
-        hinge, knob = (search.objects[waypoint - 1, problem.chain.index(f"door.{name}")] for name in ("hinge", "knob"))
+        hinge, knob = (
+            search.objects[waypoint - 1, problem.chain.index(f"door.{name}")]
+            for name in ("hinge", "knob")
+        )
         assert found.any()
         for row in z[found]:
             assert hand_off_the_handle(door_scene(), row[:9], hinge, knob) < 2e-4
-        np.testing.assert_array_equal(z[:, search.driven], np.tile(search.objects[waypoint - 1, search.driven], (len(z), 1)))
+        np.testing.assert_array_equal(
+            z[:, search.driven], np.tile(search.objects[waypoint - 1, search.driven], (len(z), 1))
+        )
         arms = slice(3, 9)
         assert (z[found, arms] >= problem.lower[waypoint - 1, arms] - 1e-9).all()
         assert (z[found, arms] <= problem.upper[waypoint - 1, arms] + 1e-9).all()
@@ -87,7 +102,9 @@ def test_where_nothing_must_hold_robots_stay(drive: vkc.TrajectoryProblem) -> No
     assert search.clear(z, 1) is z
 
 
-def test_what_is_known_is_not_worked_out_again(problem: vkc.TrajectoryProblem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_known_is_not_worked_out_again(
+    problem: vkc.TrajectoryProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """And with the same random numbers all is as if it had been."""
     known, grasp, start = Known(), int(problem.ends[0]), np.tile(problem.start, (16, 1))
     one, other, alone = knots(problem, 3, known), knots(problem, 3, known), knots(problem, 3)
@@ -144,7 +161,9 @@ def test_scatter_tells_what_does_not_fit(problem: vkc.TrajectoryProblem) -> None
     assert z.shape == (SCATTER, problem.chain.size)
     for row, residual in zip(z, residuals, strict=True):
         off = hand_off_the_handle(door_scene(), row[:9], 0.0, 0.0)
-        assert (off < 3e-4) == (residual < 1e-4) or 1e-5 < residual < 1e-3  # the two measure angles alike only where small
+        assert (off < 3e-4) == (
+            residual < 1e-4
+        ) or 1e-5 < residual < 1e-3  # the two measure angles alike only where small
     assert (residuals < 1e-4).any()
 
 
@@ -159,8 +178,12 @@ def test_scatter_where_the_base_must_be(drive: vkc.TrajectoryProblem) -> None:
 
 def test_moving_costs_what_it_does_in_searches(problem: vkc.TrajectoryProblem) -> None:
     """A radian of whatever costs 1, a metre what a radian moves the hand, but where a grasp slides."""
-    free = vkc.build(vkc.load_scene("init_3"), [vkc.Touch("stick.tip", (-1.0, 3.9, 0.1))], options=SHORT)
-    weights = dict(zip(free.chain.names, Knots(free, np.random.default_rng(0)).weights.tolist(), strict=True))
+    free = vkc.build(
+        vkc.load_scene("init_3"), [vkc.Touch("stick.tip", (-1.0, 3.9, 0.1))], options=SHORT
+    )
+    weights = dict(
+        zip(free.chain.names, Knots(free, np.random.default_rng(0)).weights.tolist(), strict=True)
+    )
     assert weights["base_x"] == 1.0 / free.chain.robot.lever
     assert weights["base_yaw"] == weights["elbow_joint"] == 1.0
     grasp = {name: weight for name, weight in weights.items() if name.startswith("stick.grip")}

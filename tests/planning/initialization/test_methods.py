@@ -56,12 +56,21 @@ def test_interpolated_seeds_hold_the_handle(seed: int) -> None:
 
 
 @pytest.mark.parametrize("method", ["interpolated", "astar"])
-@pytest.mark.parametrize("robot", [{"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8}], ids=["tank", "car"])
+@pytest.mark.parametrize(
+    "robot",
+    [{"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8}],
+    ids=["tank", "car"],
+)
 @pytest.mark.parametrize(("name", "goal"), [("door", {"hinge": 1.2}), ("drawer", {"slide": 0.35})])
-def test_seeds_of_bases_on_wheels_can_be_driven(name: str, goal: dict[str, float], robot: dict[str, Any], method: str) -> None:
+def test_seeds_of_bases_on_wheels_can_be_driven(
+    name: str, goal: dict[str, float], robot: dict[str, Any], method: str
+) -> None:
     """They roll, turn no tighter than they can, and hold what they hold; where the arm does not reach in, the base gives way."""
     scene = vkc.load_scene(name)
-    document, rng = {**scene.document, "robot": {"name": "husky_ur5e", **robot}}, np.random.default_rng(5)
+    document, rng = (
+        {**scene.document, "robot": {"name": "husky_ur5e", **robot}},
+        np.random.default_rng(5),
+    )
     scene = vkc.Scene.from_document(document, scene.folder)
     for _ in range(2):
         p = program_of(scene.sample_start(rng), [vkc.Actuate(name, goal)], options=vkc.Options())
@@ -92,13 +101,19 @@ def test_seeds_go_from_the_start_without_a_jump() -> None:
         path = problem().waypoints(z)
         reach = int(problem().ends[0])
         np.testing.assert_array_equal(path[0], problem().start)
-        # A straight way to where the hand is before the handle: every waypoint lies between its ends; and straight on.
+        # A straight way to where the hand is before the handle: every waypoint lies between its
+        # ends; and straight on.
         before = reach - OPENED.steps(OPENED.approach_time)
         low, high = np.minimum(path[0], path[before]), np.maximum(path[0], path[before])
         assert np.all((path[: before + 1] >= low - 1e-9) & (path[: before + 1] <= high + 1e-9))
-        first, last = (dataclasses.replace(door_scene(), start=path[k, :9]).tool_placement() for k in (before, reach))
+        first, last = (
+            dataclasses.replace(door_scene(), start=path[k, :9]).tool_placement()
+            for k in (before, reach)
+        )
         way = first.inverse() * last
-        np.testing.assert_allclose(way.translation, [0.0, 0.0, OPENED.approach], rtol=0.0, atol=1e-3)
+        np.testing.assert_allclose(
+            way.translation, [0.0, 0.0, OPENED.approach], rtol=0.0, atol=1e-3
+        )
         np.testing.assert_allclose(way.rotation, np.eye(3), rtol=0.0, atol=1e-3)
         assert np.abs(np.diff(path, axis=0)).max() < 0.8
 
@@ -125,12 +140,16 @@ def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
         z, *others = seeds("stationary", seed=seed, count=4)
         robot = problem().chain.robot.coordinates.size
         assert len(others) == 6
-        for number, other in enumerate(others):  # in which the base goes straight from place to place
+        for number, other in enumerate(
+            others
+        ):  # in which the base goes straight from place to place
             np.testing.assert_array_equal(other[:, 3:], z[:, 3:])
             assert all(np.abs(other - one)[:, :3].max() > 0.1 for one in [z, *others[:number]])
             bases = problem().waypoints(other)[:, :3]
             for begin, end in itertools.pairwise([0, *problem().ends]):
-                np.testing.assert_allclose(np.diff(bases[begin : end + 1], 2, axis=0), 0.0, atol=1e-12)
+                np.testing.assert_allclose(
+                    np.diff(bases[begin : end + 1], 2, axis=0), 0.0, atol=1e-12
+                )
             assert np.all((other >= problem().lower) & (other <= problem().upper))
         np.testing.assert_array_equal(z[:, :robot], np.tile(problem().start[:robot], (len(z), 1)))
         hinge = z[:, problem().chain.index("door.hinge")]
@@ -138,7 +157,9 @@ def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
         assert hinge[problem().ends[1] - 1] == 0.0
 
 
-def test_of_many_random_places_the_one_with_the_least_merit_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_random_places_the_one_with_the_least_merit_is_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     drive = program_of(hall(), [vkc.Reach((2.0, 1.5, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
 
     def merits(places: int) -> list[float]:
@@ -165,7 +186,9 @@ def test_a_seed_for_a_target_out_of_reach_is_still_a_seed() -> None:
 
 
 def test_a_fixed_base_stays_in_every_seed() -> None:
-    fixed = program_of(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
+    fixed = program_of(
+        hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT
+    )
     for z in (found.z for found in initialize(fixed, "interpolated", 0, count=3)):
         assert np.ptp(fixed.waypoints(z)[:, :3], axis=0).max() == 0.0
     still, *others = (found.z for found in initialize(fixed, "stationary", 0, count=3))
@@ -184,12 +207,20 @@ def test_scattered_configurations_are_where_they_say() -> None:
     assert np.all((z >= reach.lower[-1]) & (z <= reach.upper[-1]))
     for row, error in list(zip(z, residual, strict=True))[:20]:
         tool = dataclasses.replace(reach.scene, start=row).tool_placement()
-        off = np.concatenate([tool.translation - target.translation, pin.log3(tool.rotation.T @ target.rotation)])
-        assert np.abs(off).max() == pytest.approx(error, abs=5e-2, rel=0.5) if error > 1e-3 else np.abs(off).max() < 2e-3
+        off = np.concatenate(
+            [tool.translation - target.translation, pin.log3(tool.rotation.T @ target.rotation)]
+        )
+        assert (
+            np.abs(off).max() == pytest.approx(error, abs=5e-2, rel=0.5)
+            if error > 1e-3
+            else np.abs(off).max() < 2e-3
+        )
 
 
 def test_nothing_to_scatter() -> None:
-    free = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)], options=SHORT)
+    free = program_of(
+        door_scene(), [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)], options=SHORT
+    )
     last = scatter(free, free.segments, np.random.default_rng(0))
     assert last is not None
     z, residual = last
@@ -221,7 +252,8 @@ class Looked:
 @pytest.mark.parametrize(
     ("straight", "around", "trees", "expected"),
     [
-        # What goes straight is good: the others are looked for (s) when what was before them has been taken (S).
+        # What goes straight is good: the others are looked for (s) when what was before them has
+        # been taken (S).
         ([0.0, 0.0], [0.0, 0.0], [], "s0 S0 a0 A0 s1 S1 a1 A1"),
         ([0.0, 0.0, 0.0], [0.0], [], "s0 S0 a0 A0 s1 S1 s2 S2"),
         ([0.0], [0.0, 0.0, 0.0], [], "s0 S0 a0 A0 a1 A1 a2 A2"),
@@ -230,7 +262,8 @@ class Looked:
         ([0.0, 0.0], [0.0, 0.0], [0.0], "s0 S0 a0 A0 t0 T0 s1 S1 a1 A1"),
         ([], [0.0, 0.0], [0.0, 0.0], "a0 A0 t0 T0 a1 A1 t1 T1"),
         ([FINE], [LOST], [0.0], "s0 S0 a0 t0 T0 A0"),
-        # What goes straight hits things, what goes around does not: it waits until nothing better is left, and is asked last.
+        # What goes straight hits things, what goes around does not: it waits until nothing better
+        # is left, and is asked last.
         ([LOST, 0.0], [0.0, 0.0], [], "s0 a0 A0 a1 A1 s1 S1 S0"),
         ([POOR, 0.0], [FINE, 0.0], [0.0], "s0 a0 A0 t0 T0 a1 A1 s1 S1 S0"),
         # Both do, or there is no way around: what trees find comes first.
@@ -246,7 +279,9 @@ class Looked:
         ([None], [None], [None], "s0 a0 t0"),
     ],
 )
-def test_straight_around_and_trees_take_turns(straight: Overlaps, around: Overlaps, trees: Overlaps, expected: str) -> None:
+def test_straight_around_and_trees_take_turns(
+    straight: Overlaps, around: Overlaps, trees: Overlaps, expected: str
+) -> None:
     assert Looked(straight, around, trees).said == expected.split()
 
 
@@ -257,13 +292,22 @@ def test_every_seed_is_yielded_once_and_none_before_it_is_looked_for(
     said = Looked(straight, around, trees).said
     kinds = (("s", straight), ("a", around), ("t", trees))
     looked = [f"{kind}{k}" for kind, found in kinds for k in range(len(found))]
-    seeds = [f"{kind}{k}" for kind, found in kinds for k, overlap in enumerate(found) if overlap is not None]
+    seeds = [
+        f"{kind}{k}"
+        for kind, found in kinds
+        for k, overlap in enumerate(found)
+        if overlap is not None
+    ]
     assert sorted(said) == sorted([*looked, *map(str.upper, seeds)])
     assert all(said.index(name) < said.index(name.upper()) for name in seeds)
     overlap = {f"{kind}{k}".upper(): found[k] for kind, found in kinds for k in range(len(found))}
     for at, name in enumerate(said):
         if name in overlap:
-            known = [other.upper() for other in said[:at] if other.islower() and overlap[other.upper()] is not None]
+            known = [
+                other.upper()
+                for other in said[:at]
+                if other.islower() and overlap[other.upper()] is not None
+            ]
             left = [overlap[other] for other in known if other not in said[:at]]
             assert overlap[name] == min(left), "the best of those that wait comes first"
 
@@ -271,7 +315,9 @@ def test_every_seed_is_yielded_once_and_none_before_it_is_looked_for(
 def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
     scene, rng = vkc.load_scene("aisle_drawer"), np.random.default_rng(7)
     for _ in range(16):  # on some of these ways headings wind by a whole turn
-        problem = program_of(scene.sample_start(rng), [vkc.GoTo(2.9, 2.0, float(rng.uniform(-3.0, 3.0)))])
+        problem = program_of(
+            scene.sample_start(rng), [vkc.GoTo(2.9, 2.0, float(rng.uniform(-3.0, 3.0)))]
+        )
         (seed,) = initialize(problem, "astar", 0)
         turns = np.diff(problem.waypoints(seed.z)[:, 2])
         assert abs(turns[-1]) < 0.2
@@ -287,7 +333,8 @@ def test_what_costs_nothing_has_a_seed() -> None:
     assert np.abs(seed.z - problem.start).max() < 1e-9
 
 
-# --- through narrow places -----------------------------------------------------------------------------------------------
+# --- through narrow places
+# -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("width", [NARROW, TIGHT])
@@ -317,7 +364,9 @@ def test_in_turn_trees_come_first_where_the_others_hit_things() -> None:
 
 
 @pytest.mark.parametrize("hopeless", [True, False])
-def test_trees_grow_unless_a_goal_is_blocked_of_which_no_search_knows_better(hopeless: bool) -> None:
+def test_trees_grow_unless_a_goal_is_blocked_of_which_no_search_knows_better(
+    hopeless: bool,
+) -> None:
     asked: list[Sequence[int]] = []
 
     def answer(phases: Sequence[int]) -> bool:
@@ -361,7 +410,9 @@ def test_a_motion_through_the_narrow_gate() -> None:
 
 
 @pytest.mark.parametrize(("method", "stands"), [("astar", False), ("rrt", True)])
-def test_for_trees_the_base_stands_while_the_hand_goes_straight_in(method: str, stands: bool) -> None:
+def test_for_trees_the_base_stands_while_the_hand_goes_straight_in(
+    method: str, stands: bool
+) -> None:
     (z,) = seeds(method)
     reach = int(problem().ends[0])
     last = z[reach - OPENED.steps(OPENED.approach_time) - 1 : reach, :3]
@@ -480,13 +531,18 @@ def test_where_the_arm_goes_far_round_trees_grow_from_other_grasps_too_and_the_l
 
     def merit(z: np.ndarray) -> float:
         contacts = problem().evaluate_contacts(z, reach=problem().options.largest_margin, nearest=1)
-        return problem().objective(z, problem().timing_for(z).dt) + problem().options.penalty * contacts.shortfall(len(z)).sum()
+        return (
+            problem().objective(z, problem().timing_for(z).dt)
+            + problem().options.penalty * contacts.shortfall(len(z)).sum()
+        )
 
     assert merit(best.z) == min(map(merit, joined))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_of_every_kind_so_many_seeds_are_asked_for(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_every_kind_so_many_seeds_are_asked_for(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: dict[str, int] = {}
 
     def seeds(one: Any, most: int) -> Iterator[Seed]:
@@ -510,8 +566,14 @@ def test_trees_hold_the_handle_too() -> None:
 
 def test_the_narrow_door_is_shut_from_outside() -> None:
     """It stands open into the bedroom: a hand at its lever is in the doorway, where the arm at home has no room."""
-    scene = vkc.load_scene("household").with_state("door", {"hinge": 1.52}).with_start(base=(1.5, -0.5, 1.57))
-    plan = vkc.plan(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})], seed=0)
+    scene = (
+        vkc.load_scene("household")
+        .with_state("door", {"hinge": 1.52})
+        .with_start(base=(1.5, -0.5, 1.57))
+    )
+    plan = vkc.plan(
+        scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})], seed=0
+    )
     assert plan.success, plan.report()
     assert plan.trajectory.column("door.hinge")[-1] == pytest.approx(0.0, abs=1e-3)
     assert plan.trajectory.positions[-1, 1] < 1.0  # the wall is at 1.25: it has come out

@@ -24,7 +24,9 @@ from vkc_pin.utils.optional_imports import compiled_module
 SIZE = 9  # x, y and yaw of the base, six joints of the arm
 METRE = np.array([2.0, 2.0, *np.ones(SIZE - 2)])  # how much each coordinate counts
 GRAZE = 1.0  # share of the margins that may be missing
-HIDDEN = 0.02  # [m] that may hide between two configurations that are looked at, 0.15 rad apart; 0.011 is the worst of 60 ways
+# [m] that may hide between two configurations that are looked at, 0.15 rad apart; 0.011 is the
+# worst of 60 ways
+HIDDEN = 0.02
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -38,10 +40,21 @@ def gate() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
     return problem, guide, np.array([problem.start[3:], routes.folded_arm(0)])
 
 
-def through(seed: int, ends: np.ndarray | None = None, *, tries: int = trees.TRIES) -> np.ndarray | None:
+def through(
+    seed: int, ends: np.ndarray | None = None, *, tries: int = trees.TRIES
+) -> np.ndarray | None:
     problem, guide, arms = gate()
     ends = at(problem, GOAL)[None] if ends is None else ends
-    return connect(problem, 0, problem.start, ends, poses=guide, arms=arms, rng=np.random.default_rng(seed), tries=tries)
+    return connect(
+        problem,
+        0,
+        problem.start,
+        ends,
+        poses=guide,
+        arms=arms,
+        rng=np.random.default_rng(seed),
+        tries=tries,
+    )
 
 
 def length(path: np.ndarray) -> float:
@@ -64,7 +77,9 @@ def missing(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> np.ndarray:
     return problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).shortfall(len(z))
 
 
-def test_what_a_coarse_search_overlooks_a_finer_one_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_coarse_search_overlooks_a_finer_one_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     worst = []
     for steps in ((3.0, 3.0), (3.0, 0.04)):
         monkeypatch.setattr(trees, "_STEPS", steps)
@@ -98,14 +113,19 @@ def test_straight_ways_are_free_and_no_longer(seed: int) -> None:
     problem, guide, arms = gate()
     path = through(seed)
     assert path is not None
-    search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(seed), 0.04)
+    search = trees._Search(
+        problem, 0, problem.start, guide, arms, np.random.default_rng(seed), 0.04
+    )
     again = search.straightened(path)
     assert length(again) <= length(path) + 1e-9
     np.testing.assert_allclose(again[[0, -1]], path[[0, -1]], atol=1e-12)
     is_a_way(problem, again)
 
 
-@pytest.mark.parametrize(("there", "back", "far"), [(1.0, 0.0, False), (1.2, 0.2, False), (2.0, 1.5, True), (3.0, 0.0, False)])
+@pytest.mark.parametrize(
+    ("there", "back", "far"),
+    [(1.0, 0.0, False), (1.2, 0.2, False), (2.0, 1.5, True), (3.0, 0.0, False)],
+)
 def test_the_arm_goes_far_round_where_a_third_of_its_way_is_none_of_the_straight_one(
     there: float, back: float, far: bool
 ) -> None:
@@ -114,7 +134,9 @@ def test_the_arm_goes_far_round_where_a_third_of_its_way_is_none_of_the_straight
     z, middle = np.tile(problem.start, (problem.segments, 1)), int(problem.ends[0])
     z[:, 0] = np.linspace(0.0, 1.0, len(z))
     turn = problem.segments - middle
-    z[middle:, 3] += np.interp(np.arange(1, turn + 1), [0, turn // 2, turn], [0.0, there, there - back])
+    z[middle:, 3] += np.interp(
+        np.arange(1, turn + 1), [0, turn // 2, turn], [0.0, there, there - back]
+    )
     assert trees.far_round(problem, z) == far
 
 
@@ -159,7 +181,9 @@ def test_a_detour_is_the_share_of_a_path_that_the_arm_goes_beyond_its_straight_w
     path[1:, 0] += [0.5, 0.0]
     path[1:, 4] += [0.3, 0.1]
     driven, turned = problem.chain.metric[[0, 4]]  # what a metre and a radian count
-    assert trees._detour(path, metric) == pytest.approx(0.4 * turned / (1.0 * driven + 0.5 * turned))
+    assert trees._detour(path, metric) == pytest.approx(
+        0.4 * turned / (1.0 * driven + 0.5 * turned)
+    )
     assert trees._detour(path[[0, 2]], metric) == pytest.approx(0.0)
     assert trees._detour(path[:1], metric) == 0.0
 
@@ -172,7 +196,8 @@ def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
     assert np.all((path >= limits[:, 0]) & (path <= limits[:, 1]))
 
 
-# --- what is found -------------------------------------------------------------------------------------------------------
+# --- what is found
+# -------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=8, deadline=None)
@@ -180,13 +205,19 @@ def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
 def test_a_way_leads_through_the_gate_from_one_end_to_the_other(seed: int) -> None:
     problem, _, _ = gate()
     straight = np.array([problem.start, at(problem, GOAL)])
-    assert missing(problem, finely(straight)).max() > 0.1, "the arm at home does not hit the gate: choose a narrower one"
+    assert missing(problem, finely(straight)).max() > 0.1, (
+        "the arm at home does not hit the gate: choose a narrower one"
+    )
     path = through(seed)
     assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], straight)
     is_a_way(problem, path)
-    inside = np.abs(finely(path)[:, 0] + 0.3 - 2.0) < 0.1  # the arm at home is at the front, from 0.2 to 0.45
-    assert np.abs(finely(path)[inside][:, 3:] - problem.start[3:]).max(axis=1).min() > 0.2, "the arm is not at home there"
+    inside = (
+        np.abs(finely(path)[:, 0] + 0.3 - 2.0) < 0.1
+    )  # the arm at home is at the front, from 0.2 to 0.45
+    assert np.abs(finely(path)[inside][:, 3:] - problem.start[3:]).max(axis=1).min() > 0.2, (
+        "the arm is not at home there"
+    )
 
 
 @settings(max_examples=4, deadline=None)
@@ -202,26 +233,45 @@ def test_of_several_ends_it_is_one_that_can_be_reached(seed: int, free: int) -> 
     is_a_way(problem, path)
 
 
-@pytest.mark.parametrize("pose", [(2.0, 1.5, 0.0), (4.0, 0.5, 0.0)], ids=["in the wall", "behind a wall without a gate"])
+@pytest.mark.parametrize(
+    "pose", [(2.0, 1.5, 0.0), (4.0, 0.5, 0.0)], ids=["in the wall", "behind a wall without a gate"]
+)
 def test_there_is_no_way_to_what_is_walled_in(pose: tuple[float, float, float]) -> None:
     problem = gated(0.0)
     poses, arms = np.array([problem.start[:3], pose]), problem.start[None, 3:]
     for seed in range(2):
         rng = np.random.default_rng(seed)
-        assert connect(problem, 0, problem.start, at(problem, pose)[None], poses=poses, arms=arms, rng=rng, tries=400) is None
+        assert (
+            connect(
+                problem,
+                0,
+                problem.start,
+                at(problem, pose)[None],
+                poses=poses,
+                arms=arms,
+                rng=rng,
+                tries=400,
+            )
+            is None
+        )
 
 
 def test_of_ends_that_are_all_too_close_to_something_the_least_is_tried() -> None:
     """A goal that is a little closer than may be is where one is sent; one in the wall is not."""
     problem, _, arms = gate()
-    there, allowed = np.array([*at(problem, (1.895 - 0.49, 1.5, np.pi / 2))[:3], *arms[1]]), GRAZE * problem.options.dist_safe
+    there, allowed = (
+        np.array([*at(problem, (1.895 - 0.49, 1.5, np.pi / 2))[:3], *arms[1]]),
+        GRAZE * problem.options.dist_safe,
+    )
     towards = np.tile(there, (241, 1))
     towards[:, 0] += np.linspace(-0.3, 0.3, 241)
     short = missing(problem, towards)
     near = towards[int(np.argmax(short > allowed))]
     assert allowed < missing(problem, near[None])[0] < allowed + 3e-3
     ends, poses = np.array([towards[-1], near]), np.array([problem.start[:3], near[:3]])
-    path = connect(problem, 0, problem.start, ends, poses=poses, arms=arms, rng=np.random.default_rng(0))
+    path = connect(
+        problem, 0, problem.start, ends, poses=poses, arms=arms, rng=np.random.default_rng(0)
+    )
     assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], [problem.start, near])
     assert missing(problem, finely(path)).max() <= allowed + HIDDEN
@@ -233,7 +283,9 @@ def test_who_is_there_already_stays() -> None:
     path = connect(problem, 0, problem.start, ends, poses=guide, arms=arms, rng=rng)
     assert path is not None
     np.testing.assert_array_equal(path, np.tile(problem.start, (len(path), 1)))
-    np.testing.assert_array_equal(spread(path, 5, problem.chain.metric[: path.shape[1]]), np.tile(problem.start, (5, 1)))
+    np.testing.assert_array_equal(
+        spread(path, 5, problem.chain.metric[: path.shape[1]]), np.tile(problem.start, (5, 1))
+    )
 
 
 def test_nothing_in_the_way_nothing_beside_it() -> None:
@@ -241,21 +293,47 @@ def test_nothing_in_the_way_nothing_beside_it() -> None:
     problem = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
     end = at(problem, (2.0, 1.0, 0.5))
     end[3:] += 0.3
-    path = connect(problem, 0, problem.start, end[None], poses=end[None, :3], arms=end[None, 3:], rng=np.random.default_rng(0))
+    path = connect(
+        problem,
+        0,
+        problem.start,
+        end[None],
+        poses=end[None, :3],
+        arms=end[None, 3:],
+        rng=np.random.default_rng(0),
+    )
     assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], [problem.start, end])
     assert length(path) == pytest.approx(length(np.array([problem.start, end])), rel=1e-9)
 
 
 def test_the_arm_of_a_fixed_base_goes_around_a_pole() -> None:
-    pole = {"name": "pole", "type": "cylinder", "radius": 0.05, "length": 1.2, "position": [0.37, 0.25, 1.7]}  # from the ceiling
-    problem = program_of(hall(base="fixed", obstacles=[pole]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))])
+    pole = {
+        "name": "pole",
+        "type": "cylinder",
+        "radius": 0.05,
+        "length": 1.2,
+        "position": [0.37, 0.25, 1.7],
+    }  # from the ceiling
+    problem = program_of(
+        hall(base="fixed", obstacles=[pole]), [vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))]
+    )
     first, last = problem.start.copy(), problem.start.copy()
     first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
     assert missing(problem, np.array([first, last])).max() == 0.0
-    assert missing(problem, finely(np.array([first, last]))).max() > 0.05, "the pole is not in the way"
+    assert missing(problem, finely(np.array([first, last]))).max() > 0.05, (
+        "the pole is not in the way"
+    )
     arms = np.array([first[3:], last[3:]])
-    path = connect(problem, 0, first, last[None], poses=first[None, :3], arms=arms, rng=np.random.default_rng(0))
+    path = connect(
+        problem,
+        0,
+        first,
+        last[None],
+        poses=first[None, :3],
+        arms=arms,
+        rng=np.random.default_rng(0),
+    )
     assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], [first, last])
     np.testing.assert_array_equal(path[:, :3], np.tile(first[:3], (len(path), 1)))
@@ -281,25 +359,33 @@ def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> Non
         assert short is not None
         assert plain is not None
         np.testing.assert_array_equal(short[[0, -1]], plain[[0, -1]])
-        assert np.abs(np.diff(plain, axis=0)).max(axis=1).min() > 0.0, "it stops where the trees meet"
+        assert np.abs(np.diff(plain, axis=0)).max(axis=1).min() > 0.0, (
+            "it stops where the trees meet"
+        )
         assert length(short) <= length(plain) + 1e-9
         if seed == 0:
             assert length(short) < 0.9 * length(plain)
 
 
-# --- parts of the way that are free --------------------------------------------------------------------------------------
+# --- parts of the way that are free
+# --------------------------------------------------------------------------------------
 
 
 def search(seed: int = 0) -> trees._Search:
     problem, guide, arms = gate()
-    return trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(seed), trees._STEPS[0])
+    return trees._Search(
+        problem, 0, problem.start, guide, arms, np.random.default_rng(seed), trees._STEPS[0]
+    )
 
 
 def test_a_line_is_free_up_to_the_last_place_before_the_first_that_is_blocked() -> None:
     problem, guide, arms = gate()
     finder, rng, shares = search(), np.random.default_rng(5), []
     for _ in range(60):
-        a, b = (np.concatenate([guide[rng.integers(len(guide)), :3], arms[rng.integers(len(arms))]]) for _ in range(2))
+        a, b = (
+            np.concatenate([guide[rng.integers(len(guide)), :3], arms[rng.integers(len(arms))]])
+            for _ in range(2)
+        )
         b = b + 0.3 * rng.normal(size=SIZE)
         count = max(1, int(np.ceil(np.abs((b - a) * finder.weights).max() / finder.step)))
         rows = a + np.arange(1, count + 1)[:, None] / count * (b - a)
@@ -317,7 +403,10 @@ def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
     through_gate, all_ = [], search().runs
     for arm in arms:
         rows = np.column_stack([guide, np.tile(arm, (len(guide), 1))])
-        free, between = missing(problem, rows) <= allowed, missing(problem, (rows[1:] + rows[:-1]) / 2) <= allowed
+        free, between = (
+            missing(problem, rows) <= allowed,
+            missing(problem, (rows[1:] + rows[:-1]) / 2) <= allowed,
+        )
         own = [run for run in all_ if np.array_equal(run[0, 3:], arm)]
         covered = np.zeros(len(rows), int)
         for run in own:
@@ -350,7 +439,11 @@ def test_a_tree_that_gets_to_a_run_takes_in_all_of_it() -> None:
         end = run[-1].copy()
         end[3:] += 0.05
         path = raw(one, end[None], 200)
-        rows = [int(np.flatnonzero((path == row).all(axis=1))[0]) for row in run if (path == row).all(axis=1).any()]
+        rows = [
+            int(np.flatnonzero((path == row).all(axis=1))[0])
+            for row in run
+            if (path == row).all(axis=1).any()
+        ]
         assert len(rows) > len(run) / 3
         assert np.all(np.diff(rows) == 1), "they follow each other as on the run"
         is_a_way(problem, path)
@@ -409,15 +502,28 @@ def test_compiled_trees_refuse_what_does_not_fit() -> None:
         with pytest.raises(ValueError, match=r"robot's coordinates|one configuration|two ends"):
             call()
     trees_of = compiled_module("vkc_pin.planning.initialization._trees").Trees
-    good = [one.weights, one.lower, one.upper, one.poses[:2], one.arms, np.concatenate(one.runs), [len(run) for run in one.runs]]
+    good = [
+        one.weights,
+        one.lower,
+        one.upper,
+        one.poses[:2],
+        one.arms,
+        np.concatenate(one.runs),
+        [len(run) for run in one.runs],
+    ]
 
     def made(**changed: object) -> None:
         parts = {f"part{k}": value for k, value in enumerate(good)} | changed
-        rows = [np.ascontiguousarray(value, np.int64 if name == "part6" else float) for name, value in parts.items()]
+        rows = [
+            np.ascontiguousarray(value, np.int64 if name == "part6" else float)
+            for name, value in parts.items()
+        ]
         trees_of(one._lines, *rows, 0.1, 0.4, 7)
 
     made()
-    for number, wrong in enumerate((one.weights[1:], one.lower[1:], one.upper[1:], one.poses[:0], one.arms[:, 1:], rows[:, 1:])):
+    for number, wrong in enumerate(
+        (one.weights[1:], one.lower[1:], one.upper[1:], one.poses[:0], one.arms[:, 1:], rows[:, 1:])
+    ):
         with pytest.raises(ValueError, match="of the robot's coordinates"):
             made(**{f"part{number}": wrong})
     with pytest.raises(ValueError, match="as long as is said"):
@@ -435,10 +541,13 @@ def test_lines_refuse_what_does_not_fit() -> None:
         contacts.lines(one.first[:-1], one.waypoint, **how)
 
 
-# --- spread --------------------------------------------------------------------------------------------------------------
+# --- spread
+# --------------------------------------------------------------------------------------------------------------
 
 PATHS = st.integers(1, 6).flatmap(
-    lambda count: some.arrays(np.float64, (count, SIZE), elements=st.floats(-5.0, 5.0, allow_subnormal=False))
+    lambda count: some.arrays(
+        np.float64, (count, SIZE), elements=st.floats(-5.0, 5.0, allow_subnormal=False)
+    )
 )
 
 
@@ -466,7 +575,10 @@ def test_spread_goes_along_the_path_to_its_end(path: np.ndarray, steps: int) -> 
 
 def test_spread_is_slow_at_both_ends() -> None:
     path = np.zeros((3, SIZE))
-    path[1:, 0], path[2, 4] = 1.0, 2.0  # a metre of the base counts as much as two radians of the arm
+    path[1:, 0], path[2, 4] = (
+        1.0,
+        2.0,
+    )  # a metre of the base counts as much as two radians of the arm
     rows = np.vstack([path[:1], spread(path, 20, METRE)])
     steps = np.linalg.norm(np.diff(rows, axis=0) * METRE, axis=1)
     assert max(steps[0], steps[-1]) < 0.15 * steps.max()

@@ -11,14 +11,20 @@ from vkc_pin.planning.kinematics.batch import _KEPT, BatchFunction
 
 def make() -> ca.Function:
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
-    matrix = ca.vertcat(ca.horzcat(x[0] * y[0], ca.sin(x[1])), ca.horzcat(x[2], y[1] ** 2), ca.horzcat(ca.sumsqr(x), y[0]))
+    matrix = ca.vertcat(
+        ca.horzcat(x[0] * y[0], ca.sin(x[1])),
+        ca.horzcat(x[2], y[1] ** 2),
+        ca.horzcat(ca.sumsqr(x), y[0]),
+    )
     return ca.Function("f", [x, y], [ca.densify(matrix), ca.sumsqr(x) + y[1]])
 
 
 def one_by_one(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     function = make()
     found = [function(a, b) for a, b in zip(x, np.broadcast_to(y, (len(x), 2)), strict=True)]
-    return np.array([np.asarray(m).ravel(order="F") for m, _ in found]), np.array([np.asarray(s).ravel() for _, s in found])
+    return np.array([np.asarray(m).ravel(order="F") for m, _ in found]), np.array(
+        [np.asarray(s).ravel() for _, s in found]
+    )
 
 
 @pytest.mark.parametrize("batch", [1, 2, 7, 300])
@@ -36,7 +42,9 @@ def test_rows_are_those_of_the_function_with_entries_by_column(batch: int) -> No
 def test_one_row_for_all() -> None:
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(5, 3)), rng.normal(size=2)
-    np.testing.assert_allclose(BatchFunction(make())(x, y)[0], one_by_one(x, y)[0], rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(
+        BatchFunction(make())(x, y)[0], one_by_one(x, y)[0], rtol=0.0, atol=1e-14
+    )
 
 
 def test_results_are_the_callers_own() -> None:
@@ -59,8 +67,13 @@ def test_sizes_may_change_from_call_to_call() -> None:
 
 
 def test_arrays_need_not_be_contiguous_nor_of_floats() -> None:
-    x, y = np.arange(24)[::-1].reshape(4, 6)[:, ::2], np.asfortranarray(np.arange(8.0).reshape(4, 2))
-    np.testing.assert_allclose(BatchFunction(make())(x, y)[0], one_by_one(x, y)[0], rtol=0.0, atol=1e-12)
+    x, y = (
+        np.arange(24)[::-1].reshape(4, 6)[:, ::2],
+        np.asfortranarray(np.arange(8.0).reshape(4, 2)),
+    )
+    np.testing.assert_allclose(
+        BatchFunction(make())(x, y)[0], one_by_one(x, y)[0], rtol=0.0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("shapes", [[(4, 3), (5, 2)], [(4, 2), (4, 2)], [(4, 3), (4, 3)], [(4, 3)]])

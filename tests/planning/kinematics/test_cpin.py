@@ -59,7 +59,9 @@ JOINTS: dict[str, Callable[[], object]] = {
     "universal": lambda: pin.JointModelUniversal(np.array([1.0, 0, 0]), np.array([0, 1.0, 0])),
     "helical": lambda: pin.JointModelHelicalUnaligned(AXIS, 0.1),
 }
-MINIMAL = [name for name in JOINTS if name.startswith(("planar", "revolute", "unbounded", "prismatic"))]
+MINIMAL = [
+    name for name in JOINTS if name.startswith(("planar", "revolute", "unbounded", "prismatic"))
+]
 
 
 def tree(*kinds: str) -> pin.Model:
@@ -70,7 +72,16 @@ def tree(*kinds: str) -> pin.Model:
         parent = model.addJoint(parent, JOINTS[kind](), pin.SE3.Random(), kind)
         model.appendBodyToJoint(parent, pin.Inertia.Random(), pin.SE3.Random())
         # What a fixed joint leaves behind: a frame with an inertia of its own.
-        model.addFrame(pin.Frame(f"{kind}_tip", parent, 0, pin.SE3.Random(), pin.FrameType.FIXED_JOINT, pin.Inertia.Random()))
+        model.addFrame(
+            pin.Frame(
+                f"{kind}_tip",
+                parent,
+                0,
+                pin.SE3.Random(),
+                pin.FrameType.FIXED_JOINT,
+                pin.Inertia.Random(),
+            )
+        )
     return model
 
 
@@ -82,7 +93,9 @@ def configurations(model: pin.Model, count: int = 5) -> Iterator[np.ndarray]:
 
 
 def stacked(placements: list[pin.SE3]) -> np.ndarray:
-    return np.array([np.concatenate([m.rotation.T.ravel(), m.translation]) for m in placements]).T.reshape(12, len(placements))
+    return np.array(
+        [np.concatenate([m.rotation.T.ravel(), m.translation]) for m in placements]
+    ).T.reshape(12, len(placements))
 
 
 def numeric_placements(model: pin.Model, q: np.ndarray) -> np.ndarray:
@@ -108,11 +121,17 @@ def test_kinematics_and_dynamics_equal_numeric_pinocchio(kind: str) -> None:
     for q in configurations(model):
         v, a = random.normal(size=(2, model.nv))
         pin.framesForwardKinematics(model, data, q)
-        np.testing.assert_allclose(joints(q).full(), numeric_placements(model, q), atol=TOLERANCE, rtol=0)
+        np.testing.assert_allclose(
+            joints(q).full(), numeric_placements(model, q), atol=TOLERANCE, rtol=0
+        )
         np.testing.assert_allclose(tips(q).full(), stacked(list(data.oMf)), atol=TOLERANCE, rtol=0)
         expected = pin.rnea(model, data, q, v, a)
-        np.testing.assert_allclose(torque(q, v, a).full().ravel(), expected, atol=TOLERANCE, rtol=TOLERANCE)
-        np.testing.assert_allclose(com(q).full().ravel(), pin.centerOfMass(model, data, q), atol=TOLERANCE, rtol=0)
+        np.testing.assert_allclose(
+            torque(q, v, a).full().ravel(), expected, atol=TOLERANCE, rtol=TOLERANCE
+        )
+        np.testing.assert_allclose(
+            com(q).full().ravel(), pin.centerOfMass(model, data, q), atol=TOLERANCE, rtol=0
+        )
 
 
 @pytest.mark.parametrize("kind", JOINTS)
@@ -121,7 +140,9 @@ def test_frame_jacobian_equals_numeric_pinocchio(kind: str, reference: str) -> N
     model = tree(*dict.fromkeys(("planar", kind)))
     frame = model.getFrameId(f"{kind}_tip")
     jacobian = cpin.frame_jacobian(model, f"{kind}_tip", reference)  # type: ignore[arg-type]
-    axes = {"local_world_aligned": pin.LOCAL_WORLD_ALIGNED, "local": pin.LOCAL, "world": pin.WORLD}[reference]
+    axes = {"local_world_aligned": pin.LOCAL_WORLD_ALIGNED, "local": pin.LOCAL, "world": pin.WORLD}[
+        reference
+    ]
     data = model.createData()
     for q in configurations(model):
         expected = pin.computeFrameJacobian(model, data, q, frame, axes)
@@ -135,7 +156,10 @@ def test_first_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model
     jacobian = casadi.Function("jacobian", [z], [casadi.jacobian(placements, z)])
     point, step = np.random.default_rng(2).normal(size=coordinates.size), 1e-6
     for i, direction in enumerate(np.eye(coordinates.size)):
-        ahead, behind = (numeric_placements(arm, coordinates.q(point + sign * step * direction)) for sign in (1, -1))
+        ahead, behind = (
+            numeric_placements(arm, coordinates.q(point + sign * step * direction))
+            for sign in (1, -1)
+        )
         difference = ((ahead - behind) / (2 * step)).ravel(order="F")
         np.testing.assert_allclose(jacobian(point).full()[:, i], difference, atol=1e-7)
 
@@ -154,19 +178,29 @@ def test_second_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Mode
 
     for _ in range(20):
         direction = random.normal(size=n)
-        difference = (numeric(point + step * direction) - 2 * numeric(point) + numeric(point - step * direction)) / step**2
+        difference = (
+            numeric(point + step * direction)
+            - 2 * numeric(point)
+            + numeric(point - step * direction)
+        ) / step**2
         exact = direction @ hessian(point).full() @ direction
         assert exact == pytest.approx(difference, rel=1e-5, abs=1e-4)
 
 
 def test_dynamics_derivatives_equal_numeric_pinocchio() -> None:
-    model = tree("revolute_x", "prismatic_unaligned", "revolute_unaligned", "prismatic_y", "revolute_z")
+    model = tree(
+        "revolute_x", "prismatic_unaligned", "revolute_unaligned", "prismatic_y", "revolute_z"
+    )
     data, random = model.createData(), np.random.default_rng(5)
     q, v, a = random.normal(size=(3, model.nv))
     symbols = [casadi.SX.sym(name, model.nv) for name in "qva"]
     torque = cpin.rnea(model)(*symbols)
-    derivatives = casadi.Function("d", symbols, [casadi.jacobian(torque, symbol) for symbol in symbols])(q, v, a)
-    for exact, expected in zip(derivatives, pin.computeRNEADerivatives(model, data, q, v, a), strict=True):
+    derivatives = casadi.Function(
+        "d", symbols, [casadi.jacobian(torque, symbol) for symbol in symbols]
+    )(q, v, a)
+    for exact, expected in zip(
+        derivatives, pin.computeRNEADerivatives(model, data, q, v, a), strict=True
+    ):
         np.testing.assert_allclose(exact.full(), expected, atol=1e-11)
     com = cpin.center_of_mass(model)
     slope = casadi.Function("c", symbols[:1], [casadi.jacobian(com(symbols[0]), symbols[0])])(q)
@@ -175,7 +209,11 @@ def test_dynamics_derivatives_equal_numeric_pinocchio() -> None:
 
 def test_functions_name_their_inputs_and_outputs(arm: pin.Model) -> None:
     joints, torque = cpin.joint_placements(arm), cpin.rnea(arm)
-    assert (joints.name(), joints.name_in(), joints.name_out()) == ("joint_placements", ["q"], ["M"])
+    assert (joints.name(), joints.name_in(), joints.name_out()) == (
+        "joint_placements",
+        ["q"],
+        ["M"],
+    )
     assert joints.size_in(0) == (arm.nq, 1)
     assert joints.size_out(0) == (12, arm.njoints - 1)
     assert (torque.name_in(), torque.name_out()) == (["q", "v", "a"], ["tau"])
@@ -191,7 +229,9 @@ def test_quarter_turns_cost_no_instructions() -> None:
     for rotation in (exact, pin.rpy.rpyToMatrix(0, 0, np.pi / 2)):
         model, parent = pin.Model(), 0
         for i in range(6):
-            parent = model.addJoint(parent, pin.JointModelRX(), pin.SE3(rotation, np.array([0.1, 0, 0])), f"j{i}")
+            parent = model.addJoint(
+                parent, pin.JointModelRX(), pin.SE3(rotation, np.array([0.1, 0, 0])), f"j{i}"
+            )
         counts.append(cpin.joint_placements(model).n_instructions())
     assert counts[0] == counts[1]
     planar = tree("planar")
@@ -201,9 +241,14 @@ def test_quarter_turns_cost_no_instructions() -> None:
 
 def test_infinite_limits_do_not_matter(arm: pin.Model) -> None:
     model = arm.copy()
-    model.lowerPositionLimit, model.upperPositionLimit = np.full(model.nq, -np.inf), np.full(model.nq, np.inf)
+    model.lowerPositionLimit, model.upperPositionLimit = (
+        np.full(model.nq, -np.inf),
+        np.full(model.nq, np.inf),
+    )
     q = next(configurations(arm))
-    np.testing.assert_allclose(cpin.joint_placements(model)(q).full(), numeric_placements(arm, q), atol=TOLERANCE)
+    np.testing.assert_allclose(
+        cpin.joint_placements(model)(q).full(), numeric_placements(arm, q), atol=TOLERANCE
+    )
 
 
 def test_model_is_left_alone(arm: pin.Model) -> None:
@@ -220,7 +265,10 @@ def test_models_without_joints_and_empty_frame_lists() -> None:
 
 def test_frames_by_index_and_single_name(arm: pin.Model) -> None:
     q, index = next(configurations(arm)), arm.getFrameId("revolute_x_tip")
-    by_name, by_index = cpin.frame_placements(arm, "revolute_x_tip"), cpin.frame_placements(arm, [index])
+    by_name, by_index = (
+        cpin.frame_placements(arm, "revolute_x_tip"),
+        cpin.frame_placements(arm, [index]),
+    )
     np.testing.assert_array_equal(by_name(q).full(), by_index(q).full())
 
 
@@ -245,12 +293,18 @@ def test_ambiguous_frame_names_are_refused(arm: pin.Model) -> None:
 
 @pytest.mark.parametrize("installed", ["4.10.0", "5.1.0", "4.0.3"])
 def test_another_release_is_refused(installed: str) -> None:
-    with pytest.raises(BuildError, match=rf"pin 4\.1\.0, but {installed} is installed.*pip install 'pin==4\.1\.\*'"):
-        backends.check_versions({"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": installed, "casadi": "3.8.2"})
+    with pytest.raises(
+        BuildError, match=rf"pin 4\.1\.0, but {installed} is installed.*pip install 'pin==4\.1\.\*'"
+    ):
+        backends.check_versions(
+            {"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": installed, "casadi": "3.8.2"}
+        )
 
 
 def test_a_patch_release_is_accepted() -> None:
-    backends.check_versions({"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": "4.1.12", "casadi": "3.8.2+local"})
+    backends.check_versions(
+        {"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": "4.1.12", "casadi": "3.8.2+local"}
+    )
 
 
 def test_an_unreadable_version_is_a_build_error() -> None:
@@ -258,7 +312,9 @@ def test_an_unreadable_version_is_a_build_error() -> None:
         backends.check_versions({"pin": "4.1.0"}, {"pin": "unknown"})
 
 
-def test_a_missing_extension_says_what_to_install(monkeypatch: pytest.MonkeyPatch, arm: pin.Model) -> None:
+def test_a_missing_extension_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, arm: pin.Model
+) -> None:
     monkeypatch.setitem(sys.modules, "vkc_pin.planning.kinematics._cpin", None)
     backends._extension.cache_clear()
     with pytest.raises(BuildError, match=r"apt install g\+\+"):
@@ -274,7 +330,10 @@ def test_backend_is_upstreams_where_it_can_be_imported(monkeypatch: pytest.Monke
     cpin._backend.cache_clear()
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pinocchio.casadi") is None, reason="this pinocchio has no casadi binding")
+@pytest.mark.skipif(
+    importlib.util.find_spec("pinocchio.casadi") is None,
+    reason="this pinocchio has no casadi binding",
+)
 def test_upstream_equals_compiled(arm: pin.Model) -> None:
     q, (v, a) = next(configurations(arm)), np.random.default_rng(6).normal(size=(2, arm.nv))
     frame = arm.getFrameId("planar_tip")
@@ -285,11 +344,17 @@ def test_upstream_equals_compiled(arm: pin.Model) -> None:
         ("rnea", (), (q, v, a)),
         ("center_of_mass", (), (q,)),
     ):
-        one, other = (backend(name, arm, *arguments)(*inputs).full() for backend in (backends.upstream, backends.compiled))
+        one, other = (
+            backend(name, arm, *arguments)(*inputs).full()
+            for backend in (backends.upstream, backends.compiled)
+        )
         np.testing.assert_allclose(one, other, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("first", ["casadi", "pinocchio", "vkc_pin.planning.kinematics", "vkc_pin.planning.kinematics.backends"])
+@pytest.mark.parametrize(
+    "first",
+    ["casadi", "pinocchio", "vkc_pin.planning.kinematics", "vkc_pin.planning.kinematics.backends"],
+)
 def test_any_order_of_import_works(first: str) -> None:
     code = f"""
 import {first}
@@ -298,12 +363,16 @@ model = pinocchio.Model()
 model.addJoint(0, pinocchio.JointModelRZ(), pinocchio.SE3.Identity(), "j")
 print(vkc_pin.planning.kinematics.joint_placements(model)(0.5)[0])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) == pytest.approx(np.cos(0.5))
 
 
 def test_the_compiled_module_is_loaded_at_first_use() -> None:
     code = "import sys, vkc_pin.planning.kinematics; print('vkc_pin.planning.kinematics._cpin' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
     assert done.stdout.strip() == "False"

@@ -69,7 +69,9 @@ def test_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert here() == tmp_path / "xdg" / "vkc_pin"
 
 
-def test_a_folder_in_which_others_may_write_is_not_used(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_in_which_others_may_write_is_not_used(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for path in (folder.path, folder.path.parent):
         for mode, used in (
             (0o700, True),
@@ -85,10 +87,17 @@ def test_a_folder_in_which_others_may_write_is_not_used(folder: Libraries, monke
     assert Libraries.here() is None, "it is somebody else's"
 
 
-def test_what_is_no_folder_is_not_used(tmp_path: Path, folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_folder_is_not_used(
+    tmp_path: Path, folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "link").symlink_to(folder.path)
     (tmp_path / "file").write_text("")
-    for place in (tmp_path / "link", tmp_path / "file", tmp_path / "file" / "cache", Path("/proc/nowhere")):
+    for place in (
+        tmp_path / "link",
+        tmp_path / "file",
+        tmp_path / "file" / "cache",
+        Path("/proc/nowhere"),
+    ):
         monkeypatch.setenv(VARIABLE, str(place))
         assert Libraries.here() is None, place
     (tmp_path / "around").mkdir(mode=0o700)
@@ -130,7 +139,9 @@ def test_a_library_that_changed_is_removed(folder: Libraries) -> None:
     assert names(folder) == []
 
 
-def test_a_library_that_others_may_have_written_is_not_used(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_library_that_others_may_have_written_is_not_used(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder.publish(A, LIBRARY)
     path = folder.path / f"{A}.so"
     path.chmod(0o620)
@@ -170,7 +181,9 @@ def test_what_failed_is_tried_again_after_a_day(folder: Libraries) -> None:
     assert folder.job(A) == b"what"
 
 
-def test_libraries_that_were_not_used_for_long_go_first(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_libraries_that_were_not_used_for_long_go_first(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for index, key in enumerate([A, B, C, D, E]):
         folder.publish(key, LIBRARY)
         age(folder.path / f"{key}.so", 1000 - 100 * index)
@@ -319,7 +332,9 @@ def test_one_compiles_at_a_time(folder: Libraries) -> None:
     os.close(third)
 
 
-def test_files_appear_whole_or_not_at_all(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_appear_whole_or_not_at_all(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(self: Path, target: Path) -> Path:
         raise OSError("no space left on device")
 

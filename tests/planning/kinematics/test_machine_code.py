@@ -44,14 +44,21 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
 def make(factor: float = 3.0) -> ca.Function:
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
     branch = ca.if_else(x[1] > 0.3, ca.sqrt(ca.fabs(x[0])), ca.atan2(y[0], y[1]))
-    values = [ca.sin(x[0]) * ca.cos(x[0]) + x[1] * x[2] + factor / 7.0, ca.log(ca.fabs(x[2])), branch, ca.norm_2(x)]
+    values = [
+        ca.sin(x[0]) * ca.cos(x[0]) + x[1] * x[2] + factor / 7.0,
+        ca.log(ca.fabs(x[2])),
+        branch,
+        ca.norm_2(x),
+    ]
     return ca.Function("f", [x, y], [ca.vertcat(*values), ca.densify(x @ y.T)], {"cse": True})
 
 
 def equal(one: ca.Function, other: ca.Function, draws: int = 50) -> bool:
     rng = np.random.default_rng(7)
     for _ in range(draws):
-        inputs = [ca.DM(one.sparsity_in(i), rng.normal(size=one.nnz_in(i))) for i in range(one.n_in())]
+        inputs = [
+            ca.DM(one.sparsity_in(i), rng.normal(size=one.nnz_in(i))) for i in range(one.n_in())
+        ]
         for a, b in zip(one.call(inputs), other.call(inputs), strict=True):
             if np.array(a.nonzeros()).tobytes() != np.array(b.nonzeros()).tobytes():
                 return False
@@ -93,7 +100,10 @@ def test_a_program_is_built_anew_when_machine_code_has_come(folder: Libraries) -
     short = program_of(door_scene(), TASKS["reach"], options=OPTIONS).transcription
     assert not short.interpreted, "three waypoints are not worth it"
     options = Options(reach_waypoints=8, contact_slots=2)
-    structure, cache = program_of(door_scene(), TASKS["reach"], options=options).transcription.structure, Cache()
+    structure, cache = (
+        program_of(door_scene(), TASKS["reach"], options=options).transcription.structure,
+        Cache(),
+    )
     first = transcribe(structure, cache)
     solver = first.solver(rates=True, options=QUIET)
     assert len(first.interpreted) == 1
@@ -117,7 +127,9 @@ def evaluated(program: Transcription, x: np.ndarray, parameters: np.ndarray) -> 
     return np.array(values.nonzeros()).tobytes(), np.array(jacobian.nonzeros()).tobytes()
 
 
-def test_batches_that_are_used_much_become_machine_code(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batches_that_are_used_much_become_machine_code(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
     function = BatchFunction(make())
@@ -134,7 +146,10 @@ def test_batches_that_are_used_much_become_machine_code(folder: Libraries, monke
 
 def test_another_process_finds_it_even_if_the_first_does_not_stay(folder: Libraries) -> None:
     code = "from test_machine_code import *; MachineCode(make()).look()"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
+    }
     run = [sys.executable, "-c", code]
     processes = [subprocess.Popen(run, env=environment, stderr=subprocess.PIPE) for _ in range(2)]
     for process in processes:
@@ -148,7 +163,9 @@ def test_another_process_finds_it_even_if_the_first_does_not_stay(folder: Librar
     assert equal(make(), mine.functions[0])
 
 
-def test_the_process_that_compiles_leaves_no_zombie(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_process_that_compiles_leaves_no_zombie(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     started: list[subprocess.Popen[bytes]] = []
     run = machine_code._run
     monkeypatch.setattr(machine_code, "_run", lambda *a: started.append(run(*a)) or started[-1])
@@ -189,7 +206,9 @@ def test_functions_that_differ_have_libraries_of_their_own(folder: Libraries) ->
 
 
 @pytest.mark.parametrize("options", ["-O2 -w", "-O0"])
-def test_the_compiler_may_have_options(options: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_compiler_may_have_options(
+    options: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code = MachineCode(make())
     code.look()
     monkeypatch.setenv("CC", f"cc {options}")
@@ -203,7 +222,9 @@ def test_the_compiler_may_have_options(options: str, folder: Libraries, monkeypa
 
 
 @pytest.mark.parametrize("command", ["/nowhere/cc", "no-such-compiler", "'unbalanced"])
-def test_without_a_compiler_nothing_is_asked_for(command: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_nothing_is_asked_for(
+    command: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CC", command)
     code = MachineCode(make())
     assert not code.look()
@@ -223,7 +244,9 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("how", BROKEN)
-def test_a_broken_compiler_is_tried_once(how: str, folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_compiler_is_tried_once(
+    how: str, folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "broken", BROKEN[how]))
     code = MachineCode(make())
     assert not code.look()
@@ -236,9 +259,14 @@ def test_a_broken_compiler_is_tried_once(how: str, folder: Libraries, tmp_path: 
     assert folder.jobs() == [], "not again today"
 
 
-def test_a_compiler_that_hangs_is_ended(folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_compiler_that_hangs_is_ended(
+    folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pid = tmp_path / "pid"
-    monkeypatch.setenv("CC", script(tmp_path / "hangs", f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"))
+    monkeypatch.setenv(
+        "CC",
+        script(tmp_path / "hangs", f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"),
+    )
     monkeypatch.setattr(machine_code, "_LONGEST", 1.0)
     monkeypatch.setattr(machine_code, "_python", lambda: False)
     assert not MachineCode(make()).look()
@@ -249,7 +277,9 @@ def test_a_compiler_that_hangs_is_ended(folder: Libraries, tmp_path: Path, monke
     until(lambda: ended(int(pid.read_text())))
 
 
-def test_what_cannot_be_put_away_is_tried_once(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_put_away_is_tried_once(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(machine_code, "_python", lambda: False)
     MachineCode(make()).look()
     monkeypatch.setattr(Libraries, "remove", lambda self, name: None)
@@ -257,8 +287,15 @@ def test_what_cannot_be_put_away_is_tried_once(folder: Libraries, monkeypatch: p
     assert len(folder.jobs()) == 1
 
 
-def test_waiting_has_an_end(folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", script(tmp_path / "slow", f'while [ ! -e {tmp_path}/go ]; do sleep 0.05; done; exec cc "$@"'))
+def test_waiting_has_an_end(
+    folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(
+        "CC",
+        script(
+            tmp_path / "slow", f'while [ ! -e {tmp_path}/go ]; do sleep 0.05; done; exec cc "$@"'
+        ),
+    )
     code = MachineCode(make())
     code.look()
     assert not wait(0.2)
@@ -301,7 +338,10 @@ def until(done: Callable[[], bool]) -> None:
 def ended(pid: int) -> bool:
     """Whether a process is no more, but for its entry."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] == "Z"
+        return (
+            Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+            == "Z"
+        )
     except (FileNotFoundError, ProcessLookupError):
         return True
 
@@ -321,7 +361,9 @@ def expected() -> list[bytes]:
     return planned()
 
 
-def test_plans_are_equal_bit_for_bit(folder: Libraries, expected: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plans_are_equal_bit_for_bit(
+    folder: Libraries, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(batch, "_WORTH", 0)  # all that can be compiled is
     planner = vkc.Planner()
     assert planned(planner) == expected, "asks for them"
@@ -338,16 +380,26 @@ def test_plans_are_equal_bit_for_bit(folder: Libraries, expected: list[bytes], m
     assert len(loaded) > 2
 
 
-@pytest.mark.parametrize("trouble", ["no compiler", "broken compiler", "truncated", "open to others", "no folder", "off"])
+@pytest.mark.parametrize(
+    "trouble", ["no compiler", "broken compiler", "truncated", "open to others", "no folder", "off"]
+)
 def test_plans_do_without(
-    trouble: str, folder: Libraries, tmp_path: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
+    trouble: str,
+    folder: Libraries,
+    tmp_path: Path,
+    expected: list[bytes],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if trouble == "no compiler":
         monkeypatch.setenv("PATH", str(tmp_path))
     elif trouble == "broken compiler":
         monkeypatch.setenv("CC", script(tmp_path / "broken", BROKEN["writes garbage"]))
     elif trouble == "truncated":
-        monkeypatch.setattr(Libraries, "exists", lambda self, key: (self.path / f"{key}.so").write_bytes(b"\x7fELF" * 99) > 0)
+        monkeypatch.setattr(
+            Libraries,
+            "exists",
+            lambda self, key: (self.path / f"{key}.so").write_bytes(b"\x7fELF" * 99) > 0,
+        )
     elif trouble == "open to others":
         folder.path.chmod(0o777)
     elif trouble == "no folder":

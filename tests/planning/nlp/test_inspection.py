@@ -28,14 +28,21 @@ def test_sizes_add_up(problem: TrajectoryProblem) -> None:
     found, t = sizes(problem), problem.transcription
     assert sum(size for kind, size in found.items() if kind.startswith("variables")) == t.size
     assert sum(size for kind, size in found.items() if kind.startswith("rows")) == t.rows
-    assert sum(size for kind, size in found.items() if kind.startswith("only")) == t.rate_matrix.size1()
+    assert (
+        sum(size for kind, size in found.items() if kind.startswith("only"))
+        == t.rate_matrix.size1()
+    )
     assert found["rows: witness planes"] == problem.segments * problem.options.contact_slots
     assert found["variables: slacks"] == found["rows: witness planes"]
     shares = [size for kind, size in found.items() if kind.startswith("variables: shares")]
     assert shares == [problem.segments]
     assert found["rows: closure door"] % 7 == 0
     assert (
-        found["rows: rolling"] == found["rows: clamped freedoms"] == found["rows: own constraints"] == found["rows: pushes"] == 0
+        found["rows: rolling"]
+        == found["rows: clamped freedoms"]
+        == found["rows: own constraints"]
+        == found["rows: pushes"]
+        == 0
     )
 
 
@@ -58,13 +65,17 @@ def test_planes_of_a_program_with_a_speed_are_those_without(z: np.ndarray) -> No
     """The time of the steps is one of its parameters."""
     steps = [vkc.Actuate("door", {"hinge": 1.2})]
     slow = vkc.Constraint("slow", lambda s: ca.norm_2(s.velocity("tool")) ** 2, upper=4.0)
-    plain, timed = (program_of(vkc.load_scene("door"), steps, terms=terms) for terms in ([], [slow]))
+    plain, timed = (
+        program_of(vkc.load_scene("door"), steps, terms=terms) for terms in ([], [slow])
+    )
     for one, other in zip(planes(plain, z, 60), planes(timed, z, 60), strict=True):
         assert one.names == other.names
         np.testing.assert_allclose(one.gradient, other.gradient, atol=1e-9)
 
 
-def test_patterns_have_the_entries_that_numbers_show(problem: TrajectoryProblem, z: np.ndarray) -> None:
+def test_patterns_have_the_entries_that_numbers_show(
+    problem: TrajectoryProblem, z: np.ndarray
+) -> None:
     t = problem.transcription
     jacobian, hessian = patterns(problem)
     assert jacobian.shape == (t.rows, t.size)
@@ -86,7 +97,9 @@ def test_planes_are_distances_to_first_order(problem: TrajectoryProblem, z: np.n
         here, step = z[59], 1e-4
         assert plane.values(here[None])[0] == pytest.approx(plane.distance, abs=1e-9)
         assert plane.distances(here[None])[0] == pytest.approx(plane.distance, abs=1e-12)
-        moved = np.array([here + sign * step * axis for axis in np.eye(len(here)) for sign in (1, -1)])
+        moved = np.array(
+            [here + sign * step * axis for axis in np.eye(len(here)) for sign in (1, -1)]
+        )
         ahead, back = plane.values(moved).reshape(-1, 2).T
         assert (ahead - back) / (2 * step) == pytest.approx(plane.gradient, abs=1e-6)
         assert plane.distances(moved) == pytest.approx(plane.values(moved), abs=1e-6)

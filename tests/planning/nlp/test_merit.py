@@ -17,7 +17,13 @@ from vkc_pin.planning.solver.trust_region import Trial
 KINDS = tuple(Merit(1.0).weights)
 SHORT = vkc.Options(reach_waypoints=8, turn_waypoints=4, move_waypoints=6)
 TALL = vkc.Constraint("tall", lambda s: s.position("tool")[2], lower=2.0)
-PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [0.9, 0.0, 0.8]}
+PILLAR = {
+    "name": "pillar",
+    "type": "cylinder",
+    "radius": 0.15,
+    "length": 1.6,
+    "position": [0.9, 0.0, 0.8],
+}
 
 
 @cache
@@ -30,7 +36,9 @@ def problem(kind: str) -> vkc.TrajectoryProblem:
 
 def look(kind: str, z: np.ndarray, *, rates: bool = True) -> Infeasibility:
     p = problem(kind)
-    contacts = p.evaluate_contacts(z, reach=p.options.contact_reach, nearest=p.options.contact_slots)
+    contacts = p.evaluate_contacts(
+        z, reach=p.options.contact_reach, nearest=p.options.contact_slots
+    )
     return infeasibility(p, z, p.timing_for(p.still), contacts, rates=rates)
 
 
@@ -53,13 +61,18 @@ def test_amounts_are_what_is_missing(seed: int) -> None:
     p, z = problem("drive"), wild("drive", seed)
     found, timing = look("drive", z), p.timing_for(p.still)
     _, aside, _ = p.rolling.steps(p.waypoints(z))
-    fast = np.maximum(p.rolling.times(p.waypoints(z)) - timing.dt, 0.0) * p.rolling.rim  # of the faster wheel
+    fast = (
+        np.maximum(p.rolling.times(p.waypoints(z)) - timing.dt, 0.0) * p.rolling.rim
+    )  # of the faster wheel
     assert (found.amounts["rolling"] >= np.abs(aside) + fast - 1e-9).all()
     still = look("drive", z, rates=False).amounts["rolling"]
     np.testing.assert_allclose(still, np.abs(aside), atol=1e-12)
     assert found.amounts["terms"].max() == pytest.approx(p.term_numbers.error(z, timing.dt))
     first, second = p.rates(z)
-    over = np.maximum(np.abs(first) - timing.velocity, 0.0).sum() + np.maximum(np.abs(second) - timing.acceleration, 0.0).sum()
+    over = (
+        np.maximum(np.abs(first) - timing.velocity, 0.0).sum()
+        + np.maximum(np.abs(second) - timing.acceleration, 0.0).sum()
+    )
     assert found.amounts["rates"].sum() == pytest.approx(over)
     door = look("door", wild("door", seed), rates=False)
     assert not door.rate_excess.size
@@ -96,7 +109,9 @@ def test_its_directional_derivative_is_that_of_finite_differences(kind: str, see
     t = p.transcription
     steps, directions = p.rates(z), p.rates(z + along)
     weights_of_f = p.effort.weights(*steps)  # a quadratic function with the slope of f
-    slope = sum(2 * np.sum(w * a * (b - a)) for w, a, b in zip(weights_of_f, steps, directions, strict=True))
+    slope = sum(
+        2 * np.sum(w * a * (b - a)) for w, a, b in zip(weights_of_f, steps, directions, strict=True)
+    )
     contacts = p.evaluate_contacts(z, reach=p.options.contact_reach, nearest=t.slots)
     short = contacts.margin > contacts.distance
     falls = np.einsum("cj,cj->c", p.contacts.gradients(z, contacts), along[contacts.waypoint])
@@ -105,10 +120,19 @@ def test_its_directional_derivative_is_that_of_finite_differences(kind: str, see
         at = np.array(goal.row.waypoints, int) - 1
         residual, jacobian = solver.evaluate(z[at], goal.target)
         change = np.einsum("bij,bj->bi", jacobian, along[at])
-        distance, turn = np.linalg.norm(residual[:, :3], axis=1), np.linalg.norm(residual[:, 3:], axis=1)
-        slope += weights["poses"] * (np.einsum("bi,bi->b", residual[:, :3], change[:, :3]) / distance).sum()
+        distance, turn = (
+            np.linalg.norm(residual[:, :3], axis=1),
+            np.linalg.norm(residual[:, 3:], axis=1),
+        )
+        slope += (
+            weights["poses"]
+            * (np.einsum("bi,bi->b", residual[:, :3], change[:, :3]) / distance).sum()
+        )
         half = np.sqrt(1.0 - (turn / 2) ** 2)
-        slope += weights["poses"] * (np.einsum("bi,bi->b", residual[:, 3:], change[:, 3:]) / turn / half).sum()
+        slope += (
+            weights["poses"]
+            * (np.einsum("bi,bi->b", residual[:, 3:], change[:, 3:]) / turn / half).sum()
+        )
     assert short.any() or kind == "door"
     assert (merit(1e-6) - merit(-1e-6)) / 2e-6 == pytest.approx(slope, rel=1e-4)
 
@@ -126,7 +150,9 @@ def test_a_step_is_refused_that_makes_more_of_any_kind_missing(kind: str) -> Non
     for change, expected in ((0.01, False), (-0.01, True)):
         after = {**amounts, kind: np.full(p.segments, 0.01 + change)}
         found = Infeasibility(after, loop.found.away, loop.found.excess, loop.found.rate_excess)
-        promise = loop.merit.price(loop.found, clearance=True) - 2.0  # as much as this kind is worth
+        promise = (
+            loop.merit.price(loop.found, clearance=True) - 2.0
+        )  # as much as this kind is worth
         trial = Trial(**{**fields, "objective": 0.0, "found": found, "promise": promise})  # type: ignore[arg-type]
         assert loop.judge(trial, *loop.prices(trial)) == expected
 

@@ -18,7 +18,15 @@ def contacts(*rows: tuple[int, float, float]) -> Contacts:
     """Return contacts of (waypoint, distance, margin)."""
     table = np.array(rows, float).reshape(-1, 3)
     vectors = np.zeros((len(table), 3))
-    return Contacts(table[:, 0].astype(int), np.zeros((len(table), 2), int), table[:, 1], table[:, 2], vectors, vectors, vectors)
+    return Contacts(
+        table[:, 0].astype(int),
+        np.zeros((len(table), 2), int),
+        table[:, 1],
+        table[:, 2],
+        vectors,
+        vectors,
+        vectors,
+    )
 
 
 NEAR = contacts((0, 0.01, 0.03), (0, 0.5, 0.02), (0, 0.0, 0.5), (2, -0.25, 0.25), (2, 0.02, 0.02))
@@ -26,13 +34,17 @@ NEAR = contacts((0, 0.01, 0.03), (0, 0.5, 0.02), (0, 0.0, 0.5), (2, -0.25, 0.25)
 
 def test_shortfalls_are_of_as_many_pairs_as_there_are_planes() -> None:
     np.testing.assert_allclose(shortfalls(NEAR, 3, 2), [[0.02, 0.0], [0.0, 0.0], [0.5, 0.0]])
-    np.testing.assert_allclose(shortfalls(NEAR, 3, 3), [[0.02, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    np.testing.assert_allclose(
+        shortfalls(NEAR, 3, 3), [[0.02, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
+    )
     np.testing.assert_allclose(shortfalls(NEAR, 4, 1)[:, 0], [0.02, 0.0, 0.5, 0.0])
 
 
 def goal(kind: str, waypoints: tuple[int, ...]) -> Any:
     """Return a goal at the origin for the second of three joints."""
-    return SimpleNamespace(row=PoseRow(1, pin.SE3.Identity(), waypoints, kind), target=pin.SE3.Identity())
+    return SimpleNamespace(
+        row=PoseRow(1, pin.SE3.Identity(), waypoints, kind), target=pin.SE3.Identity()
+    )
 
 
 def look(*, rates: bool = False, goals: Any = None) -> Infeasibility:
@@ -40,15 +52,25 @@ def look(*, rates: bool = False, goals: Any = None) -> Infeasibility:
 
     The second joint is at (3, 4, 12) · waypoint, turned about z by a tenth of it.
     """
-    turns = np.array([[pin.utils.rotate("z", 0.1 * k * (j == 1)) for j in range(3)] for k in (1, 2, 3)])
-    places = np.array([[np.array([3.0, 4.0, 12.0]) * k * (j == 1) for j in range(3)] for k in (1, 2, 3)])
+    turns = np.array(
+        [[pin.utils.rotate("z", 0.1 * k * (j == 1)) for j in range(3)] for k in (1, 2, 3)]
+    )
+    places = np.array(
+        [[np.array([3.0, 4.0, 12.0]) * k * (j == 1) for j in range(3)] for k in (1, 2, 3)]
+    )
     z = np.array([[1.0], [2.0], [3.0]])
     given: list[Any] = []
     problem: Any = SimpleNamespace(
-        transcription=SimpleNamespace(slots=2, owners=np.array([0, 0, 2, 1]), rate_owners=np.array([0, 1, 2, 0, 2])),
-        pose_goals=[goal("pose", (1, 3)), goal("point", (2,)), goal("pose", ())] if goals is None else goals,
+        transcription=SimpleNamespace(
+            slots=2, owners=np.array([0, 0, 2, 1]), rate_owners=np.array([0, 1, 2, 0, 2])
+        ),
+        pose_goals=[goal("pose", (1, 3)), goal("point", (2,)), goal("pose", ())]
+        if goals is None
+        else goals,
         chain=SimpleNamespace(joint_placements=lambda at: (turns, places)),
-        excess=lambda at, timing, rates: given.append((timing, rates)) or np.array([1.0, -2.0, 0.5, -0.25]),
+        excess=lambda at, timing, rates: (
+            given.append((timing, rates)) or np.array([1.0, -2.0, 0.5, -0.25])
+        ),
         row_kinds={
             "rolling": np.array([1.0, 0.0, 0.0, 0.0]),
             "clamped": np.array([0.0, 1.0, 0.0, 0.0]),
@@ -75,7 +97,11 @@ def test_how_much_is_missing_of_each_kind_at_each_waypoint() -> None:
     assert found.excess.tolist() == [1.0, -2.0, 0.5, -0.25]
     assert found.rate_excess.shape == (0,)
     assert found.away.shape == (3, 3, 7)
-    assert np.flatnonzero(found.away.any(axis=2).ravel()).tolist() == [0, 4, 6]  # waypoint by waypoint
+    assert np.flatnonzero(found.away.any(axis=2).ravel()).tolist() == [
+        0,
+        4,
+        6,
+    ]  # waypoint by waypoint
     assert found.total == pytest.approx(78.4 + 1.0 + 2.0 + 0.75 + 0.52)
     assert found.others == pytest.approx(39.3)
 
@@ -88,7 +114,12 @@ def test_rates_beyond_their_limits_count_if_they_are_rows() -> None:
 
 def amounts(**given: list[float]) -> Infeasibility:
     rows = {kind: np.zeros(2) for kind in Merit(1.0).weights}
-    return Infeasibility({**rows, **{kind: np.array(row) for kind, row in given.items()}}, np.zeros(0), np.zeros(0), np.zeros(0))
+    return Infeasibility(
+        {**rows, **{kind: np.array(row) for kind, row in given.items()}},
+        np.zeros(0),
+        np.zeros(0),
+        np.zeros(0),
+    )
 
 
 def test_the_most_that_is_missing_besides_clearance() -> None:
@@ -107,7 +138,10 @@ def test_what_is_missing_somewhere_becomes_dearer() -> None:
     merit = Merit(2.0)
     found = amounts(clearance=[0.0, 0.2], poses=[0.09, 0.0], terms=[0.11, 0.0])
     assert merit.grow(found, 0.1)
-    assert {kind for kind, weight in merit.weights.items() if weight == 8.0} == {"clearance", "terms"}
+    assert {kind for kind, weight in merit.weights.items() if weight == 8.0} == {
+        "clearance",
+        "terms",
+    }
     assert set(merit.weights.values()) == {2.0, 8.0}
     assert not merit.grow(amounts(poses=[0.09, 0.0]), 0.1)
     assert not merit.grow(amounts(), 0.0)

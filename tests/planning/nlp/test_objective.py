@@ -25,7 +25,9 @@ def effort(*, length: bool = True, smoothing: float = SMOOTHING) -> Effort:
 def parts(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return steps and their changes of z_0..z_N."""
     first, second, start_first, start_second = MATRICES
-    return first @ path[1:] + np.outer(start_first, path[0]), second @ path[1:] + np.outer(start_second, path[0])
+    return first @ path[1:] + np.outer(start_first, path[0]), second @ path[1:] + np.outer(
+        start_second, path[0]
+    )
 
 
 def quadratic(weights: tuple[np.ndarray, np.ndarray], path: np.ndarray) -> float:
@@ -33,7 +35,10 @@ def quadratic(weights: tuple[np.ndarray, np.ndarray], path: np.ndarray) -> float
 
 
 def random_path(seed: int, scale: float = 1.0) -> np.ndarray:
-    return np.cumsum(np.random.default_rng(seed).normal(scale=0.1 * scale, size=(ENDS[-1] + 1, len(METRIC))), axis=0)
+    return np.cumsum(
+        np.random.default_rng(seed).normal(scale=0.1 * scale, size=(ENDS[-1] + 1, len(METRIC))),
+        axis=0,
+    )
 
 
 def by_hand(path: np.ndarray) -> float:
@@ -48,9 +53,9 @@ def by_hand(path: np.ndarray) -> float:
         inside = [begin < t <= end for t in at]
         for group in ([0, 1], [2], [3], [4], [5]):
             weight = METRIC[group[0]]
-            squares = np.sum(np.diff(path[begin : end + 1, group], axis=0) ** 2) + SMOOTHING * np.sum(
-                bends[inside][:, group] ** 2
-            )
+            squares = np.sum(
+                np.diff(path[begin : end + 1, group], axis=0) ** 2
+            ) + SMOOTHING * np.sum(bends[inside][:, group] ** 2)
             still = STILL * np.sqrt(weight)
             total += np.sqrt(still**2 + (end - begin) * weight * squares) - still
     return float(total)
@@ -65,7 +70,9 @@ def test_squares_are_equation_1(seed: int) -> None:
         total += np.sum(METRIC * step**2) + SMOOTHING * np.sum(METRIC * bend**2)
     squares = effort(length=False)
     assert squares.value(*parts(path)) == pytest.approx(total, rel=1e-12)
-    assert quadratic(squares.weights(*parts(random_path(9))), path) == pytest.approx(total, rel=1e-12)
+    assert quadratic(squares.weights(*parts(random_path(9))), path) == pytest.approx(
+        total, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -85,15 +92,24 @@ def test_a_way_at_even_speed_costs_its_length_however_many_waypoints_it_has() ->
     """4 m on a slant and 2 rad of a joint, in two phases of which one has nine times the waypoints."""
     for ends in ((4, 40), (36, 40)):
         path = np.zeros((41, 6))
-        path[:, :2] = np.outer(np.interp(np.arange(41), [0, ends[0], 40], [0.0, 1.0, 4.0]), [0.6, 0.8])
+        path[:, :2] = np.outer(
+            np.interp(np.arange(41), [0, ends[0], 40], [0.0, 1.0, 4.0]), [0.6, 0.8]
+        )
         path[:, 3] = np.interp(np.arange(41), [0, ends[0], 40], [0.0, 1.5, 2.0])
         first, second, start_first, start_second = differences(40, ())
-        given = first @ path[1:] + np.outer(start_first, path[0]), second @ path[1:] + np.outer(start_second, path[0])
-        assert Effort(METRIC, 0.0, np.array(ends), (), length=True).value(*given) == pytest.approx(4.0 + 0.1 * 2.0, abs=0.07)
+        given = (
+            first @ path[1:] + np.outer(start_first, path[0]),
+            second @ path[1:] + np.outer(start_second, path[0]),
+        )
+        assert Effort(METRIC, 0.0, np.array(ends), (), length=True).value(*given) == pytest.approx(
+            4.0 + 0.1 * 2.0, abs=0.07
+        )
 
 
 @given(st.integers(0, 10**6), st.integers(0, 10**6), st.floats(0.01, 3.0), st.floats(0.01, 3.0))
-def test_the_quadratic_touches_a_length_and_nowhere_lies_below(one: int, other: int, here: float, there: float) -> None:
+def test_the_quadratic_touches_a_length_and_nowhere_lies_below(
+    one: int, other: int, here: float, there: float
+) -> None:
     f, at, away = effort(), random_path(one, here), random_path(other, there)
     weights = f.weights(*parts(at))
     rise = quadratic(weights, away) - quadratic(weights, at)

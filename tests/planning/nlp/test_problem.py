@@ -31,12 +31,18 @@ REACH, TURN, MOVE = SHORT.reach_waypoints, SHORT.turn_waypoints, SHORT.move_wayp
 
 @pytest.fixture(scope="module")
 def opened() -> TrajectoryProblem:
-    return program_of(door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1, -2.2)], options=SHORT)
+    return program_of(
+        door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1, -2.2)], options=SHORT
+    )
 
 
 @pytest.fixture(scope="module")
 def two_grasps() -> TrajectoryProblem:
-    steps: list[Step] = [Grasp("cabinet", "ball"), Actuate("drawer", {"slide": 0.2}, attachment="handle_free"), Reach(POSE)]
+    steps: list[Step] = [
+        Grasp("cabinet", "ball"),
+        Actuate("drawer", {"slide": 0.2}, attachment="handle_free"),
+        Reach(POSE),
+    ]
     return program_of(full_scene(), steps, options=SHORT)
 
 
@@ -56,7 +62,8 @@ def names_of(problem: TrajectoryProblem) -> list[str]:
     return [goal.name for goal in problem.pose_goals]
 
 
-# --- bounds ---------------------------------------------------------------------------------------------------------
+# --- bounds
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_phases_follow_one_another(opened: TrajectoryProblem) -> None:
@@ -82,10 +89,16 @@ def test_objects_joints_stand_still_until_they_are_moved(opened: TrajectoryProbl
 
 
 def test_a_goal_beyond_a_limit_is_approached_as_far_as_it_goes() -> None:
-    problem = program_of(door_scene(), [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)], options=SHORT)
+    problem = program_of(
+        door_scene(), [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)], options=SHORT
+    )
     hinge = column(problem, "door.hinge")
     assert np.all(hinge[problem.ends[2] - 1 :] == 1.57)
-    panel = next(i for i, label in enumerate(problem.contacts.phases[3].labels) if label == "door.panel" and i > 20)
+    panel = next(
+        i
+        for i, label in enumerate(problem.contacts.phases[3].labels)
+        if label == "door.panel" and i > 20
+    )
     part = problem.contacts.phases[3]
     assert part.joint[panel] == 0
     expected = door_scene().objects["door"].with_state({"hinge": 1.57}).link_placement("panel")
@@ -96,12 +109,20 @@ def test_the_robot_keeps_its_limits_and_stays_in_the_arena(opened: TrajectoryPro
     robot, scene = opened.scene.robot, opened.scene
     inner = slice(0, opened.segments - 1)  # the last waypoint has the base's goal
     x_min, x_max, y_min, y_max = scene.arena
-    np.testing.assert_array_equal(opened.lower[inner, :2], np.tile([x_min, y_min], (opened.segments - 1, 1)))
-    np.testing.assert_array_equal(opened.upper[inner, :2], np.tile([x_max, y_max], (opened.segments - 1, 1)))
+    np.testing.assert_array_equal(
+        opened.lower[inner, :2], np.tile([x_min, y_min], (opened.segments - 1, 1))
+    )
+    np.testing.assert_array_equal(
+        opened.upper[inner, :2], np.tile([x_max, y_max], (opened.segments - 1, 1))
+    )
     assert np.all(np.isinf(opened.lower[inner, 2]))
     arm = slice(3, robot.coordinates.size)
-    np.testing.assert_array_equal(opened.lower[:, arm], np.tile(robot.lower[arm], (opened.segments, 1)))
-    np.testing.assert_array_equal(opened.upper[:, arm], np.tile(robot.upper[arm], (opened.segments, 1)))
+    np.testing.assert_array_equal(
+        opened.lower[:, arm], np.tile(robot.lower[arm], (opened.segments, 1))
+    )
+    np.testing.assert_array_equal(
+        opened.upper[:, arm], np.tile(robot.upper[arm], (opened.segments, 1))
+    )
     narrow = dataclasses.replace(scene, arena=(-50.0, 1.0, -1.0, 60.0))
     problem = program_of(narrow, [Reach(POSE)], options=SHORT)
     np.testing.assert_array_equal(problem.lower[0, :2], [robot.lower[0], -1.0])
@@ -152,7 +173,11 @@ def test_what_is_grasped_only_does_not_move(two_grasps: TrajectoryProblem) -> No
 
 
 def test_the_start_is_the_scenes() -> None:
-    scene = door_scene().with_state("door", {"hinge": 0.3, "knob": 0.2}).with_start(base=[0.1, 0.2, 0.3])
+    scene = (
+        door_scene()
+        .with_state("door", {"hinge": 0.3, "knob": 0.2})
+        .with_start(base=[0.1, 0.2, 0.3])
+    )
     problem = program_of(scene, [Actuate("door", {"hinge": 1.2})], options=SHORT)
     np.testing.assert_array_equal(problem.start[: len(scene.start)], scene.start)
     assert problem.start[problem.chain.index("door.hinge")] == 0.3
@@ -173,7 +198,8 @@ def test_clip_and_waypoints(opened: TrajectoryProblem) -> None:
     np.testing.assert_array_equal(path[1:], clipped)
 
 
-# --- poses ----------------------------------------------------------------------------------------------------------
+# --- poses
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_closure_holds_from_the_grasp_to_the_end_of_the_hold(opened: TrajectoryProblem) -> None:
@@ -186,9 +212,17 @@ def test_closure_holds_from_the_grasp_to_the_end_of_the_hold(opened: TrajectoryP
     assert opened.targets == (opened.scene.objects["door"].placement,) * 2
 
 
-def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(two_grasps: TrajectoryProblem) -> None:
+def test_every_object_is_closed_while_it_is_held_and_goals_are_met_at_the_end(
+    two_grasps: TrajectoryProblem,
+) -> None:
     first, second, third, fourth = two_grasps.ends.tolist()
-    at = dict(zip(names_of(two_grasps), (p.waypoints for p in two_grasps.transcription.structure.poses), strict=True))
+    at = dict(
+        zip(
+            names_of(two_grasps),
+            (p.waypoints for p in two_grasps.transcription.structure.poses),
+            strict=True,
+        )
+    )
     way = SHORT.steps(SHORT.approach_time)
     assert at == {
         "approach cabinet.ball": (first - way,),
@@ -217,7 +251,11 @@ def test_a_frame_of_the_robot_can_reach_too() -> None:
     problem = program_of(door_scene(), [Reach(POSE, frame="forearm_link")], options=SHORT)
     frame = problem.chain.model.frames[problem.chain.model.getFrameId("forearm_link")]
     (pose,) = problem.transcription.structure.poses
-    assert (names_of(problem), pose.joint, pose.waypoints) == (["goal forearm_link"], frame.parentJoint, (REACH,))
+    assert (names_of(problem), pose.joint, pose.waypoints) == (
+        ["goal forearm_link"],
+        frame.parentJoint,
+        (REACH,),
+    )
     assert pose.local == frame.placement
 
 
@@ -233,13 +271,19 @@ def test_pose_error_and_drift(opened: TrajectoryProblem) -> None:
         pin.forwardKinematics(model, data, opened.chain.coordinates.q(row))
         at = data.oMi[pose.joint] * pose.local
         if pose.shift is not None:
-            at.translation = at.translation + data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
+            at.translation = at.translation + data.oMi[pose.shift[0]].rotation @ np.array(
+                pose.shift[1]
+            )
         turn = pin.log3(target.rotation.T @ at.rotation)
         angle = np.linalg.norm(turn)
-        return np.abs(np.r_[at.translation - target.translation, 2 * np.sin(angle / 2) * turn / angle])
+        return np.abs(
+            np.r_[at.translation - target.translation, 2 * np.sin(angle / 2) * turn / angle]
+        )
 
     path = opened.waypoints(z)
-    worst = max(residual(path[t], number).max() for number, pose in enumerate(poses) for t in pose.waypoints)
+    worst = max(
+        residual(path[t], number).max() for number, pose in enumerate(poses) for t in pose.waypoints
+    )
     assert opened.pose_error(z) == pytest.approx(worst, abs=1e-8)
     reach, _, move, _ = opened.ends.tolist()
     between = [residual((path[t] + path[t + 1]) / 2) for t in range(reach, move)]
@@ -254,7 +298,9 @@ def tool(problem: TrajectoryProblem, row: np.ndarray) -> pin.SE3:
     """Return where the tool is at a configuration of the chain."""
     robot = problem.scene.robot
     data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(row[: robot.coordinates.size]))
+    pin.framesForwardKinematics(
+        robot.model, data, robot.coordinates.q(row[: robot.coordinates.size])
+    )
     return data.oMf[robot.model.getFrameId(robot.tool_frame)].copy()
 
 
@@ -272,7 +318,12 @@ def test_a_hand_comes_straight_to_what_it_grasps(step: Step, scene) -> None:  # 
     problem = program_of(scene(), [step], options=SHORT)
     number = next(k for k, name in enumerate(names_of(problem)) if name.startswith("approach "))
     pose, solver, target = (
-        part[number] for part in (problem.transcription.structure.poses, problem.transcription.pose_solvers, problem.targets)
+        part[number]
+        for part in (
+            problem.transcription.structure.poses,
+            problem.transcription.pose_solvers,
+            problem.targets,
+        )
     )
     assert pose.waypoints == (REACH - SHORT.steps(SHORT.approach_time),)
     (hold,) = problem.task.holds
@@ -283,32 +334,51 @@ def test_a_hand_comes_straight_to_what_it_grasps(step: Step, scene) -> None:  # 
     lower, upper = problem.chain.lower.copy(), problem.chain.upper.copy()
     for name, value in problem.task.state.items():
         lower[problem.chain.index(name)] = upper[problem.chain.index(name)] = value
-    z, found = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(problem.chain.size), iterations=40)
+    z, found = solver.solve(
+        seeds, target, lower=lower, upper=upper, weights=np.ones(problem.chain.size), iterations=40
+    )
     assert found.sum() > 10
     for row in z[found]:
         values = [row[problem.chain.index(f"{hold.object}.{name}")] for name in grasp.coordinates]
         there = placed.link_placement(grasp.link) * grasp.placement * grasp.motion(values)
         behind = there * pin.SE3(np.eye(3), np.array([0.0, 0.0, -SHORT.approach]))
-        np.testing.assert_allclose(tool(problem, row).homogeneous, behind.homogeneous, rtol=0.0, atol=1e-5)
+        np.testing.assert_allclose(
+            tool(problem, row).homogeneous, behind.homogeneous, rtol=0.0, atol=1e-5
+        )
 
 
-# --- what is carried --------------------------------------------------------------------------------------------------
+# --- what is carried
+# --------------------------------------------------------------------------------------------------
 
-FETCH: list[Step] = [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), Release("stick"), GoTo(0.0, 0.0)]
+FETCH: list[Step] = [
+    Grasp("ball", "pull", "stick.tip"),
+    Place("ball", (0.8, 0.6, 0.7)),
+    Release("stick"),
+    GoTo(0.0, 0.0),
+]
 
 
 @pytest.fixture(scope="module")
 def fetching() -> TrajectoryProblem:
-    scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
+    scene = room(stand(), objects=("stick", "ball")).with_held(
+        {"stick": "grip"}, at={"stick": (0.02, -0.1)}
+    )
     return program_of(scene, FETCH, options=SHORT)
 
 
 def test_free_objects_are_grasped_where_they_stand_and_closed_nowhere_else() -> None:
     aside = lifted(STICK, [0.0, 0.5, 0.0])
-    steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", aside), GoTo(0.0, 0.0), Grasp("stick")]
+    steps = [
+        Touch("stick.tip", (0.8, 0.9, 0.7)),
+        Place("stick", aside),
+        GoTo(0.0, 0.0),
+        Grasp("stick"),
+    ]
     problem = program_of(room(table()), steps, options=SHORT)
     ends = problem.ends.tolist()
-    at = list(zip(names_of(problem), problem.targets, problem.transcription.structure.poses, strict=True))
+    at = list(
+        zip(names_of(problem), problem.targets, problem.transcription.structure.poses, strict=True)
+    )
     found = [(name, target, pose.waypoints, pose.kind) for name, target, pose in at]
     way = SHORT.steps(SHORT.approach_time)
     point = pin.SE3(np.eye(3), np.array([0.8, 0.9, 0.7]))
@@ -336,33 +406,54 @@ def test_what_is_held_at_the_start_stays_where_the_hand_has_it(fetching: Traject
         assert np.all(column(problem, name)[until:] == freedom)
     for axis in "xyz":
         assert np.all(column(problem, f"ball.pull_{axis}") == (-np.pi, np.pi))
-    assert problem.choices == tuple((problem.chain.index(f"ball.pull_{a}"), REACH, 2 * REACH) for a in "zyx")
-    chosen = [column for column, _, _ in problem.choices]  # what is clamped changes while grasping only, at next to no cost
-    np.testing.assert_allclose(problem.effort.metric[chosen], 1e-4 * problem.options.velocity_weight_object, rtol=1e-12)
+    assert problem.choices == tuple(
+        (problem.chain.index(f"ball.pull_{a}"), REACH, 2 * REACH) for a in "zyx"
+    )
+    chosen = [
+        column for column, _, _ in problem.choices
+    ]  # what is clamped changes while grasping only, at next to no cost
+    np.testing.assert_allclose(
+        problem.effort.metric[chosen], 1e-4 * problem.options.velocity_weight_object, rtol=1e-12
+    )
 
 
 def test_a_loose_grasp_is_not_clamped() -> None:
-    problem = program_of(full_scene(), [Actuate("cabinet", {"swing": 0.5}, "sleeve")], options=SHORT)
+    problem = program_of(
+        full_scene(), [Actuate("cabinet", {"swing": 0.5}, "sleeve")], options=SHORT
+    )
     assert problem.choices == ()
     assert problem.transcription.structure.clamped == ()
 
 
-def test_what_is_held_through_something_is_closed_by_its_holder(fetching: TrajectoryProblem) -> None:
+def test_what_is_held_through_something_is_closed_by_its_holder(
+    fetching: TrajectoryProblem,
+) -> None:
     """The pose of the grasp is that of the tip, and the goal that of the ball on it."""
     poses = dict(zip(names_of(fetching), fetching.transcription.structure.poses, strict=True))
-    assert list(poses) == ["grasp ball.pull by stick.tip", "approach ball.pull by stick.tip", "goal ball.ball"]
+    assert list(poses) == [
+        "grasp ball.pull by stick.tip",
+        "approach ball.pull by stick.tip",
+        "goal ball.ball",
+    ]
     assert poses["goal ball.ball"].kind == "upright"
-    (row,) = random_configurations(fetching.chain.lower, fetching.chain.upper, 1, np.random.default_rng(0))
+    (row,) = random_configurations(
+        fetching.chain.lower, fetching.chain.upper, 1, np.random.default_rng(0)
+    )
     data, model = fetching.chain.model.createData(), fetching.chain.model
     pin.forwardKinematics(model, data, fetching.chain.coordinates.q(row))
     pose = poses["approach ball.pull by stick.tip"]
     assert pose.shift is not None
     tip_joint, tip = fetching.chain.frame("tip", fetching.task.holds[0])
     direction = (data.oMi[tip_joint] * tip).rotation[:, 2]
-    np.testing.assert_allclose(data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1]), SHORT.approach * direction, atol=1e-9)
+    np.testing.assert_allclose(
+        data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1]),
+        SHORT.approach * direction,
+        atol=1e-9,
+    )
 
 
-# --- what is not of one waypoint alone --------------------------------------------------------------------------------
+# --- what is not of one waypoint alone
+# --------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -370,9 +461,23 @@ def carrying() -> TrajectoryProblem:
     """A robot that rolls, a grasp that is clamped, own constraints of bounds and an equality, some with the time of a step."""
     scene = dataclasses.replace(room(table()), robot=load_robot("husky_ur5e", base="differential"))
     terms = [
-        Constraint("tip", lambda s: s.position("stick.tip"), lower=[-0.1, -0.2, 0.0], upper=0.3, tolerance=0.02),
-        Constraint("level", lambda s: s.rotation("stick.stick")[2, :2].T, lower=0.0, upper=0.0, during="place stick"),
-        Constraint("slow", lambda s: ca.norm_2(s.velocity("tool")) ** 2, upper=0.5, tolerance=0.004),
+        Constraint(
+            "tip",
+            lambda s: s.position("stick.tip"),
+            lower=[-0.1, -0.2, 0.0],
+            upper=0.3,
+            tolerance=0.02,
+        ),
+        Constraint(
+            "level",
+            lambda s: s.rotation("stick.stick")[2, :2].T,
+            lower=0.0,
+            upper=0.0,
+            during="place stick",
+        ),
+        Constraint(
+            "slow", lambda s: ca.norm_2(s.velocity("tool")) ** 2, upper=0.5, tolerance=0.004
+        ),
     ]
     steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))]
     return program_of(scene, steps, options=SHORT, terms=terms)
@@ -387,21 +492,34 @@ def test_excess_is_how_far_rows_are_outside_their_bounds(carrying: TrajectoryPro
         timing = dataclasses.replace(p.timing_for(z), dt=dt)
         rates = seed == 0  # then the wheels have limits, too
         bounds = p.row_bounds(timing if rates else None)
-        found, lower, upper = p.excess(z, timing, rates=rates), *(bound[t.firm_rows : t.rows] for bound in bounds)
+        found, lower, upper = (
+            p.excess(z, timing, rates=rates),
+            *(bound[t.firm_rows : t.rows] for bound in bounds),
+        )
         assert found.shape == (t.rows - t.firm_rows,)
         values = np.full(t.rows, np.nan)
         path = p.waypoints(z)
         step, heading = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2
-        along, aside = (np.exp(-1j * heading) * (step[:, 0] + 1j * step[:, 1])).view(float).reshape(-1, 2).T
+        along, aside = (
+            (np.exp(-1j * heading) * (step[:, 0] + 1j * step[:, 1])).view(float).reshape(-1, 2).T
+        )
         arm, turn = p.chain.robot.wheels.track / 2, np.diff(path[:, 2])
-        values[t.base_rows] = np.column_stack([aside, along - arm * turn, along + arm * turn]).ravel()
-        steps = [(column, k) for column, first, last in t.structure.clamped for k in range(first + 1, last + 1)]
+        values[t.base_rows] = np.column_stack(
+            [aside, along - arm * turn, along + arm * turn]
+        ).ravel()
+        steps = [
+            (column, k)
+            for column, first, last in t.structure.clamped
+            for k in range(first + 1, last + 1)
+        ]
         clamped = np.flatnonzero(p.row_kinds["clamped"]) + t.firm_rows
         values[clamped] = [path[k, column] - path[k - 1, column] for column, k in steps]
         values[p.term_numbers.rows] = np.asarray(t.term_values(t.pack(z), p.start, dt)[0]).ravel()
         values = values[t.firm_rows :]
         assert np.isfinite(values).all()
-        np.testing.assert_allclose(np.clip(values - found, lower, upper), values - found, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(
+            np.clip(values - found, lower, upper), values - found, rtol=0.0, atol=1e-12
+        )
         inside = (values >= lower) & (values <= upper)
         np.testing.assert_array_equal(found[inside], np.zeros(inside.sum()))
         low, high = values < lower - 1e-9, values > upper + 1e-9
@@ -422,22 +540,32 @@ def test_what_has_only_rows_of_waypoints_has_no_excess(opened: TrajectoryProblem
 
 
 def test_every_row_of_several_waypoints_is_of_one_kind(carrying: TrajectoryProblem) -> None:
-    p, t, count = carrying, carrying.transcription, carrying.transcription.rows - carrying.transcription.firm_rows
+    p, t, count = (
+        carrying,
+        carrying.transcription,
+        carrying.transcription.rows - carrying.transcription.firm_rows,
+    )
     assert set(p.row_kinds) == {"rolling", "clamped", "terms"}
     assert all(of.shape == (count,) and (of >= 0.0).all() for of in p.row_kinds.values())
-    np.testing.assert_array_equal(sum((of > 0.0).astype(int) for of in p.row_kinds.values()), np.ones(count, int))
+    np.testing.assert_array_equal(
+        sum((of > 0.0).astype(int) for of in p.row_kinds.values()), np.ones(count, int)
+    )
     np.testing.assert_array_equal(np.flatnonzero(p.row_kinds["rolling"]) + t.firm_rows, t.base_rows)
     assert len(t.base_rows) == 3 * p.segments, "not aside, and no faster than either wheel"
     clamped = sum(last - first for _, first, last in t.structure.clamped)
     assert np.count_nonzero(p.row_kinds["clamped"]) == clamped > 0
-    np.testing.assert_array_equal(np.flatnonzero(p.row_kinds["terms"]) + t.firm_rows, p.term_numbers.rows)
+    np.testing.assert_array_equal(
+        np.flatnonzero(p.row_kinds["terms"]) + t.firm_rows, p.term_numbers.rows
+    )
     for kind in ("rolling", "clamped"):
         assert set(p.row_kinds[kind]) == {0.0, 1.0}
     # Of own constraints 1e-3 is the tolerance.
     tolerances = {"tip": 0.02, "level": 1e-3, "slow": 0.004}
     for term, at in zip(p.terms, t.term_rows, strict=True):
         for rows in at.values():
-            np.testing.assert_allclose(p.row_kinds["terms"][rows - t.firm_rows], 1e-3 / tolerances[term.name])
+            np.testing.assert_allclose(
+                p.row_kinds["terms"][rows - t.firm_rows], 1e-3 / tolerances[term.name]
+            )
 
 
 def test_rows_of_several_waypoints_belong_to_the_last_of_them(carrying: TrajectoryProblem) -> None:
@@ -452,13 +580,16 @@ def test_rows_of_several_waypoints_belong_to_the_last_of_them(carrying: Trajecto
     np.testing.assert_array_equal(t.owners, owner[t.firm_rows :])
 
 
-def test_a_program_with_all_kinds_of_rows_is_feasible_where_it_is_set_up(carrying: TrajectoryProblem) -> None:
+def test_a_program_with_all_kinds_of_rows_is_feasible_where_it_is_set_up(
+    carrying: TrajectoryProblem,
+) -> None:
     missing = [check_relaxation(carrying, z) for z in iterates(carrying)]
     for kind in ("clearance", "poses", "rolling", "clamped", "terms", "rates"):
         assert max(each[kind] for each in missing) > 0.1, kind
 
 
-# --- rates ----------------------------------------------------------------------------------------------------------
+# --- rates
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> None:
@@ -467,21 +598,36 @@ def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> Non
     trajectory = as_trajectory(two_grasps, z, np.full(two_grasps.segments, dt))
     steps, changes = two_grasps.rates(z)
     assert steps.shape == (two_grasps.segments, two_grasps.chain.size)
-    assert changes.shape == (two_grasps.segments + 1 + len(two_grasps.transcription.structure.stops), two_grasps.chain.size)
+    assert changes.shape == (
+        two_grasps.segments + 1 + len(two_grasps.transcription.structure.stops),
+        two_grasps.chain.size,
+    )
     velocities = trajectory.velocities()
     moving = np.isclose(np.diff(trajectory.times), dt)
     assert np.all(velocities[~moving] == 0.0)
     assert (~moving).sum() >= 1
-    choices = [two_grasps.chain.index(name) for names in two_grasps.chain.virtual.values() for name in names]
+    choices = [
+        two_grasps.chain.index(name)
+        for names in two_grasps.chain.virtual.values()
+        for name in names
+    ]
     others = np.setdiff1d(np.arange(two_grasps.chain.size), choices)
     assert len(choices) == 4
-    np.testing.assert_allclose((velocities[moving] * dt)[:, others], steps[:, others], rtol=0.0, atol=1e-10)
-    held, slides = slice(two_grasps.ends[1], two_grasps.ends[2]), two_grasps.chain.index("drawer.handle_free")
+    np.testing.assert_allclose(
+        (velocities[moving] * dt)[:, others], steps[:, others], rtol=0.0, atol=1e-10
+    )
+    held, slides = (
+        slice(two_grasps.ends[1], two_grasps.ends[2]),
+        two_grasps.chain.index("drawer.handle_free"),
+    )
     assert np.all(steps[held, slides] != 0.0)
-    np.testing.assert_allclose((velocities[moving] * dt)[held, slides], steps[held, slides], rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(
+        (velocities[moving] * dt)[held, slides], steps[held, slides], rtol=0.0, atol=1e-10
+    )
     assert np.all(velocities[moving][: held.start, slides] == 0.0)
     accelerations = trajectory.accelerations() * dt**2
-    # Two rows stand for a waypoint of rest, the stop and the start; with a pause there they are two waypoints.
+    # Two rows stand for a waypoint of rest, the stop and the start; with a pause there they are two
+    # waypoints.
     assert len(accelerations) == len(changes)
     np.testing.assert_allclose(accelerations[:, others], changes[:, others], rtol=0.0, atol=1e-10)
 
@@ -492,8 +638,12 @@ def test_bounds_on_rates_are_the_limits(two_grasps: TrajectoryProblem) -> None:
     steps, changes = p.rates(random_path(p))
     timing = p.timing_for(p.still)
     np.testing.assert_array_equal(timing.dt, np.full(p.segments, SHORT.dt))
-    np.testing.assert_allclose(timing.velocity, np.tile(p.chain.velocity * SHORT.dt, (len(steps), 1)))
-    np.testing.assert_allclose(timing.acceleration, np.tile(p.chain.acceleration * SHORT.dt**2, (len(changes), 1)))
+    np.testing.assert_allclose(
+        timing.velocity, np.tile(p.chain.velocity * SHORT.dt, (len(steps), 1))
+    )
+    np.testing.assert_allclose(
+        timing.acceleration, np.tile(p.chain.acceleration * SHORT.dt**2, (len(changes), 1))
+    )
     assert np.all(timing.velocity > 0)
 
 
@@ -516,7 +666,9 @@ def runs(problem: TrajectoryProblem) -> list[slice]:
 
 def test_a_way_that_is_too_long_gets_more_time() -> None:
     """Only where it is too long, and so much that the profile 3s² − 2s³ is within all rates; then less again."""
-    problem = program_of(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
+    problem = program_of(
+        full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT
+    )
     first, *others = runs(problem)
     z = np.tile(problem.start, (problem.segments, 1))
     share = np.arange(1, first.stop + 1) / first.stop
@@ -530,10 +682,15 @@ def test_a_way_that_is_too_long_gets_more_time() -> None:
     for run in others:
         np.testing.assert_array_equal(timing.dt[run], np.full(run.stop - run.start, SHORT.dt))
     assert timing.violation(*problem.rates(z)) <= 0.0
-    # The bounds are the limits over the new times, row by row, and the trajectory is played at them.
+    # The bounds are the limits over the new times, row by row, and the trajectory is played at
+    # them.
     np.testing.assert_allclose(timing.velocity, problem.chain.velocity * timing.dt[:, None])
-    of_rows = np.concatenate([np.full(run.stop - run.start + 1, timing.dt[run.start]) for run in runs(problem)])
-    np.testing.assert_allclose(timing.acceleration, problem.chain.acceleration * of_rows[:, None] ** 2)
+    of_rows = np.concatenate(
+        [np.full(run.stop - run.start + 1, timing.dt[run.start]) for run in runs(problem)]
+    )
+    np.testing.assert_allclose(
+        timing.acceleration, problem.chain.acceleration * of_rows[:, None] ** 2
+    )
     motion = as_trajectory(problem, z, timing.dt)
     moving = np.abs(np.diff(motion.positions[:, 0])) > 0
     np.testing.assert_allclose(np.diff(motion.times)[moving], timing.dt[first])
@@ -543,7 +700,9 @@ def test_a_way_that_is_too_long_gets_more_time() -> None:
 
 
 def test_a_step_that_is_too_fast_gets_more_time_within_reason() -> None:
-    problem = program_of(full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT)
+    problem = program_of(
+        full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT
+    )
     first, second, *_ = runs(problem)
     for jump, enough in ((0.15, True), (30.0, False)):
         z = problem.still
@@ -579,7 +738,8 @@ def test_a_problem_does_not_change(opened: TrajectoryProblem) -> None:
     assert np.all(opened.clip(opened.still + 0.5)[:-1, :3] > opened.still[:-1, :3])
 
 
-# --- the rest -------------------------------------------------------------------------------------------------------
+# --- the rest
+# -------------------------------------------------------------------------------------------------------
 
 
 def test_contacts_are_those_of_each_waypoints_phase(opened: TrajectoryProblem) -> None:
@@ -592,7 +752,11 @@ def test_contacts_are_those_of_each_waypoints_phase(opened: TrajectoryProblem) -
         if not begin <= row < end:  # row t belongs to waypoint t + 1
             assert not set(pair) & set(held)
     everything = opened.evaluate_contacts(z, reach=3.0)
-    with_door = {int(row) for row, pair in zip(everything.waypoint, everything.pair, strict=True) if set(pair) & set(held)}
+    with_door = {
+        int(row)
+        for row, pair in zip(everything.waypoint, everything.pair, strict=True)
+        if set(pair) & set(held)
+    }
     assert with_door == set(range(begin, end))
 
 
@@ -622,7 +786,11 @@ def test_options_have_defaults() -> None:
 
 def test_scene_steps_and_options_are_left_as_they_were() -> None:
     scene, steps = door_scene(), [Actuate("door", {"hinge": 1.2})]
-    start, state, pairs = scene.start.copy(), scene.objects["door"].state.copy(), len(scene.robot.collision.collisionPairs)
+    start, state, pairs = (
+        scene.start.copy(),
+        scene.objects["door"].state.copy(),
+        len(scene.robot.collision.collisionPairs),
+    )
     program_of(scene, steps, options=SHORT)
     np.testing.assert_array_equal(scene.start, start)
     np.testing.assert_array_equal(scene.objects["door"].state, state)
@@ -637,12 +805,18 @@ def test_scene_steps_and_options_are_left_as_they_were() -> None:
         ([Actuate("dor", {"hinge": 1.0})], UnknownNameError, r"dor.*door"),
         ([Actuate("door", {"hing": 1.0})], UnknownNameError, r"hing.*hinge"),
         ([Grasp("door", "handel")], UnknownNameError, r"handel.*handle"),
-        ([Grasp("door", "handle"), Grasp("door", "handle_free")], InputError, "two grasps of one joint"),
+        (
+            [Grasp("door", "handle"), Grasp("door", "handle_free")],
+            InputError,
+            "two grasps of one joint",
+        ),
         ([Reach(POSE, frame="tol")], UnknownNameError, r"tol.*tool"),
         (["open the door"], InputError, "not a step"),
     ],
 )
-def test_steps_that_cannot_be_are_refused(steps: list[Step], error: type[Exception], match: str) -> None:
+def test_steps_that_cannot_be_are_refused(
+    steps: list[Step], error: type[Exception], match: str
+) -> None:
     with pytest.raises(error, match=match):
         program_of(door_scene(), steps, options=SHORT)
 
@@ -657,4 +831,8 @@ def test_a_grasp_is_chosen_within_its_own_phase(waypoints: int) -> None:
     spans = sorted({(first, last) for _, first, last in clamped})
     assert len(spans) == 2
     assert spans[0][1] < spans[1][0]
-    assert all(name.startswith("approach") == (waypoints > 1) for name in names_of(problem) if "approach" in name)
+    assert all(
+        name.startswith("approach") == (waypoints > 1)
+        for name in names_of(problem)
+        if "approach" in name
+    )

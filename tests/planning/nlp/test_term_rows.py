@@ -29,26 +29,59 @@ def terms_of(name: str) -> list[Constraint | Cost]:
     if name == "stick":
         return [
             vkc.Constraint("tip", lambda s: s.position("stick.tip"), lower=[-1, -2, 0], upper=3.0),
-            vkc.Constraint("tilt", lambda s: s.rotation("stick.stick")[2, 2], lower=0.9, during="place stick"),
-            vkc.Constraint("speed", lambda s: ca.norm_2(s.velocity("stick.tip")) - ca.sumsqr(s.position("tool")), upper=0.0),
-            vkc.Constraint("near", lambda s: ca.sumsqr(s.position("forearm_link") - s.position("stick.tip")), upper=9.0),
-            vkc.Constraint("elbow", lambda s: s.rate("elbow_joint"), lower=-1.0, upper=1.0, holding="stick"),
-            vkc.Cost("waves", lambda s: ca.sin(3 * s.coordinate("wrist_1_joint")) * s.position("tool")[2], weight=0.7),
-            vkc.Cost("way", lambda s: ca.sumsqr(s.velocity("tool")), weight=2.0, during=["go to", "touch with stick.tip"]),
+            vkc.Constraint(
+                "tilt", lambda s: s.rotation("stick.stick")[2, 2], lower=0.9, during="place stick"
+            ),
+            vkc.Constraint(
+                "speed",
+                lambda s: ca.norm_2(s.velocity("stick.tip")) - ca.sumsqr(s.position("tool")),
+                upper=0.0,
+            ),
+            vkc.Constraint(
+                "near",
+                lambda s: ca.sumsqr(s.position("forearm_link") - s.position("stick.tip")),
+                upper=9.0,
+            ),
+            vkc.Constraint(
+                "elbow", lambda s: s.rate("elbow_joint"), lower=-1.0, upper=1.0, holding="stick"
+            ),
+            vkc.Cost(
+                "waves",
+                lambda s: ca.sin(3 * s.coordinate("wrist_1_joint")) * s.position("tool")[2],
+                weight=0.7,
+            ),
+            vkc.Cost(
+                "way",
+                lambda s: ca.sumsqr(s.velocity("tool")),
+                weight=2.0,
+                during=["go to", "touch with stick.tip"],
+            ),
         ]
     if name == "ball":
         return [
-            vkc.Constraint("between", lambda s: ca.norm_2(s.position("ball.ball") - POINT), lower=0.1),
+            vkc.Constraint(
+                "between", lambda s: ca.norm_2(s.position("ball.ball") - POINT), lower=0.1
+            ),
             vkc.Constraint("ball", lambda s: s.velocity("ball.ball"), upper=1.0),
         ]
     assert name == "furniture"
     return [
         vkc.Constraint("panel", lambda s: s.velocity("door.panel"), lower=-1.0, upper=1.0),
         vkc.Constraint(
-            "look", lambda s: ca.dot(s.rotation("tool")[:, 2], s.position("door.panel") - s.position("tool")), lower=0.0
+            "look",
+            lambda s: ca.dot(
+                s.rotation("tool")[:, 2], s.position("door.panel") - s.position("tool")
+            ),
+            lower=0.0,
         ),
-        vkc.Constraint("tray", lambda s: s.rotation("cabinet.knob")[:, 0] * s.coordinate("cabinet.swing"), upper=1.0),
-        vkc.Constraint("hinge", lambda s: s.rate("door.hinge") + s.coordinate("cabinet.lid_hinge"), upper=1.0),
+        vkc.Constraint(
+            "tray",
+            lambda s: s.rotation("cabinet.knob")[:, 0] * s.coordinate("cabinet.swing"),
+            upper=1.0,
+        ),
+        vkc.Constraint(
+            "hinge", lambda s: s.rate("door.hinge") + s.coordinate("cabinet.lid_hinge"), upper=1.0
+        ),
         vkc.Constraint("lid", lambda s: s.coordinate("cabinet.lid_hinge"), upper=1.0),
         vkc.Cost("slide", lambda s: s.coordinate("drawer.slide") ** 2 + s.coordinate("base_yaw")),
     ]
@@ -58,13 +91,27 @@ def terms_of(name: str) -> list[Constraint | Cost]:
 def problem(name: str) -> vkc.TrajectoryProblem:
     if name == "stick":
         scene = room(table())
-        steps = [vkc.Touch("stick.tip", (0.8, 0.9, 0.7)), vkc.Place("stick", (0.8, 0.5, 0.56)), vkc.GoTo(0.0, 0.0)]
+        steps = [
+            vkc.Touch("stick.tip", (0.8, 0.9, 0.7)),
+            vkc.Place("stick", (0.8, 0.5, 0.56)),
+            vkc.GoTo(0.0, 0.0),
+        ]
     elif name == "ball":
-        scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
-        steps = [vkc.Grasp("ball", "pull", "stick.tip"), vkc.Place("ball", (0.8, 0.6, 0.7)), vkc.GoTo(0.0, 0.0)]
+        scene = room(stand(), objects=("stick", "ball")).with_held(
+            {"stick": "grip"}, at={"stick": (0.02, -0.1)}
+        )
+        steps = [
+            vkc.Grasp("ball", "pull", "stick.tip"),
+            vkc.Place("ball", (0.8, 0.6, 0.7)),
+            vkc.GoTo(0.0, 0.0),
+        ]
     else:
         scene = full_scene()
-        steps = [vkc.Actuate("cabinet", {"swing": 0.5}), vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)]
+        steps = [
+            vkc.Actuate("cabinet", {"swing": 0.5}),
+            vkc.Actuate("door", {"hinge": 1.2}),
+            vkc.GoTo(0.0, 0.0),
+        ]
     return program_of(scene, steps, options=OPTIONS, terms=terms_of(name))
 
 
@@ -84,7 +131,9 @@ def times(p: vkc.TrajectoryProblem) -> np.ndarray:
 class Numbers:
     """What a term asks a State for, in numbers: of the plain models, and of grasps by their definition."""
 
-    def __init__(self, p: vkc.TrajectoryProblem, path: np.ndarray, waypoint: int, dt: float) -> None:
+    def __init__(
+        self, p: vkc.TrajectoryProblem, path: np.ndarray, waypoint: int, dt: float
+    ) -> None:
         self.p, self.path, self.t, self.dt = p, path, waypoint, dt
         self.ends = [0, *p.ends.tolist()]
 
@@ -102,7 +151,9 @@ class Numbers:
     def _robot(self, frame: str, t: int) -> pin.SE3:
         robot = self.p.scene.robot
         data = robot.model.createData()
-        pin.forwardKinematics(robot.model, data, robot.coordinates.q(self.path[t, : robot.coordinates.size]))
+        pin.forwardKinematics(
+            robot.model, data, robot.coordinates.q(self.path[t, : robot.coordinates.size])
+        )
         return pin.updateFramePlacement(robot.model, data, robot.model.getFrameId(frame)).copy()
 
     def _held(self, owner: str, t: int, hold: Any) -> pin.SE3:
@@ -110,12 +161,16 @@ class Numbers:
         placed = self.p.scene.objects[owner]
         attachment = placed.object.attachments[hold.attachment]
         values = [self._value(f"{owner}.{name}", t) for name in attachment.coordinates]
-        grasped = placed.object.link_placement(attachment.link, placed.state) * attachment.tool(np.array(values))
+        grasped = placed.object.link_placement(attachment.link, placed.state) * attachment.tool(
+            np.array(values)
+        )
         if hold.by is None:
             holder = self._robot(self.p.scene.robot.tool_frame, t)
         else:
             carrier = self.p.scene.objects[hold.by.object]
-            holder = self._held(hold.by.object, t, hold.by) * carrier.object.link_placement(hold.link, carrier.state)
+            holder = self._held(hold.by.object, t, hold.by) * carrier.object.link_placement(
+                hold.link, carrier.state
+            )
         return holder * grasped.inverse()
 
     def at(self, frame: str, t: int, phase: Phase) -> pin.SE3:
@@ -150,13 +205,17 @@ class Numbers:
         return (self._value(name, self.t) - self._value(name, self.t - 1)) / self.dt
 
 
-def expected_values(p: vkc.TrajectoryProblem, term: Constraint | Cost, path: np.ndarray, dt: np.ndarray) -> dict[int, np.ndarray]:
+def expected_values(
+    p: vkc.TrajectoryProblem, term: Constraint | Cost, path: np.ndarray, dt: np.ndarray
+) -> dict[int, np.ndarray]:
     """Return the term's value at every waypoint of its phases after their first."""
     found = {}
     for phase, first, last in zip(p.task.phases, [0, *p.ends[:-1]], p.ends, strict=True):
         if term.active(phase.name, [hold.object for hold in phase.held]):
             for t in range(first + 1, last + 1):
-                found[int(t)] = np.asarray(ca.DM(term.expression(Numbers(p, path, int(t), dt[t - 1])))).ravel()  # type: ignore[operator, arg-type]
+                found[int(t)] = np.asarray(
+                    ca.DM(term.expression(Numbers(p, path, int(t), dt[t - 1])))
+                ).ravel()  # type: ignore[operator, arg-type]
     return found
 
 
@@ -194,13 +253,22 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     p = problem(name)
     t, rng = p.transcription, np.random.default_rng(1)
     solver = t.solver(rates=False, options=QUIET).function
-    objective, constraints, lagrangian = (solver.get_function(f) for f in ("nlp_grad_f", "nlp_jac_g", "nlp_hess_l"))
+    objective, constraints, lagrangian = (
+        solver.get_function(f) for f in ("nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
+    )
     planes = rng.normal(size=(t.segments, t.slots, 12 * (p.chain.model.njoints - 1)))
     offsets = rng.normal(size=(t.segments, t.slots))
     away = rng.normal(size=(t.segments, len(p.pose_goals), AWAY))
     excess, prices = rng.normal(size=t.rows - t.firm_rows), rng.uniform(0.0, 50.0, t.segments)
-    taken = {"away": away, "excess": excess, "prices": prices, "weights": p.effort.weights(*p.rates(random_path(p, 2)[1:]))}
-    parameters = t.parameter_vector(p.start, planes, offsets, p.target_matrix(), penalty=PENALTY, dt=times(p), **taken)
+    taken = {
+        "away": away,
+        "excess": excess,
+        "prices": prices,
+        "weights": p.effort.weights(*p.rates(random_path(p, 2)[1:])),
+    }
+    parameters = t.parameter_vector(
+        p.start, planes, offsets, p.target_matrix(), penalty=PENALTY, dt=times(p), **taken
+    )
     slack, shares = rng.uniform(size=(t.segments, t.slots)), rng.uniform(0.05, 0.95, t.segments)
     x = t.pack(random_path(p, 2)[1:], slack, shares)
     own, step, weight = p.term_numbers.rows, 1e-5, 0.7
@@ -211,7 +279,11 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
         f, gradient = objective(x, parameters)
         g, jacobian = constraints(x, parameters)
         slope = weight * np.asarray(gradient).ravel() + np.asarray(jacobian.full()).T @ multipliers
-        return np.r_[float(f), np.asarray(g).ravel()[own]], slope, np.vstack([np.asarray(gradient).T, jacobian.full()[own]])
+        return (
+            np.r_[float(f), np.asarray(g).ravel()[own]],
+            slope,
+            np.vstack([np.asarray(gradient).T, jacobian.full()[own]]),
+        )
 
     sides = [(both(x + step * e), both(x - step * e)) for e in np.eye(len(x))]
     slopes = np.array([(a[0] - b[0]) / (2 * step) for a, b in sides]).T
@@ -223,7 +295,9 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     f, z = objective(x, parameters)[0], random_path(p, 2)[1:]
     given = p.rates(z)
     squares = sum(np.sum(w * part**2) for w, part in zip(taken["weights"], given, strict=True))
-    assert p.objective(z, times(p)) == pytest.approx(p.effort.value(*given) + p.term_numbers.cost(z, times(p)))
+    assert p.objective(z, times(p)) == pytest.approx(
+        p.effort.value(*given) + p.term_numbers.cost(z, times(p))
+    )
     assert squares + p.term_numbers.cost(z, times(p)) == pytest.approx(
         float(f) - PENALTY * slack.sum() - prices @ shares, rel=1e-9
     )
@@ -234,7 +308,9 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
             owner[rows] = waypoint - 1
     values = np.asarray(t.term_values(x, p.start, times(p))[0]).ravel()
     expected = values - shares[owner[own]] * excess[own - t.firm_rows]
-    np.testing.assert_allclose(np.asarray(constraints(x, parameters)[0]).ravel()[own], expected, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        np.asarray(constraints(x, parameters)[0]).ravel()[own], expected, rtol=0.0, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -261,7 +337,9 @@ def test_a_hand_left_where_it_was_counts_after_it_was_let_go_of() -> None:
 def test_programs_with_different_terms_are_told_apart() -> None:
     def made(limit: float, upper: float, *, terms: bool = True) -> vkc.TrajectoryProblem:
         near = vkc.Constraint("near", lambda s: s.position("tool")[2] - limit, upper=upper)
-        return program_of(room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[near] if terms else [])
+        return program_of(
+            room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[near] if terms else []
+        )
 
     first = made(0.5, 1.0)
     assert made(0.5, 1.0).transcription is first.transcription
@@ -273,10 +351,14 @@ def test_programs_with_different_terms_are_told_apart() -> None:
     assert first.transcription.rows == without.transcription.rows + OPTIONS.reach_waypoints
     assert first.term_numbers.upper.tolist() == [1.0] * OPTIONS.reach_waypoints
     parameters = [p.transcription.parameters.numel() for p in (first, without)]
-    assert parameters[0] == parameters[1] + OPTIONS.reach_waypoints  # an excess each, but no term needs the time of a step
+    assert (
+        parameters[0] == parameters[1] + OPTIONS.reach_waypoints
+    )  # an excess each, but no term needs the time of a step
     fast = vkc.Cost("fast", lambda s: ca.sumsqr(s.velocity("tool")))
     timed = program_of(room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[fast])
-    assert timed.transcription.parameters.numel() == parameters[1] + OPTIONS.reach_waypoints  # a cost has no excess
+    assert (
+        timed.transcription.parameters.numel() == parameters[1] + OPTIONS.reach_waypoints
+    )  # a cost has no excess
 
 
 def test_errors_count_in_tolerances() -> None:
@@ -295,8 +377,16 @@ def test_errors_count_in_tolerances() -> None:
 
 def test_steps_take_longer_where_a_speed_asks_for_it() -> None:
     def at(limit: float, start: float = 0.0) -> vkc.TrajectoryProblem:
-        slow = vkc.Constraint("slow", lambda s: ca.norm_2(s.velocity("tool")), lower=start, upper=limit, tolerance=1e-3)
-        return program_of(room(), [vkc.GoTo(2.0, 0.0)], options=vkc.Options(reach_waypoints=20), terms=[slow])
+        slow = vkc.Constraint(
+            "slow",
+            lambda s: ca.norm_2(s.velocity("tool")),
+            lower=start,
+            upper=limit,
+            tolerance=1e-3,
+        )
+        return program_of(
+            room(), [vkc.GoTo(2.0, 0.0)], options=vkc.Options(reach_waypoints=20), terms=[slow]
+        )
 
     share = np.linspace(0.0, 1.0, 21)[1:, None]
     usual = at(9.0)
@@ -313,10 +403,21 @@ def test_steps_take_longer_where_a_speed_asks_for_it() -> None:
 
 
 def test_terms_without_a_slope_are_refused() -> None:
-    for expression in (lambda s: ca.acos(s.rotation("stick.stick")[2, 2]), lambda s: 1 / ca.sumsqr(s.velocity("tool"))):
+    for expression in (
+        lambda s: ca.acos(s.rotation("stick.stick")[2, 2]),
+        lambda s: 1 / ca.sumsqr(s.velocity("tool")),
+    ):
         for term in (vkc.Constraint("mine", expression, upper=0.2), vkc.Cost("mine", expression)):
-            with pytest.raises(vkc.InputError, match=r"terms\['mine'\]\.expression: it has no value or no slope at the start"):
-                program_of(room(table()).with_held({"stick": "grip"}), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[term])
+            with pytest.raises(
+                vkc.InputError,
+                match=r"terms\['mine'\]\.expression: it has no value or no slope at the start",
+            ):
+                program_of(
+                    room(table()).with_held({"stick": "grip"}),
+                    [vkc.GoTo(0.5, 0.5)],
+                    options=OPTIONS,
+                    terms=[term],
+                )
 
 
 def test_what_nothing_can_change_is_no_row() -> None:
@@ -329,6 +430,13 @@ def test_what_nothing_can_change_is_no_row() -> None:
 def test_an_empty_program() -> None:
     p = problem("furniture")
     for width in (None, p.chain.size + 5):
-        part = TermProgram(p.chain.model, (), ca.MX.sym("z", p.chain.size, 4), ca.MX.sym("dt", 3), p.cache, width=width)
+        part = TermProgram(
+            p.chain.model,
+            (),
+            ca.MX.sym("z", p.chain.size, 4),
+            ca.MX.sym("dt", 3),
+            p.cache,
+            width=width,
+        )
         assert part.rows == 0
         assert part.jacobian.shape == (0, 3 * (width or p.chain.size))

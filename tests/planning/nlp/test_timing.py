@@ -31,13 +31,20 @@ def test_the_profile_fits_into_the_time(seed: int, size: float) -> None:
     profile = fine**2 * (3.0 - 2.0 * fine)
     for first, last in runs:
         assert np.ptp(times[first:last]) == 0.0
-        way, duration = np.abs(np.diff(path[first : last + 1], axis=0)).sum(axis=0), times[first:last].sum()
+        way, duration = (
+            np.abs(np.diff(path[first : last + 1], axis=0)).sum(axis=0),
+            times[first:last].sum(),
+        )
         step = duration / 400
-        speed, strength = (np.abs(np.diff(profile, order)).max() / step**order * way for order in (1, 2))
+        speed, strength = (
+            np.abs(np.diff(profile, order)).max() / step**order * way for order in (1, 2)
+        )
         assert (speed <= limits[0]).all()
         assert (strength <= limits[1]).all()
         if times[first] > 0.1:  # and it is not given more than it needs, but for what may be spared
-            assert max((1.15 * speed / limits[0]).max(), (1.15**2 * strength / limits[1]).max()) > 0.98
+            assert (
+                max((1.15 * speed / limits[0]).max(), (1.15**2 * strength / limits[1]).max()) > 0.98
+            )
 
 
 def differences(path: np.ndarray, runs: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +60,9 @@ def test_stretching_gives_what_is_needed_and_no_more_than_allowed(seed: int, siz
     rng, runs = np.random.default_rng(seed), [(0, 5), (5, 6), (6, 12)]
     limits, dt = (np.full(3, 1.0), np.full(3, 4.0)), np.repeat([0.5, 1.0, 0.8], [5, 1, 6])
     timing = Timing(dt, dt, runs, limits)
-    first, second = differences(np.cumsum(0.5 * size * rng.uniform(-0.5, 0.5, (13, 3)), axis=0), runs)
+    first, second = differences(
+        np.cumsum(0.5 * size * rng.uniform(-0.5, 0.5, (13, 3)), axis=0), runs
+    )
     assert timing.velocity.shape == first.shape
     assert timing.acceleration.shape == second.shape
     longer = timing.stretched(first, second)
@@ -63,7 +72,10 @@ def test_stretching_gives_what_is_needed_and_no_more_than_allowed(seed: int, siz
         assert longer.dt[a:b] == pytest.approx(dt[a] * np.clip(1.001 * excess, 1.0, 1.5))
     assert timing.violation(first, second) == pytest.approx(
         max(
-            max(np.abs(first[a:b]).max() / dt[a], np.abs(second[a + k : b + k + 1]).max() / 4.0 / dt[a] ** 2)
+            max(
+                np.abs(first[a:b]).max() / dt[a],
+                np.abs(second[a + k : b + k + 1]).max() / 4.0 / dt[a] ** 2,
+            )
             for k, (a, b) in enumerate(runs)
         )
         - 1.0

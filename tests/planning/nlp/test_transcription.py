@@ -37,7 +37,9 @@ def differential_scene() -> Scene:
 
 @cache
 def car_scene() -> Scene:
-    return dataclasses.replace(door_scene(), robot=load_robot("husky_ur5e", base="ackermann", turning_radius=0.8))
+    return dataclasses.replace(
+        door_scene(), robot=load_robot("husky_ur5e", base="ackermann", turning_radius=0.8)
+    )
 
 
 @cache
@@ -50,17 +52,38 @@ def problem(name: str) -> TrajectoryProblem:
     if name in ("differential", "ackermann"):
         scene = differential_scene() if name == "differential" else car_scene()
         return program_of(scene, [Reach(pose), GoTo(0.0, 0.0, 1.0)], options=OPTIONS)
-    if name == "stick":  # chosen where to grasp, clamped from then on; a point, and an upright place
-        return program_of(room(table()), [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))], options=OPTIONS)
-    if name == "fetch":  # a ball with the stick that is held at the start, then the stick itself is put away
-        scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
-        steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", pose), Release("stick"), GoTo(0.0, 0.0)]
+    if (
+        name == "stick"
+    ):  # chosen where to grasp, clamped from then on; a point, and an upright place
+        return program_of(
+            room(table()),
+            [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))],
+            options=OPTIONS,
+        )
+    if (
+        name == "fetch"
+    ):  # a ball with the stick that is held at the start, then the stick itself is put away
+        scene = room(stand(), objects=("stick", "ball")).with_held(
+            {"stick": "grip"}, at={"stick": (0.02, -0.1)}
+        )
+        steps = [
+            Grasp("ball", "pull", "stick.tip"),
+            Place("ball", pose),
+            Release("stick"),
+            GoTo(0.0, 0.0),
+        ]
         return program_of(scene, steps, options=OPTIONS)
     if name == "push":  # from the start on, and then at another face
         scene = door_scene().with_state("door", {"hinge": -1.0}).with_held({"door": "push"})
-        return program_of(scene, [Actuate("door", {"hinge": -0.5}), GoTo(0.0, 0.0)], options=OPTIONS)
+        return program_of(
+            scene, [Actuate("door", {"hinge": -0.5}), GoTo(0.0, 0.0)], options=OPTIONS
+        )
     assert name == "two grasps"  # the second ends nothing: there is a pose to reach after it
-    steps = [Grasp("cabinet", "ball"), Actuate("drawer", {"slide": 0.2}, attachment="handle_free"), Reach(pose)]
+    steps = [
+        Grasp("cabinet", "ball"),
+        Actuate("drawer", {"slide": 0.2}, attachment="handle_free"),
+        Reach(pose),
+    ]
     return program_of(full_scene(), steps, options=OPTIONS)
 
 
@@ -113,7 +136,11 @@ class Point:
 
     def receded(self, waypoint: int, number: int) -> pin.SE3:
         """Return where the target of a pose has gone at a waypoint, by Pinocchio."""
-        target, away, share = self.problem.targets[number], self.away[waypoint - 1, number], self.shares[waypoint - 1]
+        target, away, share = (
+            self.problem.targets[number],
+            self.away[waypoint - 1, number],
+            self.shares[waypoint - 1],
+        )
         turn = pin.exp3(share * away[6] * away[3:6])
         return pin.SE3(target.rotation @ turn, target.translation + share * away[:3])
 
@@ -170,7 +197,9 @@ def excess_at(point: Point, which: np.ndarray) -> np.ndarray:
 
 def differences(function, x: np.ndarray, step: float = 1e-5) -> np.ndarray:  # type: ignore[no-untyped-def]
     """Return the central differences of a vector function, shape (rows, len(x))."""
-    columns = [(function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(len(x))]
+    columns = [
+        (function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(len(x))
+    ]
     return np.array(columns).T
 
 
@@ -181,7 +210,9 @@ def clamped(p: TrajectoryProblem) -> list[tuple[int, int, int]]:
         firm = p.scene.objects[hold.object].object.attachments[hold.attachment].firm
         grasps = [k for k, phase in enumerate(p.task.phases) if hold in phase.grasps]
         for k in grasps if firm else ():
-            held = itertools.takewhile(lambda j, hold=hold: hold in p.task.phases[j].held, range(k + 1, len(p.task.phases)))
+            held = itertools.takewhile(
+                lambda j, hold=hold: hold in p.task.phases[j].held, range(k + 1, len(p.task.phases))
+            )
             last = max([k, *held])
             before = max(1, int(p.ends[k]) - OPTIONS.steps(OPTIONS.approach_time))
             found += [(p.chain.index(name), before, int(p.ends[last])) for name in names]
@@ -202,7 +233,8 @@ def stretches(p: TrajectoryProblem) -> list[np.ndarray]:
     return [np.arange(a, b + 1) for a, b in itertools.pairwise(stops)]
 
 
-# --- definitions ----------------------------------------------------------------------------------------------------
+# --- definitions
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -235,9 +267,14 @@ def test_witness_rows_are_planes_over_the_placements_plus_slack(name: str) -> No
     for t, q in enumerate(p.chain.coordinates.q(point.z)):
         pin.forwardKinematics(model, data, q)
         stacked = np.concatenate(
-            [np.r_[data.oMi[j].rotation.T.ravel(), data.oMi[j].translation] for j in range(1, model.njoints)]
+            [
+                np.r_[data.oMi[j].rotation.T.ravel(), data.oMi[j].translation]
+                for j in range(1, model.njoints)
+            ]
         )
-        expected = point.planes[t] @ stacked - point.offsets[t] + point.slack[t]  # each plane has a slack of its own
+        expected = (
+            point.planes[t] @ stacked - point.offsets[t] + point.slack[t]
+        )  # each plane has a slack of its own
         np.testing.assert_allclose(g[p.transcription.slot_rows[t]], expected, rtol=0.0, atol=1e-10)
 
 
@@ -254,7 +291,11 @@ def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
             target = point.receded(waypoint, number)
             pin.forwardKinematics(model, data, p.chain.coordinates.q(point.z[waypoint - 1]))
             placement = data.oMi[pose.joint] * pose.local
-            shift = np.zeros(3) if pose.shift is None else data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
+            shift = (
+                np.zeros(3)
+                if pose.shift is None
+                else data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
+            )
             expected = [placement.translation + shift - target.translation]
             if pose.kind == "pose":
                 error = target.rotation.T @ placement.rotation
@@ -267,7 +308,9 @@ def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
 
 
 def test_there_are_goals_of_all_kinds() -> None:
-    kinds = {name: [pose.kind for pose in problem(name).transcription.structure.poses] for name in NAMES}
+    kinds = {
+        name: [pose.kind for pose in problem(name).transcription.structure.poses] for name in NAMES
+    }
     assert set(kinds["stick"]) == {"pose", "point", "upright"}
     assert {kind for name in NAMES if name != "stick" for kind in kinds[name]} == {"pose"}
     assert any(pose.shift for pose in problem("fetch").transcription.structure.poses)
@@ -294,9 +337,13 @@ def test_what_is_pushed_goes_one_way() -> None:
     path, phase = p.waypoints(point.z)[:, column], p.task.phases[0]
     assert (phase.name, phase.pushed) == ("move door.hinge", {"door.hinge": 1})
     expected = np.diff(path)[: phase.segments]
-    expected -= taken_away(point, list(range(1, phase.segments + 1)), excess_at(point, t.pushed_rows))
+    expected -= taken_away(
+        point, list(range(1, phase.segments + 1)), excess_at(point, t.pushed_rows)
+    )
     np.testing.assert_allclose(rows(point)[t.pushed_rows], expected, rtol=0.0, atol=1e-12)
-    np.testing.assert_array_equal(t.pushed_rows, t.rows - phase.segments + np.arange(phase.segments))
+    np.testing.assert_array_equal(
+        t.pushed_rows, t.rows - phase.segments + np.arange(phase.segments)
+    )
     lower, upper = p.row_bounds(None)
     assert set(lower[t.pushed_rows]) == {0.0}
     assert set(upper[t.pushed_rows]) == {np.inf}
@@ -305,8 +352,12 @@ def test_what_is_pushed_goes_one_way() -> None:
     back, there = other.task.phases[0].pushed, random_point(other)
     assert back == {"door.hinge": -1}
     moved = -np.diff(other.waypoints(there.z)[:, column])[: phase.segments]
-    moved -= taken_away(there, list(range(1, phase.segments + 1)), excess_at(there, other.transcription.pushed_rows))
-    np.testing.assert_allclose(rows(there)[other.transcription.pushed_rows], moved, rtol=0.0, atol=1e-12)
+    moved -= taken_away(
+        there, list(range(1, phase.segments + 1)), excess_at(there, other.transcription.pushed_rows)
+    )
+    np.testing.assert_allclose(
+        rows(there)[other.transcription.pushed_rows], moved, rtol=0.0, atol=1e-12
+    )
 
 
 def test_rows_of_a_base_on_wheels() -> None:
@@ -316,23 +367,38 @@ def test_rows_of_a_base_on_wheels() -> None:
         point = random_point(p)
         path, gears, robot = p.waypoints(point.z), point.gears, p.chain.robot
         assert set(gears) == {-1.0, 1.0}
-        step, heading, turn = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2, np.diff(path[:, 2])
+        step, heading, turn = (
+            np.diff(path[:, :2], axis=0),
+            (path[1:, 2] + path[:-1, 2]) / 2,
+            np.diff(path[:, 2]),
+        )
         aside = np.cos(heading) * step[:, 1] - np.sin(heading) * step[:, 0]
         along = np.cos(heading) * step[:, 0] + np.sin(heading) * step[:, 1]
-        steered = [gears * along - 0.8 * turn, gears * along + 0.8 * turn] if name == "ackermann" else []
+        steered = (
+            [gears * along - 0.8 * turn, gears * along + 0.8 * turn] if name == "ackermann" else []
+        )
         wheels = [along - robot.wheels.track / 2 * turn, along + robot.wheels.track / 2 * turn]
         expected = np.column_stack([aside, *steered, *wheels])
         owners = np.repeat(np.arange(1, p.segments + 1), expected.shape[1]).tolist()
-        expected = expected.ravel() - taken_away(point, owners, excess_at(point, p.transcription.base_rows))
-        np.testing.assert_allclose(rows(point)[p.transcription.base_rows], expected, rtol=0.0, atol=1e-12)
-        lower, upper = (bound[p.transcription.base_rows].reshape(p.segments, -1) for bound in p.row_bounds(p.timing_for(p.still)))
+        expected = expected.ravel() - taken_away(
+            point, owners, excess_at(point, p.transcription.base_rows)
+        )
+        np.testing.assert_allclose(
+            rows(point)[p.transcription.base_rows], expected, rtol=0.0, atol=1e-12
+        )
+        lower, upper = (
+            bound[p.transcription.base_rows].reshape(p.segments, -1)
+            for bound in p.row_bounds(p.timing_for(p.still))
+        )
         assert not lower[:, 0].any()
         assert not upper[:, 0].any()
         np.testing.assert_allclose(upper[:, -2:], 1.0 * OPTIONS.dt, rtol=1e-4)
         np.testing.assert_array_equal(lower[:, -2:], -upper[:, -2:])
         np.testing.assert_array_equal(lower[:, 1:-2], 0.0)
         assert np.isinf(upper[:, 1:-2]).all()
-        assert np.isinf(p.row_bounds(None)[1][p.transcription.base_rows].reshape(p.segments, -1)[:, -2:]).all()
+        assert np.isinf(
+            p.row_bounds(None)[1][p.transcription.base_rows].reshape(p.segments, -1)[:, -2:]
+        ).all()
     for name in set(NAMES) - {"differential", "ackermann"}:
         assert problem(name).transcription.base_rows.size == 0
 
@@ -346,11 +412,16 @@ def test_rate_rows_are_steps_and_their_changes(name: str) -> None:
     path = p.waypoints(point.z)
     steps = np.diff(path, axis=0)
     changes = [
-        np.diff(np.vstack([np.zeros(t.n), np.diff(path[stretch], axis=0), np.zeros(t.n)]), axis=0) for stretch in stretches(p)
+        np.diff(np.vstack([np.zeros(t.n), np.diff(path[stretch], axis=0), np.zeros(t.n)]), axis=0)
+        for stretch in stretches(p)
     ]
     expected = np.concatenate([steps.ravel(), *(change.ravel() for change in changes)])
-    # A step belongs to the waypoint that it leads to, a change to the one at which it happens, at the start to the first after.
-    owners = [*range(1, p.segments + 1), *(max(int(t), 1) for stretch in stretches(p) for t in stretch)]
+    # A step belongs to the waypoint that it leads to, a change to the one at which it happens, at
+    # the start to the first after.
+    owners = [
+        *range(1, p.segments + 1),
+        *(max(int(t), 1) for stretch in stretches(p) for t in stretch),
+    ]
     raw = point.at_shares(0.0)
     np.testing.assert_allclose(rows(raw, rates=True)[t.rows :], expected, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(t.rate_owners, np.repeat(np.array(owners) - 1, t.n))
@@ -362,17 +433,24 @@ def test_rate_rows_are_steps_and_their_changes(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_every_row_has_one_meaning(name: str) -> None:
     t = problem(name).transcription
-    parts = [t.slot_rows.ravel(), t.base_rows, *(which for at in t.pose_rows for which in at.values())]
+    parts = [
+        t.slot_rows.ravel(),
+        t.base_rows,
+        *(which for at in t.pose_rows for which in at.values()),
+    ]
     parts += [clamp_rows(problem(name)), t.pushed_rows]
     np.testing.assert_array_equal(np.sort(np.concatenate(parts)), np.arange(t.rows))
     assert t.width == t.n + t.slots + 1
     assert t.size == t.segments * t.width
-    firm = np.concatenate([t.slot_rows.ravel(), *(which for at in t.pose_rows for which in at.values())])
+    firm = np.concatenate(
+        [t.slot_rows.ravel(), *(which for at in t.pose_rows for which in at.values())]
+    )
     np.testing.assert_array_equal(np.sort(firm), np.arange(t.firm_rows))
     assert len(t.owners) == t.rows - t.firm_rows
 
 
-# --- derivatives ----------------------------------------------------------------------------------------------------
+# --- derivatives
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -422,10 +500,16 @@ def test_patterns_hold_everywhere(name: str) -> None:
         hessian = lagrangian(point.x, parameters, 1.0, np.ones(p.transcription.rows))
         sizes.add((jacobian.nnz(), hessian.nnz()))
         probe = np.random.default_rng(seed).normal(size=p.transcription.size)
-        ahead, behind = (np.asarray(constraints(point.x + s * 1e-6 * probe, parameters)[0]).ravel() for s in (1.0, -1.0))
-        np.testing.assert_allclose(np.asarray(jacobian @ probe).ravel(), (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-5)
+        ahead, behind = (
+            np.asarray(constraints(point.x + s * 1e-6 * probe, parameters)[0]).ravel()
+            for s in (1.0, -1.0)
+        )
+        np.testing.assert_allclose(
+            np.asarray(jacobian @ probe).ravel(), (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-5
+        )
     assert len(sizes) == 1
-    # Waypoints hang together by rates, and what is clamped, alone: all other rows of one touch no other's variables.
+    # Waypoints hang together by rates, and what is clamped, alone: all other rows of one touch no
+    # other's variables.
     if p.transcription.base_rows.size == 0:
         row, column = (np.array(part) for part in jacobian.sparsity().get_triplet())
         alone = ~np.isin(row, [*clamp_rows(p), *p.transcription.pushed_rows])
@@ -443,20 +527,29 @@ def test_patterns_hold_everywhere(name: str) -> None:
     for k in range(p.segments):
         columns = k * t.width + np.arange(t.n, t.width)
         np.testing.assert_array_equal(
-            np.argwhere(pattern[:, columns[:-1]]), np.column_stack([t.slot_rows[k], np.arange(t.slots)])
+            np.argwhere(pattern[:, columns[:-1]]),
+            np.column_stack([t.slot_rows[k], np.arange(t.slots)]),
         )
         assert not curved[columns[:-1]].any()
-        touched = [which for at in t.pose_rows for waypoint, which in at.items() if waypoint == k + 1]
+        touched = [
+            which for at in t.pose_rows for waypoint, which in at.items() if waypoint == k + 1
+        ]
         touched.append(t.firm_rows + np.flatnonzero(t.owners == k))
-        np.testing.assert_array_equal(np.flatnonzero(pattern[:, columns[-1]]), np.sort(np.concatenate(touched)))
+        np.testing.assert_array_equal(
+            np.flatnonzero(pattern[:, columns[-1]]), np.sort(np.concatenate(touched))
+        )
 
 
-# --- relaxation -----------------------------------------------------------------------------------------------------
+# --- relaxation
+# -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_wherever_it_is_set_up_it_is_feasible_there_with_shares_of_one(name: str) -> None:
-    p, missing = problem(name), dict.fromkeys(("poses", "rolling", "clamped", "rates", "clearance"), 0.0)
+    p, missing = (
+        problem(name),
+        dict.fromkeys(("poses", "rolling", "clamped", "rates", "clearance"), 0.0),
+    )
     for z in iterates(p):
         for kind, amount in check_relaxation(p, z).items():
             missing[kind] = max(missing.get(kind, 0.0), amount)
@@ -482,7 +575,9 @@ def test_what_is_turned_round_is_feasible_there_too(axis: np.ndarray | None, off
         assert turned.transcription is p.transcription
         check_relaxation(turned, z)
         found = Relaxed(turned, z).found
-        assert found.amounts["poses"][-1] == pytest.approx(np.pi - off + np.linalg.norm([0.1, -0.2, 0.3]), abs=1e-8)
+        assert found.amounts["poses"][-1] == pytest.approx(
+            np.pi - off + np.linalg.norm([0.1, -0.2, 0.3]), abs=1e-8
+        )
 
 
 def test_where_poses_hold_there_is_nothing_to_take_away() -> None:
@@ -497,13 +592,16 @@ def test_where_poses_hold_there_is_nothing_to_take_away() -> None:
     np.testing.assert_allclose(at.rows(1.0)[rows], at.rows(0.0)[rows], rtol=0.0, atol=1e-9)
 
 
-# --- reuse ----------------------------------------------------------------------------------------------------------
+# --- reuse
+# ----------------------------------------------------------------------------------------------------------
 
 
 def moved_door(scene: Scene) -> Scene:
     placed = scene.objects["door"]
     shifted = dataclasses.replace(
-        placed, placement=pin.SE3(pin.utils.rotate("z", 0.4), np.array([0.3, -0.2, 0.0])) * placed.placement
+        placed,
+        placement=pin.SE3(pin.utils.rotate("z", 0.4), np.array([0.3, -0.2, 0.0]))
+        * placed.placement,
     )
     return dataclasses.replace(scene, objects={**scene.objects, "door": shifted})
 
@@ -525,7 +623,10 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
     for other in others:
         assert other.transcription is first.transcription
     assert CACHE.building == spent
-    again = [program_of(scene, [Reach(pin.SE3.Random())], options=OPTIONS).transcription for _ in range(2)]
+    again = [
+        program_of(scene, [Reach(pin.SE3.Random())], options=OPTIONS).transcription
+        for _ in range(2)
+    ]
     assert again[0] is again[1]
     assert again[0] is not first.transcription
 
@@ -542,7 +643,9 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
     ],
 )
 def test_another_structure_gets_another_program(steps: list[Step], options: Options) -> None:
-    structure = program_of(door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS).transcription.structure
+    structure = program_of(
+        door_scene(), [Actuate("door", {"hinge": 1.2})], options=OPTIONS
+    ).transcription.structure
     other = program_of(door_scene(), steps, options=options).transcription.structure
     assert other.key != structure.key
 
@@ -560,14 +663,21 @@ def test_functions_of_waypoints_are_shared_by_structures() -> None:
     structure, cache = problem("reach").transcription.structure, Cache()
     pose = structure.poses[0]
     first = waypoint_functions(structure.model, 3, (pose,), cache)
-    assert waypoint_functions(structure.model, 3, (dataclasses.replace(pose, waypoints=(1, 2)),), cache) is first
+    assert (
+        waypoint_functions(
+            structure.model, 3, (dataclasses.replace(pose, waypoints=(1, 2)),), cache
+        )
+        is first
+    )
     almost = pin.SE3(pose.local.rotation, pose.local.translation + 1e-14)  # other last digits
     others = [
         waypoint_functions(structure.model, 4, (pose,), cache),
         waypoint_functions(structure.model, 3, (), cache),
         waypoint_functions(structure.model, 3, (pose, pose), cache),
         waypoint_functions(structure.model, 3, (dataclasses.replace(pose, kind="point"),), cache),
-        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, local=pin.SE3.Random()),), cache),
+        waypoint_functions(
+            structure.model, 3, (dataclasses.replace(pose, local=pin.SE3.Random()),), cache
+        ),
         waypoint_functions(structure.model, 3, (dataclasses.replace(pose, local=almost),), cache),
     ]
     assert len({id(one) for one in [first, *others]}) == 7

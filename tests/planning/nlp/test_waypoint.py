@@ -55,7 +55,9 @@ class Numbers:
         self.multipliers = rng.normal(size=SLOTS + sum(pose.rows for pose in poses))
         axes = rng.normal(size=(len(poses), 3))
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-        self.away = np.column_stack([rng.normal(size=(len(poses), 3)), axes, rng.uniform(0.0, np.pi, len(poses))])
+        self.away = np.column_stack(
+            [rng.normal(size=(len(poses), 3)), axes, rng.uniform(0.0, np.pi, len(poses))]
+        )
 
     @property
     def own(self) -> np.ndarray:
@@ -64,7 +66,13 @@ class Numbers:
 
     def inputs(self, own: np.ndarray) -> list[np.ndarray]:
         targets = np.column_stack([target_vector(target) for target in self.targets])
-        return [own, self.planes.ravel(order="F"), self.offsets, targets.ravel(order="F"), self.away.ravel()]
+        return [
+            own,
+            self.planes.ravel(order="F"),
+            self.offsets,
+            targets.ravel(order="F"),
+            self.away.ravel(),
+        ]
 
     def rows(self, own: np.ndarray) -> np.ndarray:
         """Return the rows as they are defined."""
@@ -78,7 +86,9 @@ class Numbers:
             target = pin.SE3(there.rotation @ turn, there.translation + share * away[:3])
             at = data.oMi[pose.joint] * pose.local
             if pose.shift is not None:
-                at.translation = at.translation + data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
+                at.translation = at.translation + data.oMi[pose.shift[0]].rotation @ np.array(
+                    pose.shift[1]
+                )
             offset, error = at.translation - target.translation, target.rotation.T @ at.rotation
             rows.append(offset)
             if pose.kind == "pose":
@@ -89,7 +99,9 @@ class Numbers:
         return np.concatenate(rows)
 
 
-def matrix(pattern: tuple[list[int], list[int]], values: ca.DM, shape: tuple[int, int]) -> np.ndarray:
+def matrix(
+    pattern: tuple[list[int], list[int]], values: ca.DM, shape: tuple[int, int]
+) -> np.ndarray:
     out = np.zeros(shape)
     out[pattern[0], pattern[1]] = np.array(values).ravel()
     return out
@@ -98,20 +110,33 @@ def matrix(pattern: tuple[list[int], list[int]], values: ca.DM, shape: tuple[int
 @pytest.mark.parametrize("seed", range(4))
 def test_rows_and_their_derivatives(chain: VirtualKinematicChain, seed: int) -> None:
     poses = some_poses(chain)
-    functions, numbers = WaypointFunctions(chain.model, SLOTS, poses, Cache()), Numbers(chain, poses, seed)
+    functions, numbers = (
+        WaypointFunctions(chain.model, SLOTS, poses, Cache()),
+        Numbers(chain, poses, seed),
+    )
     x, width, h = numbers.own, chain.size + SLOTS + 1, 1e-6
     assert x.shape == (width,)
     assert functions.pose_rows == [7, 6, 3]
     assert functions.rows == SLOTS + 16
-    np.testing.assert_allclose(np.array(functions.value(*numbers.inputs(x))).ravel(), numbers.rows(x), atol=1e-12)
+    np.testing.assert_allclose(
+        np.array(functions.value(*numbers.inputs(x))).ravel(), numbers.rows(x), atol=1e-12
+    )
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        return matrix(functions.jacobian_pattern, functions.jacobian(*numbers.inputs(x)), (functions.rows, width))
+        return matrix(
+            functions.jacobian_pattern,
+            functions.jacobian(*numbers.inputs(x)),
+            (functions.rows, width),
+        )
 
     steps = h * np.eye(width)
     slopes = [(numbers.rows(x + e) - numbers.rows(x - e)) / (2 * h) for e in steps]
     np.testing.assert_allclose(jacobian(x), np.column_stack(slopes), atol=1e-7)
-    upper = matrix(functions.hessian_pattern, functions.hessian(*numbers.inputs(x), numbers.multipliers), (width, width))
+    upper = matrix(
+        functions.hessian_pattern,
+        functions.hessian(*numbers.inputs(x), numbers.multipliers),
+        (width, width),
+    )
     assert (np.tril(upper, -1) == 0.0).all()
     assert upper[:, -1].any(), "shares bend what they turn"
     curvature = [numbers.multipliers @ (jacobian(x + e) - jacobian(x - e)) / (2 * h) for e in steps]
@@ -128,9 +153,19 @@ def test_rows_of_a_chain_whose_joints_follow_others(tmp_path: Path) -> None:
 def test_without_poses_only_slacks_help(chain: VirtualKinematicChain) -> None:
     """Each helps its own plane, and the share none."""
     functions, numbers = WaypointFunctions(chain.model, SLOTS, (), Cache()), Numbers(chain, (), 0)
-    inputs = [numbers.own, numbers.planes.ravel(order="F"), numbers.offsets, np.ones(12), np.ones(AWAY)]
-    np.testing.assert_allclose(np.array(functions.value(*inputs)).ravel(), numbers.rows(numbers.own), atol=1e-12)
-    jacobian = matrix(functions.jacobian_pattern, functions.jacobian(*inputs), (SLOTS, chain.size + SLOTS + 1))
+    inputs = [
+        numbers.own,
+        numbers.planes.ravel(order="F"),
+        numbers.offsets,
+        np.ones(12),
+        np.ones(AWAY),
+    ]
+    np.testing.assert_allclose(
+        np.array(functions.value(*inputs)).ravel(), numbers.rows(numbers.own), atol=1e-12
+    )
+    jacobian = matrix(
+        functions.jacobian_pattern, functions.jacobian(*inputs), (SLOTS, chain.size + SLOTS + 1)
+    )
     np.testing.assert_array_equal(jacobian[:, chain.size :], np.eye(SLOTS, SLOTS + 1))
     assert max(functions.hessian_pattern[1]) < chain.size
 
@@ -147,7 +182,9 @@ def test_functions_of_one_kind_are_built_once(chain: VirtualKinematicChain) -> N
     model, poses, cache = door_scene().robot.model, some_poses(chain)[1:2], Cache(entries=4)
     first = waypoint_functions(model, 1, poses, cache)
     later = (dataclasses.replace(poses[0], waypoints=(4, 5)),)
-    assert waypoint_functions(model.copy(), 1, later, cache) is first, "at which waypoints does not matter"
+    assert waypoint_functions(model.copy(), 1, later, cache) is first, (
+        "at which waypoints does not matter"
+    )
     second = waypoint_functions(model, 2, poses, cache)
     assert second is not first
     assert waypoint_functions(model, 1, poses, cache) is first

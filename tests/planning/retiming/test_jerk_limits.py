@@ -46,7 +46,10 @@ def test_limits_are_kept_exactly_and_nothing_jumps(seed: int, count: int, jerk: 
 def test_it_takes_hardly_longer_where_jerks_may_be_large() -> None:
     points = np.cumsum(np.random.default_rng(4).uniform(0.1, 0.4, (12, 3)), axis=0)
     path, pace, limits = made(points, 2000.0)
-    longest = [eased(path, pace, 11, limits._replace(jerk=np.full(3, jerk))).times[-1] for jerk in (2000.0, 40.0, 10.0)]
+    longest = [
+        eased(path, pace, 11, limits._replace(jerk=np.full(3, jerk))).times[-1]
+        for jerk in (2000.0, 40.0, 10.0)
+    ]
     assert longest == sorted(longest)
     assert longest[0] <= 1.03 * pace.times[-1]
 
@@ -61,7 +64,10 @@ def test_it_stays_on_the_path() -> None:
 
 
 def test_jerks_and_jumps_of_a_curve_are_those_of_its_cubics() -> None:
-    knots, rows = np.array([0.0, 0.5, 1.3, 2.0]), np.random.default_rng(1).uniform(-1.0, 1.0, (4, 2))
+    knots, rows = (
+        np.array([0.0, 0.5, 1.3, 2.0]),
+        np.random.default_rng(1).uniform(-1.0, 1.0, (4, 2)),
+    )
     smooth = CubicSpline(knots, rows, bc_type="clamped")
     jerks, jumps = Curve(knots, rows, smooth(knots, 1)).jerks()
     np.testing.assert_allclose(jerks, np.abs(smooth(knots[:-1], 3)), rtol=1e-9)

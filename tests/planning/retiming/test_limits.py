@@ -34,9 +34,16 @@ def test_wheels_have_a_velocity_of_their_own() -> None:
 
 @pytest.mark.parametrize(
     ("velocity", "acceleration", "jerk", "factor"),
-    [(0.5, 100.0, np.inf, 3.0), (9.0, 1.5, np.inf, 2.0), (9.0, 99.0, 1.5, 2.0), (9.0, 99.0, 99.0, 1.0)],
+    [
+        (0.5, 100.0, np.inf, 3.0),
+        (9.0, 1.5, np.inf, 2.0),
+        (9.0, 99.0, 1.5, 2.0),
+        (9.0, 99.0, 99.0, 1.0),
+    ],
 )
-def test_a_curve_is_slowed_until_all_limits_are_kept(velocity: float, acceleration: float, jerk: float, factor: float) -> None:
+def test_a_curve_is_slowed_until_all_limits_are_kept(
+    velocity: float, acceleration: float, jerk: float, factor: float
+) -> None:
     """The curve is 3s² − 2s³: a velocity of 1.5, an acceleration of 6 and a jerk of 12."""
     curve = Curve(np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), np.zeros((2, 1)))
     wide = np.array([np.inf])

@@ -32,7 +32,13 @@ def corner(scene: vkc.Scene) -> Trajectory:
     rows = np.tile(scene.start, (9, 1))
     rows[:, 0] += 0.2 * np.minimum(np.arange(9), 4)
     rows[:, 1] += 0.2 * np.maximum(np.arange(9) - 4, 0)
-    return Trajectory(scene.robot.coordinates.names, np.arange(9.0), rows, (vkc.PhaseSpan("go", 0, 8),), rows.shape[1])
+    return Trajectory(
+        scene.robot.coordinates.names,
+        np.arange(9.0),
+        rows,
+        (vkc.PhaseSpan("go", 0, 8),),
+        rows.shape[1],
+    )
 
 
 def off_the_lines(scene: vkc.Scene, motion: Trajectory) -> np.ndarray:

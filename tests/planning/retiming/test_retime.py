@@ -28,7 +28,9 @@ def limits(scene: vkc.Scene, names: tuple[str, ...]) -> np.ndarray:
     for owner, placed in scene.objects.items():
         item = placed.object
         rows = zip(item.lower, item.upper, item.velocity, item.acceleration, strict=True)
-        known |= {f"{owner}.{name}": row for name, row in zip(item.coordinates.names, rows, strict=True)}
+        known |= {
+            f"{owner}.{name}": row for name, row in zip(item.coordinates.names, rows, strict=True)
+        }
     return np.array([known.get(name, (-np.inf, np.inf, np.inf, np.inf)) for name in names], float)
 
 
@@ -40,17 +42,23 @@ def check_limits(scene: vkc.Scene, motion: Trajectory, *, within: float = 1e-5) 
     assert (places <= upper + within).all()
     assert (np.abs(motion.velocity(times)) <= velocity * (1 + 1e-6)).all()
     assert (np.abs(motion.acceleration(times)) <= acceleration * (1 + 1e-6)).all()
-    np.testing.assert_allclose(np.diff(places, axis=0) / 1e-3, motion.velocity(times + 5e-4)[:-1], atol=1e-3)
+    np.testing.assert_allclose(
+        np.diff(places, axis=0) / 1e-3, motion.velocity(times + 5e-4)[:-1], atol=1e-3
+    )
     np.testing.assert_array_equal(motion.velocity(motion.times[[0, -1]]), 0.0)
 
 
 def straight(scene: vkc.Scene, seed: int = 0, count: int = 12) -> Trajectory:
     """Return a motion of the robot alone through random waypoints near its start."""
     steps = np.random.default_rng(seed).normal(size=(count, len(scene.start))) * 0.2
-    rows = np.asarray(scene.start) + np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
+    rows = np.asarray(scene.start) + np.concatenate(
+        [np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)]
+    )
     rows = np.clip(rows, scene.robot.lower, scene.robot.upper)
     phases = (vkc.PhaseSpan("go", 0, count),)
-    return Trajectory(scene.robot.coordinates.names, np.arange(count + 1.0), rows, phases, rows.shape[1])
+    return Trajectory(
+        scene.robot.coordinates.names, np.arange(count + 1.0), rows, phases, rows.shape[1]
+    )
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -60,15 +68,22 @@ def test_any_waypoints(seed: int) -> None:
     motion = retimed(scene, slow)
     np.testing.assert_array_equal(motion.positions, slow.positions)
     np.testing.assert_allclose(motion(motion.times), slow.positions, atol=1e-12)
-    check_limits(scene, motion, within=1e-3)  # where it turns sharply at a limit, before anything is repaired
+    check_limits(
+        scene, motion, within=1e-3
+    )  # where it turns sharply at a limit, before anything is repaired
 
 
 def test_it_is_nearly_as_fast_as_any_motion_along_its_path() -> None:
     """With four times as many places at which the speed is known it takes hardly less time."""
     scene = vkc.load_scene("door")
     slow, share = straight(scene, 3), np.linspace(0.0, 1.0, 13)[:, None]
-    ways = np.random.default_rng(3).normal(size=(3, slow.positions.shape[1])) * np.array([[0.5], [0.2], [0.1]])
-    bends = np.concatenate([share**2 * (3.0 - 2.0 * share), np.sin(np.pi * share) ** 2, np.sin(2.0 * np.pi * share)], axis=1)
+    ways = np.random.default_rng(3).normal(size=(3, slow.positions.shape[1])) * np.array(
+        [[0.5], [0.2], [0.1]]
+    )
+    bends = np.concatenate(
+        [share**2 * (3.0 - 2.0 * share), np.sin(np.pi * share) ** 2, np.sin(2.0 * np.pi * share)],
+        axis=1,
+    )
     slow = dataclasses.replace(slow, positions=slow.positions[:1] + bends @ ways)
     usual = retimed(scene, slow).times[-1]
     with pytest.MonkeyPatch.context() as patch:
@@ -84,11 +99,18 @@ def test_it_rests_where_nothing_moves() -> None:
     spans = (vkc.PhaseSpan("reach", 0, 6), vkc.PhaseSpan("hold", 6, 13))
     times = np.concatenate([np.arange(7.0), [6.7], np.arange(7.7, 13.0)])
     motion = retimed(scene, dataclasses.replace(slow, times=times, positions=rows, phases=spans))
-    assert motion.times[7] - motion.times[6] == pytest.approx(0.7)  # as long as it did, where a phase begins
+    assert motion.times[7] - motion.times[6] == pytest.approx(
+        0.7
+    )  # as long as it did, where a phase begins
     inside = np.linspace(motion.times[6], motion.times[7], 50)
     np.testing.assert_allclose(motion.velocity(inside), 0.0, atol=1e-12)
     check_limits(scene, motion)
-    one = retimed(scene, dataclasses.replace(slow, times=times, positions=rows, phases=(vkc.PhaseSpan("go", 0, 13),)))
+    one = retimed(
+        scene,
+        dataclasses.replace(
+            slow, times=times, positions=rows, phases=(vkc.PhaseSpan("go", 0, 13),)
+        ),
+    )
     assert one.times[7] - one.times[6] < 0.01
 
 
@@ -98,7 +120,9 @@ def test_what_does_not_move_at_all_stays() -> None:
     still = dataclasses.replace(still, positions=np.tile(still.positions[:1], (13, 1)))
     motion = retimed(scene, still)
     assert motion.times[-1] == pytest.approx(1.0, abs=0.05)  # its first step, and hardly more
-    np.testing.assert_allclose(motion(np.linspace(0.0, 1.0, 30)), np.tile(still.positions[0], (30, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        motion(np.linspace(0.0, 1.0, 30)), np.tile(still.positions[0], (30, 1)), atol=1e-12
+    )
 
 
 def test_without_speeds_it_goes_from_stop_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +144,11 @@ def test_the_more_parts_the_straighter() -> None:
         motion = retimed(scene, slow, np.full(12, parts))
         np.testing.assert_array_equal(motion.positions, slow.positions)
         fine = motion(np.linspace(motion.times[4], motion.times[5], 200))
-        share = np.clip(((fine - slow.positions[4]) @ (d := slow.positions[5] - slow.positions[4])) / (d @ d), 0.0, 1.0)
+        share = np.clip(
+            ((fine - slow.positions[4]) @ (d := slow.positions[5] - slow.positions[4])) / (d @ d),
+            0.0,
+            1.0,
+        )
         off.append(np.abs(fine - slow.positions[4] - share[:, None] * d).max())
         check_limits(scene, motion)
     assert off == sorted(off, reverse=True)

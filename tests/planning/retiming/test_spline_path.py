@@ -20,13 +20,19 @@ def points(seed: int, count: int = 8) -> np.ndarray:
 def test_without_limits_it_is_twice_differentiable(seed: int, count: int) -> None:
     given_points = points(seed, count)
     path = path_through(given_points, np.ones(3), NOWHERE)
-    np.testing.assert_allclose(np.diff(path.x), np.linalg.norm(np.diff(given_points, axis=0), axis=1))
+    np.testing.assert_allclose(
+        np.diff(path.x), np.linalg.norm(np.diff(given_points, axis=0), axis=1)
+    )
     along = np.linspace(path.x[0], path.x[-1], 200)
-    np.testing.assert_allclose(path(along), CubicSpline(path.x, given_points, bc_type="natural")(along), atol=1e-9)
+    np.testing.assert_allclose(
+        path(along), CubicSpline(path.x, given_points, bc_type="natural")(along), atol=1e-9
+    )
 
 
 def test_two_points_are_a_straight_line() -> None:
-    path = path_through(np.array([[0.0, 0.0, 1.0], [1.0, 2.0, 1.0]]), np.array([1.0, 0.5, 1.0]), NOWHERE)
+    path = path_through(
+        np.array([[0.0, 0.0, 1.0], [1.0, 2.0, 1.0]]), np.array([1.0, 0.5, 1.0]), NOWHERE
+    )
     assert path.x[-1] == np.sqrt(2.0)
     np.testing.assert_allclose(path(path.x[-1] / 4), [0.25, 0.5, 1.0])
 
@@ -49,5 +55,7 @@ def test_limits_are_not_left(seed: int) -> None:
     assert (found >= lower - 1e-9).all()
     assert (found <= upper + 1e-9).all()
     np.testing.assert_allclose(path(path.x), given_points, atol=1e-12)
-    outside = path_through(given_points, np.ones(3), (lower + 0.1, upper))  # where it is already, as a start may be
+    outside = path_through(
+        given_points, np.ones(3), (lower + 0.1, upper)
+    )  # where it is already, as a start may be
     assert outside(np.linspace(path.x[0], path.x[-1], 500)).min() >= given_points.min() - 1e-9

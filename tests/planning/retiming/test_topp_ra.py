@@ -18,14 +18,18 @@ def duration(places: np.ndarray, speeds: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(("length", "fastest", "strongest"), [(1.0, 10.0, 2.0), (3.0, 0.5, 1.0)])
-def test_a_straight_way_takes_as_long_as_it_must(length: float, fastest: float, strongest: float) -> None:
+def test_a_straight_way_takes_as_long_as_it_must(
+    length: float, fastest: float, strongest: float
+) -> None:
     """Up with all there is and down again, with a stretch at full speed between them if it is long enough."""
     path = path_through(np.array([[0.0, 0.0], [length, 0.0]]), np.ones(2), FREE)
     places = np.linspace(0.0, length, 201)
     speeds = speeds_along(path, places, np.array([fastest, np.inf]), np.array([strongest, np.inf]))
     assert speeds is not None
     ramp = fastest / strongest
-    shortest = 2.0 * np.sqrt(length / strongest) if fastest * ramp > length else length / fastest + ramp
+    shortest = (
+        2.0 * np.sqrt(length / strongest) if fastest * ramp > length else length / fastest + ramp
+    )
     assert duration(places, speeds) == pytest.approx(shortest, rel=1e-2)
     assert speeds[[0, -1]].tolist() == [0.0, 0.0]
     assert speeds.max() <= fastest * (1 + 1e-6)
@@ -35,7 +39,9 @@ def test_a_straight_way_takes_as_long_as_it_must(length: float, fastest: float, 
 def test_limits_hold_all_along(seed: int) -> None:
     rng = np.random.default_rng(seed)
     path = path_through(np.cumsum(rng.normal(size=(6, 2)), axis=0), np.ones(2), FREE)
-    places = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in zip(path.x, path.x[1:], strict=False)]))
+    places = np.unique(
+        np.concatenate([np.linspace(a, b, 9) for a, b in zip(path.x, path.x[1:], strict=False)])
+    )
     velocity, acceleration = rng.uniform(0.5, 3.0, 2), rng.uniform(0.5, 3.0, 2)
     speeds = speeds_along(path, places, velocity, acceleration)
     assert speeds is not None

@@ -19,7 +19,9 @@ def opening(**resistance: float) -> tuple[Load, CubicHermiteSpline]:
     rows = slice(phase.first + 1, phase.last + 1)
     times, points = plan.trajectory.times[rows], plan.trajectory.positions[rows]
     path = CubicHermiteSpline(times - times[0], points, plan.trajectory.velocity(times))
-    load = Load(Torques(scene, plan.trajectory), np.full(len(times) - 1, len(plan.trajectory.phases) - 1))
+    load = Load(
+        Torques(scene, plan.trajectory), np.full(len(times) - 1, len(plan.trajectory.phases) - 1)
+    )
     return load, path
 
 
@@ -30,7 +32,13 @@ def test_torques_are_linear_in_what_the_search_knows(speed: float, change: float
     push, square, rest = load.linear(path, path.x, np.full(len(path.x), speed), places)
     tangents, bends = path(places, 1), path(places, 2)
     segments = np.searchsorted(path.x, places, side="right") - 1
-    direct = load._shares(segments, len(path.x) - 1, path(places), speed * tangents, speed**2 * bends + change * tangents)
+    direct = load._shares(
+        segments,
+        len(path.x) - 1,
+        path(places),
+        speed * tangents,
+        speed**2 * bends + change * tangents,
+    )
     np.testing.assert_allclose(push * change + square * speed**2 + rest, direct, atol=1e-9)
 
 

@@ -105,7 +105,9 @@ def drives(base: str) -> Trajectory:
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
-def test_motions_keep_to_what_wheels_can(base: str, known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_motions_keep_to_what_wheels_can(
+    base: str, known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also from stop to stop, where nobody knows how fast the path can be gone along."""
     if not known:
         monkeypatch.setattr(retime, "speeds_along", lambda *_: None)
@@ -127,7 +129,9 @@ def test_motions_keep_to_what_wheels_can(base: str, known: bool, monkeypatch: py
 def test_points_between_waypoints_lie_on_arcs(base: str) -> None:
     motion = drives(base)
     parts = np.array([1, 2, 4, 1, 1, 2])
-    divided = retimed(hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {})), motion, parts)
+    divided = retimed(
+        hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {})), motion, parts
+    )
     middle = divided(divided.times[:-1] + 0.0)
     np.testing.assert_allclose(middle, divided.positions[:-1], atol=1e-12)
     times = np.arange(divided.times[0], divided.times[-1], 1e-3)
@@ -138,8 +142,12 @@ def test_points_between_waypoints_lie_on_arcs(base: str) -> None:
 def test_rounding_of_places_is_no_reason_to_stop() -> None:
     """Millimetres along a wide circle, each place off by a micrometre, as a solver leaves them: one path, no turn too tight."""
     radius, points = 0.8, arcs([(1.2e-3, 0.7 * 1.2e-3 / 0.8)] * 6)
-    points[1:-1, :2] += 3e-7 * np.array([[1.0, -1.0], [-1.0, 0.5], [0.7, 1.0], [-1.0, -1.0], [0.3, 1.0]])
-    ((path, own),) = rolling_paths(points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, Rolling(radius=radius))
+    points[1:-1, :2] += 3e-7 * np.array(
+        [[1.0, -1.0], [-1.0, 0.5], [0.7, 1.0], [-1.0, -1.0], [0.3, 1.0]]
+    )
+    ((path, own),) = rolling_paths(
+        points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, Rolling(radius=radius)
+    )
     assert len(own) == 7
     dense = np.linspace(0.0, path.x[-1], 3000)
     rates, yaw = path(dense, 1), path(dense)[:, 2]
@@ -151,6 +159,16 @@ def test_on_its_smallest_circle_a_steered_base_needs_no_stop() -> None:
     """Steps grow and shrink along it, as they do where a motion begins and ends; from straight on it may bend within a step."""
     scale = np.array([1.0, 1.0, 0.5, 0.3])
     lengths = [0.02, 0.06, 0.1, 0.12, 0.12, 0.1, 0.05, 0.02]
-    assert len(rolling_paths(arcs([(length, length / 0.8) for length in lengths]), scale, FAR, Rolling(radius=0.8))) == 1
+    assert (
+        len(
+            rolling_paths(
+                arcs([(length, length / 0.8) for length in lengths]),
+                scale,
+                FAR,
+                Rolling(radius=0.8),
+            )
+        )
+        == 1
+    )
     straight = arcs([(0.1, 0.0)] * 4 + [(0.1, 0.1 / 0.81)] * 4)
     assert len(rolling_paths(straight, scale, FAR, Rolling(radius=0.8))) == 1

@@ -53,14 +53,22 @@ def system(seed: int, waypoints: int, size: int, equalities: int, planes: int) -
     total = n + len(slack) + m
     matrix = np.zeros((total, total))
     matrix[:n, :n] = hessian
-    matrix[np.arange(n, n + len(slack)), np.arange(n, n + len(slack))] = 10.0 ** rng.uniform(-4.0, 4.0, len(slack))
+    matrix[np.arange(n, n + len(slack)), np.arange(n, n + len(slack))] = 10.0 ** rng.uniform(
+        -4.0, 4.0, len(slack)
+    )
     matrix[n + len(slack) :, :n] = rows
     matrix[n + len(slack) + slack, n + np.arange(len(slack))] = -1.0
     return np.tril(matrix) + np.tril(matrix, -1).T
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10**6), st.integers(1, 6), st.integers(2, 6), st.integers(0, 2), st.integers(0, 3))
+@given(
+    st.integers(0, 10**6),
+    st.integers(1, 6),
+    st.integers(2, 6),
+    st.integers(0, 2),
+    st.integers(0, 3),
+)
 def test_systems_of_trajectories_are_solved_and_their_negative_eigenvalues_counted(
     seed: int, waypoints: int, size: int, equalities: int, planes: int
 ) -> None:
@@ -71,7 +79,9 @@ def test_systems_of_trajectories_are_solved_and_their_negative_eigenvalues_count
     wanted = np.random.default_rng(seed).normal(size=len(matrix))
     x = matrix @ wanted
     factorization.solve(x)
-    residual = np.abs(matrix @ (x - wanted)).max() / (np.abs(matrix).sum(axis=1).max() * np.abs(wanted).max())
+    residual = np.abs(matrix @ (x - wanted)).max() / (
+        np.abs(matrix).sum(axis=1).max() * np.abs(wanted).max()
+    )
     assert residual < 1e-10
 
 
@@ -82,8 +92,12 @@ def test_any_matrix_is_solved_or_said_to_be_singular(seed: int, size: int, densi
     matrix = np.where(rng.uniform(size=(size, size)) < density, rng.normal(size=(size, size)), 0.0)
     matrix += matrix.T
     factorization, done = factored(matrix)
-    if not done:  # a pivot is zero, as it is in every singular matrix and, since pivots are taken as they come, in some others
-        assert min(abs(np.linalg.det(matrix[:k, :k])) for k in range(1, size + 1)) < 1e-8 or np.any(np.diag(matrix) == 0.0)
+    # a pivot is zero, as it is in every singular matrix and, since pivots are taken as they come,
+    # in some others
+    if not done:
+        assert min(abs(np.linalg.det(matrix[:k, :k])) for k in range(1, size + 1)) < 1e-8 or np.any(
+            np.diag(matrix) == 0.0
+        )
         return
     assert factorization.negative == np.count_nonzero(np.linalg.eigvalsh(matrix) < 0.0)
 
@@ -121,7 +135,9 @@ def test_rows_that_say_the_same_are_singular_and_what_follows_is_right() -> None
 @pytest.mark.parametrize("size", [3, 9, 20])
 def test_what_only_rounding_keeps_from_being_zero_is_singular(size: int) -> None:
     """The last pivot, also where nothing but other panels is taken off it."""
-    root = np.eye(size, size - 1) + 0.1 * np.random.default_rng(size).normal(size=(size, size - 1))  # no other pivot is small
+    root = np.eye(size, size - 1) + 0.1 * np.random.default_rng(size).normal(
+        size=(size, size - 1)
+    )  # no other pivot is small
     gram = root @ root.T
     assert not factored(gram)[1]
     assert factored(gram + 1e-6 * np.eye(size))[1]
@@ -152,7 +168,9 @@ def test_entries_above_the_diagonal_and_those_in_one_place_are_summed() -> None:
     places = np.where(flipped, columns, rows), np.where(flipped, rows, columns)
     twice = [np.concatenate([part, part]) for part in places]
     factorization = KKT.Factorization(len(matrix), *twice)
-    assert factorization.factor(np.concatenate([1.5 * values, -0.5 * values])), "by the last values alone no row is primal"
+    assert factorization.factor(np.concatenate([1.5 * values, -0.5 * values])), (
+        "by the last values alone no row is primal"
+    )
     x = matrix @ np.ones(len(matrix))
     factorization.solve(x)
     np.testing.assert_allclose(x, 1.0, atol=1e-8)
@@ -167,7 +185,9 @@ def test_entries_above_the_diagonal_and_those_in_one_place_are_summed() -> None:
         (2, [0, 1], [0, -1], "in the matrix"),
     ],
 )
-def test_places_outside_of_the_matrix_are_refused(size: int, rows: list[int], columns: list[int], message: str) -> None:
+def test_places_outside_of_the_matrix_are_refused(
+    size: int, rows: list[int], columns: list[int], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         KKT.Factorization(size, np.array(rows, np.int32), np.array(columns, np.int32))
 
@@ -198,16 +218,22 @@ def test_ipopt_does_the_same_every_time_and_in_every_thread() -> None:
         assert set(threads.map(solved, range(16))) == {alone}
 
 
-@pytest.mark.parametrize("bounds", [(0.0, 0.0), (-np.inf, 0.0), (0.0, np.inf)], ids=["equal", "below", "above"])
+@pytest.mark.parametrize(
+    "bounds", [(0.0, 0.0), (-np.inf, 0.0), (0.0, np.inf)], ids=["equal", "below", "above"]
+)
 def test_ipopt_goes_where_it_goes_with_mumps(bounds: tuple[float, float]) -> None:
     """A program with a Hessian that is not definite, and more rows than it needs: two say the same."""
     x = ca.MX.sym("x", 6)
     f = ca.sumsqr(x[1:] - x[:-1] ** 2) + ca.sumsqr(1.0 - x[:-1]) + ca.cos(3.0 * x[5])
-    g = ca.vertcat(x[0] + x[1] - 1.0, x[2] * x[3] - 0.5, 2.0 * (x[0] + x[1] - 1.0), x[4] - ca.sin(x[5]))
+    g = ca.vertcat(
+        x[0] + x[1] - 1.0, x[2] * x[3] - 0.5, 2.0 * (x[0] + x[1] - 1.0), x[4] - ca.sin(x[5])
+    )
     found = []
     for options in ({"ipopt.linear_solver": "mumps"}, OWN):
         solver = ca.nlpsol("solver", "ipopt", {"x": x, "f": f, "g": g}, {**QUIET, **options})
-        result = solver(x0=np.full(6, 0.3), lbg=[bounds[0]] * 4, ubg=[bounds[1]] * 4, lbx=-5.0, ubx=5.0)
+        result = solver(
+            x0=np.full(6, 0.3), lbg=[bounds[0]] * 4, ubg=[bounds[1]] * 4, lbx=-5.0, ubx=5.0
+        )
         assert solver.stats()["success"]
         found.append(np.ravel(result["x"]))
     np.testing.assert_allclose(found[1], found[0], atol=1e-6)

@@ -23,7 +23,13 @@ from vkc_pin.planning.solver.tunnelling import Passage
 from vkc_pin.utils.budget import Budget
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
-PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.6, 0.05, 0.8]}
+PILLAR = {
+    "name": "pillar",
+    "type": "cylinder",
+    "radius": 0.15,
+    "length": 1.6,
+    "position": [1.6, 0.05, 0.8],
+}
 
 
 @cache
@@ -33,7 +39,9 @@ def round_a_pillar() -> vkc.TrajectoryProblem:
 
 def straight(problem: vkc.TrajectoryProblem, x: float, y: float = 0.0) -> np.ndarray:
     scene = problem.scene
-    return through(scene, scene.start, moved(scene.start, x=x, y=y), steps=problem.segments).positions[1:]
+    return through(
+        scene, scene.start, moved(scene.start, x=x, y=y), steps=problem.segments
+    ).positions[1:]
 
 
 @cache
@@ -63,7 +71,9 @@ def feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
     assert dataclasses.replace(still, dt=solution.dt).violation(first, second) < 1e-3
     assert problem.drift(z) < 1.0
     path = problem.waypoints(z)
-    states = np.concatenate([(1 - s) * path[:-1] + s * path[1:] for s in np.linspace(0.0, 1.0, 12)[1:-1]])
+    states = np.concatenate(
+        [(1 - s) * path[:-1] + s * path[1:] for s in np.linspace(0.0, 1.0, 12)[1:-1]]
+    )
     between = problem.contacts.evaluate(states, np.tile(np.arange(1, len(path)), 10), reach=0.0)
     assert len(between.waypoint) == 0, between.distance.min()
 
@@ -87,7 +97,9 @@ def test_counts_and_times() -> None:
 @pytest.mark.parametrize("solution", [solved, hard], ids=["pillar", "door"])
 def test_columns_that_only_grow(solution) -> None:  # type: ignore[no-untyped-def]
     history = solution().history
-    assert all(0.0 <= row.time < 1000.0 for row in history)  # since the solver began, not since the machine did
+    assert all(
+        0.0 <= row.time < 1000.0 for row in history
+    )  # since the solver began, not since the machine did
     assert [row.round for row in history] == list(range(1, len(history) + 1))
     for name in ("iterations", "time", "penalty"):
         assert np.all(np.diff([getattr(row, name) for row in history]) >= 0), name
@@ -100,10 +112,17 @@ def test_columns_that_only_grow(solution) -> None:  # type: ignore[no-untyped-de
 def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
     """Few enough waypoints to share one radius, and a straight way through two walls."""
     walls = [
-        {"name": f"wall_{k}", "type": "box", "size": [0.1, 3.0, 1.0], "position": [1.5 + 1.2 * k, (-1.0) ** k, 0.5]}
+        {
+            "name": f"wall_{k}",
+            "type": "box",
+            "size": [0.1, 3.0, 1.0],
+            "position": [1.5 + 1.2 * k, (-1.0) ** k, 0.5],
+        }
         for k in range(2)
     ]
-    problem = program_of(hall(obstacles=walls), [vkc.GoTo(4.2, 0.0, 0.0)], options=vkc.Options(reach_waypoints=14))
+    problem = program_of(
+        hall(obstacles=walls), [vkc.GoTo(4.2, 0.0, 0.0)], options=vkc.Options(reach_waypoints=14)
+    )
     history = solve(problem, straight(problem, 4.2)).history
     rejected = [(row, after) for row, after in itertools.pairwise(history) if not row.accepted]
     assert rejected, "nothing was rejected: choose a harder problem"
@@ -160,8 +179,17 @@ class Scripted:
         step: float | None = None,
         other: float = 0.0,
     ) -> None:
-        self.step, self.other, self.crossed, self.passages = step, other, list[Passage](), list[Passage]()
-        self.problem, self.z, self.is_done = SimpleNamespace(drift=lambda _: drift), np.zeros((40, 1)), done
+        self.step, self.other, self.crossed, self.passages = (
+            step,
+            other,
+            list[Passage](),
+            list[Passage](),
+        )
+        self.problem, self.z, self.is_done = (
+            SimpleNamespace(drift=lambda _: drift),
+            np.zeros((40, 1)),
+            done,
+        )
         self.solution = Solution(np.zeros((40, 1)), np.full(40, 0.25))
         self.merit, self.found = Merit(200.0), missing(0.5, other)
         self.objective, self.rounds, self.radii = 10.0, iter(rounds), list[np.ndarray]()
@@ -176,7 +204,9 @@ class Scripted:
             z=np.zeros((40, 1)),
             objective=objective,
             found=found,
-            promise=self.merit.price(found, clearance=True),  # just what came: nobody narrows the trust region
+            promise=self.merit.price(
+                found, clearance=True
+            ),  # just what came: nobody narrows the trust region
             pose_error=0.0,
             step=blank_trial(40).step if self.step is None else self.step * radius,
             contacts=contacts,  # type: ignore[arg-type]
@@ -216,12 +246,16 @@ def scripted(*rounds: tuple[float, float, bool], **how: Any) -> Scripted:
         (8.1, 0.009, False, False),
     ],
 )
-def test_what_is_nearly_free_is_first_made_free(objective: float, shortfall: float, accepted: bool, small: bool) -> None:
+def test_what_is_nearly_free_is_first_made_free(
+    objective: float, shortfall: float, accepted: bool, small: bool
+) -> None:
     """With small steps, on which planes are as good as distances."""
     _, after = scripted((objective, shortfall, accepted)).radii
     assert bool((after <= trust_region.SETTLE_RADIUS).all()) == small
     assert small or (after > trust_region.SETTLE_RADIUS).all()
-    _, after = scripted((objective, shortfall, accepted), other=0.01).radii  # first to where all else holds
+    _, after = scripted(
+        (objective, shortfall, accepted), other=0.01
+    ).radii  # first to where all else holds
     assert (after > trust_region.SETTLE_RADIUS).all()
 
 
@@ -248,11 +282,16 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
         ([(10.0, 0.0, False)] * 20, 5),  # what counts is where it is, not where it might have gone
         ([(10.0, 0.5 * 0.92**k, True) for k in range(1, 20)], 19),  # a third in five rounds
         ([(10.0, 0.5 * 0.94**k, True) for k in range(1, 20)], 5),
-        ([(10.0, 0.02, True)] + [(9.0, 0.11, True)] * 20, 7),  # counted anew where more is missing and the motion is shorter
+        (
+            [(10.0, 0.02, True)] + [(9.0, 0.11, True)] * 20,
+            7,
+        ),  # counted anew where more is missing and the motion is shorter
         ([(10.0, 1e-3, True)] * 20, 6),  # however little it is
     ],
 )
-def test_what_does_not_get_better_is_given_up(rounds: list[tuple[float, float, bool]], expected: int) -> None:
+def test_what_does_not_get_better_is_given_up(
+    rounds: list[tuple[float, float, bool]], expected: int
+) -> None:
     loop = scripted(*rounds)
     assert loop.solution.rounds == expected
     assert loop.solution.status == "not converged"
@@ -262,7 +301,10 @@ def test_what_does_not_get_better_is_given_up(rounds: list[tuple[float, float, b
 def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool) -> None:
     """No round can help that; it is not said to have converged."""
     solution = scripted((8.0, 0.0, True), (1.0, 0.0, True), drift=drift, done=True).solution
-    assert (solution.rounds, solution.converged) == (1, converged)  # nothing holds the step back any more
+    assert (solution.rounds, solution.converged) == (
+        1,
+        converged,
+    )  # nothing holds the step back any more
     assert solution.status == ("converged" if converged else "not converged")
 
 
@@ -276,7 +318,9 @@ def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool)
         ([8.0, 7.0, 6.0], 0.85, 1),  # nothing held it back
     ],
 )
-def test_what_is_good_is_improved_as_long_as_that_is_worth_while(objectives: list[float], step: float, expected: int) -> None:
+def test_what_is_good_is_improved_as_long_as_that_is_worth_while(
+    objectives: list[float], step: float, expected: int
+) -> None:
     rounds = [(objective, 0.0, True) for objective in objectives]
     solution = scripted(*rounds, done=True, step=step).solution
     assert (solution.rounds, solution.converged) == (expected, True)
@@ -288,7 +332,9 @@ def test_a_motion_that_nearly_held_is_one_to_compare_with(
 ) -> None:
     """The first motion at which everything holds is hardly better than it; one that was far from free says nothing."""
     monkeypatch.setattr(Scripted, "done", lambda _, trial: trial.contacts.violation() == 0.0)
-    solution = scripted((8.0, shortfall, True), (7.9, 0.0, True), (7.8, 0.0, True), (5.0, 0.0, True), step=1.0).solution
+    solution = scripted(
+        (8.0, shortfall, True), (7.9, 0.0, True), (7.8, 0.0, True), (5.0, 0.0, True), step=1.0
+    ).solution
     assert (solution.rounds, solution.converged) == (expected, True)
 
 
@@ -336,7 +382,13 @@ def test_where_something_would_be_carried_through_waypoints_may_move_less() -> N
 
 def test_nothing_is_carried_through_anything(monkeypatch: pytest.MonkeyPatch) -> None:
     """A seed that goes round a post the long way must not jump through it, though that is shorter and free at all waypoints."""
-    post = {"name": "post", "type": "cylinder", "radius": 0.02, "length": 1.6, "position": [1.6, -0.42, 0.8]}
+    post = {
+        "name": "post",
+        "type": "cylinder",
+        "radius": 0.02,
+        "length": 1.6,
+        "position": [1.6, -0.42, 0.8],
+    }
     cheap = dataclasses.replace(FEW, penalty=1.0)  # of what overlaps
     problem = program_of(hall(obstacles=[post]), [vkc.GoTo(3.2, 0.0, 0.0)], options=cheap)
     bow = straight(problem, 3.2).copy()
@@ -373,14 +425,18 @@ def test_standing_still_where_one_is_already() -> None:
     assert problem.objective(solution.z, solution.dt) <= 1e-3
 
 
-def test_the_merit_falls_from_one_accepted_step_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_merit_falls_from_one_accepted_step_to_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """While weights and times stay: f and what all that is missing costs. No round promises more than staying would cost."""
     problem = round_a_pillar()
     merits: list[tuple[float, float, bool]] = []
     judge = solver._Loop.judge
 
     def watch(loop, trial, *prices):  # type: ignore[no-untyped-def]
-        before, after = (loop.merit.price(found, clearance=True).sum() for found in (loop.found, trial.found))
+        before, after = (
+            loop.merit.price(found, clearance=True).sum() for found in (loop.found, trial.found)
+        )
         accepted = judge(loop, trial, *prices)
         merits.append((loop.objective + before, trial.objective + after, accepted))
         assert trial.promise.min() > -1e-6

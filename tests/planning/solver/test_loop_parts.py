@@ -27,7 +27,9 @@ N = 8
 
 def contact(distance: float, margin: float = 0.02, waypoint: int = 0) -> Contacts:
     row, vector = np.array([distance]), np.array([[1.0, 0.0, 0.0]])
-    return Contacts(np.array([waypoint]), np.array([[0, 1]]), row, np.array([margin]), vector, vector, vector)
+    return Contacts(
+        np.array([waypoint]), np.array([[0, 1]]), row, np.array([margin]), vector, vector, vector
+    )
 
 
 def missing(**amounts: float) -> Infeasibility:
@@ -45,17 +47,28 @@ def parts(**fields: Any) -> Any:
     return loop
 
 
-# --- what is close ----------------------------------------------------------------------------------------------------
+# --- what is close
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("short", "free", "clear"),
-    [(0.0, True, True), (0.9, True, True), (1.1, True, False), (0.0, False, False), (1.1, False, False)],
+    [
+        (0.0, True, True),
+        (0.9, True, True),
+        (1.1, True, False),
+        (0.0, False, False),
+        (1.1, False, False),
+    ],
 )
 def test_all_is_clear_if_it_is_at_the_waypoints_and_between(
     short: float, free: bool, clear: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    at, between, crossed = contact(0.02 - short * CLOSE_ENOUGH), contact(0.5, 0.4), [Passage((1, 2), 3, 4)]
+    at, between, crossed = (
+        contact(0.02 - short * CLOSE_ENOUGH),
+        contact(0.5, 0.4),
+        [Passage((1, 2), 3, 4)],
+    )
     asked: list[tuple[float, int]] = []
 
     def evaluate(z: np.ndarray, *, reach: float, nearest: int) -> Contacts:
@@ -64,25 +77,39 @@ def test_all_is_clear_if_it_is_at_the_waypoints_and_between(
 
     options = SimpleNamespace(contact_reach=0.25, contact_slots=4)
     loop = parts(
-        problem=SimpleNamespace(evaluate_contacts=evaluate), options=options, solution=SimpleNamespace(timings={"coal": 1.0})
+        problem=SimpleNamespace(evaluate_contacts=evaluate),
+        options=options,
+        solution=SimpleNamespace(timings={"coal": 1.0}),
     )
-    monkeypatch.setattr(module, "collisions_between", lambda problem, z: Between(between, free, crossed))
+    monkeypatch.setattr(
+        module, "collisions_between", lambda problem, z: Between(between, free, crossed)
+    )
     found, told, passages = loop.contacts(np.zeros((N, 2)))
     assert (told, passages, asked) == (clear, crossed, [(0.25, 4)])
     assert sorted(found.distance.tolist()) == sorted([*at.distance.tolist(), 0.5])
     assert 1.0 < loop.solution.timings["coal"] < 1.5  # what it took, once more
 
 
-# --- what it costs ----------------------------------------------------------------------------------------------------
+# --- what it costs
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("first", "last", "dear"), [(3, 4, [2, 3, 4]), (0, 0, [0]), (1, 1, [0, 1]), (0, 2, [0, 1, 2]), (7, 7, [6, 7])]
+    ("first", "last", "dear"),
+    [(3, 4, [2, 3, 4]), (0, 0, [0]), (1, 1, [0, 1]), (0, 2, [0, 1, 2]), (7, 7, [6, 7])],
 )
-def test_a_passage_makes_the_waypoints_around_its_segments_too_dear(first: int, last: int, dear: list[int]) -> None:
+def test_a_passage_makes_the_waypoints_around_its_segments_too_dear(
+    first: int, last: int, dear: list[int]
+) -> None:
     """Segment k ends at row k of z_1..z_N and begins at the one before."""
-    loop = parts(merit=Merit(10.0), found=missing(poses=0.009, clearance=0.5), passages=[Passage((1, 2), 0, 7)])
-    trial: Any = SimpleNamespace(found=missing(rolling=0.2), passages=[Passage((1, 2), 5, 5), Passage((1, 3), first, last)])
+    loop = parts(
+        merit=Merit(10.0),
+        found=missing(poses=0.009, clearance=0.5),
+        passages=[Passage((1, 2), 0, 7)],
+    )
+    trial: Any = SimpleNamespace(
+        found=missing(rolling=0.2), passages=[Passage((1, 2), 5, 5), Passage((1, 3), first, last)]
+    )
     before, after = loop.prices(trial)
     assert np.flatnonzero(np.isinf(after)).tolist() == dear
     assert before.tolist() == pytest.approx([0.0] * 3 + [5.09] + [0.0] * 4)
@@ -105,7 +132,8 @@ def test_what_was_promised_and_what_came_of_it(monkeypatch: pytest.MonkeyPatch) 
     assert given == [(3.0 + 3.0 - 0.75, 3.0 + 3.0 - 1.25, 13.0)]
 
 
-# --- going on ---------------------------------------------------------------------------------------------------------
+# --- going on
+# ---------------------------------------------------------------------------------------------------------
 
 
 class Clock:
@@ -124,11 +152,18 @@ class Clock:
 
 
 def gone_on(
-    *, others: float = 0.0, rates: bool = False, short: float = 0.5, rate: float = 0.0, left: float = 0.0
+    *,
+    others: float = 0.0,
+    rates: bool = False,
+    short: float = 0.5,
+    rate: float = 0.0,
+    left: float = 0.0,
 ) -> tuple[Any, list[str]]:
     """Return a loop that has accepted a trial, and what it has done on the way."""
     done: list[str] = []
-    problem = SimpleNamespace(timing_for=lambda z: Clock(f"of {z}"), pace=lambda z: ("fast", "faster"))
+    problem = SimpleNamespace(
+        timing_for=lambda z: Clock(f"of {z}"), pace=lambda z: ("fast", "faster")
+    )
     loop = parts(
         problem=problem,
         found=missing(poses=others),
@@ -148,14 +183,24 @@ def gone_on(
         rate=rate,
     )
     loop.accept(trial)
-    assert (loop.z, loop.at, loop.found, loop.passages) == (trial.z, trial.contacts, trial.found, trial.passages)
+    assert (loop.z, loop.at, loop.found, loop.passages) == (
+        trial.z,
+        trial.contacts,
+        trial.found,
+        trial.passages,
+    )
     assert (loop.objective, loop.pose_error, loop.solution.z) == (3.0, 0.25, "new")
     assert loop.solution.dt == loop.timing.dt
     return loop, done
 
 
 def test_what_was_a_motion_keeps_its_time() -> None:
-    for how in ({}, {"others": 0.9 * TOLERANCE}, {"others": 0.01, "rates": True}, {"short": 0.5, "rate": 1.0}):
+    for how in (
+        {},
+        {"others": 0.9 * TOLERANCE},
+        {"others": 0.01, "rates": True},
+        {"short": 0.5, "rate": 1.0},
+    ):
         loop, done = gone_on(**how)  # type: ignore[arg-type]
         assert (loop.timing.dt, done, loop.rates) == ("old", [], how.get("rates", False))
 
@@ -166,8 +211,12 @@ def test_what_was_none_gets_another() -> None:
         assert (loop.timing.dt, done, loop.rates) == ("of new", ["look"], False)
 
 
-@pytest.mark.parametrize(("short", "rate", "slower"), [(0.009, 1.5e-4, True), (0.011, 1.0, False), (0.0, 0.9e-4, False)])
-def test_what_nearly_holds_and_is_too_fast_is_given_time(short: float, rate: float, slower: bool) -> None:
+@pytest.mark.parametrize(
+    ("short", "rate", "slower"), [(0.009, 1.5e-4, True), (0.011, 1.0, False), (0.0, 0.9e-4, False)]
+)
+def test_what_nearly_holds_and_is_too_fast_is_given_time(
+    short: float, rate: float, slower: bool
+) -> None:
     loop, done = gone_on(short=short, rate=rate)
     assert (loop.timing.dt, done) == (("stretched", ["look"]) if slower else ("old", []))
     assert not loop.rates
@@ -196,13 +245,21 @@ def test_where_time_does_not_help_limits_on_rates_become_rows() -> None:
 def test_it_is_done_where_everything_holds(change: dict[str, Any], done: bool) -> None:
     told = {"satisfied": True, "clear": True, "pose_error": 0.0, "over": 0.0, **change}
     problem = SimpleNamespace(pace=lambda z: ("fast", "faster"))
-    loop = parts(problem=problem, pose_error=told["pose_error"], timing=Clock("now", over=told["over"]))
-    trial: Any = SimpleNamespace(z=np.zeros((N, 2)), satisfied=told["satisfied"], clear=told["clear"])
+    loop = parts(
+        problem=problem, pose_error=told["pose_error"], timing=Clock("now", over=told["over"])
+    )
+    trial: Any = SimpleNamespace(
+        z=np.zeros((N, 2)), satisfied=told["satisfied"], clear=told["clear"]
+    )
     assert loop.done(trial) == done
 
 
-@pytest.mark.parametrize(("short", "grows"), [(0.9 * CLOSE_ENOUGH, False), (1.1 * CLOSE_ENOUGH, True)])
-def test_only_what_is_missing_becomes_dearer_and_multipliers_are_forgotten(short: float, grows: bool) -> None:
+@pytest.mark.parametrize(
+    ("short", "grows"), [(0.9 * CLOSE_ENOUGH, False), (1.1 * CLOSE_ENOUGH, True)]
+)
+def test_only_what_is_missing_becomes_dearer_and_multipliers_are_forgotten(
+    short: float, grows: bool
+) -> None:
     done: list[str] = []
     subproblem = SimpleNamespace(forget=lambda: done.append("forget"))
     loop = parts(subproblem=subproblem, merit=Merit(2.0), found=missing(clearance=short))
@@ -211,17 +268,24 @@ def test_only_what_is_missing_becomes_dearer_and_multipliers_are_forgotten(short
     assert done == ["forget"]
 
 
-# --- when it is given up ----------------------------------------------------------------------------------------------
+# --- when it is given up
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("short", "accepted", "rounds"), [(0.009, False, 12), (0.011, False, 5), (0.009, True, 5), (0.011, True, 5), (0.0, False, 12)]
+    ("short", "accepted", "rounds"),
+    [(0.009, False, 12), (0.011, False, 5), (0.009, True, 5), (0.011, True, 5), (0.0, False, 12)],
 )
 def test_steps_that_are_too_long_are_no_lack_of_progress_where_hardly_any_clearance_is_missing(
     short: float, accepted: bool, rounds: int
 ) -> None:
     found = missing(clearance=short, poses=0.1)
-    row = {"objective": 1.0, "pose_error": 0.1, "contacts": contact(0.02 - short), "step": np.zeros(N)}
+    row = {
+        "objective": 1.0,
+        "pose_error": 0.1,
+        "contacts": contact(0.02 - short),
+        "step": np.zeros(N),
+    }
     loop: Any = SimpleNamespace(
         solution=Solution(np.zeros((N, 2)), np.ones(N)),
         found=found,
@@ -238,19 +302,28 @@ def test_steps_that_are_too_long_are_no_lack_of_progress_where_hardly_any_cleara
     assert loop.solution.rounds == rounds
 
 
-# --- what is returned -------------------------------------------------------------------------------------------------
+# --- what is returned
+# -------------------------------------------------------------------------------------------------
 
 
 def drive() -> vkc.TrajectoryProblem:
-    return program_of(hall(), [vkc.GoTo(1.0, 0.0)], options=vkc.Options(reach_waypoints=N, max_outer=7))
+    return program_of(
+        hall(), [vkc.GoTo(1.0, 0.0)], options=vkc.Options(reach_waypoints=N, max_outer=7)
+    )
 
 
 @pytest.mark.parametrize(("short", "astray"), [(0.009, 0.0), (0.011, 0.011), (0.0, 0.0)])
-def test_what_is_clearly_in_something_is_said_to_be_astray(short: float, astray: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_clearly_in_something_is_said_to_be_astray(
+    short: float, astray: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     problem, asked = drive(), list[Any]()
-    monkeypatch.setattr(module, "_iterate", lambda loop, region, callback, rounds: asked.append((callback, rounds)))
+    monkeypatch.setattr(
+        module, "_iterate", lambda loop, region, callback, rounds: asked.append((callback, rounds))
+    )
     monkeypatch.setattr(_Loop, "contacts", lambda loop, z: (no_contacts(), True, []))
-    monkeypatch.setattr(vkc.TrajectoryProblem, "evaluate_contacts", lambda self, z, **how: contact(0.02 - short))
+    monkeypatch.setattr(
+        vkc.TrajectoryProblem, "evaluate_contacts", lambda self, z, **how: contact(0.02 - short)
+    )
     solution = solve(problem, problem.still)
     assert (solution.status, solution.converged) == ("not converged", False)
     assert solution.astray == pytest.approx(astray)
@@ -260,7 +333,9 @@ def test_what_is_clearly_in_something_is_said_to_be_astray(short: float, astray:
 
 
 @pytest.mark.parametrize("good", [False, True])
-def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(good: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(
+    good: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What was not finished is not said to be astray; what was good is returned as it was."""
     problem = drive()
     kept = problem.still + 0.1, np.full(N, 0.5)
@@ -272,9 +347,13 @@ def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(good: bool, 
 
     monkeypatch.setattr(module, "_iterate", ended)
     monkeypatch.setattr(_Loop, "contacts", lambda loop, z: (no_contacts(), True, []))
-    monkeypatch.setattr(vkc.TrajectoryProblem, "evaluate_contacts", lambda self, z, **how: contact(-1.0))
+    monkeypatch.setattr(
+        vkc.TrajectoryProblem, "evaluate_contacts", lambda self, z, **how: contact(-1.0)
+    )
     solution = solve(problem, problem.still)
-    assert (solution.status, solution.converged) == (("converged", True) if good else ("time limit", False))
+    assert (solution.status, solution.converged) == (
+        ("converged", True) if good else ("time limit", False)
+    )
     assert solution.astray == 0.0
     np.testing.assert_array_equal(solution.z, kept[0] if good else problem.clip(problem.still))
     assert (solution.dt is kept[1]) == good
@@ -288,4 +367,6 @@ def test_rounds_are_timed_from_where_they_begin(monkeypatch: pytest.MonkeyPatch)
     rows = solve(problem, problem.still, rounds=3).history
     assert rows
     assert 0.0 < rows[0].time < 20.0
-    assert all(before.time < after.time < before.time + 20.0 for before, after in itertools.pairwise(rows))
+    assert all(
+        before.time < after.time < before.time + 20.0 for before, after in itertools.pairwise(rows)
+    )

@@ -20,14 +20,22 @@ def past_a_post(reach: float = 0.02) -> vkc.Scene:
     """Return a hall in which the hand, driven sideways, sweeps through a post `reach` [m] ahead of the tool's frame."""
     tool = hall().with_start(arm=ARM).tool_placement().translation
     x, y = float(tool[0]) + reach, float(tool[1]) + WIDTH / 2
-    post = {"name": "post", "type": "cylinder", "radius": 0.03, "length": 1.6, "position": [x, y, 0.8]}
+    post = {
+        "name": "post",
+        "type": "cylinder",
+        "radius": 0.03,
+        "length": 1.6,
+        "position": [x, y, 0.8],
+    }
     return hall(obstacles=[post]).with_start(arm=ARM)
 
 
 def straight(scene: vkc.Scene) -> tuple[TrajectoryProblem, np.ndarray]:
     """Return a problem of few waypoints, and the straight way sideways without the start, shape (N, n)."""
     problem = program_of(scene, [vkc.GoTo(0.0, WIDTH, 0.0)], options=FEW)
-    return problem, through(scene, scene.start, moved(scene.start, y=WIDTH), steps=FEW.reach_waypoints).positions[1:]
+    return problem, through(
+        scene, scene.start, moved(scene.start, y=WIDTH), steps=FEW.reach_waypoints
+    ).positions[1:]
 
 
 def sub_states(problem: TrajectoryProblem, z: np.ndarray, segment: int, count: int) -> np.ndarray:
@@ -40,21 +48,32 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     scene, steps = past_a_post(), [vkc.GoTo(0.0, WIDTH, 0.0)]
     plan = vkc.plan(scene, steps, options=FEW)
     assert plan.success, plan.report()
-    assert plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.005  # it went round the post
+    assert (
+        plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.005
+    )  # it went round the post
 
     problem, _ = straight(scene)
-    nothing, free, passed = collisions_between(problem, np.tile(problem.start, (problem.segments, 1)))
+    nothing, free, passed = collisions_between(
+        problem, np.tile(problem.start, (problem.segments, 1))
+    )
     assert free
     assert passed == []
     assert nothing.violation() == 0.0
     nothing = nothing.select(np.zeros(0, int))
-    monkeypatch.setattr("vkc_pin.planning.solver.loop.collisions_between", lambda problem, z: Between(nothing, True, []))
+    monkeypatch.setattr(
+        "vkc_pin.planning.solver.loop.collisions_between",
+        lambda problem, z: Between(nothing, True, []),
+    )
     blind = vkc.plan(scene, steps, options=FEW, initialization="interpolated")
     assert not blind.success
     assert blind.status == "rejected"  # the solver was content, validation was not
-    assert {(v.constraint, "post" in v.subject) for v in blind.validation.violations} == {("penetration", True)}
+    assert {(v.constraint, "post" in v.subject) for v in blind.validation.violations} == {
+        ("penetration", True)
+    }
     segment = int(blind.validation.violations[0].waypoint)
-    ends = problem.contacts.evaluate(blind.trajectory.positions[segment : segment + 2], np.array([1, 1]), reach=0.02)
+    ends = problem.contacts.evaluate(
+        blind.trajectory.positions[segment : segment + 2], np.array([1, 1]), reach=0.02
+    )
     assert len(ends.waypoint) == 0  # free at both waypoints
 
 
@@ -93,7 +112,9 @@ def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
 
     def depth(lift: float) -> float:
         lifted = z.copy()
-        lifted[1:3, :2] -= lift * normal[:2]  # the robot is the first of the pair, the normal points from it
+        lifted[1:3, :2] -= (
+            lift * normal[:2]
+        )  # the robot is the first of the pair, the normal points from it
         states = sub_states(problem, lifted, 2, 2000)
         contacts = problem.contacts.evaluate(states, np.full(len(states), 3), reach=0.1)
         return float(contacts.distance[(contacts.pair == pair).all(axis=1)].min())
@@ -110,9 +131,13 @@ def test_a_start_that_is_close_to_something_may_leave_it() -> None:
     scene = hall(obstacles=[wall])
     assert 0.0 < scene.start_clearance() < KEEP
     problem = program_of(scene, [vkc.GoTo(-1.0, 0.0, 0.0)], options=FEW)
-    away = through(scene, scene.start, moved(scene.start, x=-1.0), steps=FEW.reach_waypoints).positions[1:]
+    away = through(
+        scene, scene.start, moved(scene.start, x=-1.0), steps=FEW.reach_waypoints
+    ).positions[1:]
     assert len(collisions_between(problem, away).contacts.waypoint) == 0
-    into = through(scene, scene.start, moved(scene.start, x=1.0), steps=FEW.reach_waypoints).positions[1:]
+    into = through(
+        scene, scene.start, moved(scene.start, x=1.0), steps=FEW.reach_waypoints
+    ).positions[1:]
     assert 0 in collisions_between(problem, into).contacts.waypoint
 
 
@@ -132,4 +157,11 @@ def test_merged_contacts_are_in_order() -> None:
 
 def test_standing_still_has_nothing_in_between() -> None:
     problem, _ = straight(hall().with_start(arm=ARM))
-    assert len(collisions_between(problem, np.tile(problem.start, (problem.segments, 1))).contacts.waypoint) == 0
+    assert (
+        len(
+            collisions_between(
+                problem, np.tile(problem.start, (problem.segments, 1))
+            ).contacts.waypoint
+        )
+        == 0
+    )

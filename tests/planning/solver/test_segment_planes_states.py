@@ -13,17 +13,44 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts
-from vkc_pin.planning.solver.segment_planes import CLOSE, CLOSE_ENOUGH, FINER, KEEP, SPACING, _deepest, collisions_between, merge
+from vkc_pin.planning.solver.segment_planes import (
+    CLOSE,
+    CLOSE_ENOUGH,
+    FINER,
+    KEEP,
+    SPACING,
+    _deepest,
+    collisions_between,
+    merge,
+)
 
-POST = {"name": "post", "type": "cylinder", "radius": 0.02, "length": 1.6, "position": [0.0, 2.0, 0.8]}
+POST = {
+    "name": "post",
+    "type": "cylinder",
+    "radius": 0.02,
+    "length": 1.6,
+    "position": [0.0, 2.0, 0.8],
+}
 
 
-def contacts(rows: np.ndarray, pairs: np.ndarray, distance: np.ndarray, margin: np.ndarray | None = None) -> Contacts:
+def contacts(
+    rows: np.ndarray, pairs: np.ndarray, distance: np.ndarray, margin: np.ndarray | None = None
+) -> Contacts:
     vectors = np.zeros((len(rows), 3))
-    return Contacts(rows, pairs, distance, np.zeros(len(rows)) if margin is None else margin, vectors, vectors, vectors)
+    return Contacts(
+        rows,
+        pairs,
+        distance,
+        np.zeros(len(rows)) if margin is None else margin,
+        vectors,
+        vectors,
+        vectors,
+    )
 
 
-def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The middles of pieces that are no longer than `SPACING`; then `FINER` in each of those that something is near."""
     scene = hall(obstacles=[POST])
     problem = program_of(scene, [vkc.GoTo(0.0, 3.0)], options=vkc.Options(reach_waypoints=4))
@@ -33,7 +60,9 @@ def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(mo
     asked: list[tuple[np.ndarray, np.ndarray, float, Contacts]] = []
     evaluate = ContactModel.evaluate
 
-    def noted(model: ContactModel, states: np.ndarray, waypoints: np.ndarray, **how: Any) -> Contacts:
+    def noted(
+        model: ContactModel, states: np.ndarray, waypoints: np.ndarray, **how: Any
+    ) -> Contacts:
         found = evaluate(model, states, waypoints, **how)
         asked.append((states, waypoints, how["reach"], found))
         return found
@@ -52,9 +81,14 @@ def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(mo
     rows = np.unique(near.waypoint)
     assert 0 < len(rows) < len(states)
     piece = np.arange(len(states)) - np.repeat(np.cumsum(counts) - counts, counts)
-    shares = ((piece[rows][:, None] + (np.arange(FINER) + 0.5) / FINER) / np.repeat(counts, counts)[rows][:, None]).ravel()
+    shares = (
+        (piece[rows][:, None] + (np.arange(FINER) + 0.5) / FINER)
+        / np.repeat(counts, counts)[rows][:, None]
+    ).ravel()
     np.testing.assert_array_equal(ends, np.repeat(waypoints[rows], FINER))
-    np.testing.assert_allclose(finer, path[ends - 1] + shares[:, None] * (path[ends] - path[ends - 1]), atol=1e-12)
+    np.testing.assert_allclose(
+        finer, path[ends - 1] + shares[:, None] * (path[ends] - path[ends - 1]), atol=1e-12
+    )
 
 
 def test_contacts_at_both_ends_stand_for_what_is_between() -> None:
@@ -64,21 +98,34 @@ def test_contacts_at_both_ends_stand_for_what_is_between() -> None:
     z = np.array([moved(scene.start, y=y) for y in (1.0, 2.0, 3.0)])
     found = collisions_between(problem, z).contacts
     assert set(found.waypoint.tolist()) == {0, 1, 2}
-    np.testing.assert_allclose(found.distance, np.einsum("ci,ci->c", found.normal, found.second - found.first), atol=1e-12)
+    np.testing.assert_allclose(
+        found.distance, np.einsum("ci,ci->c", found.normal, found.second - found.first), atol=1e-12
+    )
     labels = problem.contacts.phases[0].labels
     base = [k for k in range(len(found.waypoint)) if labels[found.pair[k, 0]] == "base_link"]
     ends = {int(found.waypoint[k]): k for k in base if found.margin[k] - found.distance[k] > KEEP}
     assert {0, 1} <= set(ends)
     first, last = ends[0], ends[1]
     np.testing.assert_array_equal(found.second[first], found.second[last])  # the post stands
-    np.testing.assert_allclose(found.first[last] - found.first[first], [0.0, 1.0, 0.0], atol=1e-9)  # the base drives a metre
+    np.testing.assert_allclose(
+        found.first[last] - found.first[first], [0.0, 1.0, 0.0], atol=1e-9
+    )  # the base drives a metre
 
 
 @pytest.mark.parametrize(("gap", "free"), [(0.9, False), (1.1, True)])
 def test_what_is_far_enough_between(gap: float, free: bool) -> None:
     """Driven past a wall at `gap` of what will do."""
     half = 0.5
-    scene = hall(obstacles=[{"name": "wall", "type": "box", "size": [4.0, 0.1, half], "position": [1.0, 1.0, half / 2]}])
+    scene = hall(
+        obstacles=[
+            {
+                "name": "wall",
+                "type": "box",
+                "size": [4.0, 0.1, half],
+                "position": [1.0, 1.0, half / 2],
+            }
+        ]
+    )
     problem = program_of(scene, [vkc.GoTo(2.0, 0.0)], options=vkc.Options(reach_waypoints=3))
     here = scene.start_clearance()
     y = here - gap * CLOSE_ENOUGH
@@ -92,7 +139,9 @@ pairs = st.tuples(st.integers(0, 6), st.integers(0, 6))
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), pairs, st.floats(-1.0, 1.0)), max_size=30))
-def test_of_each_segment_and_pair_the_deepest_is_kept(rows: list[tuple[int, tuple[int, int], float]]) -> None:
+def test_of_each_segment_and_pair_the_deepest_is_kept(
+    rows: list[tuple[int, tuple[int, int], float]],
+) -> None:
     segment = np.array([0, 0, 1, 2, 2, 3])
     states, both = (np.array([row[k] for row in rows], int) for k in (0, 1))
     distance = np.array([row[2] for row in rows])
@@ -108,9 +157,14 @@ def test_of_each_segment_and_pair_the_deepest_is_kept(rows: list[tuple[int, tupl
 
 
 def test_merged_contacts_come_by_waypoint_and_those_first_that_fall_shortest() -> None:
-    one = contacts(np.array([0, 1]), np.array([[0, 1], [0, 2]]), np.array([0.3, 0.1]), np.array([0.02, 0.02]))
+    one = contacts(
+        np.array([0, 1]), np.array([[0, 1], [0, 2]]), np.array([0.3, 0.1]), np.array([0.02, 0.02])
+    )
     other = contacts(
-        np.array([0, 1, 0]), np.array([[0, 3], [0, 4], [0, 5]]), np.array([0.5, 0.2, 0.1]), np.array([0.4, 0.3, 0.0])
+        np.array([0, 1, 0]),
+        np.array([[0, 3], [0, 4], [0, 5]]),
+        np.array([0.5, 0.2, 0.1]),
+        np.array([0.4, 0.3, 0.0]),
     )
     joined = merge(one, other)
     assert joined.waypoint.tolist() == [0, 0, 0, 1, 1]

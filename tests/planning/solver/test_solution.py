@@ -9,7 +9,12 @@ from vkc_pin.planning.solver.solution import Solution
 
 def test_nothing_has_happened_yet() -> None:
     one, other = (Solution(np.zeros((2, 1)), np.ones(2)) for _ in range(2))
-    assert (one.converged, one.status, one.astray, one.radius) == (False, "not converged", 0.0, None)
+    assert (one.converged, one.status, one.astray, one.radius) == (
+        False,
+        "not converged",
+        0.0,
+        None,
+    )
     assert (one.rounds, one.iterations, one.history) == (0, 0, [])
     assert one.timings == {"coal": 0.0, "casadi": 0.0, "ipopt": 0.0}
     one.timings["coal"] = 1.0

@@ -25,19 +25,27 @@ def loop(kind: str) -> _Loop:
         return begun(problem, problem.still, 200.0)
     scene = hall()
     problem = program_of(scene, [vkc.GoTo(1.0, 0.0)], options=SHORT)
-    return begun(problem, through(scene, scene.start, moved(scene.start, x=1.0), steps=8).positions[1:], 200.0)
+    return begun(
+        problem,
+        through(scene, scene.start, moved(scene.start, x=1.0), steps=8).positions[1:],
+        200.0,
+    )
 
 
 @pytest.mark.parametrize("kind", ["far", "there"])
 @pytest.mark.parametrize("rates", [False, True])
 @pytest.mark.parametrize("size", [0.05, 0.5])
-def test_it_promises_no_more_than_a_motion_within_the_region_keeps(kind: str, rates: bool, size: float) -> None:
+def test_it_promises_no_more_than_a_motion_within_the_region_keeps(
+    kind: str, rates: bool, size: float
+) -> None:
     """Without obstacles near the model is exact but for Ipopt's tolerance: what is left comes true."""
     state = loop(kind)
     state.rates = rates
     state.look()
     radius = np.full(state.problem.segments, size)
-    step = state.subproblem.solve(state.z, state.at, state.found, state.merit, state.timing, radius, rates=rates)
+    step = state.subproblem.solve(
+        state.z, state.at, state.found, state.merit, state.timing, radius, rates=rates
+    )
     assert np.all(np.abs(step.z - state.z) <= size * (1 + 1e-6))
     assert np.all((step.z >= state.problem.lower - 1e-6) & (step.z <= state.problem.upper + 1e-6))
     assert np.all((step.shares >= 0.0) & (step.shares <= 1.0))
@@ -65,7 +73,9 @@ def test_multipliers_are_of_the_round_before() -> None:
         if forget:
             state.subproblem.forget()
         before = state.solution.iterations
-        state.subproblem.solve(state.z, state.at, state.found, state.merit, state.timing, radius, rates=False)
+        state.subproblem.solve(
+            state.z, state.at, state.found, state.merit, state.timing, radius, rates=False
+        )
         counts.append(state.solution.iterations - before)
     assert counts[1] <= counts[0] == counts[2]
     assert set(state.solution.timings) == {"coal", "casadi", "ipopt"}
@@ -74,7 +84,12 @@ def test_multipliers_are_of_the_round_before() -> None:
 @pytest.mark.parametrize("missing", [False, True])
 def test_only_planes_that_are_short_at_the_iterate_may_stay_short(missing: bool) -> None:
     """However little it costs: next to a box that is in the way, beside which the iterate keeps its margin or not."""
-    box = {"name": "box", "type": "box", "size": [0.2, 0.2, 1.0], "position": [1.6 if missing else 1.85, 0.0, 0.5]}
+    box = {
+        "name": "box",
+        "type": "box",
+        "size": [0.2, 0.2, 1.0],
+        "position": [1.6 if missing else 1.85, 0.0, 0.5],
+    }
     scene = hall(obstacles=[box])
     problem = program_of(scene, [vkc.GoTo(1.2, 0.0)], options=SHORT)
     still = begun(problem, problem.still, 1e-3)
@@ -83,7 +98,9 @@ def test_only_planes_that_are_short_at_the_iterate_may_stay_short(missing: bool)
         still = begun(problem, driven, 1e-3)
     assert bool(still.found.amounts["clearance"].any()) == missing
     radius = np.full(problem.segments, 2.0)
-    step = still.subproblem.solve(still.z, still.at, still.found, still.merit, still.timing, radius, rates=False)
+    step = still.subproblem.solve(
+        still.z, still.at, still.found, still.merit, still.timing, radius, rates=False
+    )
     assert bool((step.slack > 1e-3).any()) == missing
     if not missing:
         np.testing.assert_array_equal(step.slack, 0.0)

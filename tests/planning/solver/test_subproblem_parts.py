@@ -28,11 +28,17 @@ class Ipopt:
         self.asked: list[dict[str, Any]] = []
         self.how: list[dict[str, Any]] = []
         self.stats = {"iter_count": 11, "success": True}
-        self.answer = np.array([[1.0, 2.0, 0.25, 0.5, 0.75], [3.0, 4.0, -0.5, 0.25, 1.5], [5.0, 6.0, 0.0, 0.0, -0.5]])
+        self.answer = np.array(
+            [[1.0, 2.0, 0.25, 0.5, 0.75], [3.0, 4.0, -0.5, 0.25, 1.5], [5.0, 6.0, 0.0, 0.0, -0.5]]
+        )
 
     def __call__(self, **arguments: Any) -> dict[str, Any]:
         self.asked.append(arguments)
-        return {"x": self.answer.ravel(), "lam_x": f"x{len(self.asked)}", "lam_g": f"g{len(self.asked)}"}
+        return {
+            "x": self.answer.ravel(),
+            "lam_x": f"x{len(self.asked)}",
+            "lam_g": f"g{len(self.asked)}",
+        }
 
 
 class Made:
@@ -57,7 +63,10 @@ class Made:
             start="start",
             target_matrix=lambda: "targets",
             contacts=SimpleNamespace(planes=lambda z, at, slots: ("planes", "offsets")),
-            row_bounds=lambda timing: (f"low {timing and timing.dt}", f"high {timing and timing.dt}"),
+            row_bounds=lambda timing: (
+                f"low {timing and timing.dt}",
+                f"high {timing and timing.dt}",
+            ),
             rates=lambda z: ("first", "second"),
             effort=SimpleNamespace(weights=lambda *rates: ("weights", *rates)),
             rolling=SimpleNamespace(gears=lambda path: ("gears", path)),
@@ -78,7 +87,13 @@ class Made:
         self.noted = {"given": given, **named}
         return np.array([1.0, 2.0])
 
-    def solve(self, *, poses: list[float], rates: bool = False, short: list[tuple[int, float]] | None = None) -> Step:
+    def solve(
+        self,
+        *,
+        poses: list[float],
+        rates: bool = False,
+        short: list[tuple[int, float]] | None = None,
+    ) -> Step:
         """Return where a round leads, of which so much of poses, and of the clearance of pairs, is missing."""
         rows = {kind: np.zeros(N) for kind in Merit(1.0).weights}
         rows["poses"], rows["clearance"] = np.array(poses), np.full(N, 0.5)
@@ -86,11 +101,21 @@ class Made:
         pairs = short or []
         at = np.array([row for row, _ in pairs], int)
         missing, vectors = np.array([by for _, by in pairs]), np.zeros((len(pairs), 3))
-        near = Contacts(at, np.zeros((len(pairs), 2), int), 0.02 - missing, np.full(len(pairs), 0.02), vectors, vectors, vectors)
+        near = Contacts(
+            at,
+            np.zeros((len(pairs), 2), int),
+            0.02 - missing,
+            np.full(len(pairs), 0.02),
+            vectors,
+            vectors,
+            vectors,
+        )
         merit = Merit(3.0)
         merit.weights["clearance"] = 7.0
         timing: Any = SimpleNamespace(dt="dt")
-        return self.subproblem.solve(Z, near, found, merit, timing, np.array([0.2, 0.1, 0.3]), rates=rates)
+        return self.subproblem.solve(
+            Z, near, found, merit, timing, np.array([0.2, 0.1, 0.3]), rates=rates
+        )
 
 
 @pytest.fixture
@@ -125,7 +150,9 @@ def test_what_keeps_its_margin_has_no_slack_and_what_falls_short_has_all(made: M
         ([0.01, 0.0, 1e-9], [1.0, 0.0, 1.0]),  # one waypoint that is far off lets all be
     ],
 )
-def test_shares_are_where_something_else_is_missing(made: Made, poses: list[float], shares: list[float]) -> None:
+def test_shares_are_where_something_else_is_missing(
+    made: Made, poses: list[float], shares: list[float]
+) -> None:
     made.solve(poses=poses)
     (asked,) = made.ipopt.asked
     np.testing.assert_array_equal(asked["x0"][2], shares)
@@ -137,7 +164,9 @@ def test_rows_on_rates_are_there_if_they_are_asked_for(made: Made) -> None:
     for rates in (False, True):
         made.solve(poses=[0.0, 0.0, 0.0], rates=rates)
         asked = made.ipopt.asked[-1]
-        assert (asked["lbg"], asked["ubg"]) == (("low dt", "high dt") if rates else ("low None", "high None"))
+        assert (asked["lbg"], asked["ubg"]) == (
+            ("low dt", "high dt") if rates else ("low None", "high None")
+        )
         assert made.ipopt.how[-1]["rates"] == rates
         assert asked["p"].tolist() == [1.0, 2.0, 8.0, 9.0]
 
@@ -146,7 +175,11 @@ def test_what_the_program_is_given(made: Made) -> None:
     made.solve(poses=[0.0, 0.0, 0.0])
     noted = made.noted
     assert noted["given"] == ("start", "planes", "offsets", "targets")
-    assert (noted["weights"], noted["penalty"], noted["dt"]) == (("weights", "first", "second"), 7.0, "dt")
+    assert (noted["weights"], noted["penalty"], noted["dt"]) == (
+        ("weights", "first", "second"),
+        7.0,
+        "dt",
+    )
     assert noted["gears"] == ("gears", "path")
     assert (noted["away"].shape, noted["excess"].tolist()) == ((N, 1, 7), [0.25])
 
@@ -170,7 +203,9 @@ def test_multipliers_are_taken_over_only_from_one_exact_round_to_the_next(made: 
         assert how["ipopt.linear_solver"] == "own"
         assert how["ipopt.print_level"] == 0  # it says nothing, not even of errors
         assert how["ipopt.max_iter"] == (40 if kind == "rough" else 77)
-        assert (asked.get("lam_x0"), asked.get("lam_g0")) == ((f"x{before}", f"g{before}") if before else (None, None))
+        assert (asked.get("lam_x0"), asked.get("lam_g0")) == (
+            (f"x{before}", f"g{before}") if before else (None, None)
+        )
     made.subproblem.forget()
     made.solve(poses=exact)
     assert "lam_x0" not in made.ipopt.asked[-1]

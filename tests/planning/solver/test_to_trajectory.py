@@ -19,8 +19,14 @@ ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
 
 @cache
 def fetching() -> TrajectoryProblem:
-    scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
-    return program_of(scene, [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), GoTo(0.0, 0.0)], options=SHORT)
+    scene = room(stand(), objects=("stick", "ball")).with_held(
+        {"stick": "grip"}, at={"stick": (0.02, -0.1)}
+    )
+    return program_of(
+        scene,
+        [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), GoTo(0.0, 0.0)],
+        options=SHORT,
+    )
 
 
 @cache
@@ -29,7 +35,9 @@ def placing() -> TrajectoryProblem:
 
 
 def unfolded(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
-    z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed))
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
+    )
     return z, as_trajectory(problem, z, problem.timing_for(problem.still).dt)
 
 
@@ -48,10 +56,18 @@ def test_what_is_held_when_and_through_what() -> None:
     names = ["reach ball.pull by stick.tip", "place ball", "go to"]
     assert [phase.name for phase in motion.phases] == names
     both = {"stick": "grip", "ball": "pull"}
-    assert [dict(phase.held) for phase in motion.phases] == [{"stick": "grip"}, both, {"stick": "grip"}]
+    assert [dict(phase.held) for phase in motion.phases] == [
+        {"stick": "grip"},
+        both,
+        {"stick": "grip"},
+    ]
     assert [phase["by"] for phase in motion.to_dict()["phases"]] == [{}, {"ball": "stick.tip"}, {}]
     n = SHORT.reach_waypoints
-    assert [(phase.first, phase.last) for phase in motion.phases] == [(0, n), (n, 2 * n + 1), (2 * n + 1, 3 * n + 2)]
+    assert [(phase.first, phase.last) for phase in motion.phases] == [
+        (0, n),
+        (n, 2 * n + 1),
+        (2 * n + 1, 3 * n + 2),
+    ]
     assert pauses(fetching(), motion) == [n + 1, 2 * n + 2]
 
 
@@ -74,7 +90,9 @@ def test_what_is_put_down_last_is_let_go_of_at_the_end() -> None:
         ([Release()], {"door": "handle"}, "let go"),
     ],
 )
-def test_a_hand_opens_at_the_end_only_if_it_is_told_to(steps: list[Step], held: dict[str, str], last: str) -> None:
+def test_a_hand_opens_at_the_end_only_if_it_is_told_to(
+    steps: list[Step], held: dict[str, str], last: str
+) -> None:
     scene = door_scene().with_held(held) if steps[0] == Release() else door_scene()
     motion = unfolded(program_of(scene, steps, options=SHORT))[1]
     assert motion.phases[-1].name == last
@@ -86,7 +104,9 @@ def test_a_hand_opens_at_the_end_only_if_it_is_told_to(steps: list[Step], held: 
 def test_what_is_let_go_of_before_anything_happens() -> None:
     """A door in the hand at the start is held in no phase. What the hand chose means nothing any more; it keeps its value."""
     for attachment in ("handle", "handle_free"):
-        problem = program_of(door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT)
+        problem = program_of(
+            door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT
+        )
         motion = unfolded(problem)[1]
         assert [dict(phase.held) for phase in motion.phases] == [{}]
     assert np.all(motion.column("door.handle_free") == 0.0)
@@ -113,6 +133,12 @@ def test_where_a_hand_holds_something_is_what_it_chose(make) -> None:  # type: i
         columns = [problem.chain.index(name) for name in names]
         held = [k for k, phase in enumerate(problem.task.phases) if hold in phase.held]
         first, last = ends[held[0]], ends[held[-1] + 1]
-        np.testing.assert_array_equal(rows[first : last + 1, columns], path[first : last + 1, columns])
-        np.testing.assert_array_equal(rows[:first, columns], np.tile(path[first, columns], (first, 1)))
-        np.testing.assert_array_equal(rows[last:, columns], np.tile(path[last, columns], (len(rows) - last, 1)))
+        np.testing.assert_array_equal(
+            rows[first : last + 1, columns], path[first : last + 1, columns]
+        )
+        np.testing.assert_array_equal(
+            rows[:first, columns], np.tile(path[first, columns], (first, 1))
+        )
+        np.testing.assert_array_equal(
+            rows[last:, columns], np.tile(path[last, columns], (len(rows) - last, 1))
+        )

@@ -15,20 +15,31 @@ DOOR, STICK = Hold("door", "free"), Hold("stick", "grip")
 
 
 def phase(
-    name: str, *, held: tuple[Hold, ...] = (), leaves: tuple[Hold, ...] = (), grasps: tuple[Hold, ...] = (), opening: Any = None
+    name: str,
+    *,
+    held: tuple[Hold, ...] = (),
+    leaves: tuple[Hold, ...] = (),
+    grasps: tuple[Hold, ...] = (),
+    opening: Any = None,
 ) -> Any:
     return SimpleNamespace(name=name, held=held, leaves=leaves, grasps=grasps, opening=opening)
 
 
 def made(
-    phases: list[Any], ends: list[int], *, after: tuple[Hold, ...] = (), holds: tuple[Hold, ...] = ()
+    phases: list[Any],
+    ends: list[int],
+    *,
+    after: tuple[Hold, ...] = (),
+    holds: tuple[Hold, ...] = (),
 ) -> tuple[Trajectory, np.ndarray]:
     """Return the motion and the waypoints, of one joint and two that rest, and of what the hand chose of the door.
 
     Steps take 1, 2, 3, ... seconds, and the gripper a tenth of one.
     """
     count = ends[-1]
-    path = np.column_stack([10.0 + np.arange(count + 1.0), np.zeros((count + 1, 2)), 100.0 + np.arange(count + 1.0)])
+    path = np.column_stack(
+        [10.0 + np.arange(count + 1.0), np.zeros((count + 1, 2)), 100.0 + np.arange(count + 1.0)]
+    )
     names = ("joint", "aside", "turn", "door.free")
     used = DOOR in holds or any(DOOR in (*phase.held, *phase.grasps) for phase in phases)
     problem: Any = SimpleNamespace(
@@ -57,15 +68,23 @@ def seen(motion: Trajectory) -> tuple[list[float], list[float], list[tuple[str, 
 
 def test_it_waits_where_something_is_grasped() -> None:
     """At the begin of the phase after."""
-    motion, _ = made([phase("reach", grasps=(STICK,)), phase("carry", held=(STICK,))], [2, 4], after=(STICK,))
-    assert seen(motion) == ([10, 11, 12, 12, 13, 14], [1, 2, 0.1, 3, 4], [("reach", 0, 2), ("carry", 2, 5)])
+    motion, _ = made(
+        [phase("reach", grasps=(STICK,)), phase("carry", held=(STICK,))], [2, 4], after=(STICK,)
+    )
+    assert seen(motion) == (
+        [10, 11, 12, 12, 13, 14],
+        [1, 2, 0.1, 3, 4],
+        [("reach", 0, 2), ("carry", 2, 5)],
+    )
     assert motion.times[0] == 0.0
     assert [span.holds for span in motion.phases] == [(), (STICK,)]
 
 
 def test_it_waits_where_something_is_let_go_of() -> None:
     """In the first phase, too."""
-    motion, _ = made([phase("away", leaves=(STICK,)), phase("on"), phase("again", leaves=(STICK,))], [1, 2, 4])
+    motion, _ = made(
+        [phase("away", leaves=(STICK,)), phase("on"), phase("again", leaves=(STICK,))], [1, 2, 4]
+    )
     assert seen(motion) == (
         [10, 10, 11, 12, 12, 13, 14],
         [0.1, 1, 2, 0.1, 3, 4],
@@ -88,7 +107,13 @@ def test_at_the_very_end_it_waits_if_something_is_let_go_of() -> None:
     assert seen(made([phase("go")], [2])[0])[2] == [("go", 0, 2)]
 
 
-def chosen(phases: list[Any], ends: list[int], *, holds: tuple[Hold, ...] = (), after: tuple[Hold, ...] = ()) -> list[int]:
+def chosen(
+    phases: list[Any],
+    ends: list[int],
+    *,
+    holds: tuple[Hold, ...] = (),
+    after: tuple[Hold, ...] = (),
+) -> list[int]:
     """Return from which waypoint the hand's choice is, at every one; pauses left out."""
     motion, _ = made(phases, ends, holds=holds, after=after)
     column, rows = motion.positions[:, 3] - 100.0, motion.positions[:, 0] - 10.0

@@ -23,14 +23,18 @@ SEGMENTS, BLOCK = 30, 10  # three blocks
 
 def trial(promise: Any = 0.0, *, step: Any = 0.1) -> Trial:
     """Return where a round led: what the planes promised would be left, and how far it went."""
-    rows = [np.broadcast_to(np.asarray(values, float), (SEGMENTS,)).copy() for values in (promise, step)]
+    rows = [
+        np.broadcast_to(np.asarray(values, float), (SEGMENTS,)).copy() for values in (promise, step)
+    ]
     fields = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
     return Trial(**{**fields, "promise": rows[0], "step": rows[1]})  # type: ignore[arg-type]
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.floats(-1.0, 10.0), st.floats(-10.0, 10.0), st.floats(0.0, 100.0))
-def test_a_step_is_accepted_that_keeps_enough_of_its_promise(promised: float, actual: float, merit: float) -> None:
+def test_a_step_is_accepted_that_keeps_enough_of_its_promise(
+    promised: float, actual: float, merit: float
+) -> None:
     accepted = judge(promised, actual, merit)
     if promised >= 1e-4 * max(1.0, merit):
         assert accepted == (actual > 0.05 * promised)
@@ -73,7 +77,10 @@ def test_what_half_keeps_its_promise_keeps_the_radius() -> None:
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_radii_stay_positive_and_one_to_a_block(seed: int) -> None:
-    rng, region = np.random.default_rng(seed), TrustRegion(SEGMENTS, BLOCK, np.repeat([0.5, 1e-3, 1e-6], 10))
+    rng, region = (
+        np.random.default_rng(seed),
+        TrustRegion(SEGMENTS, BLOCK, np.repeat([0.5, 1e-3, 1e-6], 10)),
+    )
     for _ in range(20):
         before, promise, after, step = rng.uniform(0.0, 2.0, (4, SEGMENTS))
         region.adapt(before, after, trial(promise, step=step), bool(rng.integers(2)))
@@ -90,7 +97,9 @@ def test_stuck_is_where_something_is_in_the_way_and_does_not_move() -> None:
     assert region.stuck(trial(step=step), shortfall)
     shortfall[15] = 2 * CLOSE_ENOUGH  # which moves
     assert not region.stuck(trial(step=step), shortfall)
-    assert not region.stuck(trial(step=step), np.zeros(SEGMENTS))  # nothing in the way: all must have stopped
+    assert not region.stuck(
+        trial(step=step), np.zeros(SEGMENTS)
+    )  # nothing in the way: all must have stopped
     assert region.stuck(trial(step=0.0), np.zeros(SEGMENTS))
     region.settle()
     np.testing.assert_array_equal(region.radius, SETTLE_RADIUS)

@@ -22,7 +22,12 @@ from vkc_pin.planning.solver.trust_region import (
 
 
 def adapted(
-    promised: list[float], actual: list[float], step: list[float], *, accepted: bool = True, radius: float = 0.5
+    promised: list[float],
+    actual: list[float],
+    step: list[float],
+    *,
+    accepted: bool = True,
+    radius: float = 0.5,
 ) -> list[float]:
     """Return the radii of two blocks of two waypoints each, of which so much was promised and came; in units of the radius."""
     region = TrustRegion(4, 2, np.full(4, radius))
@@ -40,13 +45,24 @@ def adapted(
 
 def test_what_kept_its_promise_at_the_edge_becomes_wider() -> None:
     for step, wider in ((1.0, True), (1.01 * INSIDE, True), (0.99 * INSIDE, False), (0.1, False)):
-        assert adapted([10.0, 10.0], [10.0, 10.0], [step, 0.0]) == [pytest.approx(1.5 if wider else 1.0), 1.0]
+        assert adapted([10.0, 10.0], [10.0, 10.0], [step, 0.0]) == [
+            pytest.approx(1.5 if wider else 1.0),
+            1.0,
+        ]
 
 
 def test_seven_tenths_of_a_promise_are_enough() -> None:
     """And a little less, in what does not matter."""
-    for share, wider in ((7.1, True), (7.0 - 0.9 * NO_MATTER, True), (7.0 - 1.1 * NO_MATTER, False), (12.0, True)):
-        assert adapted([10.0, 10.0], [share, 5.0], [1.0, 1.0]) == [pytest.approx(1.5 if wider else 1.0), 1.0]
+    for share, wider in (
+        (7.1, True),
+        (7.0 - 0.9 * NO_MATTER, True),
+        (7.0 - 1.1 * NO_MATTER, False),
+        (12.0, True),
+    ):
+        assert adapted([10.0, 10.0], [share, 5.0], [1.0, 1.0]) == [
+            pytest.approx(1.5 if wider else 1.0),
+            1.0,
+        ]
 
 
 def test_what_came_to_less_than_a_quarter_becomes_narrower() -> None:
@@ -55,7 +71,10 @@ def test_what_came_to_less_than_a_quarter_becomes_narrower() -> None:
         assert adapted([10.0, 10.0], [share, 5.0], [0.8, 0.8]) == [pytest.approx(expected), 1.0]
     for missing, narrower in ((0.9 * NO_MATTER, False), (1.1 * NO_MATTER, True)):
         expected = SHRINK * 0.8 if narrower else 1.0
-        assert adapted([0.1, 0.0], [0.1 - missing, 0.0], [0.8, 0.8]) == [pytest.approx(expected), 1.0]
+        assert adapted([0.1, 0.0], [0.1 - missing, 0.0], [0.8, 0.8]) == [
+            pytest.approx(expected),
+            1.0,
+        ]
 
 
 def test_a_step_that_was_longer_than_the_radius_does_not_count_as_such() -> None:
@@ -63,10 +82,18 @@ def test_a_step_that_was_longer_than_the_radius_does_not_count_as_such() -> None
 
 
 def test_what_is_refused_makes_all_smaller_unless_one_is_to_blame() -> None:
-    assert adapted([10.0, 10.0], [10.0, 10.0], [1.0, 0.5], accepted=False) == pytest.approx([SHRINK, 0.5 * SHRINK])
-    assert adapted([10.0, 10.0], [10.0, 0.0], [1.0, 0.5], accepted=False) == pytest.approx([1.0, 0.5 * SHRINK])
-    assert adapted([10.0, 10.0], [10.0, 0.0], [1.0, 0.5], accepted=True) == pytest.approx([1.5, 0.5 * SHRINK])
-    assert adapted([10.0, 10.0], [0.0, 0.0], [1.0, 0.5], accepted=False) == pytest.approx([SHRINK, 0.5 * SHRINK])
+    assert adapted([10.0, 10.0], [10.0, 10.0], [1.0, 0.5], accepted=False) == pytest.approx(
+        [SHRINK, 0.5 * SHRINK]
+    )
+    assert adapted([10.0, 10.0], [10.0, 0.0], [1.0, 0.5], accepted=False) == pytest.approx(
+        [1.0, 0.5 * SHRINK]
+    )
+    assert adapted([10.0, 10.0], [10.0, 0.0], [1.0, 0.5], accepted=True) == pytest.approx(
+        [1.5, 0.5 * SHRINK]
+    )
+    assert adapted([10.0, 10.0], [0.0, 0.0], [1.0, 0.5], accepted=False) == pytest.approx(
+        [SHRINK, 0.5 * SHRINK]
+    )
 
 
 def test_radii_do_not_vanish() -> None:
@@ -120,7 +147,15 @@ def test_smaller_steps_and_beginning_again() -> None:
 
 @pytest.mark.parametrize(
     ("segments", "length", "blocks"),
-    [(1, 10, [1]), (4, 10, [4]), (14, 10, [14]), (16, 10, [8, 8]), (6, 2, [2, 2, 2]), (7, 2, [2, 2, 2, 1]), (5, 1, [1] * 5)],
+    [
+        (1, 10, [1]),
+        (4, 10, [4]),
+        (14, 10, [14]),
+        (16, 10, [8, 8]),
+        (6, 2, [2, 2, 2]),
+        (7, 2, [2, 2, 2, 1]),
+        (5, 1, [1] * 5),
+    ],
 )
 def test_blocks(segments: int, length: int, blocks: list[int]) -> None:
     found = TrustRegion(segments, length).block

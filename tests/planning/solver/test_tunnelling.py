@@ -24,7 +24,13 @@ def past(x: float, *obstacles: dict[str, object]) -> tuple[TrajectoryProblem, np
 
 
 def post(x: float, y: float = 0.0, radius: float = 0.02) -> dict[str, object]:
-    return {"name": "post", "type": "cylinder", "radius": radius, "length": 1.6, "position": [x, y, 0.8]}
+    return {
+        "name": "post",
+        "type": "cylinder",
+        "radius": radius,
+        "length": 1.6,
+        "position": [x, y, 0.8],
+    }
 
 
 def pairs(problem: TrajectoryProblem, z: np.ndarray) -> set[tuple[str, str]]:

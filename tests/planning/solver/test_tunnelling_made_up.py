@@ -21,7 +21,9 @@ class Made:
         self.back, self.boundary, self.aside = back, boundary, aside
 
     def phases_of(self, waypoints: np.ndarray) -> np.ndarray:
-        np.testing.assert_array_equal(waypoints, SEGMENTS + 1)  # each is at the end of its segment's phase
+        np.testing.assert_array_equal(
+            waypoints, SEGMENTS + 1
+        )  # each is at the end of its segment's phase
         return (waypoints > self.boundary).astype(int)
 
     def normals(self, z: np.ndarray, waypoints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -51,13 +53,19 @@ def test_it_comes_out_on_the_other_side() -> None:
     assert found(overlaps((3, 0, 1), (4, 0, 1)), {5, 6, 7}) == [Passage((0, 1), 0, 2)]
     assert found(overlaps((5, 0, 1)), {6, 7}) == [Passage((0, 1), 1, 3)]
     assert found(overlaps((3, 0, 1), (4, 0, 1)), set()) == []
-    assert found(overlaps((3, 0, 1), (4, 0, 1)), {3, 4}) == []  # what normals are inside does not matter
+    assert (
+        found(overlaps((3, 0, 1), (4, 0, 1)), {3, 4}) == []
+    )  # what normals are inside does not matter
 
 
 @pytest.mark.parametrize("state", range(S))
 def test_what_begins_or_ends_inside_is_none(state: int) -> None:
     back = set(range(state + 1, S))
-    expected = [Passage((0, 1), int(SEGMENTS[state - 1]), int(SEGMENTS[state + 1]))] if 0 < state < S - 1 else []
+    expected = (
+        [Passage((0, 1), int(SEGMENTS[state - 1]), int(SEGMENTS[state + 1]))]
+        if 0 < state < S - 1
+        else []
+    )
     assert found(overlaps((state, 0, 1)), back) == expected
 
 
@@ -79,7 +87,9 @@ def test_another_pair_is_another_overlap(other: tuple[int, int]) -> None:
 
 
 def test_pairs_that_overlap_at_the_same_states_do_not_mix() -> None:
-    both = overlaps(*((row, 0, k) for row in (2, 3, 4) for k in (1, 2)), *((row, 1, 2) for row in (2, 3, 4)))
+    both = overlaps(
+        *((row, 0, k) for row in (2, 3, 4) for k in (1, 2)), *((row, 1, 2) for row in (2, 3, 4))
+    )
     assert found(both, {5, 6, 7}) == [Passage(pair, 0, 2) for pair in ((0, 1), (0, 2), (1, 2))]
 
 

@@ -13,12 +13,30 @@ from vkc_pin.world.models.object_file import load_object
 def built() -> Article:
     made = Article("thing", Link("base"))
     made.base.box((0.0, -0.2, 0.0), (0.3, 0.2, 0.5), "oak")
-    moved = made.joint("slide", "prismatic", (0.0, 0.0, 0.6), (-1, 0, 0), 0.3, lower=-0.1, link="tray", acceleration=1.5)
+    moved = made.joint(
+        "slide",
+        "prismatic",
+        (0.0, 0.0, 0.6),
+        (-1, 0, 0),
+        0.3,
+        lower=-0.1,
+        link="tray",
+        acceleration=1.5,
+    )
     moved.box((-0.1, -0.1, -0.05), (0.1, 0.1, 0.05), "white")
     moved.cylinder((-0.2, 0.0, 0.0), 0.02, 0.3, "y", "steel")
     moved.ball((0.0, 0.0, 0.2), 0.05, "steel")
     moved.rod((0.1, 0.0, 0.0), (0.3, -0.2, 0.4), 0.03, "steel")
-    made.attach("grip", moved, (-0.2, 0.0, 0.0), (1, 0, 0), (0, 0, 1), joint="revolute", axis=[0, 1, 0], limits=(-0.5, 0.5))
+    made.attach(
+        "grip",
+        moved,
+        (-0.2, 0.0, 0.0),
+        (1, 0, 0),
+        (0, 0, 1),
+        joint="revolute",
+        axis=[0, 1, 0],
+        limits=(-0.5, 0.5),
+    )
     return made
 
 
@@ -30,13 +48,21 @@ def test_masses_and_inertias_are_those_of_the_shapes() -> None:
             pin.Inertia.FromCylinder(500.0 * np.pi * 0.02**2 * 0.3, 0.02, 0.3),
             pin.SE3(pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), np.array([-0.2, 0.0, 0.0])),
         ),
-        (pin.Inertia.FromSphere(500.0 * 4 / 3 * np.pi * 0.05**3, 0.05), pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.2]))),
+        (
+            pin.Inertia.FromSphere(500.0 * 4 / 3 * np.pi * 0.05**3, 0.05),
+            pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.2])),
+        ),
     )
     rod = np.array([0.2, -0.2, 0.4])
-    turned = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), rod / np.linalg.norm(rod)).matrix()
+    turned = pin.Quaternion.FromTwoVectors(
+        np.array([0.0, 0.0, 1.0]), rod / np.linalg.norm(rod)
+    ).matrix()
     length = float(np.linalg.norm(rod))
     shapes += (
-        (pin.Inertia.FromCylinder(500.0 * np.pi * 0.03**2 * length, 0.03, length), pin.SE3(turned, np.array([0.2, -0.1, 0.2]))),
+        (
+            pin.Inertia.FromCylinder(500.0 * np.pi * 0.03**2 * length, 0.03, length),
+            pin.SE3(turned, np.array([0.2, -0.1, 0.2])),
+        ),
     )
     expected = pin.Inertia.Zero()
     for inertia, where in shapes:
@@ -50,14 +76,24 @@ def test_masses_and_inertias_are_those_of_the_shapes() -> None:
 def test_limits_and_rates_are_those_that_were_asked_for() -> None:
     thing = load_object(built().description)
     assert (thing.name, thing.links, thing.urdf) == ("thing", ("base", "tray"), None)
-    assert (thing.lower[0], thing.upper[0], thing.velocity[0], thing.acceleration[0]) == (-0.1, 0.3, 0.5, 1.5)
-    np.testing.assert_allclose(thing.link_placement("tray", [0.2]).translation, [-0.2, 0.0, 0.6], rtol=0.0, atol=1e-12)
+    assert (thing.lower[0], thing.upper[0], thing.velocity[0], thing.acceleration[0]) == (
+        -0.1,
+        0.3,
+        0.5,
+        1.5,
+    )
+    np.testing.assert_allclose(
+        thing.link_placement("tray", [0.2]).translation, [-0.2, 0.0, 0.6], rtol=0.0, atol=1e-12
+    )
 
 
 def test_what_is_drawn_is_what_collides() -> None:
     thing = load_object(built().description)
     drawn, solid = (
-        [(type(shape.geometry).__name__, shape.placement.homogeneous.tolist()) for shape in geometry.geometryObjects]
+        [
+            (type(shape.geometry).__name__, shape.placement.homogeneous.tolist())
+            for shape in geometry.geometryObjects
+        ]
         for geometry in (thing.visual, thing.collision)
     )
     assert drawn == solid

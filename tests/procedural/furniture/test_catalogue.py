@@ -38,7 +38,11 @@ def hand() -> list:
     tool = data.oMf[model.getFrameId(ROBOT.tool_frame)]
     names = ("gripper", "wrist_3")
     found = zip(geometry.geometryObjects, shapes.oMg, strict=True)
-    return [(shape.geometry, tool.actInv(where)) for shape, where in found if shape.name.startswith(names)]
+    return [
+        (shape.geometry, tool.actInv(where))
+        for shape, where in found
+        if shape.name.startswith(names)
+    ]
 
 
 HAND = hand()
@@ -51,11 +55,20 @@ def test_the_hand_fits_around_every_handle(kind: str, seed: int) -> None:
     own = placed(kind, seed)
     assert len(own.object.attachments) >= 2
     for attachment in own.object.attachments.values():
-        tool = own.link_placement(attachment.link) * attachment.tool(np.zeros(len(attachment.freedoms)))
+        tool = own.link_placement(attachment.link) * attachment.tool(
+            np.zeros(len(attachment.freedoms))
+        )
         for shape in standing_geometry(own):
             link = shape.name.rpartition("_")[0]
-            least = min(shape_distance(solid, tool * where, shape.geometry, shape.placement) for solid, where in HAND)
-            assert least >= (0.005 if link == attachment.link else 0.02), (attachment.name, shape.name, least)
+            least = min(
+                shape_distance(solid, tool * where, shape.geometry, shape.placement)
+                for solid, where in HAND
+            )
+            assert least >= (0.005 if link == attachment.link else 0.02), (
+                attachment.name,
+                shape.name,
+                least,
+            )
 
 
 @FEW
@@ -72,9 +85,15 @@ def test_links_pass_each_other(kind: str, seed: int) -> None:
             parents = [shape.parentJoint for shape in own.object.collision.geometryObjects]
             moved = own.object.links_moved_by({joint})
             moving = [s for s in shapes if s.name.rpartition("_")[0] in moved]
-            others = [s for s, parent in zip(shapes, parents, strict=True) if s.name.rpartition("_")[0] not in moved]
+            others = [
+                s
+                for s, parent in zip(shapes, parents, strict=True)
+                if s.name.rpartition("_")[0] not in moved
+            ]
             least = 0.0 if kind in ("faucet", "valve") else 5e-4  # levers sit on their spindles
-            assert clearance(placed_shapes(moving), placed_shapes(others), reach=0.01) >= least - 1e-6, (joint, value, parents)
+            assert (
+                clearance(placed_shapes(moving), placed_shapes(others), reach=0.01) >= least - 1e-6
+            ), (joint, value, parents)
 
 
 @FEW
@@ -92,7 +111,10 @@ def test_what_opens_comes_towards_who_opens_it(kind: str, seed: int) -> None:
             )
         )
         before, after = (
-            (own.with_state({joint: value}).link_placement(attachment.link) * attachment.placement).translation
+            (
+                own.with_state({joint: value}).link_placement(attachment.link)
+                * attachment.placement
+            ).translation
             for value in (0.0, 0.3 * own.object.upper[own.object.coordinates.index(joint)])
         )
         moved = after - before
@@ -123,7 +145,9 @@ def test_a_number_stands_for_one_object() -> None:
         one, same, other = (vkc.random_object(kind, seed) for seed in (3, 3, 4))
         assert one == same != other
     code = "import json, vkc_pin as vkc; print(json.dumps(vkc.random_object('oven', 8)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
     assert yaml.safe_load(done.stdout) == vkc.random_object("oven", 8)
 
 

@@ -38,7 +38,9 @@ def test_a_bar_is_held_anywhere_between_its_posts(kind: str, along: int) -> None
         tool = free.tool([slide, turn])
         off = np.delete(tool.translation - centre, along)
         np.testing.assert_allclose(off, 0.0, atol=1e-9)
-        assert abs(tool.translation[along] - FACE[along]) == pytest.approx(0.1)  # 0.03 from a post, at 0.13
+        assert abs(tool.translation[along] - FACE[along]) == pytest.approx(
+            0.1
+        )  # 0.03 from a post, at 0.13
         assert abs(tool.rotation[along, 0]) < 1e-9  # the fingers close across the bar
     level = fixed.placement.rotation
     np.testing.assert_allclose(level[:, 2], [1, 0, 0], atol=1e-9)
@@ -46,7 +48,9 @@ def test_a_bar_is_held_anywhere_between_its_posts(kind: str, along: int) -> None
 
 @pytest.mark.parametrize(("height", "down"), [(0.9, 0.0), (0.55, 0.0), (0.3, 0.65), (0.1, 0.65)])
 def test_low_bars_are_taken_from_above(height: float, down: float) -> None:
-    approach = load_object(made("level", height).description).attachment("handle").placement.rotation[:, 2]
+    approach = (
+        load_object(made("level", height).description).attachment("handle").placement.rotation[:, 2]
+    )
     np.testing.assert_allclose(approach, [np.cos(down), 0.0, -np.sin(down)], atol=1e-6)
 
 
@@ -54,6 +58,8 @@ def test_a_knob_is_held_from_any_direction_before_it() -> None:
     free = load_object(made("knob").description).attachment("handle_free")
     rng = np.random.default_rng(0)
     for _ in range(20):
-        tool = free.tool(rng.uniform([f.lower for f in free.freedoms], [f.upper for f in free.freedoms]))
+        tool = free.tool(
+            rng.uniform([f.lower for f in free.freedoms], [f.upper for f in free.freedoms])
+        )
         np.testing.assert_allclose(tool.translation, np.array(FACE) - [0.05, 0.0, 0.0], atol=1e-9)
         assert tool.rotation[0, 2] > 0.4  # the approach

@@ -29,7 +29,9 @@ def parts(scene: vkc.Scene) -> tuple[list, list]:
     """Return what stood there before, and the clutter."""
     new = [shape for shape in scene.obstacles if shape.name.startswith("clutter_")]
     old = [shape for shape in scene.obstacles if not shape.name.startswith("clutter_")]
-    return old + [shape for placed in scene.objects.values() for shape in standing_geometry(placed)], new
+    return old + [
+        shape for placed in scene.objects.values() for shape in standing_geometry(placed)
+    ], new
 
 
 @settings(max_examples=5, deadline=None)
@@ -39,7 +41,10 @@ def test_everything_stands_or_hangs_and_hits_nothing(seed: int, things: int) -> 
     assert len(new) == things
     for shape in new:
         picture = isinstance(shape.geometry, coal.Box) and 2 * min(shape.geometry.halfSide) == 0.025
-        gaps = sorted(shape_distance(shape.geometry, shape.placement, other.geometry, other.placement) for other in old)
+        gaps = sorted(
+            shape_distance(shape.geometry, shape.placement, other.geometry, other.placement)
+            for other in old
+        )
         if picture:  # let into one wall, away from all else
             assert gaps[0] == pytest.approx(-0.005, abs=1e-4)
         else:
@@ -53,7 +58,10 @@ def test_hands_have_room_and_so_have_places_that_stay_clear() -> None:
     _, new = parts(cluttered(home(), 250, seed=2, clear=[PLACE]))
     shapes = [(shape.geometry, shape.placement) for shape in new]
     ball = vkc.load_scene("household").objects["cup"].placement.copy()
-    for middle, radius in [PLACE, *((p.placement.translation, 0.15) for p in home().objects.values() if p.object.free)]:
+    for middle, radius in [
+        PLACE,
+        *((p.placement.translation, 0.15) for p in home().objects.values() if p.object.free),
+    ]:
         ball.translation = np.array(middle)
         assert clearance(shapes, [(coal.Sphere(radius), ball)]) > -1e-6
 

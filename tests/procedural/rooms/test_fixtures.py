@@ -13,8 +13,15 @@ from vkc_pin.procedural.rooms.fixtures import OPENED, fixture, known_objects, ow
 
 def test_measures_are_those_of_what_is_shut() -> None:
     drawer = fixture("drawer")
-    np.testing.assert_allclose([drawer.low, drawer.high], [[-0.125, -0.3, 0.0], [0.55, 0.3, 0.9]], atol=6e-3)
-    assert (drawer.type, drawer.in_wall, drawer.lift, drawer.counter) == ("drawer", False, 0.0, None)
+    np.testing.assert_allclose(
+        [drawer.low, drawer.high], [[-0.125, -0.3, 0.0], [0.55, 0.3, 0.9]], atol=6e-3
+    )
+    assert (drawer.type, drawer.in_wall, drawer.lift, drawer.counter) == (
+        "drawer",
+        False,
+        0.0,
+        None,
+    )
     door = fixture("narrow_door")
     assert (door.low[1], door.high[1]) == pytest.approx((-0.81, 0.095))
     assert door.in_wall
@@ -43,7 +50,9 @@ def test_what_stands_high_in_its_file_stands_on_the_floor(tmp_path: Path) -> Non
     assert fixture(description).lift == pytest.approx(-0.7, abs=1e-3)
 
 
-@pytest.mark.parametrize(("kind", "nearest"), [("cabinett", "cabinet"), ("random_ovn", "random_oven")])
+@pytest.mark.parametrize(
+    ("kind", "nearest"), [("cabinett", "cabinet"), ("random_ovn", "random_oven")]
+)
 def test_unknown_objects(kind: str, nearest: str) -> None:
     with pytest.raises(vkc.UnknownNameError) as found:
         fixture(kind)

@@ -13,15 +13,21 @@ from vkc_pin.procedural.rooms.footprints import Floor, Frame, Rectangle
 from vkc_pin.world.models.shapes import shape_distance
 
 LENGTHS = st.floats(0.1, 2.0)
-RECTANGLES = st.builds(Rectangle, st.floats(-2, 2), st.floats(-2, 2), LENGTHS, LENGTHS, st.floats(-4, 4))
+RECTANGLES = st.builds(
+    Rectangle, st.floats(-2, 2), st.floats(-2, 2), LENGTHS, LENGTHS, st.floats(-4, 4)
+)
 
 
 def as_box(one: Rectangle) -> tuple[coal.Box, pin.SE3]:
-    return coal.Box(one.length, one.width, 1.0), pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, one.yaw), np.array([one.x, one.y, 0.0]))
+    return coal.Box(one.length, one.width, 1.0), pin.SE3(
+        pin.rpy.rpyToMatrix(0.0, 0.0, one.yaw), np.array([one.x, one.y, 0.0])
+    )
 
 
 @given(RECTANGLES, RECTANGLES)
-def test_the_gap_is_no_more_than_the_distance_and_positive_where_that_is(one: Rectangle, other: Rectangle) -> None:
+def test_the_gap_is_no_more_than_the_distance_and_positive_where_that_is(
+    one: Rectangle, other: Rectangle
+) -> None:
     distance = shape_distance(*as_box(one), *as_box(other))
     gap = one.gap(other)
     assert gap == pytest.approx(other.gap(one))
@@ -39,7 +45,9 @@ def test_the_distance_of_a_point(one: Rectangle, x: float, y: float) -> None:
     assert found == pytest.approx(expected, abs=2e-3)
 
 
-@pytest.mark.parametrize(("side", "expected"), [(0, (3.0, 1.0)), (1, (-1.0, 2.0)), (2, (-3.0, -1.0)), (3, (1.0, -2.0))])
+@pytest.mark.parametrize(
+    ("side", "expected"), [(0, (3.0, 1.0)), (1, (-1.0, 2.0)), (2, (-3.0, -1.0)), (3, (1.0, -2.0))]
+)
 def test_frames_at_walls_look_out_of_the_room(side: int, expected: tuple[float, float]) -> None:
     frame = Floor(6.0, 4.0).at_wall(side, 1.0)
     assert (frame.x, frame.y) == pytest.approx(expected)
@@ -52,8 +60,15 @@ def test_what_a_floor_holds() -> None:
     floor = Floor(4.0, 6.0)
     assert floor.holds(Rectangle(1.5, 2.5, 1.0, 1.0))
     assert not floor.holds(Rectangle(1.5, 2.5, 1.0, 1.0, 0.5))
-    assert floor.free([], 0.5, [[1.4, 0.0], [1.6, 0.0], [0.0, 2.6]]).tolist() == [True, False, False]
-    assert floor.free([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [[0.9, 0.0], [1.1, 0.0]]).tolist() == [False, True]
+    assert floor.free([], 0.5, [[1.4, 0.0], [1.6, 0.0], [0.0, 2.6]]).tolist() == [
+        True,
+        False,
+        False,
+    ]
+    assert floor.free([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [[0.9, 0.0], [1.1, 0.0]]).tolist() == [
+        False,
+        True,
+    ]
 
 
 @pytest.mark.parametrize(("width", "expected"), [(2.4, True), (2.8, False)])

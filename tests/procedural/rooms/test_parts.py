@@ -16,7 +16,10 @@ FLOOR = Floor(6.0, 5.0)
 
 
 def scene(*standing: parts.Part, walls: bool = False) -> vkc.Scene:
-    obstacles = [*(parts.walls(FLOOR, 2.4, standing) if walls else []), *(o for part in standing for o in part.obstacles)]
+    obstacles = [
+        *(parts.walls(FLOOR, 2.4, standing) if walls else []),
+        *(o for part in standing for o in part.obstacles),
+    ]
     objects = [entry for part in standing for entry in part.objects]
     arena = {"x": [-6.0, 6.0], "y": [-6.0, 6.0]}
     own = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "arena": arena, "floor": False}
@@ -33,7 +36,9 @@ def test_a_table_stands_on_its_footprint_and_has_a_free_side(side: int) -> None:
     wall = FLOOR.at_wall(side, 0.4)
     table = parts.table("table", Frame(*wall.point(-0.5, 0.0), wall.yaw), (0.8, 1.4, 0.74))
     low, high = extent(scene(table))
-    assert [*low[:2], *high[:2]] == pytest.approx([*table.footprint.corners.min(axis=0), *table.footprint.corners.max(axis=0)])
+    assert [*low[:2], *high[:2]] == pytest.approx(
+        [*table.footprint.corners.min(axis=0), *table.footprint.corners.max(axis=0)]
+    )
     assert (low[2], high[2]) == pytest.approx((0.0, 0.74), abs=1e-3)
     assert len(table.obstacles) == 5
     assert table.before is not None
@@ -45,7 +50,9 @@ def test_a_table_stands_on_its_footprint_and_has_a_free_side(side: int) -> None:
 def test_a_shelf_stands_against_its_wall() -> None:
     shelf = parts.shelf("shelf", FLOOR.at_wall(0, 0.3), (0.3, 1.0, 1.8), 4)
     low, high = extent(scene(shelf))
-    assert np.array([low, high]) == pytest.approx(np.array([[2.68, -0.2, 0.0], [2.98, 0.8, 1.8]]), abs=1e-3)
+    assert np.array([low, high]) == pytest.approx(
+        np.array([[2.68, -0.2, 0.0], [2.98, 0.8, 1.8]]), abs=1e-3
+    )
     boards = sorted(item["position"][2] for item in shelf.obstacles if "board" in item["name"])
     assert len(boards) == 4
     assert min(np.diff(boards)) > 0.3
@@ -64,17 +71,26 @@ def test_what_opens_stands_at_its_wall_and_has_room_to(kind: str, side: int) -> 
     room = scene(part, walls=True)
     placed = room.objects[kind]
     walls = placed_shapes(room.obstacles)
-    assert clearance(placed_shapes(standing_geometry(placed)), walls) > -2e-3  # frames of doors touch their wall
+    assert (
+        clearance(placed_shapes(standing_geometry(placed)), walls) > -2e-3
+    )  # frames of doors touch their wall
     joint = placed.object.coordinates.names[0]
     for share in np.linspace(0.0, 1.0, 6):  # moving parts keep the clearance that plans do
         high = min(placed.object.upper[0], 1.57)
         moved = placed.with_state({joint: share * high})
         parents = [shape.parentJoint for shape in placed.object.collision.geometryObjects]
-        moving = [shape for shape, parent in zip(standing_geometry(moved), parents, strict=True) if parent]
+        moving = [
+            shape for shape, parent in zip(standing_geometry(moved), parents, strict=True) if parent
+        ]
         assert clearance(placed_shapes(moving), walls) > 0.02
-    tool = placed.link_placement(placed.object.attachment().link) * placed.object.attachment().placement
+    tool = (
+        placed.link_placement(placed.object.attachment().link)
+        * placed.object.attachment().placement
+    )
     assert part.before is not None
-    assert part.before.distance([tool.translation[:2]])[0] == pytest.approx(0.0, abs=1e-6)  # the handle is before it
+    assert part.before.distance([tool.translation[:2]])[0] == pytest.approx(
+        0.0, abs=1e-6
+    )  # the handle is before it
     assert FLOOR.half_length(side + 1) - abs(np.array(part.spot)[side % 2]) > 0.8
 
 
@@ -84,7 +100,12 @@ def test_small_things_stand_on_a_counter(kind: str, seed: int) -> None:
     part = parts.opened("it", fixture(kind, seed), FLOOR, 2, 0.3, 1.8)
     low, high = extent(scene(part))
     room = scene(part)
-    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(room.objects["it"])])
+    boxes = np.array(
+        [
+            world_box(shape.geometry, shape.placement)
+            for shape in standing_geometry(room.objects["it"])
+        ]
+    )
     assert boxes[:, 0].min(axis=0)[2] == pytest.approx(high[2] + 0.001, abs=1e-4)
     assert (boxes[:, 0].min(axis=0)[:2] >= low[:2]).all()
     assert (boxes[:, 1].max(axis=0)[:2] <= high[:2]).all()
@@ -99,7 +120,12 @@ def test_small_things_stand_on_a_counter(kind: str, seed: int) -> None:
 def test_walls_close_the_room_but_for_doors() -> None:
     door = parts.opened("door", fixture("door"), FLOOR, 1, -1.0, 1.8)
     closed, open_ = (parts.walls(FLOOR, 2.4, standing) for standing in ((), (door,)))
-    assert [item["name"] for item in closed] == ["wall_east", "wall_north", "wall_west", "wall_south"]
+    assert [item["name"] for item in closed] == [
+        "wall_east",
+        "wall_north",
+        "wall_west",
+        "wall_south",
+    ]
     assert [item["name"] for item in open_ if "north" in item["name"]] == [
         "wall_north_1",
         "wall_north_above_door",

@@ -31,7 +31,12 @@ OBJECTS = st.one_of(st.none(), st.lists(st.sampled_from(KNOWN), max_size=2).map(
 def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
     """Return the collision shapes of every part and of the walls."""
     found: dict[str, list] = {part.name: [] for part in layout.parts}
-    owners = {entry["name"]: part.name for part in layout.parts for entry in part.obstacles if not part.objects}
+    owners = {
+        entry["name"]: part.name
+        for part in layout.parts
+        for entry in part.obstacles
+        if not part.objects
+    }
     counters = {entry["name"] for part in layout.parts for entry in part.obstacles if part.objects}
     for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True):
         if label in counters:
@@ -45,34 +50,49 @@ def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
 
 @settings(max_examples=12, deadline=None, phases=[Phase.generate])
 @given(NUMBERS, st.floats(0.0, 1.0), OBJECTS, st.booleans())
-def test_a_room_is_sound(number: int, clutter: float, objects: tuple[str, ...] | None, cup: bool) -> None:
-    layout = random_layout(number, clutter=clutter, objects=objects, carried=("cup",) if cup else ())
+def test_a_room_is_sound(
+    number: int, clutter: float, objects: tuple[str, ...] | None, cup: bool
+) -> None:
+    layout = random_layout(
+        number, clutter=clutter, objects=objects, carried=("cup",) if cup else ()
+    )
     scene = layout.scene()
     assert all(4.0 <= size <= 7.0 for size in (layout.floor.width, layout.floor.depth))
 
     shapes = groups(layout, scene)
     for one, other in itertools.combinations(shapes, 2):
         distance = clearance(placed_shapes(shapes[one]), placed_shapes(shapes[other]), reach=0.05)
-        carried = "cup" in (one, other) or ("counters" in (one, other) and "walls" not in (one, other))
+        carried = "cup" in (one, other) or (
+            "counters" in (one, other) and "walls" not in (one, other)
+        )
         door = "walls" in (one, other) and any("door" in name for name in (one, other))
         least = -2e-3 if door else 5e-4 if carried else 0.0 if "walls" in (one, other) else 0.05
         assert distance >= least - 1e-9, (one, other, distance)
 
     assert scene.start_clearance() >= START_CLEARANCE
     for yaw in np.linspace(-np.pi, np.pi, 7):  # it can turn where it starts
-        assert scene.with_start(base=[*layout.start[:2], yaw]).start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE
+        assert (
+            scene.with_start(base=[*layout.start[:2], yaw]).start_clearance(reach=START_CLEARANCE)
+            >= START_CLEARANCE
+        )
 
     for part in layout.parts:
         if part.before is None:
             continue
         assert layout.floor.holds(part.before)
-        assert all(part.before.gap(other.footprint) > 0.0 for other in layout.parts if other.footprint != part.footprint)
+        assert all(
+            part.before.gap(other.footprint) > 0.0
+            for other in layout.parts
+            if other.footprint != part.footprint
+        )
         assert part.spot is not None
         for yaw in (0.0, 1.5, 3.0):  # and where it has to stand
             there = scene.with_start(base=[*part.spot, yaw])
             assert there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE, part.name
     spots = [part.spot for part in layout.parts if part.spot is not None]
-    assert layout.floor.connected([p.footprint for p in layout.parts], layout.radius, [layout.start[:2], *spots])
+    assert layout.floor.connected(
+        [p.footprint for p in layout.parts], layout.radius, [layout.start[:2], *spots]
+    )
 
 
 def test_a_number_stands_for_one_room() -> None:
@@ -85,8 +105,12 @@ def test_a_number_stands_for_one_room() -> None:
 
 
 def test_another_process_makes_the_same_room() -> None:
-    code = "import json, vkc_pin as vkc; print(json.dumps(vkc.random_room(8, clutter=0.4).document))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    code = (
+        "import json, vkc_pin as vkc; print(json.dumps(vkc.random_room(8, clutter=0.4).document))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
     assert yaml.safe_load(done.stdout) == vkc.random_room(8, clutter=0.4).document
 
 
@@ -108,11 +132,18 @@ def test_a_room_can_be_saved(tmp_path: Path) -> None:
         assert shape_distance(one.geometry, one.placement, other.geometry, other.placement) < 0.0
 
 
-def test_objects_made_at_random_differ_from_room_to_room_and_are_kept_with_it(tmp_path: Path) -> None:
+def test_objects_made_at_random_differ_from_room_to_room_and_are_kept_with_it(
+    tmp_path: Path,
+) -> None:
     asked = ("random_drawers", "random_drawers", "random_microwave", "refrigerator")
     rooms = [vkc.random_room(number, objects=asked, clutter=0.1) for number in (4, 5)]
     assert list(rooms[0].objects) == ["drawers_1", "drawers_2", "microwave", "refrigerator"]
-    sizes = {tuple(placed.object.upper) for room in rooms for name, placed in room.objects.items() if "drawers" in name}
+    sizes = {
+        tuple(placed.object.upper)
+        for room in rooms
+        for name, placed in room.objects.items()
+        if "drawers" in name
+    }
     assert len(sizes) == 4
     assert {"microwave_counter", "microwave_worktop"} <= set(rooms[0].obstacle_names)
     file = tmp_path / "room.yaml"
@@ -122,25 +153,39 @@ def test_objects_made_at_random_differ_from_room_to_room_and_are_kept_with_it(tm
     assert again.objects["drawers_1"].object.model == rooms[0].objects["drawers_1"].object.model
 
 
-def test_objects_by_path_and_by_description(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_objects_by_path_and_by_description(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     description = vkc.random_object("chest", 3)
     vkc.write_object(description, tmp_path / "my.chest.yaml")
     monkeypatch.chdir(tmp_path)
-    room = vkc.random_room(1, objects=["./my.chest.yaml", tmp_path / "my.chest.yaml", description, "dishwasher"], clutter=0.0)
+    room = vkc.random_room(
+        1,
+        objects=["./my.chest.yaml", tmp_path / "my.chest.yaml", description, "dishwasher"],
+        clutter=0.0,
+    )
     assert list(room.objects) == ["my_chest_1", "my_chest_2", "chest", "dishwasher"]
     monkeypatch.chdir("/")
     again = vkc.Scene.from_document(room.document, room.folder)  # paths are whole
     assert again.document == room.document
     for name in room.objects:
-        low = min(world_box(shape.geometry, shape.placement)[0][2] for shape in standing_geometry(room.objects[name]))
+        low = min(
+            world_box(shape.geometry, shape.placement)[0][2]
+            for shape in standing_geometry(room.objects[name])
+        )
         assert low == pytest.approx(0.0, abs=1e-4)
 
 
 def test_what_was_asked_for_is_there() -> None:
-    room = vkc.random_room(3, objects=("drawer", "drawer", "door"), tables=2, carried=("cup", "ball"), clutter=0.0)
+    room = vkc.random_room(
+        3, objects=("drawer", "drawer", "door"), tables=2, carried=("cup", "ball"), clutter=0.0
+    )
     assert list(room.objects) == ["drawer_1", "drawer_2", "door", "cup", "ball"]
     assert sum(name.endswith("_top") for name in room.obstacle_names) == 2
-    few, many = (len(vkc.random_room(3, objects=(), clutter=clutter).obstacle_names) for clutter in (0.1, 1.0))
+    few, many = (
+        len(vkc.random_room(3, objects=(), clutter=clutter).obstacle_names)
+        for clutter in (0.1, 1.0)
+    )
     assert few < many
 
 
@@ -148,7 +193,11 @@ def test_what_was_asked_for_is_there() -> None:
 def test_wrong_numbers(number: object) -> None:
     with pytest.raises(vkc.InputError) as found:
         vkc.random_room(number)  # type: ignore[arg-type]
-    assert (found.value.field, found.value.expected, found.value.got) == ("number", "a whole number of at least 0", repr(number))
+    assert (found.value.field, found.value.expected, found.value.got) == (
+        "number",
+        "a whole number of at least 0",
+        repr(number),
+    )
 
 
 def test_unknown_settings_and_parts() -> None:
@@ -165,11 +214,15 @@ def test_what_finds_no_place_is_said() -> None:
     assert "fewer objects" in str(found.value.expected)
 
 
-def test_things_and_robots_as_imports_write_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_things_and_robots_as_imports_write_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Imported objects have their frame in their middle: the floor is free before their face, not from inside of them."""
     box = '<collision><origin xyz="{} 0 0.2"/><geometry><box size="{} 0.5 0.4"/></geometry></collision>'
     body, door = box.format(0.03, 0.64), box.format(-0.3, 0.02)
-    ends = '<parent link="body"/><child link="door"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
+    ends = (
+        '<parent link="body"/><child link="door"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
+    )
     joint = f'<joint name="hinge" type="revolute">{ends}</joint>'
     urdf = f'<robot name="oven"><link name="body">{body}</link><link name="door">{door}</link>{joint}</robot>'
     own = fixture({"urdf": urdf, "attachments": []})
@@ -177,7 +230,11 @@ def test_things_and_robots_as_imports_write_them(tmp_path: Path, monkeypatch: py
     assert fixture("dishwasher").face == pytest.approx(0.0, abs=0.03)
     write_gripper(tmp_path / "mine")
     monkeypatch.chdir(tmp_path)
-    room = vkc.random_room(7, objects=[{"urdf": urdf, "attachments": []}], robot="mine/robot.yaml", clutter=0.0)
+    room = vkc.random_room(
+        7, objects=[{"urdf": urdf, "attachments": []}], robot="mine/robot.yaml", clutter=0.0
+    )
     assert room.robot.name == "mine"
     assert list(room.objects) == ["oven"]
-    assert vkc.random_room(7, objects=["drawer"], robot=Path("mine"), clutter=0.0).robot.name == "mine"  # type: ignore[arg-type]
+    assert (
+        vkc.random_room(7, objects=["drawer"], robot=Path("mine"), clutter=0.0).robot.name == "mine"
+    )  # type: ignore[arg-type]

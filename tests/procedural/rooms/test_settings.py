@@ -38,7 +38,11 @@ def test_wrong_settings(changes: dict[str, Any], field: str, expected: str) -> N
 
 @pytest.mark.parametrize(
     ("field", "name", "nearest"),
-    [("objects", "dor", "door"), ("objects", "random_ovn", "random_oven"), ("carried", "cub", "cup")],
+    [
+        ("objects", "dor", "door"),
+        ("objects", "random_ovn", "random_oven"),
+        ("carried", "cub", "cup"),
+    ],
 )
 def test_unknown_types(field: str, name: str, nearest: str) -> None:
     with pytest.raises(vkc.UnknownNameError) as found:

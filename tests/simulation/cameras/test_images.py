@@ -15,7 +15,16 @@ from vkc_pin.simulation.replay import Replay
 from vkc_pin.simulation.result import SimulationResult
 
 HEAD = Camera("head", "base", (0.0, 0.0, 1.5), (1.2, 0.0, 0.6), width=96, height=64)
-WRIST = Camera("wrist", "hand", (0.0, -0.12, -0.12), (0.0, 0.0, 0.1), up=(0.0, -1.0, 0.0), fov=75.0, width=48, height=48)
+WRIST = Camera(
+    "wrist",
+    "hand",
+    (0.0, -0.12, -0.12),
+    (0.0, 0.0, 0.1),
+    up=(0.0, -1.0, 0.0),
+    fov=75.0,
+    width=48,
+    height=48,
+)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +72,9 @@ def test_pixels_of_the_floor_are_on_the_floor(images: Images, executed: Simulati
         v, u = np.mgrid[: camera.height, : camera.width]
         focal = camera.height / 2.0 / np.tan(np.radians(camera.fov) / 2.0)
         x, y = (u + 0.5 - camera.width / 2.0) / focal, -(v + 0.5 - camera.height / 2.0) / focal
-        points = (np.stack([x, y, -np.ones_like(x)], axis=-1) * depth[..., None]) @ seat.rotation.T + seat.translation
+        points = (
+            np.stack([x, y, -np.ones_like(x)], axis=-1) * depth[..., None]
+        ) @ seat.rotation.T + seat.translation
         floor = what == images.segments.index("floor")
         assert floor.sum() >= least
         assert np.abs(points[floor][:, 2]).max() < 0.01
@@ -78,7 +89,9 @@ def test_as_bytes_and_back(images: Images) -> None:
         np.testing.assert_array_equal(again.pictures[name], pixels)
 
 
-def test_without_opengl_the_error_says_so(monkeypatch: pytest.MonkeyPatch, executed: SimulationResult) -> None:
+def test_without_opengl_the_error_says_so(
+    monkeypatch: pytest.MonkeyPatch, executed: SimulationResult
+) -> None:
     monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
     with pytest.raises(vkc.VkcError, match="EGL or OSMesa"):
         taken(executed, [HEAD], np.zeros(1))

@@ -17,7 +17,10 @@ def test_the_target_is_in_the_middle_and_up_is_up(
     position: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...]
 ) -> None:
     ahead = np.subtract(target, position)
-    assume(np.linalg.norm(np.cross(ahead, up)) > 1e-2 * max(1.0, np.linalg.norm(ahead) * np.linalg.norm(up)))
+    assume(
+        np.linalg.norm(np.cross(ahead, up))
+        > 1e-2 * max(1.0, np.linalg.norm(ahead) * np.linalg.norm(up))
+    )
     place = Camera("eye", BASE, position, target, up=up).placement  # type: ignore[arg-type]
     seen = place.inverse().act(np.array(target))
     np.testing.assert_allclose(seen, [0.0, 0.0, -np.linalg.norm(ahead)], atol=1e-9)

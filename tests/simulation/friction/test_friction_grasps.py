@@ -29,10 +29,13 @@ def test_a_drawer_is_pulled_by_friction() -> None:
     assert result.contacts == ()
     (grip,) = result.grips
     assert grip.slip < 0.005
-    # The hand pulls with what the drawer's mass takes, as a weld does; the robot waits while the fingers close.
+    # The hand pulls with what the drawer's mass takes, as a weld does; the robot waits while the
+    # fingers close.
     welded = plan.simulate().grips[0]
     assert 0.2 * welded.force < grip.force < 3.0 * welded.force
-    assert result.planned.times[-1] == pytest.approx(plan.trajectory.times[-1] + result.physics.grip_time)
+    assert result.planned.times[-1] == pytest.approx(
+        plan.trajectory.times[-1] + result.physics.grip_time
+    )
     assert any("slide towards each other" in note for note in result.notes)
 
 
@@ -50,7 +53,9 @@ def test_a_cup_is_carried_and_put_down() -> None:
     assert result.ok, result.report()
     (grip,) = result.grips
     assert grip.force > 0.25 * 9.81 * 0.9  # its weight at least
-    assert grip.slip < 0.005  # round bends as well, where MuJoCo's usual contacts let it creep; see `Builder.gripping`
+    assert (
+        grip.slip < 0.005
+    )  # round bends as well, where MuJoCo's usual contacts let it creep; see `Builder.gripping`
     assert max(miss.amount for miss in result.misses if miss.unit == "m") < 0.01
 
 
@@ -61,7 +66,8 @@ def test_a_gripper_that_is_described_closes_its_own_fingers(tmp_path: Path) -> N
     result = plan.simulate(grasp="friction")
     assert result.ok, result.report()
     assert not any("slide towards" in note for note in result.notes)
-    # Fingers close as far as the handle lets them: 20 mm apart, and deeper by what contacts give way.
+    # Fingers close as far as the handle lets them: 20 mm apart, and deeper by what contacts give
+    # way.
     world = result.rows[:, len(scene.start) : len(scene.start) + 2]
     assert world.min() == pytest.approx(0.01, abs=0.004)
 
@@ -73,5 +79,11 @@ def test_what_is_in_the_hand_at_the_start_stays_there() -> None:
     assert grip.broken is None, result.report()
     assert grip.force == pytest.approx(9.81 * 0.4, rel=0.3)
     assert result.misses[0].amount < 0.01
-    lost = simulate(scene, [vkc.Grasp("stick")], still(scene, 1.5), grasp="friction", physics=vkc.Physics(friction=1e-3))
+    lost = simulate(
+        scene,
+        [vkc.Grasp("stick")],
+        still(scene, 1.5),
+        grasp="friction",
+        physics=vkc.Physics(friction=1e-3),
+    )
     assert lost.grips[0].broken is not None or lost.misses[0].amount > 0.01

@@ -20,7 +20,10 @@ def test_a_motion_waits_where_it_is_told_to(make: object) -> None:
     longer = paused(motion, [at, at], 0.5)
     assert len(longer.times) == len(motion.times) + 1
     assert longer.times[-1] == pytest.approx(motion.times[-1] + 0.5)
-    before, after = np.linspace(0.0, time - 1e-6, 50), np.linspace(time + 1e-6, motion.times[-1], 50)
+    before, after = (
+        np.linspace(0.0, time - 1e-6, 50),
+        np.linspace(time + 1e-6, motion.times[-1], 50),
+    )
     for read in ("at", "velocity", "acceleration"):
         one, other = getattr(longer, read), getattr(motion, read)
         np.testing.assert_allclose(one(before), other(before), atol=1e-9)
@@ -29,7 +32,10 @@ def test_a_motion_waits_where_it_is_told_to(make: object) -> None:
     np.testing.assert_allclose(longer.at(inside), np.tile(motion.at(time), (20, 1)), atol=1e-12)
     assert np.abs(longer.velocity(inside)).max() < 1e-9
     # The pause is of the phase that begins there.
-    assert [(p.first, p.last) for p in longer.phases][:2] == [(0, at), (at, motion.phases[1].last + 1)]
+    assert [(p.first, p.last) for p in longer.phases][:2] == [
+        (0, at),
+        (at, motion.phases[1].last + 1),
+    ]
     assert [p.holds for p in longer.phases] == [p.holds for p in motion.phases]
 
 

@@ -15,7 +15,9 @@ def numbered(count: int) -> list[tuple[str, int]]:
     return [(str(k), k) for k in range(count)]
 
 
-@pytest.mark.parametrize("how", [{}, {"jobs": 2}, {"jobs": 2, "dask": True}], ids=["here", "processes", "dask"])
+@pytest.mark.parametrize(
+    "how", [{}, {"jobs": 2}, {"jobs": 2, "dask": True}], ids=["here", "processes", "dask"]
+)
 def test_every_task_once(how: dict[str, Any]) -> None:
     if how.get("dask"):
         pytest.importorskip("distributed")
@@ -56,7 +58,9 @@ def test_a_process_that_dies_loses_and_repeats_nothing(tmp_path: Path) -> None:
     assert (tmp_path / "2").exists()
 
 
-@pytest.mark.parametrize(("function", "limit"), [(fatal, None), (hanging, 1.0)], ids=["dies", "hangs"])
+@pytest.mark.parametrize(
+    ("function", "limit"), [(fatal, None), (hanging, 1.0)], ids=["dies", "hangs"]
+)
 def test_a_task_that_no_process_survives(function: Any, limit: float | None) -> None:
     pytest.importorskip("distributed")
     found = dict(results(function, numbered(4), jobs=2, dask=True, limit=limit))
@@ -79,7 +83,9 @@ def test_processes_that_keep_much_are_not_paused() -> None:
     dask = pytest.importorskip("dask")
     pytest.importorskip("distributed")
     with dask.config.set({"distributed.worker.memory.pause": 1e-4}):
-        assert dict(results(slow, numbered(6), jobs=2, dask=True)) == {str(k): 2 * k for k in range(6)}
+        assert dict(results(slow, numbered(6), jobs=2, dask=True)) == {
+            str(k): 2 * k for k in range(6)
+        }
 
 
 def test_many_processes_have_enough_memory_each() -> None:
@@ -100,7 +106,9 @@ def test_processes_have_one_thread_and_are_not_this_one() -> None:
 
 def test_a_scheduler_of_somebody_else() -> None:
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
         found = dict(results(double, numbered(5), scheduler=cluster.scheduler_address))
     assert found == {str(k): 2 * k for k in range(5)}
 
@@ -125,12 +133,16 @@ def test_a_scheduler_without_workers_is_told_of(monkeypatch: pytest.MonkeyPatch)
     distributed = pytest.importorskip("distributed")
     monkeypatch.setattr("vkc_pin.utils.parallel.engine._LOOKED", 0.2)
     told: list[str] = []
-    with distributed.LocalCluster(n_workers=0, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+    with distributed.LocalCluster(
+        n_workers=0, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
 
         def tell(line: str) -> None:
             told.append(line)
             if "no workers" in line:
                 cluster.scale(1)
 
-        assert dict(results(double, numbered(3), scheduler=cluster.scheduler_address, tell=tell)) == {"0": 0, "1": 2, "2": 4}
+        assert dict(
+            results(double, numbered(3), scheduler=cluster.scheduler_address, tell=tell)
+        ) == {"0": 0, "1": 2, "2": 4}
     assert sum("no workers" in line for line in told) == 1

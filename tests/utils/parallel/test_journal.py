@@ -16,7 +16,12 @@ def opened(path: Path, header: dict[str, dict[str, str]] = HEADER) -> Journal:
 
 
 def line(key: int) -> dict[str, object]:
-    return {"key": str(key), "records": [{"number": key}], "memory_mb": 100.0 + key, "seconds": 0.5 * key}
+    return {
+        "key": str(key),
+        "records": [{"number": key}],
+        "memory_mb": 100.0 + key,
+        "seconds": 0.5 * key,
+    }
 
 
 def test_what_was_written_is_there_again(tmp_path: Path) -> None:
@@ -40,7 +45,11 @@ def test_it_is_read_while_it_is_written(tmp_path: Path) -> None:
     journal._stream.write(b'{"key": "5", "rec')
     journal._stream.flush()
     kept = Kept.read(tmp_path / "j")
-    assert (kept.lines, kept.sessions, kept.memory) == (journal.lines, journal.sessions, journal.memory)
+    assert (kept.lines, kept.sessions, kept.memory) == (
+        journal.lines,
+        journal.sessions,
+        journal.memory,
+    )
     assert kept.seconds == 2.0 + 1.5  # of each session, the time until its last task
     assert (tmp_path / "j").read_bytes().endswith(b'"rec')
     with pytest.raises(InputError, match="cannot read this"):
@@ -98,9 +107,19 @@ def test_records_stay_in_the_file(tmp_path: Path) -> None:
         with pytest.raises(KeyError):
             lines["300"]
     del journal.lines["7"]
-    assert ("7" in journal.lines, len(journal.lines), list(journal.lines)[6:8]) == (False, 299, ["6", "8"])
-    journal.append({**line(7), "records": [{"number": 7}, {"number": 7, "again": True}]})  # what is run again counts
-    assert journal.lines["7"] == Kept.read(tmp_path / "j").lines["7"] == [{"number": 7}, {"number": 7, "again": True}]
+    assert ("7" in journal.lines, len(journal.lines), list(journal.lines)[6:8]) == (
+        False,
+        299,
+        ["6", "8"],
+    )
+    journal.append(
+        {**line(7), "records": [{"number": 7}, {"number": 7, "again": True}]}
+    )  # what is run again counts
+    assert (
+        journal.lines["7"]
+        == Kept.read(tmp_path / "j").lines["7"]
+        == [{"number": 7}, {"number": 7, "again": True}]
+    )
 
 
 def test_memories_and_the_time_of_the_writer(tmp_path: Path) -> None:
@@ -108,7 +127,14 @@ def test_memories_and_the_time_of_the_writer(tmp_path: Path) -> None:
     journal.append({"session": {"jobs": 2}})
     journal.append(line(0))  # of a version that did not say it
     for key, process in ((1, "a"), (2, "b"), (3, "a")):
-        journal.append({**line(key), "process": process, "resident_mb": 10.0 * key, "client_seconds": 0.01 * key})
+        journal.append(
+            {
+                **line(key),
+                "process": process,
+                "resident_mb": 10.0 * key,
+                "client_seconds": 0.01 * key,
+            }
+        )
     kept = Kept.read(tmp_path / "j")
     assert kept.memories == {"a": [10.0, 30.0], "b": [20.0]}
     assert kept.sessions == [{"jobs": 2, "trials": 4, "seconds": 1.5, "client_seconds": 0.03}]
@@ -132,7 +158,9 @@ def test_any_cut_leaves_whole_lines(tmp_path: Path) -> None:
 
 def test_of_another_recipe(tmp_path: Path) -> None:
     opened(tmp_path / "j")._stream.close()
-    with pytest.raises(InputError, match=r"the episodes in this folder were run otherwise.*recipe abc.*recipe xyz") as caught:
+    with pytest.raises(
+        InputError, match=r"the episodes in this folder were run otherwise.*recipe abc.*recipe xyz"
+    ) as caught:
         opened(tmp_path / "j", {**HEADER, "settings": {"recipe": "xyz"}})
     assert caught.value.field == "recipe"
 

@@ -11,7 +11,12 @@ import pytest
 from vkc_pin.options import Options
 from vkc_pin.validation.dynamics import torques as torques_module
 from vkc_pin.validation.dynamics.bounds import bounds
-from vkc_pin.validation.dynamics.rates import ACCEPTED_RATE_TOLERANCE, JUMP_TOLERANCE, REST_TOLERANCE, check_rates
+from vkc_pin.validation.dynamics.rates import (
+    ACCEPTED_RATE_TOLERANCE,
+    JUMP_TOLERANCE,
+    REST_TOLERANCE,
+    check_rates,
+)
 from vkc_pin.validation.dynamics.torques import TORQUE_TOLERANCE, Motors
 
 TIMES = np.array([0.0, 1.0, 3.0, 4.0])
@@ -19,10 +24,16 @@ KNOTS = np.array([0.0, 0.5, 1.0, 3.0, 4.0])
 
 
 def test_tolerances_are_those_of_the_pages() -> None:
-    assert (ACCEPTED_RATE_TOLERANCE, REST_TOLERANCE, JUMP_TOLERANCE, TORQUE_TOLERANCE) == (1e-3, 1e-6, 1e-3, 5e-3)
+    assert (ACCEPTED_RATE_TOLERANCE, REST_TOLERANCE, JUMP_TOLERANCE, TORQUE_TOLERANCE) == (
+        1e-3,
+        1e-6,
+        1e-3,
+        5e-3,
+    )
 
 
-# --- rates ------------------------------------------------------------------------------------------------------------
+# --- rates
+# ------------------------------------------------------------------------------------------------------------
 
 
 def column(count: int, **values: float) -> np.ndarray:
@@ -62,10 +73,15 @@ def told(
         velocities=lambda: velocity,
         accelerations=lambda: acceleration,
     )
-    samples: Any = SimpleNamespace(trajectory=motion, bounds=lambda name: (0.0, 0.0, *limits), unit=lambda name: "rad")
+    samples: Any = SimpleNamespace(
+        trajectory=motion, bounds=lambda name: (0.0, 0.0, *limits), unit=lambda name: "rad"
+    )
     rows = list(check_rates(samples, Options(jerk_time=jerk_time)))
     assert {one.subject for one in rows} <= {"joint"}
-    return [(one.constraint, one.waypoint, one.time, pytest.approx(one.amount), one.unit, one.detail) for one in rows]
+    return [
+        (one.constraint, one.waypoint, one.time, pytest.approx(one.amount), one.unit, one.detail)
+        for one in rows
+    ]
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -76,7 +92,15 @@ def test_without_a_curve_steps_have_velocities_and_waypoints_accelerations(sign:
     assert told(smooth=False, acceleration=column(4, at_3=sign * 5.0)) == [
         ("acceleration", 3, 4.0, 1.0, "rad/s²", "5.000 rad/s² is more than 4.000 rad/s²")
     ]
-    assert told(smooth=False, velocity=column(3, at_0=sign * 2.0), jerk=column(4, at_0=99.0), jerk_time=1.0) == []
+    assert (
+        told(
+            smooth=False,
+            velocity=column(3, at_0=sign * 2.0),
+            jerk=column(4, at_0=99.0),
+            jerk_time=1.0,
+        )
+        == []
+    )
 
 
 def test_along_a_curve_each_cubic_has_its_largest() -> None:
@@ -85,7 +109,9 @@ def test_along_a_curve_each_cubic_has_its_largest() -> None:
         assert told(velocity=column(4, **{f"at_{piece}": 2.5})) == [
             ("velocity", at, TIMES[at], 0.5, "rad/s", "2.500 rad/s is more than 2.000 rad/s")
         ]
-        assert [row[:2] for row in told(acceleration=column(4, **{f"at_{piece}": 5.0}))] == [("acceleration", at)]
+        assert [row[:2] for row in told(acceleration=column(4, **{f"at_{piece}": 5.0}))] == [
+            ("acceleration", at)
+        ]
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(1.0009, False), (1.0011, True)])
@@ -96,11 +122,15 @@ def test_a_thousandth_more_is_all_right(share: float, wrong: bool) -> None:
 
 
 @pytest.mark.parametrize("end", [0, 1])
-@pytest.mark.parametrize(("speed", "wrong"), [(0.9e-6, False), (-0.9e-6, False), (1.1e-6, True), (-1.1e-6, True)])
+@pytest.mark.parametrize(
+    ("speed", "wrong"), [(0.9e-6, False), (-0.9e-6, False), (1.1e-6, True), (-1.1e-6, True)]
+)
 def test_it_rests_at_both_ends(end: int, speed: float, wrong: bool) -> None:
     rests = (speed, 0.0) if end == 0 else (0.0, speed)
     found = told(rests=rests)
-    assert [row[:3] for row in found] == ([("velocity", (0, 3)[end], (0.0, 4.0)[end])] if wrong else [])
+    assert [row[:3] for row in found] == (
+        [("velocity", (0, 3)[end], (0.0, 4.0)[end])] if wrong else []
+    )
 
 
 def test_jerks_and_jumps_of_acceleration() -> None:
@@ -109,17 +139,27 @@ def test_jerks_and_jumps_of_acceleration() -> None:
         ("jerk", 1, 1.0, 2.0, "rad/s³", "10.000 rad/s³ is more than 8.000 rad/s³")
     ]
     assert told(jumps=column(5, at_4=0.5), jerk_time=0.5) == [
-        ("jerk", 3, 4.0, 0.496, "rad/s² at once", "0.500 rad/s² at once is more than 0.004 rad/s² at once")
+        (
+            "jerk",
+            3,
+            4.0,
+            0.496,
+            "rad/s² at once",
+            "0.500 rad/s² at once is more than 0.004 rad/s² at once",
+        )
     ]
     assert told(jumps=column(5, at_1=0.0039), jerk_time=0.5) == []
-    assert [row[:3] for row in told(jumps=column(5, at_1=0.0041), jerk_time=0.5)] == [("jerk", 0, 0.0)]
+    assert [row[:3] for row in told(jumps=column(5, at_1=0.0041), jerk_time=0.5)] == [
+        ("jerk", 0, 0.0)
+    ]
     wild = {"jerk": column(4, at_2=99.0), "jumps": column(5, at_2=99.0)}
     assert told(**wild) == []  # type: ignore[arg-type]
     assert told(**wild, jerk_time=0.5, limits=(2.0, np.inf)) == []  # type: ignore[arg-type]
     assert len(told(**wild, jerk_time=0.5)) == 2  # type: ignore[arg-type]
 
 
-# --- what bounds ------------------------------------------------------------------------------------------------------
+# --- what bounds
+# ------------------------------------------------------------------------------------------------------
 
 
 def bounding(
@@ -131,11 +171,15 @@ def bounding(
     jerk_time: float = 0.0,
 ) -> list[tuple[Any, ...]]:
     """Return what bounds a motion of two coordinates; rates of the first, as shares of the limits 2 and 4, on each cubic."""
-    rates = [np.column_stack([np.array(part) * limit, np.zeros(4)]) for part, limit in ((velocity, 2.0), (acceleration, 4.0))]
+    rates = [
+        np.column_stack([np.array(part) * limit, np.zeros(4)])
+        for part, limit in ((velocity, 2.0), (acceleration, 4.0))
+    ]
     jerks = np.column_stack([np.zeros(4) if jerk is None else np.array(jerk), np.zeros(4)])
     curve = SimpleNamespace(times=KNOTS, speeds=lambda: rates, jerks=lambda: (jerks, None))
     samples: Any = SimpleNamespace(
-        trajectory=SimpleNamespace(curve=curve, names=("one", "two")), bounds=lambda name: (0.0, 0.0, 2.0, 4.0)
+        trajectory=SimpleNamespace(curve=curve, names=("one", "two")),
+        bounds=lambda name: (0.0, 0.0, 2.0, 4.0),
     )
     moments: Any = SimpleNamespace(pieces=np.array([0, 1, 2, 3, 0, 1, 2, 3]))
     found = bounds(samples, moments, torques, jerk_time)
@@ -170,21 +214,39 @@ def test_where_nothing_moves_it_rests() -> None:
 def test_jerks_count_as_far_as_they_are_limited() -> None:
     jerk = [8.0, 0.0, 0.0, 0.0]
     assert bounding([0.5] * 4, [0.1] * 4, NONE, jerk=jerk)[0][1:3] == ("velocity", 1.0)
-    assert bounding([0.5] * 4, [0.1] * 4, NONE, jerk=jerk, jerk_time=0.2)[0][1:3] == ("velocity", 1.0)
-    assert bounding([0.5] * 4, [0.1] * 4, NONE, jerk=jerk, jerk_time=0.5)[1] == ("one", "jerk", 0.125, 0.0, 0.5)
+    assert bounding([0.5] * 4, [0.1] * 4, NONE, jerk=jerk, jerk_time=0.2)[0][1:3] == (
+        "velocity",
+        1.0,
+    )
+    assert bounding([0.5] * 4, [0.1] * 4, NONE, jerk=jerk, jerk_time=0.5)[1] == (
+        "one",
+        "jerk",
+        0.125,
+        0.0,
+        0.5,
+    )
 
 
-# --- torques ----------------------------------------------------------------------------------------------------------
+# --- torques
+# ----------------------------------------------------------------------------------------------------------
 
 
 def motors(
-    torques: Any, limits: Any = (10.0, 20.0), *, known: bool = True, weightless: tuple[str, ...] = (), smooth: bool = True
+    torques: Any,
+    limits: Any = (10.0, 20.0),
+    *,
+    known: bool = True,
+    weightless: tuple[str, ...] = (),
+    smooth: bool = True,
 ) -> Any:
     """Return motors that have these torques at four moments; a tenth of that at rest."""
     made = object.__new__(Motors)
     numbers = np.array(torques, float)
     made.trajectory = SimpleNamespace(  # type: ignore[assignment]
-        names=("slide", "turn"), times=TIMES, robot_size=2, curve=SimpleNamespace(times=KNOTS) if smooth else None
+        names=("slide", "turn"),
+        times=TIMES,
+        robot_size=2,
+        curve=SimpleNamespace(times=KNOTS) if smooth else None,
     )
     made.samples = SimpleNamespace(unit=lambda name: "m" if name == "slide" else "rad")  # type: ignore[assignment]
     made.moments = SimpleNamespace(  # type: ignore[assignment, misc]
@@ -202,15 +264,22 @@ def motors(
         assert phases.tolist() == [10 * made.waypoints[row] for row in rows]
         return np.asarray(numbers[rows] * (1.0 if full else 0.1))
 
-    efforts = SimpleNamespace(known=known, limits=np.array(limits), notes=("nothing is stated",) if not known else ())
-    made._torques = SimpleNamespace(efforts=efforts, weightless=weightless, at=at, phases_of=lambda at: 10 * at)  # type: ignore
+    efforts = SimpleNamespace(
+        known=known, limits=np.array(limits), notes=("nothing is stated",) if not known else ()
+    )
+    made._torques = SimpleNamespace(
+        efforts=efforts, weightless=weightless, at=at, phases_of=lambda at: 10 * at
+    )  # type: ignore
     return made
 
 
 def test_the_worst_of_each_joint_is_named() -> None:
     made = motors([[1.0, 2.0], [-15.0, 2.0], [12.0, 2.0], [1.0, -300.0]])
     assert made.waypoints.tolist() == [0, 0, 1, 2]
-    rows = [(one.constraint, one.subject, one.waypoint, one.time, one.amount, one.unit) for one in made.violations()]
+    rows = [
+        (one.constraint, one.subject, one.waypoint, one.time, one.amount, one.unit)
+        for one in made.violations()
+    ]
     assert rows == [("torque", "slide", 0, 0.6, 5.0, "N"), ("torque", "turn", 2, 3.5, 280.0, "N·m")]
     details = [one.detail for one in made.violations()]
     assert details == [
@@ -222,7 +291,10 @@ def test_the_worst_of_each_joint_is_named() -> None:
 
 @pytest.mark.parametrize(("share", "wrong"), [(1.0049, False), (1.0051, True)])
 def test_half_a_hundredth_more_is_all_right(share: float, wrong: bool) -> None:
-    assert bool(motors([[0.0, 0.0], [0.0, 0.0], [-10.0 * share, 0.0], [0.0, 0.0]]).violations()) == wrong
+    assert (
+        bool(motors([[0.0, 0.0], [0.0, 0.0], [-10.0 * share, 0.0], [0.0, 0.0]]).violations())
+        == wrong
+    )
 
 
 def test_what_nobody_knows_is_no_share() -> None:
@@ -232,7 +304,9 @@ def test_what_nobody_knows_is_no_share() -> None:
 
 
 def test_what_is_said_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torques_module, "bounds", lambda samples, moments, shares, jerk_time: ("bounds", jerk_time))
+    monkeypatch.setattr(
+        torques_module, "bounds", lambda samples, moments, shares, jerk_time: ("bounds", jerk_time)
+    )
     assert motors([[1.0, 2.0], [-5.0, 2.0], [3.0, 2.0], [1.0, 2.0]]).facts() == {
         "torque": 0.5,
         "bounds": ("bounds", 0.0),

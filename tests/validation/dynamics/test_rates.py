@@ -47,10 +47,14 @@ def played(share: float) -> Trajectory:
     rows[1, elbow] += share * 1.4 / 6.0 * 2.0**2  # 3s² − 2s³ in 2 s has 6 / 2² at its ends
     times = np.array([0.0, 2.0])
     curve = Curve(times, rows, np.zeros_like(rows))
-    return Trajectory(motion.names, times, rows, (PhaseSpan("move", 0, 1),), motion.robot_size, curve)
+    return Trajectory(
+        motion.names, times, rows, (PhaseSpan("move", 0, 1),), motion.robot_size, curve
+    )
 
 
-@pytest.mark.parametrize(("share", "kinds"), [(1.0005, set()), (1.0015, {"acceleration"}), (0.5, set())])
+@pytest.mark.parametrize(
+    ("share", "kinds"), [(1.0005, set()), (1.0015, {"acceleration"}), (0.5, set())]
+)
 def test_an_excess_of_a_thousandth_of_the_limit_is_all_right(share: float, kinds: set[str]) -> None:
     assert {kind for kind, _ in found(played(share))} == kinds
 
@@ -77,7 +81,11 @@ def test_accelerations_that_jump_are_named() -> None:
     violation = found(motion, jerk_time=1e-3)["jerk", "rad/s² at once"]
     assert violation.amount == pytest.approx(jumps.max() - 1.4e-3)
     at = motion.curve.times[int(np.argmax(jumps))]
-    assert motion.times[violation.waypoint] <= at <= motion.times[min(violation.waypoint + 1, len(motion.times) - 1)]
+    assert (
+        motion.times[violation.waypoint]
+        <= at
+        <= motion.times[min(violation.waypoint + 1, len(motion.times) - 1)]
+    )
 
 
 def test_what_is_gone_through_faster_is_too_fast_in_all_that_it_does() -> None:
@@ -85,7 +93,9 @@ def test_what_is_gone_through_faster_is_too_fast_in_all_that_it_does() -> None:
     assert motion.curve is not None
     quick = Curve(motion.curve.times / 3.0, motion.curve.positions, motion.curve.rates * 3.0)
     rows = check_rates(
-        Samples(drawer_plan().scene, dataclasses.replace(motion, times=motion.times / 3.0, curve=quick)),
+        Samples(
+            drawer_plan().scene, dataclasses.replace(motion, times=motion.times / 3.0, curve=quick)
+        ),
         vkc.Options(jerk_time=0.2),
     )
     assert {row.constraint for row in rows} == {"velocity", "acceleration", "jerk"}

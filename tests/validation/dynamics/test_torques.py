@@ -24,7 +24,9 @@ HEAVY = {"stiffness": 120.0, "springref": -2.0}
 
 def said(scene: vkc.Scene, trajectory: vkc.Trajectory | None = None) -> Report:
     plan = door_plan()
-    return validate(scene, plan.steps, plan.trajectory if trajectory is None else trajectory, plan.options)
+    return validate(
+        scene, plan.steps, plan.trajectory if trajectory is None else trajectory, plan.options
+    )
 
 
 def test_a_door_that_is_too_heavy_is_named_by_joint_torque_and_time(tmp_path: Path) -> None:
@@ -40,14 +42,19 @@ def test_a_door_that_is_too_heavy_is_named_by_joint_torque_and_time(tmp_path: Pa
     planted = dataclasses.replace(plan, scene=closer(**HEAVY), validation=report, status="rejected")
     verdict = judge(planted.save(tmp_path / "heavy.npz"))
     assert verdict.agrees
-    assert {(found.rule, found.subject) for found in verdict.found} == {(v.constraint, v.subject) for v in report.violations}
+    assert {(found.rule, found.subject) for found in verdict.found} == {
+        (v.constraint, v.subject) for v in report.violations
+    }
 
 
 def test_a_door_that_damps_is_too_fast_until_it_is_timed_for_it() -> None:
     scene, plan = closer(damping=400.0), door_plan()
     fast = said(scene)
     assert fast.violations
-    assert all(violation.constraint == "torque" and "if it were slow" in violation.detail for violation in fast.violations)
+    assert all(
+        violation.constraint == "torque" and "if it were slow" in violation.detail
+        for violation in fast.violations
+    )
     slower = retimed(scene, plan.trajectory)
     report = said(scene, slower)
     assert report.ok
@@ -63,7 +70,9 @@ def test_a_light_door_changes_nothing() -> None:
     report = said(light)
     assert report.ok
     assert 0.0 < report.torque < 0.5
-    np.testing.assert_array_equal(retimed(light, plan.trajectory).times, retimed(plan.scene, plan.trajectory).times)
+    np.testing.assert_array_equal(
+        retimed(light, plan.trajectory).times, retimed(plan.scene, plan.trajectory).times
+    )
 
 
 def test_a_payload_that_is_too_heavy_to_hold_is_found_while_nothing_moves() -> None:
@@ -80,7 +89,9 @@ def test_without_masses_torques_are_not_looked_at_and_that_is_said_once() -> Non
     model = pin.Model(scene.robot.model)
     for joint in range(1, model.njoints):
         model.inertias[joint] = pin.Inertia.Zero()
-    scene = dataclasses.replace(closer(**HEAVY), robot=dataclasses.replace(scene.robot, model=model))
+    scene = dataclasses.replace(
+        closer(**HEAVY), robot=dataclasses.replace(scene.robot, model=model)
+    )
     report = said(scene)
     assert report.ok
     assert report.torque == 0.0
@@ -104,7 +115,10 @@ def test_jerk_bounds_nothing_unless_it_is_limited() -> None:
 def test_reports_tell_of_torques_and_plans_keep_that(tmp_path: Path) -> None:
     plan = door_plan()
     assert plan.metrics["torque"] == plan.validation.torque > 0.0
-    assert f"torques     {100.0 * plan.validation.torque:.0f} % of what the motors have" in plan.report()
+    assert (
+        f"torques     {100.0 * plan.validation.torque:.0f} % of what the motors have"
+        in plan.report()
+    )
     assert f"bounded by  {plan.validation.bounds[0]}" in plan.report()
     assert plan.to_dict()["bounds"][0] == dataclasses.asdict(plan.validation.bounds[0])
     loaded = vkc.Plan.load(plan.save(tmp_path / "door.npz"))

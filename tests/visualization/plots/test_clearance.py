@@ -25,7 +25,13 @@ def curves(plan: Plan) -> dict[str, ClearanceCurve]:
 
 
 def test_kinds_of_pairs(curves: dict[str, ClearanceCurve]) -> None:
-    kinds = ["robot – itself", "robot – objects", "robot – obstacles", "objects – surroundings", "gripper – what it grasps"]
+    kinds = [
+        "robot – itself",
+        "robot – objects",
+        "robot – obstacles",
+        "objects – surroundings",
+        "gripper – what it grasps",
+    ]
     assert list(curves) == kinds
     for curve in curves.values():
         assert curve.distances.shape == TIMES.shape
@@ -48,9 +54,14 @@ def test_distance_to_obstacles_is_coals(curves: dict[str, ClearanceCurve], plan:
             for j in obstacles:
                 if labels[j] == "floor" and objects[i].parentJoint == 1:
                     continue
-                a, b = (coal.Transform3s(shapes.oMg[m].rotation, shapes.oMg[m].translation) for m in (i, j))
+                a, b = (
+                    coal.Transform3s(shapes.oMg[m].rotation, shapes.oMg[m].translation)
+                    for m in (i, j)
+                )
                 request, result = coal.DistanceRequest(), coal.DistanceResult()
-                distance = coal.distance(objects[i].geometry, a, objects[j].geometry, b, request, result)
+                distance = coal.distance(
+                    objects[i].geometry, a, objects[j].geometry, b, request, result
+                )
                 nearest = min(nearest, (distance, (labels[i], labels[j])))
         assert curve.distances[k] == pytest.approx(nearest[0], abs=1e-5)
         assert curve.pairs[k] == nearest[1]

@@ -72,7 +72,9 @@ def test_the_picture_is_small_and_not_empty(door_plan: Plan) -> None:
     assert min(pixels.shape[:2]) > 120
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20
     assert (np.abs(pixels - (224, 51, 89)).max(axis=2) < 40).sum() > 20, "the path of the tool"
-    assert (np.abs(picture(door_plan.scene._repr_html_()) - (224, 51, 89)).max(axis=2) < 40).sum() == 0
+    assert (
+        np.abs(picture(door_plan.scene._repr_html_()) - (224, 51, 89)).max(axis=2) < 40
+    ).sum() == 0
 
 
 def test_names_cannot_break_out(plan: Plan) -> None:
@@ -115,5 +117,12 @@ assert "image/png" in html
 assert [matplotlib.rcParams[name] for name in names] == before
 assert "matplotlib.pyplot" not in sys.modules
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr

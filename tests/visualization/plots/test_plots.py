@@ -30,7 +30,11 @@ def figures(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> dict[str, A
     folder = tmp_path_factory.mktemp("plots") / "new"
     figures = plotting.plot(plan, folder)
     assert isinstance(figures, dict)
-    assert sorted(file.name for file in folder.iterdir()) == ["clearance.png", "joints.png", "top_view.png"]
+    assert sorted(file.name for file in folder.iterdir()) == [
+        "clearance.png",
+        "joints.png",
+        "top_view.png",
+    ]
     return {"folder": folder, **figures}
 
 
@@ -52,7 +56,9 @@ def test_pictures_are_not_empty(figures: dict[str, Any], name: str) -> None:
 def test_positions_and_rates_by_group_with_limits(figures: dict[str, Any], plan: Plan) -> None:
     axes = figures["joints"].axes
     assert [a.get_ylabel().split(" [")[0] for a in axes] == [
-        f"{group} {what}" for group in ("base", "arm", "object") for what in ("position", "velocity", "acceleration")
+        f"{group} {what}"
+        for group in ("base", "arm", "object")
+        for what in ("position", "velocity", "acceleration")
     ]
     assert all("[" in a.get_ylabel() for a in axes)
     assert [a.get_xlabel() for a in axes[-3:]] == ["time [s]"] * 3
@@ -73,16 +79,22 @@ def test_positions_and_rates_by_group_with_limits(figures: dict[str, Any], plan:
 def test_rates_are_the_curve_s(plan: Plan) -> None:
     """Accelerations jump at knots: both values are drawn, and no peak is lost between samples."""
     motion = plan.trajectory
-    curve = Curve(motion.times, motion.positions, np.gradient(motion.positions, motion.times, axis=0))
+    curve = Curve(
+        motion.times, motion.positions, np.gradient(motion.positions, motion.times, axis=0)
+    )
     smooth = dataclasses.replace(plan, trajectory=dataclasses.replace(motion, curve=curve))
-    for number, (shown, peaks) in enumerate(zip(plotting.plot_joints(smooth).axes[1:3], curve.speeds(), strict=True), 1):
+    for number, (shown, peaks) in enumerate(
+        zip(plotting.plot_joints(smooth).axes[1:3], curve.speeds(), strict=True), 1
+    ):
         line = shown.get_lines()[2]
         read = (curve.velocity, curve.acceleration)[number - 1]
         assert np.allclose(line.get_ydata(), read(line.get_xdata())[:, 2])
         assert np.abs(line.get_ydata()).max() == pytest.approx(peaks[:, 2].max(), rel=1e-3)
 
 
-def test_a_quantity_that_only_some_have_leaves_the_others_free(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_quantity_that_only_some_have_leaves_the_others_free(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Torques, say: a column more, without axes where there is none."""
 
     def torques(plan: Judged, times: Floats) -> tuple[Floats, Floats]:
@@ -90,7 +102,9 @@ def test_a_quantity_that_only_some_have_leaves_the_others_free(plan: Plan, monke
         values[:, 3:9] = 20.0
         return times, values
 
-    made = Quantity("torque", {"m": "N", "rad": "N·m"}, torques, lambda plan, name: 150.0, lambda motion: {})
+    made = Quantity(
+        "torque", {"m": "N", "rad": "N·m"}, torques, lambda plan, name: 150.0, lambda motion: {}
+    )
     monkeypatch.setattr(joints, "QUANTITIES", (*joints.QUANTITIES, made))
     axes = plotting.plot_joints(plan).axes
     assert [a.get_ylabel() for a in axes[3::4] if a.get_visible()] == ["arm torque [N·m]"]
@@ -124,15 +138,24 @@ def test_top_view_shows_rooms_base_and_paths(figures: dict[str, Any], plan: Plan
     outlines = {patch.get_label(): patch.get_xy() for patch in axes.patches}
     for name, row in (("start", 0), ("end", -1)):
         corners = outlines[name]
-        assert np.allclose((corners.min(axis=0) + corners.max(axis=0)) / 2, plan.trajectory.positions[row, :2], atol=0.1)
+        assert np.allclose(
+            (corners.min(axis=0) + corners.max(axis=0)) / 2,
+            plan.trajectory.positions[row, :2],
+            atol=0.1,
+        )
         assert 0.9 < np.ptp(corners, axis=0).max() < 1.3, "the Husky is 0.99 m long and 0.67 m wide"
     boxes = [(patch.get_xy().min(axis=0), patch.get_xy().max(axis=0)) for patch in axes.patches]
     sofa = ([-2.4, -1.775], [-0.6, -1.125])
-    assert any(np.allclose(low, sofa[0], atol=1e-3) and np.allclose(high, sofa[1], atol=1e-3) for low, high in boxes)
+    assert any(
+        np.allclose(low, sofa[0], atol=1e-3) and np.allclose(high, sofa[1], atol=1e-3)
+        for low, high in boxes
+    )
     assert any(not patch.get_fill() for patch in axes.patches), "the lintel is above the robot"
 
 
-@pytest.mark.parametrize(("suffix", "head"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")])
+@pytest.mark.parametrize(
+    ("suffix", "head"), [(".png", b"\x89PNG"), (".svg", b"<?xml"), (".pdf", b"%PDF")]
+)
 def test_one_combined_figure(plan: Plan, tmp_path: Path, suffix: str, head: bytes) -> None:
     file = tmp_path / "deep" / f"all{suffix}"
     figure = plotting.plot(plan, file)
@@ -142,7 +165,9 @@ def test_one_combined_figure(plan: Plan, tmp_path: Path, suffix: str, head: byte
     assert [f.name for f in file.parent.iterdir()] == [file.name], "no temporary file stays"
 
 
-def test_without_a_path_nothing_is_written(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_path_nothing_is_written(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert len(plotting.plot(plan).axes) == 11  # type: ignore[union-attr]
     assert not list(tmp_path.iterdir())

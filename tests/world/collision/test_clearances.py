@@ -38,15 +38,32 @@ class Room:
         self.shapes = [coal.Box(*(2 * half)) for half in self.halves]
         for k in range(MOVING):
             joint = 1 + int(rng.integers(3))
-            self.geometry.addGeometryObject(pin.GeometryObject(f"s{k}", joint, 0, anywhere(rng, 0.2), self.shapes[k]))
-        self.joints = np.array([*(s.parentJoint for s in self.geometry.geometryObjects), *[0] * STANDING])
+            self.geometry.addGeometryObject(
+                pin.GeometryObject(f"s{k}", joint, 0, anywhere(rng, 0.2), self.shapes[k])
+            )
+        self.joints = np.array(
+            [*(s.parentJoint for s in self.geometry.geometryObjects), *[0] * STANDING]
+        )
         self.standing = [anywhere(rng, 0.6) for _ in range(STANDING)]
-        self.pairs = np.array([(a, b) for a, b in itertools.combinations(range(MOVING + STANDING), 2) if a < MOVING])
+        self.pairs = np.array(
+            [(a, b) for a, b in itertools.combinations(range(MOVING + STANDING), 2) if a < MOVING]
+        )
         self.usual = rng.choice([0.0, 0.02, 0.1], len(self.pairs))
-        self.q = np.array([pin.integrate(self.model, pin.neutral(self.model), rng.normal(size=5)) for _ in range(STATES)])
+        self.q = np.array(
+            [
+                pin.integrate(self.model, pin.neutral(self.model), rng.normal(size=5))
+                for _ in range(STATES)
+            ]
+        )
         self.z, self.waypoints = rng.normal(size=(STATES, 2)), rng.integers(0, WAYPOINTS, STATES)
         eased = {int(pair): [(1, 3, -0.05)] for pair in rng.permutation(len(self.pairs))[:8]}
-        away = Place(rng.permutation(len(self.pairs))[:20], -np.inf, np.array([1]), np.zeros(1), np.full(1, 9.0))
+        away = Place(
+            rng.permutation(len(self.pairs))[:20],
+            -np.inf,
+            np.array([1]),
+            np.zeros(1),
+            np.full(1, 9.0),
+        )
         self.margins = Margins(self.usual, eased, [away])
 
     def clearances(self) -> Clearances:
@@ -57,35 +74,60 @@ class Room:
         boxes = Boxes(self.joints, rotations, centers, self.halves, self.pairs)
         return Clearances(ShapePlacements(self.model, self.geometry), boxes, shapes, self.margins)
 
-    def all_pairs(self, reach: float, standing: bool) -> list[list[tuple[float, float, int, float]]]:
+    def all_pairs(
+        self, reach: float, standing: bool
+    ) -> list[list[tuple[float, float, int, float]]]:
         """Return, for each state, distance − margin, distance, number and margin of every pair that counts, sorted."""
         data, placed, found = self.model.createData(), pin.GeometryData(self.geometry), []
         every = np.arange(len(self.pairs))
         for state, q in enumerate(self.q):
             pin.updateGeometryPlacements(self.model, data, self.geometry, placed, q)
             where, rows = [*placed.oMg, *self.standing], []
-            margins = self.margins.at(every, np.full(len(every), self.waypoints[state]), self.z, np.full(len(every), state))
+            margins = self.margins.at(
+                every,
+                np.full(len(every), self.waypoints[state]),
+                self.z,
+                np.full(len(every), state),
+            )
             for k, (a, b) in enumerate(self.pairs.tolist()):
                 request, result = coal.DistanceRequest(), coal.DistanceResult()
                 ends = [coal.Transform3s(where[i].rotation, where[i].translation) for i in (a, b)]
-                distance = coal.distance(self.shapes[a], ends[0], self.shapes[b], ends[1], request, result)
+                distance = coal.distance(
+                    self.shapes[a], ends[0], self.shapes[b], ends[1], request, result
+                )
                 if distance < reach and margins[k] > -np.inf and (standing or b < MOVING):
-                    rows.append((float(distance - margins[k]), float(distance), k, float(margins[k])))
+                    rows.append(
+                        (float(distance - margins[k]), float(distance), k, float(margins[k]))
+                    )
             found.append(sorted(rows))
         return found
 
 
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([None, 0, 1, 4]), st.sampled_from([0.0, 0.1, 2.0]), st.booleans())
-def test_those_that_fall_shortest_of_their_margins(seed: int, most: int | None, reach: float, standing: bool) -> None:
+def test_those_that_fall_shortest_of_their_margins(
+    seed: int, most: int | None, reach: float, standing: bool
+) -> None:
     room = Room(seed)
-    expected = [(state, *row) for state, rows in enumerate(room.all_pairs(reach, standing)) for row in rows[:most]]
+    expected = [
+        (state, *row)
+        for state, rows in enumerate(room.all_pairs(reach, standing))
+        for row in rows[:most]
+    ]
     with pytest.MonkeyPatch.context() as patch:
         for worth in (1, 100):  # four threads, and one
             patch.setattr(looking, "_WORTH", worth)
-            found = room.clearances().nearest(room.q, room.z, room.waypoints, reach=reach, most=most, standing=standing)
+            found = room.clearances().nearest(
+                room.q, room.z, room.waypoints, reach=reach, most=most, standing=standing
+            )
             short = found.distance - found.margin
-            mine = zip(*(part.tolist() for part in (found.row, short, found.distance, found.pair, found.margin)), strict=True)
+            mine = zip(
+                *(
+                    part.tolist()
+                    for part in (found.row, short, found.distance, found.pair, found.margin)
+                ),
+                strict=True,
+            )
             assert [*mine] == expected
             along = np.einsum("ci,ci->c", found.normal, found.second - found.first)
             np.testing.assert_allclose(along, found.distance, atol=1e-6)
@@ -97,11 +139,21 @@ def test_the_first_in_which_something_is_hit(seed: int, reach: float, allowed: f
     room = Room(seed)
     room.waypoints[:] = waypoint = int(room.waypoints[0])
     rows, order = room.all_pairs(reach, standing=True), room.rng.permutation(STATES)
-    hit = [any(margin - distance > allowed for _, distance, _, margin in rows[state]) for state in order]
+    hit = [
+        any(margin - distance > allowed for _, distance, _, margin in rows[state])
+        for state in order
+    ]
     expected = hit.index(True) if True in hit else STATES
-    mine = room.clearances().first_blocked(room.q[order], room.z[order], waypoint, reach=reach, allowed=allowed)
+    mine = room.clearances().first_blocked(
+        room.q[order], room.z[order], waypoint, reach=reach, allowed=allowed
+    )
     assert mine == expected
-    assert room.clearances().first_blocked(room.q[:0], room.z[:0], waypoint, reach=reach, allowed=allowed) == 0
+    assert (
+        room.clearances().first_blocked(
+            room.q[:0], room.z[:0], waypoint, reach=reach, allowed=allowed
+        )
+        == 0
+    )
 
 
 def test_what_stands_elsewhere() -> None:
@@ -112,11 +164,14 @@ def test_what_stands_elsewhere() -> None:
     after = before.placed(boxes, {MOVING + 2: place})
     room.standing[2] = place
     for mine, anew in zip(
-        *(c.nearest(room.q, room.z, room.waypoints, reach=0.3) for c in (after, room.clearances())), strict=True
+        *(c.nearest(room.q, room.z, room.waypoints, reach=0.3) for c in (after, room.clearances())),
+        strict=True,
     ):
         np.testing.assert_array_equal(mine, anew)
     unmoved = Room(4).clearances().nearest(room.q, room.z, room.waypoints, reach=0.3)
-    np.testing.assert_array_equal(before.nearest(room.q, room.z, room.waypoints, reach=0.3).distance, unmoved.distance)
+    np.testing.assert_array_equal(
+        before.nearest(room.q, room.z, room.waypoints, reach=0.3).distance, unmoved.distance
+    )
 
 
 def test_what_does_not_belong_together_is_refused() -> None:
@@ -132,4 +187,6 @@ def test_what_does_not_belong_together_is_refused() -> None:
             mine.nearest(q, z, waypoints, reach=0.1)
     fewer = Margins(room.usual[:-1], {})
     with pytest.raises(ValueError, match="belong"):
-        Clearances(mine.placements, mine.boxes, mine.shapes, fewer).nearest(room.q, room.z, room.waypoints, reach=0.1)
+        Clearances(mine.placements, mine.boxes, mine.shapes, fewer).nearest(
+            room.q, room.z, room.waypoints, reach=0.1
+        )

@@ -18,7 +18,10 @@ def test_the_least_that_holds_there(seed: int) -> None:
     rng = np.random.default_rng(seed)
     usual = rng.uniform(0.0, 0.05, PAIRS)
     eased = {
-        int(pair): [(int(first), int(first + rng.integers(4)), float(rng.normal())) for first in rng.integers(0, 8, 2)]
+        int(pair): [
+            (int(first), int(first + rng.integers(4)), float(rng.normal()))
+            for first in rng.integers(0, 8, 2)
+        ]
         for pair in rng.permutation(PAIRS)[:4]
     }
     places = []
@@ -31,21 +34,29 @@ def test_the_least_that_holds_there(seed: int) -> None:
     z, rows = rng.normal(size=(6, COORDINATES)), rng.integers(0, 6, len(pairs))
     expected = []
     for pair, waypoint, row in zip(pairs.tolist(), waypoints.tolist(), rows.tolist(), strict=True):
-        some = [usual[pair], *(margin for first, last, margin in eased.get(pair, ()) if first <= waypoint <= last)]
+        some = [
+            usual[pair],
+            *(margin for first, last, margin in eased.get(pair, ()) if first <= waypoint <= last),
+        ]
         for place in places:
             here = z[row, place.columns]
             if pair in place.pairs and np.all((place.lower <= here) & (here <= place.upper)):
                 some.append(place.margin)
         expected.append(min(some))
     assert len(set(expected)) > PAIRS, "something changes"
-    np.testing.assert_array_equal(Margins(usual, eased, places).at(pairs, waypoints, z, rows), expected)
+    np.testing.assert_array_equal(
+        Margins(usual, eased, places).at(pairs, waypoints, z, rows), expected
+    )
 
 
 def test_wrong_numbers_are_refused() -> None:
     usual, one, z = np.zeros(3), np.zeros(1, int), np.zeros((1, 2))
     with pytest.raises(IndexError, match="pair"):
         Margins(usual, {3: [(0, 1, 0.0)]})
-    for place in (Place(one + 3, 0.0, one, z[0, :1], z[0, :1]), Place(one, 0.0, one - 1, z[0, :1], z[0, :1])):
+    for place in (
+        Place(one + 3, 0.0, one, z[0, :1], z[0, :1]),
+        Place(one, 0.0, one - 1, z[0, :1], z[0, :1]),
+    ):
         with pytest.raises(IndexError):
             Margins(usual, {}, [place])
     with pytest.raises(ValueError, match="limits"):

@@ -16,7 +16,9 @@ from vkc_pin.world.trajectory.world_model import World
 def test_numbers_of_a_placement() -> None:
     rotation = pin.exp3(np.array([0.1, 0.2, 0.3]))
     (numbers,) = columns_of([pin.SE3(rotation, np.array([4.0, 5.0, 6.0]))])
-    np.testing.assert_array_equal(numbers, [*rotation[:, 0], *rotation[:, 1], *rotation[:, 2], 4.0, 5.0, 6.0])
+    np.testing.assert_array_equal(
+        numbers, [*rotation[:, 0], *rotation[:, 1], *rotation[:, 2], 4.0, 5.0, 6.0]
+    )
     assert columns_of([]).shape == (0, 12)
 
 
@@ -37,13 +39,19 @@ def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
         for numbers, placement in zip(row, placed.oMg, strict=True):
             np.testing.assert_array_equal(numbers[:9].reshape(3, 3).T, placement.rotation)
             np.testing.assert_array_equal(numbers[9:], placement.translation)
-    np.testing.assert_array_equal(mine.at(q[:1]), found[:1])  # what was handed out before has not changed
+    np.testing.assert_array_equal(
+        mine.at(q[:1]), found[:1]
+    )  # what was handed out before has not changed
 
 
 def test_shapes_are_where_pinocchio_says() -> None:
     world = World(door_scene())
     limits = (np.full(world.coordinates.size, limit) for limit in (-1.0, 1.0))
-    check(world.model, world.bodies, world.coordinates.q(random_configurations(*limits, 5, np.random.default_rng(0))))
+    check(
+        world.model,
+        world.bodies,
+        world.coordinates.q(random_configurations(*limits, 5, np.random.default_rng(0))),
+    )
 
 
 JOINTS = [
@@ -62,9 +70,15 @@ def test_joints_of_all_types_carry_shapes() -> None:
         parent = model.addJoint(parent, joint(), pin.SE3.Random(), f"j{k}")
         shape = pin.GeometryObject(f"s{k}", parent, 0, pin.SE3.Random(), coal.Sphere(0.1))
         geometry.addGeometryObject(shape)
-    geometry.addGeometryObject(pin.GeometryObject("stands", 0, 0, pin.SE3.Random(), coal.Sphere(0.1)))
+    geometry.addGeometryObject(
+        pin.GeometryObject("stands", 0, 0, pin.SE3.Random(), coal.Sphere(0.1))
+    )
     neutral = pin.neutral(model)
-    check(model, geometry, np.array([pin.integrate(model, neutral, rng.normal(size=model.nv)) for _ in range(4)]))
+    check(
+        model,
+        geometry,
+        np.array([pin.integrate(model, neutral, rng.normal(size=model.nv)) for _ in range(4)]),
+    )
 
 
 def test_configurations_of_another_size_are_refused() -> None:
@@ -76,5 +90,9 @@ def test_configurations_of_another_size_are_refused() -> None:
 def test_no_states_and_no_shapes() -> None:
     world = World(door_scene())
     q = world.coordinates.q(np.zeros((2, world.coordinates.size)))
-    assert ShapePlacements(world.model, world.bodies).at(q[:0]).shape == (0, len(world.bodies.geometryObjects), 12)
+    assert ShapePlacements(world.model, world.bodies).at(q[:0]).shape == (
+        0,
+        len(world.bodies.geometryObjects),
+        12,
+    )
     assert ShapePlacements(world.model, pin.GeometryModel()).at(q).shape == (2, 0, 12)

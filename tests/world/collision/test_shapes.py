@@ -51,7 +51,9 @@ def solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
         "Cone": lambda: coal.Cone(a, b),
         "Ellipsoid": lambda: coal.Ellipsoid(a, b, c),
         "Convex": lambda: convex_hull(rng.normal(scale=0.2, size=(12, 3))),
-        "large Convex": lambda: convex_hull(rng.normal(scale=0.2, size=(400, 3))),  # whose corners coal climbs along
+        "large Convex": lambda: convex_hull(
+            rng.normal(scale=0.2, size=(400, 3))
+        ),  # whose corners coal climbs along
         "TriangleP": lambda: coal.TriangleP(*corners),
         "Halfspace": lambda: coal.Halfspace(normal(rng), a),
         "Plane": lambda: coal.Plane(normal(rng), a),
@@ -60,19 +62,40 @@ def solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
     return made[kind]()
 
 
-CONVEX = ("Box", "Sphere", "Capsule", "Cylinder", "Cone", "Ellipsoid", "Convex", "large Convex", "TriangleP")
+CONVEX = (
+    "Box",
+    "Sphere",
+    "Capsule",
+    "Cylinder",
+    "Cone",
+    "Ellipsoid",
+    "Convex",
+    "large Convex",
+    "TriangleP",
+)
 KINDS = (*CONVEX, "Halfspace", "Plane", "BVHModelOBBRSS")
 
 
 def by_coal(
-    first: coal.CollisionGeometry, here: pin.SE3, second: coal.CollisionGeometry, there: pin.SE3, tolerance: float = 1e-6
+    first: coal.CollisionGeometry,
+    here: pin.SE3,
+    second: coal.CollisionGeometry,
+    there: pin.SE3,
+    tolerance: float = 1e-6,
 ) -> np.ndarray:
     """Return distance, normal and witness points, as coal's bindings give them when asked for nothing else."""
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.gjk_tolerance = tolerance
     one, other = (coal.Transform3s(place.rotation, place.translation) for place in (here, there))
     coal.distance(first, one, second, other, request, result)
-    return np.array([result.min_distance, *result.normal, *result.getNearestPoint1(), *result.getNearestPoint2()])
+    return np.array(
+        [
+            result.min_distance,
+            *result.normal,
+            *result.getNearestPoint1(),
+            *result.getNearestPoint2(),
+        ]
+    )
 
 
 def table(found: Witnesses) -> np.ndarray:
@@ -80,8 +103,16 @@ def table(found: Witnesses) -> np.ndarray:
 
 
 @settings(max_examples=400, deadline=None)
-@given(st.sampled_from(CONVEX), st.sampled_from(KINDS), SEEDS, st.sampled_from([0.0, 0.0, 0.03]), st.sampled_from([1e-6, 1e-8]))
-def test_distances_are_those_of_the_bindings(one: str, other: str, seed: int, swept: float, tolerance: float) -> None:
+@given(
+    st.sampled_from(CONVEX),
+    st.sampled_from(KINDS),
+    SEEDS,
+    st.sampled_from([0.0, 0.0, 0.03]),
+    st.sampled_from([1e-6, 1e-8]),
+)
+def test_distances_are_those_of_the_bindings(
+    one: str, other: str, seed: int, swept: float, tolerance: float
+) -> None:
     rng = np.random.default_rng(seed)
     first, second = solid(one, rng), solid(other, rng)
     if one != "TriangleP":
@@ -91,7 +122,10 @@ def test_distances_are_those_of_the_bindings(one: str, other: str, seed: int, sw
     both = Shapes([first, second], tolerance=tolerance)
     try:
         expected = by_coal(first, here, second, there, tolerance)
-    except (RuntimeError, ValueError) as error:  # triangles and boxes, meshes and what has a radius swept around it
+    except (
+        RuntimeError,
+        ValueError,
+    ) as error:  # triangles and boxes, meshes and what has a radius swept around it
         with pytest.raises(type(error), match="not yet supported"):
             both.distances(where, *pair)
         return
@@ -105,9 +139,13 @@ def test_meshes() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         first, second, here, there = mesh(rng), mesh(rng), anywhere(rng), anywhere(rng)
-        both = Shapes([first, second]).witnesses(columns_of([here, there])[None], np.zeros(1, int), np.array([[0, 1]]))
+        both = Shapes([first, second]).witnesses(
+            columns_of([here, there])[None], np.zeros(1, int), np.array([[0, 1]])
+        )
         told = [0, *range(4, 10)]  # coal writes no normal for two meshes
-        np.testing.assert_array_equal(table(both)[0, told], by_coal(first, here, second, there)[told])
+        np.testing.assert_array_equal(
+            table(both)[0, told], by_coal(first, here, second, there)[told]
+        )
 
 
 class Room:
@@ -115,11 +153,16 @@ class Room:
 
     def __init__(self, seed: int, states: int = 20) -> None:
         rng = np.random.default_rng(seed)
-        self.solids = [solid(kind, rng) for kind in ("Box", "Convex", "Cylinder", "Capsule", "Box", "Sphere", "large Convex")]
+        self.solids = [
+            solid(kind, rng)
+            for kind in ("Box", "Convex", "Cylinder", "Capsule", "Box", "Sphere", "large Convex")
+        ]
         self.standing = [anywhere(rng) for _ in self.solids[MOVING:]]
         self.places = [[anywhere(rng) for _ in range(MOVING)] for _ in range(states)]
         self.where = np.array([columns_of(row) for row in self.places])
-        pairs = [pair for pair in itertools.combinations(range(len(self.solids)), 2) if pair[0] < MOVING]
+        pairs = [
+            pair for pair in itertools.combinations(range(len(self.solids)), 2) if pair[0] < MOVING
+        ]
         self.states, which = np.divmod(rng.permutation(states * len(pairs)), len(pairs))
         self.pairs = np.array(pairs)[which]
 
@@ -144,17 +187,27 @@ def test_many_pairs_in_any_order_and_by_any_number_of_threads(seed: int) -> None
         patch.setattr(asking, "_WORTH", 1)
         for threads in (1, 2, 5):
             shapes = room.shapes(threads)
-            np.testing.assert_array_equal(table(shapes.witnesses(room.where, room.states, room.pairs)), expected)
-            np.testing.assert_array_equal(shapes.distances(room.where, room.states, room.pairs), expected[:, 0])
+            np.testing.assert_array_equal(
+                table(shapes.witnesses(room.where, room.states, room.pairs)), expected
+            )
+            np.testing.assert_array_equal(
+                shapes.distances(room.where, room.states, room.pairs), expected[:, 0]
+            )
 
 
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([None, 0, 1, 3]), st.sampled_from([0.05, 0.3, np.inf]), st.booleans())
-def test_those_that_fall_shortest_of_their_margins(seed: int, most: int | None, reach: float, bounded: bool) -> None:
+def test_those_that_fall_shortest_of_their_margins(
+    seed: int, most: int | None, reach: float, bounded: bool
+) -> None:
     """With lower bounds that tell nothing, or as much as bounds can."""
     room, rng = Room(seed, states=8), np.random.default_rng(seed)
     distances, margins = room.expected()[:, 0], rng.choice([0.0, 0.02, 0.1], len(room.pairs))
-    bounds = distances - margins - rng.uniform(0.0, 0.2, len(margins)) if bounded else np.full(len(margins), -np.inf)
+    bounds = (
+        distances - margins - rng.uniform(0.0, 0.2, len(margins))
+        if bounded
+        else np.full(len(margins), -np.inf)
+    )
     order, numbers = np.lexsort((bounds, room.states)), rng.permutation(len(room.pairs))
     edges = np.searchsorted(room.states[order], np.arange(9))
     wanted = []
@@ -182,13 +235,20 @@ def test_those_that_fall_shortest_of_their_margins(seed: int, most: int | None, 
 
 def test_of_equal_ones_the_lower_number_comes_first() -> None:
     balls = [coal.Sphere(0.1)] * 4
-    where = columns_of([pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0, -1.0, 1.0)])[None]
+    where = columns_of(
+        [pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0, -1.0, 1.0)]
+    )[None]
     pairs = np.array([[0, 1], [0, 2], [0, 3]])
     for numbers, expected in (([3, 2, 1], [2, 0]), ([1, 2, 3], [0, 2])):
         pick = np.array([0, 2])
         known = {"margins": np.zeros(2), "bounds": np.zeros(2), "reach": np.inf, "rounding": 0.0}
         chosen, _ = Shapes(balls).shortest(
-            where, np.array([0, 2]), pairs[pick], numbers=np.array(numbers)[pick], most=None, **known
+            where,
+            np.array([0, 2]),
+            pairs[pick],
+            numbers=np.array(numbers)[pick],
+            most=None,
+            **known,
         )
         assert pick[chosen].tolist() == expected
 
@@ -198,9 +258,19 @@ def test_only_what_may_be_among_the_shortest_is_asked_for() -> None:
     balls = [coal.Sphere(0.1)] * 3
     where = columns_of([pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0, 0.5)])[None]
     pairs, bounds = np.array([[0, 1], [0, 2]]), np.array([0.5, 5.0])
-    known = {"numbers": np.arange(2), "margins": np.zeros(2), "bounds": bounds, "reach": np.inf, "rounding": 1e-6}
-    assert Shapes(balls).shortest(where, np.array([0, 2]), pairs, most=1, **known)[0].tolist() == [0]
-    assert Shapes(balls).shortest(where, np.array([0, 2]), pairs, most=None, **known)[0].tolist() == [1, 0]
+    known = {
+        "numbers": np.arange(2),
+        "margins": np.zeros(2),
+        "bounds": bounds,
+        "reach": np.inf,
+        "rounding": 1e-6,
+    }
+    assert Shapes(balls).shortest(where, np.array([0, 2]), pairs, most=1, **known)[0].tolist() == [
+        0
+    ]
+    assert Shapes(balls).shortest(where, np.array([0, 2]), pairs, most=None, **known)[
+        0
+    ].tolist() == [1, 0]
 
 
 def test_what_stands_elsewhere() -> None:
@@ -208,8 +278,12 @@ def test_what_stands_elsewhere() -> None:
     shapes = room.shapes()
     other = shapes.placed({MOVING + 1: place})
     standing = [room.standing[0], place, *room.standing[2:]]
-    np.testing.assert_array_equal(table(other.witnesses(room.where, room.states, room.pairs)), room.expected(standing))
-    np.testing.assert_array_equal(table(shapes.witnesses(room.where, room.states, room.pairs)), room.expected())
+    np.testing.assert_array_equal(
+        table(other.witnesses(room.where, room.states, room.pairs)), room.expected(standing)
+    )
+    np.testing.assert_array_equal(
+        table(shapes.witnesses(room.where, room.states, room.pairs)), room.expected()
+    )
     with pytest.raises(IndexError, match="stands"):
         shapes.placed({0: place})
 
@@ -227,7 +301,9 @@ def test_who_is_first_makes_no_difference_but_of_sign(one: str, other: str, seed
 
 
 def test_a_million_pairs() -> None:
-    balls = Shapes([coal.Sphere(0.1), coal.Sphere(0.2)], [pin.SE3(np.eye(3), np.array([0.0, 0.0, 3.0]))])
+    balls = Shapes(
+        [coal.Sphere(0.1), coal.Sphere(0.2)], [pin.SE3(np.eye(3), np.array([0.0, 0.0, 3.0]))]
+    )
     where = np.tile(columns_of([pin.SE3.Identity()]), (1000, 1, 1))
     where[:, 0, 11] = np.linspace(-1.0, 1.0, 1000)
     states = np.random.default_rng(0).integers(0, 1000, 1_000_000)
@@ -259,14 +335,26 @@ def test_nothing_asked_nothing_found() -> None:
 def test_wrong_numbers_are_refused() -> None:
     room = Room(0)
     shapes, one = room.shapes(), np.zeros(1, int)
-    for states, pairs in ((one, [[0, 7]]), (one, [[-1, 0]]), (one + 20, [[0, 1]]), (one - 1, [[0, 1]])):
+    for states, pairs in (
+        (one, [[0, 7]]),
+        (one, [[-1, 0]]),
+        (one + 20, [[0, 1]]),
+        (one - 1, [[0, 1]]),
+    ):
         with pytest.raises(IndexError):
             shapes.distances(room.where, states, np.array(pairs))
     with pytest.raises(ValueError, match="shape"):
         shapes.distances(room.where[:, :2], one, np.array([[0, 1]]))
     with pytest.raises(ValueError, match="states"):
         shapes.distances(room.where, np.zeros(2, int), np.array([[0, 1]]))
-    known = {"numbers": one, "margins": np.zeros(1), "bounds": np.zeros(1), "reach": 1.0, "most": 1, "rounding": 0.0}
+    known = {
+        "numbers": one,
+        "margins": np.zeros(1),
+        "bounds": np.zeros(1),
+        "reach": 1.0,
+        "most": 1,
+        "rounding": 0.0,
+    }
     for edges in ([0, 2, 1], [0, 1], [1] * 21, [0] * 21):
         with pytest.raises(ValueError, match="edges"):
             shapes.shortest(room.where, np.array(edges), np.array([[0, 1]]), **known)

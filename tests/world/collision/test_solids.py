@@ -27,7 +27,9 @@ def hull(seed: int) -> coal.Convex:
 
 
 def distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> float:
-    return float(Shapes([first, second]).distances(NOWHERE, np.zeros(1, int), np.array([[0, 1]]))[0])
+    return float(
+        Shapes([first, second]).distances(NOWHERE, np.zeros(1, int), np.array([[0, 1]]))[0]
+    )
 
 
 def test_what_is_not_known_is_refused_by_name() -> None:
@@ -88,7 +90,10 @@ def test_faces_of_no_points_are_refused(wrong: np.ndarray) -> None:
 def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was compiled against another coal or Pinocchio, or is not there."""
     solids.compiled.cache_clear()
-    for theirs, mine, said in (("2.9.1", pin.__version__, r"against coal 2\.9\.1"), (coal.__version__, "3.9.0", r"pin 3\.9\.0")):
+    for theirs, mine, said in (
+        ("2.9.1", pin.__version__, r"against coal 2\.9\.1"),
+        (coal.__version__, "3.9.0", r"pin 3\.9\.0"),
+    ):
         with monkeypatch.context() as patch:
             built = types.SimpleNamespace(COAL_VERSION=theirs, PINOCCHIO_VERSION=mine)
             patch.setattr(solids, "compiled_module", lambda _, built=built: built)
@@ -119,7 +124,13 @@ print(float(shapes.distances(where, np.zeros(1, int), np.array([[0, 1]]))[0]).he
 def test_boxes_are_as_large_as_they_are_whatever_is_asked_first() -> None:
     """Along an axis, as the first question of a process, coal would make them larger by 1e-10 from then on."""
     answers = {
-        subprocess.run([sys.executable, "-c", before + _FIRST], capture_output=True, text=True, check=True, timeout=60).stdout
+        subprocess.run(
+            [sys.executable, "-c", before + _FIRST],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        ).stdout
         for before in ("", "import vkc_pin as vkc; vkc.load_scene('door')\n")
     }
     assert len(answers) == 1
@@ -129,5 +140,7 @@ def test_boxes_are_as_large_as_they_are_whatever_is_asked_first() -> None:
 def test_nothing_is_said_of_what_lives_until_the_process_ends() -> None:
     """Caches and globals keep shapes."""
     code = "import builtins, coal; from vkc_pin.world.collision.shapes import Shapes; builtins.kept = Shapes([coal.Sphere(0.1)])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
     assert done.stdout + done.stderr == ""

@@ -18,8 +18,15 @@ def gap(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> float:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.booleans(), st.sampled_from([0.05, 0.5, np.inf]))
-def test_all_that_may_come_near_and_nothing_else(seed: int, states: int, moving: bool, limit: float) -> None:
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 40),
+    st.booleans(),
+    st.sampled_from([0.05, 0.5, np.inf]),
+)
+def test_all_that_may_come_near_and_nothing_else(
+    seed: int, states: int, moving: bool, limit: float
+) -> None:
     rng = np.random.default_rng(seed)
     lower = np.cumsum(rng.normal(0.0, 0.2, (states, 5, 3)), axis=0) + rng.uniform(-2.0, 2.0, (5, 3))
     upper = lower + rng.uniform(0.0, 0.8, (5, 3))
@@ -41,7 +48,9 @@ def test_all_that_may_come_near_and_nothing_else(seed: int, states: int, moving:
     expected = []
     for k, (a, b) in enumerate(zip(first, last, strict=True)):
         for p, (i, j) in enumerate(pairs.tolist()):
-            ends = sum(gap((bottoms[s, i], tops[s, i]), (bottoms[s, j], tops[s, j])) for s in (a, b))
+            ends = sum(
+                gap((bottoms[s, i], tops[s, i]), (bottoms[s, j], tops[s, j])) for s in (a, b)
+            )
             if moves[phases[k], [i, j]].any() and (ends - moved[k, i] - moved[k, j]) / 2 < limit:
                 expected.append((k, p))
     assert list(zip(at.tolist(), which.tolist(), strict=True)) == expected
@@ -50,7 +59,12 @@ def test_all_that_may_come_near_and_nothing_else(seed: int, states: int, moving:
 def test_what_is_not_there_is_refused() -> None:
     corner = np.zeros((2, 1, 3))
     boxes = WorldBoxes(corner, corner + 1.0, np.full((1, 3), 3.0), np.full((1, 3), 4.0))
-    good = {"moved": np.zeros((1, 2)), "moves": np.ones((1, 2), bool), "phases": np.zeros(1, int), "limit": 9.0}
+    good = {
+        "moved": np.zeros((1, 2)),
+        "moves": np.ones((1, 2), bool),
+        "phases": np.zeros(1, int),
+        "limit": 9.0,
+    }
     here, pair = np.zeros(1, int), np.array([[0, 1]])
     at, which = boxes.near(here, here, pair, **good)
     assert (at.tolist(), which.tolist()) == ([0], [0])
@@ -62,7 +76,11 @@ def test_what_is_not_there_is_refused() -> None:
     ):
         with pytest.raises(IndexError, match="no such"):
             boxes.near(first, here, pairs, **{**good, **more})
-    for more in ({"moved": np.zeros((1, 3))}, {"moves": np.ones((1, 3), bool)}, {"moved": np.zeros((2, 2))}):
+    for more in (
+        {"moved": np.zeros((1, 3))},
+        {"moves": np.ones((1, 3), bool)},
+        {"moved": np.zeros((2, 2))},
+    ):
         with pytest.raises(ValueError, match=r"shape|moves|stretch"):
             boxes.near(here, here, pair, **{**good, **more})
     with pytest.raises(ValueError, match="shape"):

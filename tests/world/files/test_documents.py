@@ -16,13 +16,27 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files import documents
-from vkc_pin.world.files.documents import Document, check, field_name, parse_json, read_bytes, read_text, read_yaml
+from vkc_pin.world.files.documents import (
+    Document,
+    check,
+    field_name,
+    parse_json,
+    read_bytes,
+    read_text,
+    read_yaml,
+)
 from vkc_pin.world.files.fields import Name, Number, Positive, Schema, Vector3
 from vkc_pin.world.files.xml import read_xml
 
-NAMES = st.text("abcdefgh", min_size=1, max_size=4).filter(lambda name: name not in ("no", "off", "on", "yes"))
+NAMES = st.text("abcdefgh", min_size=1, max_size=4).filter(
+    lambda name: name not in ("no", "off", "on", "yes")
+)
 LEAVES = st.integers(-9, 9) | st.floats(-1e3, 1e3) | st.booleans() | NAMES
-DATA = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(NAMES, inner, max_size=3), max_leaves=12)
+DATA = st.recursive(
+    LEAVES,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(NAMES, inner, max_size=3),
+    max_leaves=12,
+)
 
 
 class Part(Schema):
@@ -44,7 +58,13 @@ def written(folder: Path, text: str) -> Path:
 
 def paths(data: Any, path: tuple[str | int, ...] = ()) -> dict[tuple[str | int, ...], Any]:
     """Return every field of nested data."""
-    items: Any = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    items: Any = (
+        data.items()
+        if isinstance(data, dict)
+        else enumerate(data)
+        if isinstance(data, list)
+        else ()
+    )
     found = {path: data}
     for key, value in items:
         found.update(paths(value, (*path, key)))
@@ -109,10 +129,17 @@ def test_an_empty_file_is_nothing(tmp_path: Path) -> None:
         ("name: a\nparts:\n  - size: 1\n  - size: -1\n", 4, "parts[1].size", "a number > 0"),
         ("name: a\nparts:\n  - size: 1\n    at: [1, 2]\n", 4, "parts[0].at", "3 values"),
         ("name: a\nparts: 3\n", 2, "parts", "a list"),
-        ("parts: [{size: 0}]\nname: 3\n", 1, "parts[0].size", "a number > 0"),  # the first in the file, not in the schema
+        (
+            "parts: [{size: 0}]\nname: 3\n",
+            1,
+            "parts[0].size",
+            "a number > 0",
+        ),  # the first in the file, not in the schema
     ],
 )
-def test_the_first_wrong_field_is_told(tmp_path: Path, text: str, line: int | None, field: str, told: str) -> None:
+def test_the_first_wrong_field_is_told(
+    tmp_path: Path, text: str, line: int | None, field: str, told: str
+) -> None:
     with pytest.raises(InputError, match=told) as caught:
         check(read_yaml(written(tmp_path, text)), Thing)
     assert (caught.value.field, caught.value.file) == (field, tmp_path / "thing.yaml")
@@ -128,7 +155,11 @@ def test_errors_inside_get_the_place_unless_they_have_one(tmp_path: Path) -> Non
     document = read_yaml(written(tmp_path, "a: 1\nb:\n  c: 2\n"))
     with pytest.raises(InputError) as plain, document.at(("b", "c")):
         raise InputError("too large", field="mass", expected=1, got=2)
-    assert (plain.value.line, plain.value.field, plain.value.problem) == (3, "b.c", "mass: too large")
+    assert (plain.value.line, plain.value.field, plain.value.problem) == (
+        3,
+        "b.c",
+        "mass: too large",
+    )
     with pytest.raises(UnknownNameError) as unknown, document.at(("b",)):
         raise UnknownNameError("link", "armm", ["arm", "leg"])
     assert (unknown.value.line, unknown.value.nearest) == (2, "arm")
@@ -170,7 +201,10 @@ def test_aliases_of_aliases(tmp_path: Path) -> None:
     """Nine lines that mean a billion items."""
     names = "abcdefghi"
     lines = [f"a: &a [{', '.join('x' * 9)}]"]
-    lines += [f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]" for before, name in itertools.pairwise(names)]
+    lines += [
+        f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]"
+        for before, name in itertools.pairwise(names)
+    ]
     with pytest.raises(InputError, match="too many fields") as caught:
         read_yaml(written(tmp_path, "\n".join(lines)))
     assert caught.value.line in range(1, 10)
@@ -186,7 +220,10 @@ def test_lists_inside_each_other(tmp_path: Path, open_: str, close: str) -> None
 
 
 def test_many_lists_after_each_other_are_not_deep(tmp_path: Path) -> None:
-    assert len(read_yaml(written(tmp_path, "[" + "[1], " * (10 * documents.DEEPEST) + "]")).data) == 10 * documents.DEEPEST
+    assert (
+        len(read_yaml(written(tmp_path, "[" + "[1], " * (10 * documents.DEEPEST) + "]")).data)
+        == 10 * documents.DEEPEST
+    )
 
 
 def test_json_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,16 +255,26 @@ def test_bytes_within_bounds(tmp_path: Path) -> None:
 
 def test_what_has_no_end_is_refused() -> None:
     """What yields as it is asked could fill the memory; what is handed over whole is taken."""
-    for endless in (itertools.repeat(0.0), (0.0 for _ in itertools.count()), map(abs, itertools.count())):
+    for endless in (
+        itertools.repeat(0.0),
+        (0.0 for _ in itertools.count()),
+        map(abs, itertools.count()),
+    ):
         with pytest.raises(InputError, match=r"parts\[0\].at: wrong kind of value") as raised:
             check(Document({"name": "a", "parts": [{"size": 1.0, "at": endless}]}), Thing)
         assert raised.value.expected == "a list, fields, text or a number"
     for at in ((1.0, 2.0, 3.0), [1, 2, 3]):
-        assert check(Document({"name": "a", "parts": [{"size": 1.0, "at": at}]}), Thing).parts[0].at == (1.0, 2.0, 3.0)
+        assert check(Document({"name": "a", "parts": [{"size": 1.0, "at": at}]}), Thing).parts[
+            0
+        ].at == (1.0, 2.0, 3.0)
 
 
 def test_text_can_be_written() -> None:
-    for document in (Document({"name": "x", "parts": ["a\ud800"]}), Document({"x\udfff": [1]}), Document(["\ud800"])):
+    for document in (
+        Document({"name": "x", "parts": ["a\ud800"]}),
+        Document({"x\udfff": [1]}),
+        Document(["\ud800"]),
+    ):
         with pytest.raises(InputError, match="not text"):
             check(document, Thing)
     around: dict[str, object] = {}

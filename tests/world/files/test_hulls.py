@@ -71,7 +71,9 @@ def test_points_in_one_plane_have_no_hull(count: int) -> None:
 @pytest.mark.parametrize("vertices", [16, 40])
 def test_outer_hull_contains_its_points_with_few_corners(vertices: int) -> None:
     tube = trimesh.creation.cylinder(0.05, height=0.4, sections=100)
-    points = np.asarray(tube.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])).vertices)
+    points = np.asarray(
+        tube.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])).vertices
+    )
     hull = outer_hull(points, vertices=vertices)
     assert len(hull.vertices) <= vertices
     assert outside(points, hull) < 1e-9
@@ -87,8 +89,14 @@ def test_cut_finds_the_waist(cutting: ModuleType) -> None:
     for part, z in zip(parts, (0.05, 0.35, 0.65), strict=True):
         part.apply_translation([0, 0, z])
     dumbbell = trimesh.util.concatenate(parts)
-    pieces = [trimesh.convex.convex_hull(points) for points in cutting.cut(dumbbell, 3, axis=(0, 0, 1), steps=14)]
-    assert sum(piece.volume for piece in pieces) < 0.4 * trimesh.convex.convex_hull(dumbbell.vertices).volume
+    pieces = [
+        trimesh.convex.convex_hull(points)
+        for points in cutting.cut(dumbbell, 3, axis=(0, 0, 1), steps=14)
+    ]
+    assert (
+        sum(piece.volume for piece in pieces)
+        < 0.4 * trimesh.convex.convex_hull(dumbbell.vertices).volume
+    )
     inside = trimesh.sample.sample_surface(dumbbell, 500, seed=1)[0]
     assert max(min(outside(point[None], piece) for piece in pieces) for point in inside) < 1e-9
 
@@ -105,9 +113,14 @@ def test_the_tool_makes_the_committed_meshes(tmp_path: Path) -> None:
     shutil.copytree(ROBOT, folder)
     (folder / "collision" / name).unlink()
     command = [sys.executable, str(ROOT / "tools" / "make_collision.py"), str(folder)]
-    table = subprocess.run([*command, "wrist_3_link"], capture_output=True, text=True, check=True).stdout
+    table = subprocess.run(
+        [*command, "wrist_3_link"], capture_output=True, text=True, check=True
+    ).stdout
     assert "| `wrist_3_link` | 1 | 40 | 0.190 | 0.200 | 6 % |" in table
-    made, committed = (trimesh.load_mesh(file) for file in (folder / "collision" / name, ROBOT / "collision" / name))
+    made, committed = (
+        trimesh.load_mesh(file)
+        for file in (folder / "collision" / name, ROBOT / "collision" / name)
+    )
     np.testing.assert_allclose(made.bounds, committed.bounds, atol=1e-6)
     assert made.volume == pytest.approx(committed.volume, rel=1e-4)
     unknown = subprocess.run([*command, "wrist_4_link"], capture_output=True, text=True)

@@ -12,8 +12,11 @@ import trimesh
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.meshes import convex_hull, load_convex, load_mesh, load_parts, to_bvh
 
-# Two cubes of edge 1, one metre apart; in an OBJ file the indices go on counting through all objects.
-FACES = np.array([[1, 2, 4, 3], [5, 7, 8, 6], [1, 5, 6, 2], [3, 4, 8, 7], [1, 3, 7, 5], [2, 6, 8, 4]])
+# Two cubes of edge 1, one metre apart; in an OBJ file the indices go on counting through all
+# objects.
+FACES = np.array(
+    [[1, 2, 4, 3], [5, 7, 8, 6], [1, 5, 6, 2], [3, 4, 8, 7], [1, 3, 7, 5], [2, 6, 8, 4]]
+)
 CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 
 
@@ -24,7 +27,9 @@ def two_cubes(path: Path, materials: bool = False) -> Path:
         lines += [f"usemtl colour{k}"] if materials else []
         lines += ["f " + " ".join(str(i + 8 * k) for i in face) for face in FACES]
     path.write_text("\n".join(lines) + "\n")
-    (path.parent / "two.mtl").write_text("newmtl colour0\nKd 1.0 0.0 0.0\nnewmtl colour1\nKd 0.0 0.0 1.0\n")
+    (path.parent / "two.mtl").write_text(
+        "newmtl colour0\nKd 1.0 0.0 0.0\nnewmtl colour1\nKd 0.0 0.0 1.0\n"
+    )
     return path
 
 
@@ -42,13 +47,17 @@ def test_convex_hull_is_what_coal_holds(tmp_path: Path) -> None:
     assert shape.num_points == 8
     result = coal.DistanceResult()
     at = coal.Transform3s(np.eye(3), np.array([1.5 + 0.7 + 0.25, 0.5, 0.5]))
-    distance = coal.distance(shape, coal.Transform3s.Identity(), coal.Sphere(0.25), at, coal.DistanceRequest(), result)
+    distance = coal.distance(
+        shape, coal.Transform3s.Identity(), coal.Sphere(0.25), at, coal.DistanceRequest(), result
+    )
     assert distance == pytest.approx(0.7, abs=1e-6)
 
 
 def test_hull_of_many_points() -> None:
     points = np.random.default_rng(0).standard_normal((500, 3))
-    assert convex_hull(points).computeVolume() == pytest.approx(trimesh.convex.convex_hull(points).volume)
+    assert convex_hull(points).computeVolume() == pytest.approx(
+        trimesh.convex.convex_hull(points).volume
+    )
 
 
 def test_finely_meshed_cone_has_more_neighbours_than_coal_takes() -> None:
@@ -57,12 +66,17 @@ def test_finely_meshed_cone_has_more_neighbours_than_coal_takes() -> None:
     shape = convex_hull(np.vstack([rim, [0.0, 0.0, 2.0]]))
     assert np.pi * 2.0 / 3.0 - 1e-3 < shape.computeVolume() < 1.1 * np.pi * 2.0 / 3.0
     hull = trimesh.convex.convex_hull(np.asarray(shape.points()))
-    assert (rim @ hull.face_normals.T - np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])).max() < 1e-7
+    assert (
+        rim @ hull.face_normals.T - np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])
+    ).max() < 1e-7
 
 
 def test_colours_are_parts(tmp_path: Path) -> None:
     parts = load_parts(two_cubes(tmp_path / "two.obj", materials=True), 2.0)
-    assert sorted(part.colour or () for part in parts) == [(0.0, 0.0, 1.0, 1.0), (1.0, 0.0, 0.0, 1.0)]
+    assert sorted(part.colour or () for part in parts) == [
+        (0.0, 0.0, 1.0, 1.0),
+        (1.0, 0.0, 0.0, 1.0),
+    ]
     assert sum(len(part.faces) for part in parts) == 24
     assert max(part.vertices.max() for part in parts) == pytest.approx(6.0)
     shape = to_bvh(parts[0])
@@ -88,7 +102,11 @@ def test_less_detail_keeps_the_shape(tmp_path: Path) -> None:
         ("thing.xyz3", "?", "cannot read"),
         ("number.obj", "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no numbers|cannot|empty"),
         ("flat.obj", "v 0 0\nv 1 0\nv 0 1\nv 1 1\nf 1 2 3\nf 2 3 4\n", "cannot read"),
-        ("far.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e300\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 3 1 4\n", "out of range"),
+        (
+            "far.obj",
+            "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e300\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 3 1 4\n",
+            "out of range",
+        ),
     ],
 )
 def test_bad_meshes_are_named(tmp_path: Path, name: str, text: str | None, problem: str) -> None:
@@ -105,19 +123,28 @@ def test_bad_meshes_are_named(tmp_path: Path, name: str, text: str | None, probl
     [
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", (1.0, 1.0, 1e-3)),
         ("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n", (1.0, 1.0, 1e-3)),
-        ("v 0 0 1\nv 1 0 1\nv 0 1 1\nv 4 0 1\nv 5 0 1\nv 4 3 1\nf 1 2 3\nf 4 5 6\n", (5.0, 3.0, 1e-3)),
+        (
+            "v 0 0 1\nv 1 0 1\nv 0 1 1\nv 4 0 1\nv 5 0 1\nv 4 3 1\nf 1 2 3\nf 4 5 6\n",
+            (5.0, 3.0, 1e-3),
+        ),
         ("v 0 0 0\nv 1 0 0\nv 1 1 1e-7\nv 0 1 0\nf 1 2 3\nf 1 3 4\n", (1.0, 1.0, 1e-3)),
         ("v 0 2 0\nv 1 2 0\nv 3 2 0\nf 1 2 3\n", (3.0, 1e-3, 1e-3)),  # a line
     ],
     ids=["triangle", "square", "two", "nearly", "line"],
 )
-def test_flat_meshes_are_thickened_with_a_warning(tmp_path: Path, text: str, size: tuple[float, float, float]) -> None:
+def test_flat_meshes_are_thickened_with_a_warning(
+    tmp_path: Path, text: str, size: tuple[float, float, float]
+) -> None:
     file = tmp_path / "picture.obj"
     file.write_text(text)
-    with pytest.warns(UserWarning, match=r"hall of .*picture\.obj is flat: it collides as a plate, 1 mm thick"):
+    with pytest.warns(
+        UserWarning, match=r"hall of .*picture\.obj is flat: it collides as a plate, 1 mm thick"
+    ):
         shape = load_convex(file, about="hall")
     corners = np.asarray(shape.points())
-    assert np.ptp(corners, axis=0) == pytest.approx(size, rel=0.42 if size[1] == 1e-3 else 1e-3)  # a bar may stand on its edge
+    assert np.ptp(corners, axis=0) == pytest.approx(
+        size, rel=0.42 if size[1] == 1e-3 else 1e-3
+    )  # a bar may stand on its edge
     given = load_mesh(file).vertices
     for point in np.asarray(given):  # the sheet is in its middle
         ball = coal.distance(

@@ -29,16 +29,22 @@ def test_names_work_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_a_name_that_does_not_exist() -> None:
-    with pytest.raises(UnknownNameError, match=r"there is no scene 'draw'; did you mean 'drawer'\?") as caught:
+    with pytest.raises(
+        UnknownNameError, match=r"there is no scene 'draw'; did you mean 'drawer'\?"
+    ) as caught:
         find("scenes", "*.yaml", "draw", what="scene")
     assert set(caught.value.choices) == set(available("scenes", "*.yaml"))
 
 
-def test_an_installed_package_has_them_inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_installed_package_has_them_inside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     inside = tmp_path / "site-packages" / "vkc_pin"
     (inside / "scenes").mkdir(parents=True)
     (inside / "scenes" / "own.yaml").write_text("")
-    monkeypatch.setattr("vkc_pin.world.files.resources.__file__", str(inside / "files" / "resources.py"))
+    monkeypatch.setattr(
+        "vkc_pin.world.files.resources.__file__", str(inside / "files" / "resources.py")
+    )
     assert folder("scenes") == inside / "scenes"
     assert list(available("scenes", "*.yaml")) == ["own"]
     assert folder("robots") == inside.parent / "robots"  # a source tree has them beside the package

@@ -29,11 +29,15 @@ def collision(shape: str, origin: str = "") -> str:
 
 
 @pytest.mark.parametrize("kind", ["visual", "collision"])
-def test_shapes_without_end_are_refused_before_anything_is_built_of_them(tmp_path: Path, kind: str) -> None:
+def test_shapes_without_end_are_refused_before_anything_is_built_of_them(
+    tmp_path: Path, kind: str
+) -> None:
     """Seven thousand of them took Pinocchio minutes."""
     shape = collision('<sphere radius="0.2"/>')
     many = shape.replace("collision", kind) * 7000
-    with pytest.raises(InputError, match=f"too many <{kind}> elements.*expected at most 1000.*got 7000"):
+    with pytest.raises(
+        InputError, match=f"too many <{kind}> elements.*expected at most 1000.*got 7000"
+    ):
         load_urdf(urdf(tmp_path, shape + many if kind == "visual" else many))
     enough = shape.replace("collision", kind) * 1000
     _, collides, drawn = load_urdf(urdf(tmp_path, shape + enough if kind == "visual" else enough))
@@ -53,19 +57,25 @@ def test_shapes_without_end_are_refused_before_anything_is_built_of_them(tmp_pat
 def test_triangles_enclose_the_solid(tmp_path: Path, shape: str, volume: float) -> None:
     """They are drawn around round shapes, with little more than their volume, where the element has its origin."""
     (tmp_path / "wedge.obj").write_text(WEDGE)
-    (found,) = read_urdf(urdf(tmp_path, collision(shape, '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'))).shapes("collision")
+    (found,) = read_urdf(
+        urdf(tmp_path, collision(shape, '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'))
+    ).shapes("collision")
     mesh, solid = found.mesh(), found.solid()
     assert volume * (1 - 1e-3) <= mesh.volume <= 1.02 * volume
     solid.computeLocalAABB()
     box = solid.aabb_local
     local = (mesh.vertices - found.placement.translation) @ found.placement.rotation
-    np.testing.assert_allclose([local.min(axis=0), local.max(axis=0)], [box.min_, box.max_], atol=5e-3)
+    np.testing.assert_allclose(
+        [local.min(axis=0), local.max(axis=0)], [box.min_, box.max_], atol=5e-3
+    )
     assert (found.link, found.name, found.kind) == ("a", "a_0", shape[1:].partition(" ")[0])
 
 
 def test_a_flat_mesh_is_named_by_link_and_file(tmp_path: Path) -> None:
     (tmp_path / "sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 2 0\nv 0 2 0\nf 1 2 3\nf 1 3 4\n")
-    (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="sheet.obj"/>'))).shapes("collision")
+    (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="sheet.obj"/>'))).shapes(
+        "collision"
+    )
     with pytest.warns(UserWarning, match=rf"{found.link} of .*sheet\.obj is flat"):
         assert found.solid().computeVolume() == pytest.approx(2e-3)
 
@@ -73,7 +83,9 @@ def test_a_flat_mesh_is_named_by_link_and_file(tmp_path: Path) -> None:
 def test_the_hull_of_a_mesh_is_its_solid(tmp_path: Path) -> None:
     ring = trimesh.creation.annulus(0.3, 0.5, 1.0)
     ring.export(tmp_path / "ring.stl")
-    (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="ring.stl"/>'))).shapes("collision")
+    (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="ring.stl"/>'))).shapes(
+        "collision"
+    )
     assert found.solid().computeVolume() == pytest.approx(ring.convex_hull.volume, rel=1e-3)
     assert found.mesh().volume == pytest.approx(ring.volume, rel=1e-3)
     assert ring.volume < 0.9 * ring.convex_hull.volume
@@ -82,18 +94,24 @@ def test_the_hull_of_a_mesh_is_its_solid(tmp_path: Path) -> None:
 @settings(max_examples=200, deadline=None)
 @given(ANGLES, ANGLES, ANGLES)
 def test_angles_are_those_of_pinocchio(roll: float, pitch: float, yaw: float) -> None:
-    np.testing.assert_allclose(_rotation(roll, pitch, yaw), pin.rpy.rpyToMatrix(roll, pitch, yaw), atol=1e-14)
+    np.testing.assert_allclose(
+        _rotation(roll, pitch, yaw), pin.rpy.rpyToMatrix(roll, pitch, yaw), atol=1e-14
+    )
     origin = f'<origin rpy="{roll} {pitch} {yaw}"/>'
     element = f'<link name="b"/><joint name="j" type="fixed"><parent link="a"/><child link="b"/>{origin}</joint>'
     model = pin.buildModelFromXML(f'<robot name="r"><link name="a"/>{element}</robot>')
-    np.testing.assert_array_equal(_rotation(roll, pitch, yaw), model.frames[model.getFrameId("b")].placement.rotation)
+    np.testing.assert_array_equal(
+        _rotation(roll, pitch, yaw), model.frames[model.getFrameId("b")].placement.rotation
+    )
 
 
 def test_colours_by_name_and_in_place(tmp_path: Path) -> None:
     ball = '<geometry><sphere radius="1"/></geometry>'
     own = f'<visual>{ball}<material name="red"><color rgba="1 0 0 1"/></material></visual>'
     named, plain = f'<visual>{ball}<material name="red"/></visual>', f"<visual>{ball}</visual>"
-    shapes = read_urdf(urdf(tmp_path, named + own + plain + collision('<sphere radius="1"/>'))).shapes("visual")
+    shapes = read_urdf(
+        urdf(tmp_path, named + own + plain + collision('<sphere radius="1"/>'))
+    ).shapes("visual")
     assert [shape.colour for shape in shapes] == [(1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0), None]
     assert [shape.name for shape in shapes] == ["a_0", "a_1", "a_2"]
 
@@ -113,7 +131,12 @@ def test_addresses_of_meshes(tmp_path: Path) -> None:
     robot = read_urdf(path, {"other": tmp_path / "elsewhere"})
     assert robot.resolve("package://other/a.stl") == named
     assert robot.resolve("package://pack/meshes/b.stl") == around
-    assert robot.resolve("c.stl") == robot.resolve(f"file://{beside}") == robot.resolve(str(beside)) == beside
+    assert (
+        robot.resolve("c.stl")
+        == robot.resolve(f"file://{beside}")
+        == robot.resolve(str(beside))
+        == beside
+    )
     for address in ("package://other/b.stl", "package://nowhere/a.stl", "a.stl"):
         with pytest.raises(InputError, match="no such mesh") as caught:
             robot.resolve(address)
@@ -148,7 +171,11 @@ def test_a_tree_is_as_pinocchio_reads_it(tmp_path: Path) -> None:
     assert own == model
     theirs = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
     for ours, other in zip(collision.geometryObjects, theirs.geometryObjects, strict=True):
-        assert (ours.name, ours.parentJoint, ours.parentFrame) == (other.name, other.parentJoint, other.parentFrame)
+        assert (ours.name, ours.parentJoint, ours.parentFrame) == (
+            other.name,
+            other.parentJoint,
+            other.parentFrame,
+        )
         assert ours.placement.isApprox(other.placement, 1e-14)
         assert ours.geometry == other.geometry
     assert read_urdf(tmp_path / "t.urdf").links == ("a", "b", "c")

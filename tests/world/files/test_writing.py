@@ -66,7 +66,11 @@ def test_links_are_followed(tmp_path: Path, there: bool) -> None:
     link.symlink_to(Path("elsewhere") / "file")
     chain.symlink_to(link)
     assert check_writable(chain) == target
-    assert everything(tmp_path) == {"link", "chain", *(("elsewhere", "elsewhere/file") if there else ())}
+    assert everything(tmp_path) == {
+        "link",
+        "chain",
+        *(("elsewhere", "elsewhere/file") if there else ()),
+    }
     assert write_atomically(chain, b"after") == chain
     assert (link.is_symlink(), chain.is_symlink(), target.read_bytes()) == (True, True, b"after")
     assert everything(tmp_path) == {"link", "chain", "elsewhere", "elsewhere/file"}
@@ -84,7 +88,9 @@ def _pipe(path: Path) -> str:
 
 def _device(path: Path) -> str:
     if os.getuid():
-        pytest.skip("only root can make a device, and those of the machine are not to be played with")
+        pytest.skip(
+            "only root can make a device, and those of the machine are not to be played with"
+        )
     os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 3))
     return "got a device"
 
@@ -110,7 +116,9 @@ def test_what_is_no_file_is_refused(tmp_path: Path, make: object) -> None:
     said = make(path)  # type: ignore[operator]
     before = everything(tmp_path)
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
-        with pytest.raises(InputError, match=f"cannot write this.*expected a regular file or a new one.*{said}") as caught:
+        with pytest.raises(
+            InputError, match=f"cannot write this.*expected a regular file or a new one.*{said}"
+        ) as caught:
             write(path)
         assert caught.value.file == str(path)
     assert everything(tmp_path) == before
@@ -128,7 +136,9 @@ def test_what_is_no_file_is_refused(tmp_path: Path, make: object) -> None:
         ("/proc/nowhere/plan.npz", "got "),
     ],
 )
-def test_what_cannot_be_written_is_refused(tmp_path: Path, path: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_is_refused(
+    tmp_path: Path, path: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.chdir(tmp_path)
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
@@ -158,7 +168,9 @@ for write in (check_writable, lambda path: write_atomically(path, b"after")):
     except InputError as error:
         print(error.got)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
     assert len(done.stdout.splitlines()) == 2
     assert done.stdout.lower().count("permission") == 2
     assert path.read_text() == "before"
@@ -172,7 +184,10 @@ def test_checking_leaves_no_trace(tmp_path: Path) -> None:
 def test_outputs_that_get_in_each_others_way(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("one")
     one, other = tmp_path / "one", tmp_path / "other"
-    check_outputs({"--a": one, "--b": other, "--c": tmp_path / "new" / "file"}, kept={"PLAN": tmp_path / "plan"})
+    check_outputs(
+        {"--a": one, "--b": other, "--c": tmp_path / "new" / "file"},
+        kept={"PLAN": tmp_path / "plan"},
+    )
     with pytest.raises(InputError, match=r"--b: cannot write this .*got a folder"):
         check_outputs({"--a": one, "--b": tmp_path})
     for again in (one, tmp_path / "new" / ".." / "one", tmp_path / "link"):
@@ -238,7 +253,10 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     assert sorted(path.name for path in target.iterdir()) == [".vkc-pin.json", "b"]
     assert [path.name for path in target.parent.iterdir()] == ["folder"]
     (tmp_path / "file").write_text("3", encoding="utf-8")
-    with pytest.raises(InputError, match="no folder"), folder_at_once(tmp_path / "file", force=True):
+    with (
+        pytest.raises(InputError, match="no folder"),
+        folder_at_once(tmp_path / "file", force=True),
+    ):
         pass
 
 

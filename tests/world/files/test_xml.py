@@ -15,7 +15,11 @@ from vkc_pin.world.files.xml import check_indices, line_of, parse_xml, quote, re
 FILE = Path("thing.urdf")
 
 
-@given(st.recursive(st.text("ab <>&\n", max_size=5), lambda inside: st.lists(inside, max_size=4), max_leaves=20))
+@given(
+    st.recursive(
+        st.text("ab <>&\n", max_size=5), lambda inside: st.lists(inside, max_size=4), max_leaves=20
+    )
+)
 def test_elements_are_those_of_the_standard_library_and_know_their_lines(tree: object) -> None:
     lines = ["<robot>"]
 
@@ -39,7 +43,10 @@ def test_elements_are_those_of_the_standard_library_and_know_their_lines(tree: o
     assert line_of(theirs) is None
 
 
-@pytest.mark.parametrize(("text", "line"), [("<robot>\n<a>\n</robot>", 3), ("", 1), ("<robot/>\n<robot/>", 2), ("<robot", 1)])
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [("<robot>\n<a>\n</robot>", 3), ("", 1), ("<robot/>\n<robot/>", 2), ("<robot", 1)],
+)
 def test_what_is_no_xml(text: str, line: int) -> None:
     with pytest.raises(InputError, match="not valid XML") as caught:
         parse_xml(text, FILE)

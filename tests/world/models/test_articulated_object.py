@@ -27,7 +27,13 @@ def test_door() -> None:
     np.testing.assert_array_equal(door.velocity, [1.0, 2.0])
     np.testing.assert_array_equal(door.acceleration, [1.0, 4.0])
     (latch,) = door.latches
-    assert (latch.joint, latch.held_at, latch.released_by, latch.threshold, latch.engaged_within) == (
+    assert (
+        latch.joint,
+        latch.held_at,
+        latch.released_by,
+        latch.threshold,
+        latch.engaged_within,
+    ) == (
         "hinge",
         0.0,
         "knob",
@@ -54,36 +60,69 @@ def test_door() -> None:
 
 def test_the_door_moves_as_its_description_says() -> None:
     door = load_object("door")
-    closed, pushed = (door.link_placement("lever", [hinge, 0.0]).translation for hinge in (0.0, 1.0))
-    assert pushed[0] > closed[0] + 0.5, "hinge > 0 pushes the panel away from the handle's side, towards +x"
-    level, turned = (door.link_placement("lever", [0.0, knob]) * door.attachment().placement for knob in (0.0, 0.5))
-    assert turned.translation[2] < level.translation[2] - 0.02, "knob > 0 turns the lever's end down"
-    np.testing.assert_allclose(level.rotation[:, 2], [1.0, 0.0, 0.0], atol=1e-12)  # the tool approaches along +x
-    np.testing.assert_allclose(level.rotation[:, 0], [0.0, 0.0, 1.0], atol=1e-12)  # and closes across the bar
+    closed, pushed = (
+        door.link_placement("lever", [hinge, 0.0]).translation for hinge in (0.0, 1.0)
+    )
+    assert pushed[0] > closed[0] + 0.5, (
+        "hinge > 0 pushes the panel away from the handle's side, towards +x"
+    )
+    level, turned = (
+        door.link_placement("lever", [0.0, knob]) * door.attachment().placement
+        for knob in (0.0, 0.5)
+    )
+    assert turned.translation[2] < level.translation[2] - 0.02, (
+        "knob > 0 turns the lever's end down"
+    )
+    np.testing.assert_allclose(
+        level.rotation[:, 2], [1.0, 0.0, 0.0], atol=1e-12
+    )  # the tool approaches along +x
+    np.testing.assert_allclose(
+        level.rotation[:, 0], [0.0, 0.0, 1.0], atol=1e-12
+    )  # and closes across the bar
     assert 0.95 <= level.translation[2] <= 1.0
-    assert -0.125 - 0.02 <= level.translation[0] <= -0.07 - 0.02, "the bar stands in front of the panel's face at -0.02"
+    assert -0.125 - 0.02 <= level.translation[0] <= -0.07 - 0.02, (
+        "the bar stands in front of the panel's face at -0.02"
+    )
 
 
 def test_drawer() -> None:
     drawer = load_object("drawer")
     assert drawer.coordinates.names == ("slide",)
-    assert (drawer.lower[0], drawer.upper[0], drawer.velocity[0], drawer.acceleration[0]) == (0.0, 0.4, 0.5, 1.0)
+    assert (drawer.lower[0], drawer.upper[0], drawer.velocity[0], drawer.acceleration[0]) == (
+        0.0,
+        0.4,
+        0.5,
+        1.0,
+    )
     assert drawer.latches == ()
     assert list(drawer.attachments) == ["handle", "handle_free", "push"]
-    moved = drawer.link_placement("tray", [0.4]).translation - drawer.link_placement("tray", [0.0]).translation
-    np.testing.assert_allclose(moved, [-0.4, 0.0, 0.0], atol=1e-12)  # out of the cabinet, towards whoever pulls
+    moved = (
+        drawer.link_placement("tray", [0.4]).translation
+        - drawer.link_placement("tray", [0.0]).translation
+    )
+    np.testing.assert_allclose(
+        moved, [-0.4, 0.0, 0.0], atol=1e-12
+    )  # out of the cabinet, towards whoever pulls
 
 
 @pytest.mark.parametrize(("name", "steps"), [("door", (158, 3)), ("drawer", (41,))])
-def test_moving_parts_keep_away_from_the_base_over_the_whole_range(name: str, steps: tuple[int, ...]) -> None:
+def test_moving_parts_keep_away_from_the_base_over_the_whole_range(
+    name: str, steps: tuple[int, ...]
+) -> None:
     thing = load_object(name)
     still = [s for s in thing.collision.geometryObjects if s.parentJoint == 0]
     assert len(still) >= 3
-    grids = [np.linspace(*limits, n) for *limits, n in zip(thing.lower, thing.upper, steps, strict=True)]
+    grids = [
+        np.linspace(*limits, n) for *limits, n in zip(thing.lower, thing.upper, steps, strict=True)
+    ]
     nearest = np.inf
     for state in itertools.product(*grids):
         placed = standing_geometry(PlacedObject(name, thing, pin.SE3.Identity(), np.array(state)))
-        moving = [s for s, original in zip(placed, thing.collision.geometryObjects, strict=True) if original.parentJoint != 0]
+        moving = [
+            s
+            for s, original in zip(placed, thing.collision.geometryObjects, strict=True)
+            if original.parentJoint != 0
+        ]
         nearest = min(nearest, clearance(placed_shapes(moving), placed_shapes(still)))
     assert 0.02 < nearest < 0.05
 
@@ -92,7 +131,11 @@ GRASPS = [
     ("fixed", "", ()),
     ("revolute", "axis: [1, 2, -2], limits: [-0.4, 0.5]", ("",)),
     ("prismatic", "axis: [1, 2, -2], limits: [-0.4, 0.5]", ("",)),
-    ("cylindrical", "axis: [1, 2, -2], limits: [-0.4, 0.5], turn: [-1.2, 1.1]", ("_slide", "_turn")),
+    (
+        "cylindrical",
+        "axis: [1, 2, -2], limits: [-0.4, 0.5], turn: [-1.2, 1.1]",
+        ("_slide", "_turn"),
+    ),
     ("spherical", "", ("_x", "_y", "_z")),
     ("spherical", "limits: [-0.4, 0.5]", ("_x", "_y", "_z")),
 ]
@@ -100,8 +143,14 @@ GRASPS = [
 
 @pytest.mark.parametrize(("joint", "fields", "suffixes"), GRASPS)
 @pytest.mark.parametrize("standoff", [0.0, 0.07])
-def test_an_attachment_moves_as_its_joint_does(joint: str, fields: str, suffixes: tuple[str, ...], standoff: float) -> None:
-    entry = ", ".join(part for part in (f"name: grip, link: panel, joint: {joint}, standoff: {standoff}", fields) if part)
+def test_an_attachment_moves_as_its_joint_does(
+    joint: str, fields: str, suffixes: tuple[str, ...], standoff: float
+) -> None:
+    entry = ", ".join(
+        part
+        for part in (f"name: grip, link: panel, joint: {joint}, standoff: {standoff}", fields)
+        if part
+    )
     grip = load_text(URDF, f"urdf: thing.urdf\nattachments: [{{{entry}}}]").attachment()
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([0.1, 0.2, -0.3]))
     grip = dataclasses.replace(grip, placement=placement)
@@ -109,8 +158,13 @@ def test_an_attachment_moves_as_its_joint_does(joint: str, fields: str, suffixes
     assert grip.coordinates == tuple(f"grip{suffix}" for suffix in suffixes)
     stated = {"_turn": (-1.2, 1.1)} if joint == "cylindrical" else {}
     usual = (-0.4, 0.5) if "limits" in fields else (-np.pi, np.pi)
-    assert [(f.lower, f.upper) for f in grip.freedoms] == [stated.get(suffix, usual) for suffix in suffixes]
-    v, axis = np.random.default_rng(0).uniform(-1.0, 1.0, len(suffixes)), np.array([1.0, 2.0, -2.0]) / 3.0
+    assert [(f.lower, f.upper) for f in grip.freedoms] == [
+        stated.get(suffix, usual) for suffix in suffixes
+    ]
+    v, axis = (
+        np.random.default_rng(0).uniform(-1.0, 1.0, len(suffixes)),
+        np.array([1.0, 2.0, -2.0]) / 3.0,
+    )
     turn, centre = Rotation.identity(), np.zeros(3)
     if joint == "spherical":
         turn = Rotation.from_euler("XYZ", v)
@@ -119,8 +173,12 @@ def test_an_attachment_moves_as_its_joint_does(joint: str, fields: str, suffixes
         centre = axis * (v[0] if joint != "revolute" else 0.0)
     moved = grip.motion(v)
     np.testing.assert_allclose(moved.rotation, turn.as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(moved.translation, centre + turn.apply([0.0, 0.0, -standoff]), atol=1e-12)
-    np.testing.assert_allclose(grip.tool(v).homogeneous, placement.homogeneous @ moved.homogeneous, atol=1e-12)
+    np.testing.assert_allclose(
+        moved.translation, centre + turn.apply([0.0, 0.0, -standoff]), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        grip.tool(v).homogeneous, placement.homogeneous @ moved.homogeneous, atol=1e-12
+    )
     with pytest.raises(InputError, match="one a freedom"):
         grip.motion([*v, 0.0])
 
@@ -148,7 +206,9 @@ def test_the_freedoms_of_a_region_follow_each_other() -> None:
     down = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
     for around, tilt, slide in rng.uniform([-3, -0.5, 0], [3, 0.5, 0.02], (20, 3)):
         tool = rim.tool([around, tilt, slide])
-        spin = Rotation.from_euler("z", -around).as_matrix()  # seen from above the hand goes the other way
+        spin = Rotation.from_euler(
+            "z", -around
+        ).as_matrix()  # seen from above the hand goes the other way
         turn = spin @ down @ Rotation.from_euler("y", tilt).as_matrix()
         np.testing.assert_allclose(tool.rotation, turn, rtol=0.0, atol=1e-12)
         at = spin @ [0.3, 0.0, 0.0] + [0.0, 0.0, 0.1] + turn @ [0.6 * slide, 0.0, 0.8 * slide]

@@ -73,12 +73,20 @@ def test_q_and_back(seed: int) -> None:
 @given(st.integers(0, 2**32 - 1))
 def test_a_free_joint_is_where_its_numbers_say(seed: int) -> None:
     model = mixed()
-    coordinates, data, (z,) = Coordinates(model), model.createData(), random_z(np.random.default_rng(seed), 1)
+    coordinates, data, (z,) = (
+        Coordinates(model),
+        model.createData(),
+        random_z(np.random.default_rng(seed), 1),
+    )
     pin.forwardKinematics(model, data, coordinates.q(z))
-    np.testing.assert_allclose(data.oMi[3].homogeneous, pin.XYZQUATToSE3(z[4:11]).homogeneous, atol=1e-12)
+    np.testing.assert_allclose(
+        data.oMi[3].homogeneous, pin.XYZQUATToSE3(z[4:11]).homogeneous, atol=1e-12
+    )
     np.testing.assert_allclose(data.oMi[1].translation[:2], z[:2])
     np.testing.assert_allclose(data.oMi[1].rotation, pin.utils.rotate("z", z[2]), atol=1e-12)
-    np.testing.assert_allclose((data.oMi[3].inverse() * data.oMi[4]).rotation, pin.utils.rotate("x", z[11]), atol=1e-12)
+    np.testing.assert_allclose(
+        (data.oMi[3].inverse() * data.oMi[4]).rotation, pin.utils.rotate("x", z[11]), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.1, 1.0, 2.0, np.pi - 1e-6, np.pi])
@@ -90,17 +98,27 @@ def test_half_way_between_two_orientations(angle: float) -> None:
         axis = rng.normal(size=3)
         axis /= np.linalg.norm(axis)
         first = pin.SE3.Random()
-        second = pin.SE3(first.rotation @ pin.exp3(angle * axis), first.translation + rng.normal(size=3))
+        second = pin.SE3(
+            first.rotation @ pin.exp3(angle * axis), first.translation + rng.normal(size=3)
+        )
         ends = np.zeros((2, coordinates.size))
         ends[:, 4:11] = [pin.SE3ToXYZQUAT(first), pin.SE3ToXYZQUAT(second)]
-        if ends[0, 7:11] @ ends[1, 7:11] < 0.0:  # of the two quaternions of one orientation the nearer
+        if (
+            ends[0, 7:11] @ ends[1, 7:11] < 0.0
+        ):  # of the two quaternions of one orientation the nearer
             ends[1, 7:11] *= -1.0
         data = model.createData()
         angles = []
         for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-            pin.forwardKinematics(model, data, coordinates.q((1 - share) * ends[0] + share * ends[1]))
+            pin.forwardKinematics(
+                model, data, coordinates.q((1 - share) * ends[0] + share * ends[1])
+            )
             at = data.oMi[3]
-            np.testing.assert_allclose(at.translation, (1 - share) * first.translation + share * second.translation, atol=1e-12)
+            np.testing.assert_allclose(
+                at.translation,
+                (1 - share) * first.translation + share * second.translation,
+                atol=1e-12,
+            )
             turn = pin.log3(first.rotation.T @ at.rotation)
             if angle > 1e-3 and 0.0 < share < 1.0:
                 np.testing.assert_allclose(np.abs(turn @ axis), np.linalg.norm(turn), atol=1e-6)
@@ -120,7 +138,9 @@ def test_symbols_are_the_numbers_where_there_is_no_free_joint() -> None:
     z = ca.SX.sym("z", coordinates.size)
     function = ca.Function("q", [z], [coordinates.q_symbolic(z)])
     for row in np.random.default_rng(1).uniform(-3.0, 3.0, (10, coordinates.size)):
-        np.testing.assert_allclose(np.asarray(function(row)).ravel(), coordinates.q(row), atol=1e-15)
+        np.testing.assert_allclose(
+            np.asarray(function(row)).ravel(), coordinates.q(row), atol=1e-15
+        )
 
 
 def test_what_does_not_fit() -> None:

@@ -39,7 +39,11 @@ def random_tree(rng: np.random.Generator, joints: int) -> pin.Model:
             model.addJointFrame(k)
         model.appendBodyToJoint(k, pin.Inertia.Random(), pin.SE3.Random())
         model.addFrame(pin.Frame(f"l{k}", k, 0, pin.SE3.Random(), pin.FrameType.BODY), False)
-        model.addFrame(pin.Frame(f"j{k}" if k == 0 else f"x{k}", k, 0, pin.SE3.Random(), pin.FrameType.FIXED_JOINT))
+        model.addFrame(
+            pin.Frame(
+                f"j{k}" if k == 0 else f"x{k}", k, 0, pin.SE3.Random(), pin.FrameType.FIXED_JOINT
+            )
+        )
     return model
 
 
@@ -61,21 +65,31 @@ def test_a_grafted_tree_moves_as_it_did(seed: int, below: int, above: int) -> No
     pin.framesForwardKinematics(trunk, below_alone, Coordinates(trunk).q(z_trunk))
     pin.framesForwardKinematics(branch, above_alone, Coordinates(branch).q(z_branch))
     for index in range(trunk.nframes):
-        np.testing.assert_allclose(data.oMf[index].homogeneous, below_alone.oMf[index].homogeneous, atol=1e-12)
+        np.testing.assert_allclose(
+            data.oMf[index].homogeneous, below_alone.oMf[index].homogeneous, atol=1e-12
+        )
     root = below_alone.oMi[parent] * placement
     for index, frame in enumerate(branch.frames[1:], 1):
         there = data.oMf[model.getFrameId(f"b.{frame.name}", frame.type)]
-        np.testing.assert_allclose(there.homogeneous, (root * above_alone.oMf[index]).homogeneous, atol=1e-11)
+        np.testing.assert_allclose(
+            there.homogeneous, (root * above_alone.oMf[index]).homogeneous, atol=1e-11
+        )
     for index in range(1, branch.njoints):
         there, alone = model.joints[joints[index]], branch.joints[index]
         assert model.names[joints[index]] == f"b.{branch.names[index]}"
         assert there.shortname() == alone.shortname()
         for limit in ("effortLimit", "velocityLimit"):
             mine, its = getattr(model, limit), getattr(branch, limit)
-            np.testing.assert_array_equal(mine[there.idx_v : there.idx_v + there.nv], its[alone.idx_v : alone.idx_v + alone.nv])
+            np.testing.assert_array_equal(
+                mine[there.idx_v : there.idx_v + there.nv],
+                its[alone.idx_v : alone.idx_v + alone.nv],
+            )
         for limit in ("lowerPositionLimit", "upperPositionLimit"):
             mine, its = getattr(model, limit), getattr(branch, limit)
-            np.testing.assert_array_equal(mine[there.idx_q : there.idx_q + there.nq], its[alone.idx_q : alone.idx_q + alone.nq])
+            np.testing.assert_array_equal(
+                mine[there.idx_q : there.idx_q + there.nq],
+                its[alone.idx_q : alone.idx_q + alone.nq],
+            )
 
 
 @settings(max_examples=30, deadline=None)
@@ -89,7 +103,9 @@ def test_no_mass_is_lost(seed: int) -> None:
     graft(model, branch, parent=2, placement=placement)
     z_trunk, z_branch = rng.normal(size=trunk.nv), rng.normal(size=branch.nv)
     data, below, above = model.createData(), trunk.createData(), branch.createData()
-    centre = pin.centerOfMass(model, data, Coordinates(model).q(np.concatenate([z_trunk, z_branch])))
+    centre = pin.centerOfMass(
+        model, data, Coordinates(model).q(np.concatenate([z_trunk, z_branch]))
+    )
     first = pin.centerOfMass(trunk, below, Coordinates(trunk).q(z_trunk))
     second = pin.centerOfMass(branch, above, Coordinates(branch).q(z_branch))
     root = below.oMi[2] * placement
@@ -99,7 +115,11 @@ def test_no_mass_is_lost(seed: int) -> None:
         (branch.inertias[0].mass, root.act(branch.inertias[0].lever)),
     ]
     assert pin.computeTotalMass(model) == pytest.approx(sum(mass for mass, _ in parts))
-    np.testing.assert_allclose(centre, sum(mass * point for mass, point in parts) / sum(mass for mass, _ in parts), atol=1e-9)
+    np.testing.assert_allclose(
+        centre,
+        sum(mass * point for mass, point in parts) / sum(mass for mass, _ in parts),
+        atol=1e-9,
+    )
 
 
 def test_what_is_grafted_is_not_changed() -> None:
@@ -131,27 +151,42 @@ def test_shapes_go_along(seed: int) -> None:
     branch, trunk = random_tree(rng, 3), random_tree(rng, 2)
     shapes = pin.GeometryModel()
     for k in range(5):
-        shape = pin.GeometryObject(f"s{k}", int(rng.integers(4)), pin.SE3.Random(), coal.Box(*rng.uniform(0.1, 1.0, 3)))
-        shape.meshColor, shape.meshScale, shape.meshPath = rng.uniform(size=4), rng.uniform(1.0, 2.0, 3), f"mesh{k}.stl"
+        shape = pin.GeometryObject(
+            f"s{k}", int(rng.integers(4)), pin.SE3.Random(), coal.Box(*rng.uniform(0.1, 1.0, 3))
+        )
+        shape.meshColor, shape.meshScale, shape.meshPath = (
+            rng.uniform(size=4),
+            rng.uniform(1.0, 2.0, 3),
+            f"mesh{k}.stl",
+        )
         shape.overrideMaterial = bool(k % 2)
         shapes.addGeometryObject(shape)
     model, placement, geometry = pin.Model(trunk), pin.SE3.Random(), pin.GeometryModel()
     geometry.addGeometryObject(pin.GeometryObject("first", 0, pin.SE3.Identity(), coal.Sphere(0.1)))
     joints = graft(model, branch, parent=1, placement=placement, prefix="b.")
-    added = graft_geometry(geometry, shapes.geometryObjects, joints=joints, placement=placement, prefix="b.")
+    added = graft_geometry(
+        geometry, shapes.geometryObjects, joints=joints, placement=placement, prefix="b."
+    )
     assert added == [1, 2, 3, 4, 5]
     z_trunk, z_branch = rng.normal(size=trunk.nv), rng.normal(size=branch.nv)
     data, below, above = model.createData(), trunk.createData(), branch.createData()
     there, alone = geometry.createData(), shapes.createData()
-    pin.updateGeometryPlacements(model, data, geometry, there, Coordinates(model).q(np.concatenate([z_trunk, z_branch])))
+    pin.updateGeometryPlacements(
+        model, data, geometry, there, Coordinates(model).q(np.concatenate([z_trunk, z_branch]))
+    )
     pin.forwardKinematics(trunk, below, Coordinates(trunk).q(z_trunk))
     pin.updateGeometryPlacements(branch, above, shapes, alone, Coordinates(branch).q(z_branch))
-    for index, (original, where) in zip(added, zip(shapes.geometryObjects, alone.oMg, strict=True), strict=True):
+    for index, (original, where) in zip(
+        added, zip(shapes.geometryObjects, alone.oMg, strict=True), strict=True
+    ):
         twin = geometry.geometryObjects[index]
         expected = below.oMi[1] * placement * where
         np.testing.assert_allclose(there.oMg[index].homogeneous, expected.homogeneous, atol=1e-11)
         assert twin.name == f"b.{original.name}"
-        assert (twin.meshPath, twin.overrideMaterial) == (original.meshPath, original.overrideMaterial)
+        assert (twin.meshPath, twin.overrideMaterial) == (
+            original.meshPath,
+            original.overrideMaterial,
+        )
         np.testing.assert_array_equal(twin.meshColor, original.meshColor)
         np.testing.assert_array_equal(twin.meshScale, original.meshScale)
 

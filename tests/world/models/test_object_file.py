@@ -46,15 +46,23 @@ def test_limits_that_are_not_stated_have_documented_defaults() -> None:
     np.testing.assert_array_equal(thing.acceleration, [3.0, DEFAULT_ACCELERATION])
 
 
-@pytest.mark.parametrize(("free", "stated", "firm"), [(0, "", 0), (1, "", 1), (0, "firm: true", 1), (1, "firm: false", 0)])
-def test_a_hand_clamps_what_is_free_unless_told_otherwise(free: int, stated: str, firm: int) -> None:
+@pytest.mark.parametrize(
+    ("free", "stated", "firm"),
+    [(0, "", 0), (1, "", 1), (0, "firm: true", 1), (1, "firm: false", 0)],
+)
+def test_a_hand_clamps_what_is_free_unless_told_otherwise(
+    free: int, stated: str, firm: int
+) -> None:
     text = f"urdf: thing.urdf\nfree: {bool(free)}\nattachments: [{{name: grip, link: panel, {stated}}}]"
     assert load_text(URDF, text).attachment().firm is bool(firm)
 
 
 def test_what_stands_free_cannot_be_pushed() -> None:
     with pytest.raises(InputError, match="nothing that leads it") as caught:
-        load_text(URDF, "urdf: thing.urdf\nfree: true\nattachments: [{name: grip, link: panel, contact: push}]")
+        load_text(
+            URDF,
+            "urdf: thing.urdf\nfree: true\nattachments: [{name: grip, link: panel, contact: push}]",
+        )
     assert (caught.value.line, caught.value.field) == (3, "attachments[0].contact")
 
 
@@ -78,7 +86,9 @@ def test_two_grasps_cannot_share_a_coordinate() -> None:
         ("latches:", "latch:", 7, "latch", "latches"),
     ],
 )
-def test_unknown_names_in_a_description(old: str, new: str, line: int, field: str, nearest: str) -> None:
+def test_unknown_names_in_a_description(
+    old: str, new: str, line: int, field: str, nearest: str
+) -> None:
     with pytest.raises(UnknownNameError) as caught:
         load_text(URDF, BASE.replace(old, new))
     assert (caught.value.line, caught.value.field, caught.value.nearest) == (line, field, nearest)
@@ -94,21 +104,61 @@ def test_unknown_names_in_a_description(old: str, new: str, line: int, field: st
         ("acceleration: 3", "acceleration: yes", 3, "joints.hinge.acceleration"),
         ("link: panel", "position: [0, 0, 0]", 5, "attachments[0].link"),
         ("link: panel", "link: panel\n    joint: revolute", 5, "attachments[0]"),
-        ("link: panel", "link: panel\n    joint: revolute\n    axis: [0, 0, 0]", 8, "attachments[0].axis"),
+        (
+            "link: panel",
+            "link: panel\n    joint: revolute\n    axis: [0, 0, 0]",
+            8,
+            "attachments[0].axis",
+        ),
         (
             "link: panel",
             "link: panel\n    joint: revolute\n    axis: [0, 0, 1]\n    limits: [0.1, 1]",
             9,
             "attachments[0].limits",
         ),
-        ("link: panel", "link: panel\n    joint: spherical\n    axis: [0, 0, 1]", 5, "attachments[0]"),
-        ("link: panel", "link: panel\n    joint: spherical\n    limits: [0.1, 1]", 8, "attachments[0].limits"),
+        (
+            "link: panel",
+            "link: panel\n    joint: spherical\n    axis: [0, 0, 1]",
+            5,
+            "attachments[0]",
+        ),
+        (
+            "link: panel",
+            "link: panel\n    joint: spherical\n    limits: [0.1, 1]",
+            8,
+            "attachments[0].limits",
+        ),
         ("link: panel", f"link: panel\n    joint: cylindrical\n{SLIDE}", 5, "attachments[0]"),
-        ("link: panel", f"link: panel\n    joint: cylindrical\n{SLIDE}\n    turn: [1, 2]", 10, "attachments[0].turn"),
-        ("link: panel", f"link: panel\n    joint: cylindrical\n{SLIDE}\n    turn: 1.2", 10, "attachments[0].turn"),
-        ("link: panel", "link: panel\n    joint: cylindrical\n    axis: [0, 1, 0]\n    turn: [-1, 1]", 5, "attachments[0]"),
-        ("link: panel", "link: panel\n    joint: cylindrical\n    limits: [-1, 1]\n    turn: [-1, 1]", 5, "attachments[0]"),
-        ("link: panel", f"link: panel\n    joint: revolute\n{SLIDE}\n    turn: [-1, 1]", 5, "attachments[0]"),
+        (
+            "link: panel",
+            f"link: panel\n    joint: cylindrical\n{SLIDE}\n    turn: [1, 2]",
+            10,
+            "attachments[0].turn",
+        ),
+        (
+            "link: panel",
+            f"link: panel\n    joint: cylindrical\n{SLIDE}\n    turn: 1.2",
+            10,
+            "attachments[0].turn",
+        ),
+        (
+            "link: panel",
+            "link: panel\n    joint: cylindrical\n    axis: [0, 1, 0]\n    turn: [-1, 1]",
+            5,
+            "attachments[0]",
+        ),
+        (
+            "link: panel",
+            "link: panel\n    joint: cylindrical\n    limits: [-1, 1]\n    turn: [-1, 1]",
+            5,
+            "attachments[0]",
+        ),
+        (
+            "link: panel",
+            f"link: panel\n    joint: revolute\n{SLIDE}\n    turn: [-1, 1]",
+            5,
+            "attachments[0]",
+        ),
         ("link: panel", "link: panel\n    turn: [-1, 1]", 5, "attachments[0]"),
         ("link: panel", "link: panel\n    standoff: -0.01", 7, "attachments[0].standoff"),
         ("link: panel", "link: panel\n    firm: 2", 7, "attachments[0].firm"),
@@ -117,11 +167,36 @@ def test_unknown_names_in_a_description(old: str, new: str, line: int, field: st
         ("link: panel", "link: panel\n    opening: wide", 7, "attachments[0].opening"),
         ("link: panel", "link: panel\n    contact: pull", 7, "attachments[0].contact"),
         ("link: panel", "link: panel\n    contact: push\n    firm: true", 5, "attachments[0]"),
-        ("link: panel", f"link: panel\n    freedoms: [{{{ALONG}}}, {{{ALONG}}}]", 5, "attachments[0]"),
-        ("link: panel", f"link: panel\n    joint: spherical\n    freedoms: [{{{ALONG}}}]", 5, "attachments[0]"),
-        ("link: panel", f"link: panel\n    freedoms: [{{{ALONG}, turn: [0, 0, 1]}}]", 7, "attachments[0].freedoms[0]"),
-        ("link: panel", f"link: panel\n    freedoms: [{{{ALONG}, through: [0, 0, 1]}}]", 7, "attachments[0].freedoms[0]"),
-        ("link: panel", "link: panel\n    freedoms: [{name: up, limits: [0, 1]}]", 7, "attachments[0].freedoms[0]"),
+        (
+            "link: panel",
+            f"link: panel\n    freedoms: [{{{ALONG}}}, {{{ALONG}}}]",
+            5,
+            "attachments[0]",
+        ),
+        (
+            "link: panel",
+            f"link: panel\n    joint: spherical\n    freedoms: [{{{ALONG}}}]",
+            5,
+            "attachments[0]",
+        ),
+        (
+            "link: panel",
+            f"link: panel\n    freedoms: [{{{ALONG}, turn: [0, 0, 1]}}]",
+            7,
+            "attachments[0].freedoms[0]",
+        ),
+        (
+            "link: panel",
+            f"link: panel\n    freedoms: [{{{ALONG}, through: [0, 0, 1]}}]",
+            7,
+            "attachments[0].freedoms[0]",
+        ),
+        (
+            "link: panel",
+            "link: panel\n    freedoms: [{name: up, limits: [0, 1]}]",
+            7,
+            "attachments[0].freedoms[0]",
+        ),
         (
             "link: panel",
             "link: panel\n    freedoms: [{name: up, slide: [0, 0, 0], limits: [0, 1]}]",
@@ -129,7 +204,12 @@ def test_unknown_names_in_a_description(old: str, new: str, line: int, field: st
             "attachments[0].freedoms[0].slide",
         ),
         ("link: panel", "link: panel\n    approach: [1, 0, 0]", 5, "attachments[0]"),
-        ("link: panel", "link: panel\n    approach: [1, 0, 0]\n    closing: [1, 0, 1]", 5, "attachments[0]"),
+        (
+            "link: panel",
+            "link: panel\n    approach: [1, 0, 0]\n    closing: [1, 0, 1]",
+            5,
+            "attachments[0]",
+        ),
         ("link: panel", "link: panel\n  - name: grip\n    link: panel", 7, "attachments[1].name"),
         ("joint: hinge,", "joint: hinge, held_at: 2,", 8, "latches[0].held_at"),
         ("released_by: knob", "released_by: hinge", 8, "latches[0].released_by"),
@@ -150,12 +230,24 @@ def test_wrong_values_in_a_description(old: str, new: str, line: int, field: str
     [
         (URDF.replace("</robot>", ""), "not valid XML"),
         (URDF.replace("robot", "model"), "expected an element <robot>"),
-        (URDF.replace('type="continuous"', 'type="floating"'), "knob: this joint type is not supported"),
-        (URDF.replace('<axis xyz="1 0 0"/>', '<axis xyz="1 0 0"/><mimic joint="hinge"/>'), "knob: joints that mimic"),
-        (URDF.replace('velocity="1"', 'velocity="0"'), "hinge.limit.velocity"),
-        (URDF.replace('child link="lever"', 'child link="lver"'), "knob: child: there is no link 'lver'; did you mean 'lever'"),
         (
-            URDF.replace('<link name="panel"/>', f'<link name="panel"><visual><geometry>{SHAPES[0]}</geometry></visual></link>'),
+            URDF.replace('type="continuous"', 'type="floating"'),
+            "knob: this joint type is not supported",
+        ),
+        (
+            URDF.replace('<axis xyz="1 0 0"/>', '<axis xyz="1 0 0"/><mimic joint="hinge"/>'),
+            "knob: joints that mimic",
+        ),
+        (URDF.replace('velocity="1"', 'velocity="0"'), "hinge.limit.velocity"),
+        (
+            URDF.replace('child link="lever"', 'child link="lver"'),
+            "knob: child: there is no link 'lver'; did you mean 'lever'",
+        ),
+        (
+            URDF.replace(
+                '<link name="panel"/>',
+                f'<link name="panel"><visual><geometry>{SHAPES[0]}</geometry></visual></link>',
+            ),
             "nothing in this URDF can collide",
         ),
     ],
@@ -195,16 +287,24 @@ def test_wrong_shapes_are_refused(kind: str, shape: str, problem: str) -> None:
 
 def test_shapes_stand_where_pinocchio_has_them(tmp_path: Path) -> None:
     rng, shapes = np.random.default_rng(0), ""
-    for xyz, rpy in zip(rng.uniform(-1.0, 1.0, (20, 3)).tolist(), rng.uniform(-3.0, 3.0, (20, 3)).tolist(), strict=True):
+    for xyz, rpy in zip(
+        rng.uniform(-1.0, 1.0, (20, 3)).tolist(),
+        rng.uniform(-3.0, 3.0, (20, 3)).tolist(),
+        strict=True,
+    ):
         origin = f'<origin xyz="{" ".join(map(str, xyz))}" rpy="{" ".join(map(str, rpy))}"/>'
         shapes += f"<collision>{origin}<geometry>{SHAPES[0]}</geometry></collision>"
     file = tmp_path / "thing.urdf"
     file.write_text(URDF.replace('<link name="panel"/>', f'<link name="panel">{shapes}</link>'))
     model, collision, _ = load_urdf(file)
-    theirs = pin.buildGeomFromUrdfString(model, file.read_text(), pin.GeometryType.COLLISION).geometryObjects
+    theirs = pin.buildGeomFromUrdfString(
+        model, file.read_text(), pin.GeometryType.COLLISION
+    ).geometryObjects
     assert [s.name for s in collision.geometryObjects] == [s.name for s in theirs]
     for ours, other in zip(collision.geometryObjects, theirs, strict=True):
-        np.testing.assert_allclose(ours.placement.homogeneous, other.placement.homogeneous, rtol=0.0, atol=1e-15)
+        np.testing.assert_allclose(
+            ours.placement.homogeneous, other.placement.homogeneous, rtol=0.0, atol=1e-15
+        )
         assert (ours.parentJoint, ours.parentFrame) == (other.parentJoint, other.parentFrame)
 
 
@@ -215,7 +315,10 @@ def test_capsules_and_colours_of_an_object() -> None:
     thing = load_text(URDF.replace('<link name="panel"/>', panel), BASE)
     (solid,) = (shape.geometry for shape in thing.collision.geometryObjects)
     assert (solid.radius, solid.halfLength) == (0.1, 0.2)
-    assert [tuple(shape.meshColor) for shape in thing.visual.geometryObjects] == [(1.0, 0.0, 0.0, 1.0), (0.9, 0.9, 0.9, 1.0)]
+    assert [tuple(shape.meshColor) for shape in thing.visual.geometryObjects] == [
+        (1.0, 0.0, 0.0, 1.0),
+        (0.9, 0.9, 0.9, 1.0),
+    ]
     assert [shape.overrideMaterial for shape in thing.visual.geometryObjects] == [True, False]
 
 
@@ -223,7 +326,9 @@ def test_capsules_and_colours_of_an_object() -> None:
 def test_collision_meshes_become_their_convex_hulls(tmp_path: Path, filename: str) -> None:
     folder = tmp_path / "things"
     folder.mkdir()
-    (folder / "wedge.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    (folder / "wedge.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    )
     mesh = f'<geometry><mesh filename="{filename}" scale="2 2 1"/></geometry>'
     (folder / "t.urdf").write_text(
         f'<robot name="t"><link name="l"><visual>{mesh}</visual><collision>{mesh}</collision></link></robot>'
@@ -251,7 +356,9 @@ def test_unknown_objects_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_description_that_is_handed_over(tmp_path: Path) -> None:
-    (tmp_path / "wedge.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    (tmp_path / "wedge.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    )
     mesh = '<collision><geometry><mesh filename="wedge.obj"/></geometry></collision>'
     urdf = f'<robot name="wedge"><link name="base">{mesh}</link></robot>'
     description = {"urdf": urdf, "free": True, "attachments": [{"name": "grip", "link": "base"}]}
@@ -263,4 +370,7 @@ def test_a_description_that_is_handed_over(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected text"):
         load_object({1: urdf})  # type: ignore[dict-item]
     (tmp_path / "wedge.urdf").write_text(urdf)
-    assert load_object({**description, "urdf": "wedge.urdf"}, folder=tmp_path).urdf == tmp_path / "wedge.urdf"
+    assert (
+        load_object({**description, "urdf": "wedge.urdf"}, folder=tmp_path).urdf
+        == tmp_path / "wedge.urdf"
+    )

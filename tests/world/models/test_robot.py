@@ -15,7 +15,14 @@ from vkc_pin.world.models.robot import _LEAST_LEVER, Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.scene import Scene
 
-ARM = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+ARM = [
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+]
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +36,12 @@ def ur5e(q: np.ndarray) -> np.ndarray:
     total = np.eye(4)
     for k, twist in enumerate([np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]):
         c, s, ct, st = np.cos(q[k]), np.sin(q[k]), np.cos(twist), np.sin(twist)
-        total = total @ [[c, -s * ct, s * st, a[k] * c], [s, c * ct, -c * st, a[k] * s], [0, st, ct, d[k]], [0, 0, 0, 1]]
+        total = total @ [
+            [c, -s * ct, s * st, a[k] * c],
+            [s, c * ct, -c * st, a[k] * s],
+            [0, st, ct, d[k]],
+            [0, 0, 0, 1],
+        ]
     return total
 
 
@@ -67,16 +79,22 @@ def test_forward_kinematics_against_the_makers_parameters(husky: Robot) -> None:
         flange = base @ foot @ ur5e(z[3:])
         np.testing.assert_allclose(placement(husky, "tool0", z).homogeneous, flange, atol=1e-12)
         tool = flange @ pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.142224])).homogeneous
-        np.testing.assert_allclose(placement(husky, husky.tool_frame, z).homogeneous, tool, atol=1e-12)
+        np.testing.assert_allclose(
+            placement(husky, husky.tool_frame, z).homogeneous, tool, atol=1e-12
+        )
 
 
 def test_foot_is_turned_by_pi(husky: Robot) -> None:
-    np.testing.assert_allclose(placement(husky, "ur_base_link", np.zeros(9)).rotation, np.diag([-1, -1, 1]), atol=1e-12)
+    np.testing.assert_allclose(
+        placement(husky, "ur_base_link", np.zeros(9)).rotation, np.diag([-1, -1, 1]), atol=1e-12
+    )
 
 
 def test_fingers_leave_the_opening_free(husky: Robot) -> None:
     data, placed = husky.model.createData(), husky.collision.createData()
-    pin.updateGeometryPlacements(husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky)))
+    pin.updateGeometryPlacements(
+        husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky))
+    )
     tool = placement(husky, "tool", at_rest(husky))
 
     def gap(shape: coal.CollisionGeometry, offset: tuple[float, float, float]) -> float:
@@ -95,7 +113,9 @@ def test_fingers_leave_the_opening_free(husky: Robot) -> None:
             for k, m in enumerate(placed.oMg)
         )
 
-    assert 0.0 < gap(coal.Box(0.085, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.002  # what the fingers close on lies along x
+    assert (
+        0.0 < gap(coal.Box(0.085, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.002
+    )  # what the fingers close on lies along x
     assert gap(coal.Box(0.09, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.0
     assert gap(coal.Box(0.02, 0.3, 0.03), (0.0, 0.0, 0.0)) > 0.02  # and passes through along y
     assert gap(coal.Box(0.02, 0.02, 0.3), (0.0, 0.0, 0.15)) > 0.02  # z points away from the palm
@@ -104,10 +124,19 @@ def test_fingers_leave_the_opening_free(husky: Robot) -> None:
 
 def test_collision_pieces_contain_the_links(husky: Robot) -> None:
     for link in husky.links:
-        shapes = [shape for shape in husky.collision.geometryObjects if shape.name.rpartition("_")[0] == link]
-        assert all(isinstance(shape.geometry, coal.Convex) and shape.geometry.num_points <= 40 for shape in shapes)
+        shapes = [
+            shape
+            for shape in husky.collision.geometryObjects
+            if shape.name.rpartition("_")[0] == link
+        ]
+        assert all(
+            isinstance(shape.geometry, coal.Convex) and shape.geometry.num_points <= 40
+            for shape in shapes
+        )
         frame = husky.model.frames[husky.model.getFrameId(link)].placement
-        skin = trimesh.util.concatenate([shape.mesh() for shape in husky.file.shapes("visual") if shape.link == link])
+        skin = trimesh.util.concatenate(
+            [shape.mesh() for shape in husky.file.shapes("visual") if shape.link == link]
+        )
         points = np.vstack([skin.vertices, trimesh.sample.sample_surface(skin, 3000, seed=0)[0]])
         points = points @ frame.rotation.T + frame.translation
         outside = np.full(len(points), np.inf)
@@ -121,18 +150,27 @@ def test_collision_pieces_contain_the_links(husky: Robot) -> None:
 
 def test_home_is_free_of_collisions_by_far(husky: Robot) -> None:
     data, placed = husky.model.createData(), husky.collision.createData()
-    pin.computeDistances(husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky)))
+    pin.computeDistances(
+        husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky))
+    )
     assert min(result.min_distance for result in placed.distanceResults) > 0.05
 
 
 def test_pairs(husky: Robot) -> None:
     everything = load_robot("husky_ur5e", pairs="all")
     assert len(husky.collision.geometryObjects) == 18
-    # 4 shapes on the base, 1, 3, 2, 1, 1 on the arm's links, 6 on the hand: all but those on the same joint
+    # 4 shapes on the base, 1, 3, 2, 1, 1 on the arm's links, 6 on the hand: all but those on the
+    # same joint
     counts = [4, 1, 3, 2, 1, 1, 6]
-    assert len(everything.collision.collisionPairs) == (sum(counts) ** 2 - sum(count**2 for count in counts)) // 2
+    assert (
+        len(everything.collision.collisionPairs)
+        == (sum(counts) ** 2 - sum(count**2 for count in counts)) // 2
+    )
     assert len(husky.collision.collisionPairs) == 95
-    links = {frozenset((husky.link_of(pair.first), husky.link_of(pair.second))) for pair in husky.collision.collisionPairs}
+    links = {
+        frozenset((husky.link_of(pair.first), husky.link_of(pair.second)))
+        for pair in husky.collision.collisionPairs
+    }
     assert frozenset(("base_link", "gripper_link")) in links
     assert frozenset(("upper_arm_link", "forearm_link")) not in links
 
@@ -155,8 +193,12 @@ def test_the_lever_is_how_far_a_radian_moves_the_hand(husky: Robot) -> None:
         pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
         return np.array(data.oMf[tool].translation)
 
-    for z in rng.uniform(np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi), (400, len(robot.lower))):
-        steps.append([np.linalg.norm(hand(z + 1e-6 * row) - hand(z)) / 1e-6 for row in np.eye(len(z))[3:]])
+    for z in rng.uniform(
+        np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi), (400, len(robot.lower))
+    ):
+        steps.append(
+            [np.linalg.norm(hand(z + 1e-6 * row) - hand(z)) / 1e-6 for row in np.eye(len(z))[3:]]
+        )
     assert robot.lever == pytest.approx(np.sqrt(np.mean(np.square(steps), axis=0)).mean(), rel=0.05)
     assert robot.lever == load_robot("husky_ur5e").lever
 
@@ -164,11 +206,21 @@ def test_the_lever_is_how_far_a_radian_moves_the_hand(husky: Robot) -> None:
 def test_the_front_is_as_far_ahead_as_the_hand_reaches(husky: Robot) -> None:
     """Of all corners of the touch links, in the tool frame; without such a link it is the tool frame itself."""
     frame = husky.model.frames[husky.model.getFrameId(husky.tool_frame)]
-    hand = [s for k, s in enumerate(husky.collision.geometryObjects) if husky.link_of(k) in husky.touch_links]
-    ahead = [frame.placement.actInv(s.placement).act(point)[2] for s in hand for point in s.geometry.points()]
+    hand = [
+        s
+        for k, s in enumerate(husky.collision.geometryObjects)
+        if husky.link_of(k) in husky.touch_links
+    ]
+    ahead = [
+        frame.placement.actInv(s.placement).act(point)[2]
+        for s in hand
+        for point in s.geometry.points()
+    ]
     np.testing.assert_allclose(husky.front.translation, [0.0, 0.0, max(ahead)], rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(husky.front.rotation, np.eye(3))
-    np.testing.assert_array_equal(dataclasses.replace(husky, touch_links=()).front.homogeneous, np.eye(4))
+    np.testing.assert_array_equal(
+        dataclasses.replace(husky, touch_links=()).front.homogeneous, np.eye(4)
+    )
 
 
 def test_an_arm_that_does_not_turn_has_the_least_lever(husky: Robot) -> None:

@@ -35,7 +35,10 @@ def test_bases() -> None:
 
 def test_wheels_and_the_least_radius_of_a_turn(tmp_path: Path) -> None:
     husky = load_robot("husky_ur5e", base="ackermann", turning_radius=0.8)
-    assert (husky.turning_radius, load_robot("husky_ur5e", base="differential").turning_radius) == (0.8, 0.0)
+    assert (husky.turning_radius, load_robot("husky_ur5e", base="differential").turning_radius) == (
+        0.8,
+        0.0,
+    )
     assert husky.wheels is not None
     assert husky.wheels.rim == pytest.approx(husky.wheels.radius * husky.wheels.speed)
     source = (FOLDER / "husky_ur5e.urdf").as_posix()
@@ -54,7 +57,10 @@ def test_wheels_and_the_least_radius_of_a_turn(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=expected) as caught:
             load_robot(file, **given)  # type: ignore[arg-type]
         assert caught.value.field == "turning_radius"
-    for wheels, field in (("{track: 0.5, radius: 0.1}", "speed"), ("{track: -1, radius: 0.1, speed: 3}", "track")):
+    for wheels, field in (
+        ("{track: 0.5, radius: 0.1}", "speed"),
+        ("{track: -1, radius: 0.1, speed: 3}", "track"),
+    ):
         file.write_text(text + f"base: {{wheels: {wheels}}}\n")
         with pytest.raises(InputError, match=field):
             load_robot(file)
@@ -62,7 +68,12 @@ def test_wheels_and_the_least_radius_of_a_turn(tmp_path: Path) -> None:
 
 def test_locked_joints_and_another_tool_frame() -> None:
     robot = load_robot("husky_ur5e", tool_frame="wrist_2_link", locked_joints={"elbow_joint": -1.5})
-    assert robot.coordinates.names[3:] == ("shoulder_pan_joint", "shoulder_lift_joint", "wrist_1_joint", "wrist_2_joint")
+    assert robot.coordinates.names[3:] == (
+        "shoulder_pan_joint",
+        "shoulder_lift_joint",
+        "wrist_1_joint",
+        "wrist_2_joint",
+    )
     whole = load_robot("husky_ur5e")
     arm = np.array([0.3, -1.0, -1.5, 0.4, 0.2, 0.0])
     here = placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
@@ -75,7 +86,12 @@ def test_locked_joints_and_another_tool_frame() -> None:
 
 @pytest.mark.parametrize(
     ("name", "tool", "joints"),
-    [("panda", "panda_hand_tcp", 7), ("tiago_no_hand", "wrist_ft_tool_link", 8), ("ur5", "tool0", 6), ("kinova", None, 6)],
+    [
+        ("panda", "panda_hand_tcp", 7),
+        ("tiago_no_hand", "wrist_ft_tool_link", 8),
+        ("ur5", "tool0", 6),
+        ("kinova", None, 6),
+    ],
 )
 def test_robots_of_example_robot_data(name: str, tool: str | None, joints: int) -> None:
     robot = load_robot(name)
@@ -90,7 +106,10 @@ def test_robots_of_example_robot_data(name: str, tool: str | None, joints: int) 
 
 def test_tiago_with_its_hand() -> None:
     robot = load_robot("tiago", tool_frame="hand_tool_link", pairs="all")
-    assert robot.coordinates.names[3:] == ("torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8)))
+    assert robot.coordinates.names[3:] == (
+        "torso_lift_joint",
+        *(f"arm_{k}_joint" for k in range(1, 8)),
+    )
 
 
 def test_any_urdf_has_sensible_defaults(tmp_path: Path) -> None:
@@ -99,12 +118,18 @@ def test_any_urdf_has_sensible_defaults(tmp_path: Path) -> None:
         '<joint name="follower" type="revolute"><parent link="l3"/><child link="f"/><mimic joint="j0"/>'
         '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
     )
-    robot = load_robot(small_urdf(tmp_path, joints=wheel, links='<link name="w"/><link name="f"/>'), pairs="all")
+    robot = load_robot(
+        small_urdf(tmp_path, joints=wheel, links='<link name="w"/><link name="f"/>'), pairs="all"
+    )
     assert robot.coordinates.names[3:] == ("j0", "j1", "j2")
     assert robot.name == "small"
-    np.testing.assert_allclose(robot.velocity, [1, 1, 2, 1.0, 1.5, 1.5])  # the first is as slow as what follows it
+    np.testing.assert_allclose(
+        robot.velocity, [1, 1, 2, 1.0, 1.5, 1.5]
+    )  # the first is as slow as what follows it
     np.testing.assert_allclose(robot.acceleration, [3, 3, 6, 1.4, 1.4, 1.4])
-    np.testing.assert_array_equal(robot.model.jointPlacements[3].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    np.testing.assert_array_equal(
+        robot.model.jointPlacements[3].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    )
 
 
 def test_robot_yaml_beside_a_urdf_is_used(tmp_path: Path) -> None:
@@ -113,8 +138,17 @@ def test_robot_yaml_beside_a_urdf_is_used(tmp_path: Path) -> None:
         "urdf: small.urdf\ntool_frame: l3\nhome: {j1: 0.5}\njoints: {j2: {velocity: 0.2, acceleration: 9}}\n"
     )
     robot = load_robot(file, pairs="all")
-    assert (robot.tool_frame, robot.home.tolist(), robot.velocity[5], robot.acceleration[5]) == ("l3", [0.0, 0.5, 0.0], 0.2, 9.0)
-    assert load_robot(tmp_path / "robot.yaml", pairs="all", home={"j1": -1.0}).home.tolist() == [0.0, -1.0, 0.0]
+    assert (robot.tool_frame, robot.home.tolist(), robot.velocity[5], robot.acceleration[5]) == (
+        "l3",
+        [0.0, 0.5, 0.0],
+        0.2,
+        9.0,
+    )
+    assert load_robot(tmp_path / "robot.yaml", pairs="all", home={"j1": -1.0}).home.tolist() == [
+        0.0,
+        -1.0,
+        0.0,
+    ]
 
 
 def test_a_robot_is_called_as_its_folder_or_its_file(tmp_path: Path) -> None:
@@ -130,7 +164,9 @@ def test_a_copied_urdf_finds_the_meshes_of_example_robot_data(tmp_path: Path) ->
     copy.write_text(original.urdf.read_text())
     assert "package://example-robot-data/" in copy.read_text()
     found = load_robot(copy, pairs="all")
-    assert [shape.name for shape in found.collision.geometryObjects] == [s.name for s in original.collision.geometryObjects]
+    assert [shape.name for shape in found.collision.geometryObjects] == [
+        s.name for s in original.collision.geometryObjects
+    ]
     copy.write_text(original.urdf.read_text().replace("/link0.stl", "/link00.stl"))
     with pytest.raises(InputError, match=r"link00\.stl"):
         load_robot(copy, pairs="all")
@@ -166,10 +202,17 @@ def test_broken_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"package://nowhere/m\.stl"):
         load_robot(small_urdf(tmp_path, links=mesh, joints=joint))
     (tmp_path / "bad.stl").write_text("")
-    file = small_urdf(tmp_path, links=mesh.replace("package://nowhere/m.stl", "bad.stl"), joints=joint)
+    file = small_urdf(
+        tmp_path, links=mesh.replace("package://nowhere/m.stl", "bad.stl"), joints=joint
+    )
     with pytest.raises(InputError, match=r"bad\.stl"):
         load_robot(file)
-    bare = file.read_text().replace("<collision>", "<visual>").replace("</collision>", "</visual>").replace("bad.stl", "")
+    bare = (
+        file.read_text()
+        .replace("<collision>", "<visual>")
+        .replace("</collision>", "</visual>")
+        .replace("bad.stl", "")
+    )
     file.write_text(bare)
     with pytest.raises(InputError, match="can collide"):
         load_robot(file)
@@ -183,11 +226,15 @@ def test_srdf_with_an_unknown_link(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="there is no link 'l5'") as caught:
         load_robot(file)
     assert (caught.value.file, caught.value.line) == (tmp_path / "small.srdf", 2)
-    assert len(load_robot(file, pairs="sampled").collision.collisionPairs) == 0  # it cannot touch itself
+    assert (
+        len(load_robot(file, pairs="sampled").collision.collisionPairs) == 0
+    )  # it cannot touch itself
 
 
 def test_no_pair_left(tmp_path: Path) -> None:
-    pairs = "".join(f'<disable_collisions link1="l{i}" link2="l{j}"/>' for i in range(4) for j in range(i))
+    pairs = "".join(
+        f'<disable_collisions link1="l{i}" link2="l{j}"/>' for i in range(4) for j in range(i)
+    )
     (tmp_path / "small.srdf").write_text(f"<robot>{pairs}</robot>")
     with pytest.raises(InputError, match="no pair of links"):
         load_robot(small_urdf(tmp_path))
@@ -197,7 +244,11 @@ def test_a_copy_of_the_robot_works_elsewhere(husky: Robot, tmp_path: Path) -> No
     shutil.copytree(FOLDER, tmp_path / "husky_ur5e")
     twin = load_robot(tmp_path / "husky_ur5e" / "husky_ur5e.urdf")
     assert twin.urdf.parent == (tmp_path / "husky_ur5e").resolve()
-    assert (twin.name, twin.tool_frame, len(twin.collision.collisionPairs)) == (husky.name, "tool", 95)
+    assert (twin.name, twin.tool_frame, len(twin.collision.collisionPairs)) == (
+        husky.name,
+        "tool",
+        95,
+    )
     with pytest.raises(dataclasses.FrozenInstanceError):
         twin.name = "other"  # type: ignore[misc]
 
@@ -208,9 +259,15 @@ def test_joints_outside_their_limits_are_refused(tmp_path: Path, field: str, by_
     """Planned or locked, in robot.yaml or as an argument."""
     small_urdf(tmp_path)
     for joint in ("j1", "j2"):
-        about = ["urdf: small.urdf", "tool_frame: l2", *([f"{field}: {{{joint}: 2.5}}"] if by_file else [])]
+        about = [
+            "urdf: small.urdf",
+            "tool_frame: l2",
+            *([f"{field}: {{{joint}: 2.5}}"] if by_file else []),
+        ]
         (tmp_path / "robot.yaml").write_text("\n".join(about) + "\n")
-        with pytest.raises(InputError, match=r"rests outside its limits .expected between -2 and 2, got 2.5") as caught:
+        with pytest.raises(
+            InputError, match=r"rests outside its limits .expected between -2 and 2, got 2.5"
+        ) as caught:
             load_robot(tmp_path / "robot.yaml", **({} if by_file else {field: {joint: 2.5}}))  # type: ignore[arg-type]
         assert caught.value.field == f"{field}.{joint}"
         assert (caught.value.file, caught.value.line) == (
@@ -219,7 +276,9 @@ def test_joints_outside_their_limits_are_refused(tmp_path: Path, field: str, by_
         load_robot(tmp_path / "small.urdf", **{field: {joint: 2.0 + 1e-7}})  # type: ignore[arg-type]
 
 
-def driving_urdf(folder: Path, *, order: str = "xyt", shape: bool = False, tilted: bool = False) -> Path:
+def driving_urdf(
+    folder: Path, *, order: str = "xyt", shape: bool = False, tilted: bool = False
+) -> Path:
     """The small robot on joints of its own that drive it about, as simulators have them; with links of nothing between."""
     file = small_urdf(folder)
     names, joints, solid = (
@@ -235,14 +294,20 @@ def driving_urdf(folder: Path, *, order: str = "xyt", shape: bool = False, tilte
         joints += f'<axis xyz="{axis}"/><limit lower="-9" upper="9"/></joint>'
     links = "".join(f'<link name="{name}"/>' for name in names[:3])
     text = file.read_text().replace("</robot>", f"{links}{joints}</robot>")
-    file.write_text(text.replace('<link name="m1"/>', f'<link name="m1">{solid}</collision></link>') if shape else text)
+    file.write_text(
+        text.replace('<link name="m1"/>', f'<link name="m1">{solid}</collision></link>')
+        if shape
+        else text
+    )
     return file
 
 
 @pytest.mark.parametrize("order", ["xyt", "yxt", "txy", "xty"])
 def test_a_base_of_its_own_is_noticed(tmp_path: Path, order: str) -> None:
     file = driving_urdf(tmp_path, order=order)
-    with pytest.warns(UserWarning, match=r"small.urdf: the virtual base .* are locked: drive_0, drive_1, drive_2$"):
+    with pytest.warns(
+        UserWarning, match=r"small.urdf: the virtual base .* are locked: drive_0, drive_1, drive_2$"
+    ):
         robot = load_robot(file)
     assert robot.coordinates.names == ("base_x", "base_y", "base_yaw", "j0", "j1", "j2")
     with warnings.catch_warnings():
@@ -259,7 +324,10 @@ def test_a_base_that_stands_still_leaves_it_alone(tmp_path: Path) -> None:
     assert robot.coordinates.names[3:] == ("drive_0", "drive_1", "drive_2", "j0", "j1", "j2")
 
 
-@pytest.mark.parametrize("change", [{"shape": True}, {"tilted": True}, {"order": "xxt"}, {"order": "xyx"}, {"order": "ttx"}])
+@pytest.mark.parametrize(
+    "change",
+    [{"shape": True}, {"tilted": True}, {"order": "xxt"}, {"order": "xyx"}, {"order": "ttx"}],
+)
 def test_what_is_no_base_of_its_own(tmp_path: Path, change: dict[str, object]) -> None:
     """Something on it that could collide, slides that climb, too few directions."""
     assert len(load_robot(driving_urdf(tmp_path, **change)).coordinates.names) == 9  # type: ignore[arg-type]
@@ -270,14 +338,24 @@ def test_height_of_the_root(tmp_path: Path) -> None:
     file = small_urdf(tmp_path)
     low, z = load_robot(file), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {height: 0.25}\n")
-    for robot, height in ((load_robot(file), 0.25), (load_robot(file, height=0.7), 0.7), (load_robot(file, height=0.0), 0.0)):
+    for robot, height in (
+        (load_robot(file), 0.25),
+        (load_robot(file, height=0.7), 0.7),
+        (load_robot(file, height=0.0), 0.0),
+    ):
         assert robot.height == height
         for frame in ("l0", "l3"):
             raised = placement(low, frame, z)
             raised.translation += np.array([0.0, 0.0, height])
             assert placement(robot, frame, z).isApprox(raised, 1e-12)
-        for shape, other in zip(robot.collision.geometryObjects[:1], low.collision.geometryObjects[:1], strict=True):
-            np.testing.assert_allclose(shape.placement.translation - other.placement.translation, [0.0, 0.0, height], atol=1e-12)
+        for shape, other in zip(
+            robot.collision.geometryObjects[:1], low.collision.geometryObjects[:1], strict=True
+        ):
+            np.testing.assert_allclose(
+                shape.placement.translation - other.placement.translation,
+                [0.0, 0.0, height],
+                atol=1e-12,
+            )
     with pytest.raises(InputError, match="height"):
         load_robot(file, height=float("nan"))
 

@@ -24,7 +24,9 @@ def test_joint_placements_are_clean(husky: Robot) -> None:
 
 def test_visual_geometry_is_light_and_coloured(husky: Robot) -> None:
     shapes = husky.visual.geometryObjects
-    triangles = sum(shape.geometry.num_tris for shape in shapes if isinstance(shape.geometry, coal.BVHModelBase))
+    triangles = sum(
+        shape.geometry.num_tris for shape in shapes if isinstance(shape.geometry, coal.BVHModelBase)
+    )
     assert 10_000 < triangles < 100_000
     assert all(shape.meshPath == "" for shape in shapes)
     assert len({tuple(shape.meshColor.round(3)) for shape in shapes}) > 5
@@ -42,7 +44,11 @@ def test_locking_agrees_with_the_whole_model() -> None:
     pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
     pin.framesForwardKinematics(full, whole, q)
     for index, frame in enumerate(robot.model.frames):
-        kinds = [i for i, other in enumerate(full.frames) if other.name == frame.name and other.type == frame.type]
+        kinds = [
+            i
+            for i, other in enumerate(full.frames)
+            if other.name == frame.name and other.type == frame.type
+        ]
         if kinds:
             assert data.oMf[index].isApprox(whole.oMf[kinds[0]], 1e-9), frame.name
     assert pin.computeTotalMass(robot.model) == pytest.approx(pin.computeTotalMass(full))

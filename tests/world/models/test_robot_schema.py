@@ -26,7 +26,9 @@ from vkc_pin.world.models.robot_file import load_robot
         ("srdf: none.srdf", None, "none.srdf"),
     ],
 )
-def test_mistakes_in_a_robot_yaml(tmp_path: Path, text: str, line: int | None, problem: str) -> None:
+def test_mistakes_in_a_robot_yaml(
+    tmp_path: Path, text: str, line: int | None, problem: str
+) -> None:
     small_urdf(tmp_path)
     (tmp_path / "robot.yaml").write_text(f"urdf: small.urdf\n{text}\n")
     with pytest.raises(InputError, match=problem) as caught:

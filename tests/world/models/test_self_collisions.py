@@ -24,7 +24,10 @@ def husky() -> Robot:
 
 
 def test_committed_list_is_what_sampling_finds(husky: Robot) -> None:
-    assert sample_allowed_pairs(husky, samples=3000, seed=7) == read_srdf(SRDF, links=husky.file.links).allowed
+    assert (
+        sample_allowed_pairs(husky, samples=3000, seed=7)
+        == read_srdf(SRDF, links=husky.file.links).allowed
+    )
 
 
 def test_a_free_home_is_one_from_which_plans_can_begin() -> None:
@@ -32,7 +35,9 @@ def test_a_free_home_is_one_from_which_plans_can_begin() -> None:
 
 
 def test_same_seed_same_pairs(husky: Robot) -> None:
-    assert sample_allowed_pairs(husky, samples=100, seed=3) == sample_allowed_pairs(husky, samples=100, seed=3)
+    assert sample_allowed_pairs(husky, samples=100, seed=3) == sample_allowed_pairs(
+        husky, samples=100, seed=3
+    )
 
 
 def test_reasons(husky: Robot) -> None:
@@ -51,7 +56,11 @@ def test_always_and_never(tmp_path: Path) -> None:
     joints = "".join(
         f'<joint name="{child}_joint" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
         f'<origin xyz="{x} 0 0"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
-        for parent, child, x in (("foot", "middle", 0.3), ("middle", "inner", 0.2), ("inner", "outer", 4.0))
+        for parent, child, x in (
+            ("foot", "middle", 0.3),
+            ("middle", "inner", 0.2),
+            ("inner", "outer", 4.0),
+        )
     )
     (tmp_path / "odd.urdf").write_text(f'<robot name="odd">{links}{joints}</robot>')
     robot = load_robot(tmp_path / "odd.urdf", pairs="all")
@@ -69,7 +78,9 @@ def test_written_file_reads_back(husky: Robot, tmp_path: Path) -> None:
     file = write_srdf(husky, tmp_path / "new.srdf", samples=50)
     again = read_srdf(file, links=husky.file.links)
     assert again.allowed == sample_allowed_pairs(husky, samples=50)
-    assert list(again.state(husky.coordinates.names[3:]).values()) == pytest.approx(list(husky.home))
+    assert list(again.state(husky.coordinates.names[3:]).values()) == pytest.approx(
+        list(husky.home)
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["new.srdf"]
     assert load_robot("husky_ur5e", srdf=file).home == pytest.approx(husky.home)
 
@@ -79,8 +90,20 @@ def ball(name: str, radius: float, x: float = 0.0) -> str:
     return f'<link name="{name}"><collision>{shape}</collision></link>'
 
 
-def hinge(parent: str, child: str, x: float = 0.0, *, kind: str = "revolute", axis: str = "0 0 1", upper: float = 1.5) -> str:
-    limit = "" if kind == "fixed" else f'<axis xyz="{axis}"/><limit lower="{-upper}" upper="{upper}" velocity="1" effort="1"/>'
+def hinge(
+    parent: str,
+    child: str,
+    x: float = 0.0,
+    *,
+    kind: str = "revolute",
+    axis: str = "0 0 1",
+    upper: float = 1.5,
+) -> str:
+    limit = (
+        ""
+        if kind == "fixed"
+        else f'<axis xyz="{axis}"/><limit lower="{-upper}" upper="{upper}" velocity="1" effort="1"/>'
+    )
     return (
         f'<joint name="{child}_joint" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{x} 0 0"/>'
         f"{limit}</joint>"
@@ -120,15 +143,31 @@ def test_neighbours_across_fixed_links_are_neighbours(tmp_path: Path) -> None:
     allowed = sample_allowed_pairs(robot, samples=200)
     assert allowed["bracket", "cover"] == "Adjacent"  # from an overlap to a few cm
     assert allowed["post", "shoulder"] == "Adjacent"
-    wide = (tmp_path / "arm.urdf").read_text().replace("0.05 0 0", "0.09 0 0").replace('"1.5"', '"3"').replace("-1.5", "-3")
+    wide = (
+        (tmp_path / "arm.urdf")
+        .read_text()
+        .replace("0.05 0 0", "0.09 0 0")
+        .replace('"1.5"', '"3"')
+        .replace("-1.5", "-3")
+    )
     (tmp_path / "arm.urdf").write_text(wide)
-    assert ("bracket", "cover") not in sample_allowed_pairs(load_robot(tmp_path / "arm.urdf", pairs="all"), samples=200)
+    assert ("bracket", "cover") not in sample_allowed_pairs(
+        load_robot(tmp_path / "arm.urdf", pairs="all"), samples=200
+    )
 
 
 def test_neighbours_that_an_srdf_leaves_out(tmp_path: Path) -> None:
     robot = load_robot(bracket(tmp_path, far=0.5, srdf=""))
-    kept_apart = {tuple(sorted((robot.link_of(p.first), robot.link_of(p.second)))) for p in robot.collision.collisionPairs}
-    assert not kept_apart & {("post", "shoulder"), ("bracket", "cover"), ("cover", "post"), ("bracket", "shoulder")}
+    kept_apart = {
+        tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
+        for p in robot.collision.collisionPairs
+    }
+    assert not kept_apart & {
+        ("post", "shoulder"),
+        ("bracket", "cover"),
+        ("cover", "post"),
+        ("bracket", "shoulder"),
+    }
     assert ("elbow", "post") in kept_apart
 
 
@@ -136,31 +175,54 @@ def slider(folder: Path, *, room: float, srdf: str | None = None, at: float = 0.
     """A finger of radius 20 mm on two slides between two walls; the wall in front of it is at most `room` away from it."""
     slides = [hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=room)]
     slides.append(hinge("carriage", "finger", 0.0, kind="prismatic", axis="0 1 0", upper=1e-6))
-    return arm(folder, ball("wall", 0.02), ball("carriage", 0.001, 2.0), ball("finger", 0.02), *slides, srdf=srdf)
+    return arm(
+        folder,
+        ball("wall", 0.02),
+        ball("carriage", 0.001, 2.0),
+        ball("finger", 0.02),
+        *slides,
+        srdf=srdf,
+    )
 
 
 def test_links_that_are_always_close_keep_half_of_what_they_can(tmp_path: Path) -> None:
     robot = load_robot(slider(tmp_path, room=0.012, at=0.004))
     assert list(robot.tight) == [("finger", "wall")]
-    assert robot.tight["finger", "wall"] == pytest.approx(0.004, abs=1e-9)  # at home; at most it would be 16 mm
+    assert robot.tight["finger", "wall"] == pytest.approx(
+        0.004, abs=1e-9
+    )  # at home; at most it would be 16 mm
     assert robot.own_margin(("finger", "wall"), 0.02) == pytest.approx(0.002, abs=1e-9)
     assert robot.own_margin(("finger", "wall"), 0.001) == 0.001
     assert robot.own_margin(("carriage", "wall"), 0.02) == 0.02
-    margins = {tuple(sorted((robot.link_of(i), robot.link_of(j)))): value for (i, j), value in robot.own_margins(0.02).items()}
+    margins = {
+        tuple(sorted((robot.link_of(i), robot.link_of(j)))): value
+        for (i, j), value in robot.own_margins(0.02).items()
+    }
     assert margins == {("finger", "wall"): pytest.approx(0.002, abs=1e-9)}
 
 
 @pytest.mark.parametrize("srdf", [None, ""], ids=["sampled", "srdf"])
 def test_links_that_touch_wherever_they_are(tmp_path: Path, srdf: str | None) -> None:
     file = slider(tmp_path, room=0.0005, srdf=srdf)
-    other = ball("far", 0.01) + hinge("finger", "far", 0.5, upper=3.1) + ball("end", 0.3) + hinge("far", "end", 0.4)
+    other = (
+        ball("far", 0.01)
+        + hinge("finger", "far", 0.5, upper=3.1)
+        + ball("end", 0.3)
+        + hinge("far", "end", 0.4)
+    )
     file.write_text(file.read_text().replace("</robot>", f"{other}</robot>"))
     if srdf is None:
         robot = load_robot(file)
     else:
-        with pytest.warns(UserWarning, match=r"arm.urdf: links that always overlap or touch are not kept apart: finger – wall$"):
+        with pytest.warns(
+            UserWarning,
+            match=r"arm.urdf: links that always overlap or touch are not kept apart: finger – wall$",
+        ):
             robot = load_robot(file)
-    kept_apart = {tuple(sorted((robot.link_of(p.first), robot.link_of(p.second)))) for p in robot.collision.collisionPairs}
+    kept_apart = {
+        tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
+        for p in robot.collision.collisionPairs
+    }
     assert ("finger", "wall") not in kept_apart
     assert ("end", "wall") in kept_apart
 
@@ -168,7 +230,9 @@ def test_links_that_touch_wherever_they_are(tmp_path: Path, srdf: str | None) ->
 def test_a_home_that_is_stated_may_overlap_with_a_warning(tmp_path: Path) -> None:
     file = slider(tmp_path, room=0.1, at=0.02, srdf="")
     home = {"carriage_joint": -0.03, "finger_joint": 0.0}
-    with pytest.warns(UserWarning, match=r"links that overlap at home are not kept apart: finger – wall$"):
+    with pytest.warns(
+        UserWarning, match=r"links that overlap at home are not kept apart: finger – wall$"
+    ):
         robot = load_robot(file, home=home, srdf=file.with_suffix(".srdf"), pairs="sampled")
     assert robot.home.tolist() == [-0.03, 0.0]
 
@@ -176,18 +240,25 @@ def test_a_home_that_is_stated_may_overlap_with_a_warning(tmp_path: Path) -> Non
 def test_a_home_that_nobody_states_is_free(tmp_path: Path) -> None:
     """Only what is not said to rest somewhere is moved, as little as was found; the same every time."""
     file = slider(tmp_path, room=0.1, at=-0.01)
-    with pytest.warns(UserWarning, match=r"arm.urdf: links overlap where the arm would rest; .* carriage_joint: 0.0\d+"):
+    with pytest.warns(
+        UserWarning,
+        match=r"arm.urdf: links overlap where the arm would rest; .* carriage_joint: 0.0\d+",
+    ):
         robot = load_robot(file)
     assert 0.03 - 1e-9 <= robot.home[0] < 0.06  # 20 mm of clearance
     with pytest.warns(UserWarning, match="links overlap"):
         np.testing.assert_array_equal(load_robot(file).home, robot.home)
 
 
-def test_a_survey_is_kept_by_all_it_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_survey_is_kept_by_all_it_depends_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The second time nothing is sampled; other shapes, limits, homes and lists are other robots."""
     monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
     sampled, real = [], self_collisions._survey
-    monkeypatch.setattr(self_collisions, "_survey", lambda *rest: (sampled.append(rest), real(*rest))[1])
+    monkeypatch.setattr(
+        self_collisions, "_survey", lambda *rest: (sampled.append(rest), real(*rest))[1]
+    )
     file = slider(tmp_path, room=0.012, at=0.004)
     first, again = load_robot(file), load_robot(file)
     assert len(sampled) == 1
@@ -197,7 +268,9 @@ def test_a_survey_is_kept_by_all_it_depends_on(tmp_path: Path, monkeypatch: pyte
         again.own_margins(0.02),
     )
     text = file.read_text()
-    for count, change in enumerate([("0.02", "0.021"), ('upper="0.012"', 'upper="0.013"'), ("0.044", "0.045")], 2):
+    for count, change in enumerate(
+        [("0.02", "0.021"), ('upper="0.012"', 'upper="0.013"'), ("0.044", "0.045")], 2
+    ):
         file.write_text(text.replace(*change))
         assert text.count(change[0])
         load_robot(file)
@@ -205,7 +278,9 @@ def test_a_survey_is_kept_by_all_it_depends_on(tmp_path: Path, monkeypatch: pyte
     file.write_text(text)
     load_robot(file, home={"carriage_joint": 0.001})
     assert len(sampled) == 5
-    assert survey(first, {("finger", "wall"): "Never"}, samples=10).allowed == {("finger", "wall"): "Never"}
+    assert survey(first, {("finger", "wall"): "Never"}, samples=10).allowed == {
+        ("finger", "wall"): "Never"
+    }
     assert len(sampled) == 6
 
 

@@ -48,7 +48,9 @@ SOLIDS: list[tuple[Callable[[], coal.CollisionGeometry], float]] = [
 
 def random_solids(rng: np.random.Generator, count: int, size: float) -> list[Solid]:
     kinds = [SOLIDS[int(k)][0]() for k in rng.integers(len(SOLIDS), size=count)]
-    return [(kind, pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))) for kind in kinds]
+    return [
+        (kind, pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))) for kind in kinds
+    ]
 
 
 @settings(max_examples=60, deadline=None)
@@ -59,7 +61,9 @@ def test_clearance_is_the_smallest_distance(seed: int, size: float) -> None:
     least = min(shape_distance(*one, *other) for one in first for other in second)
     assert clearance(first, second) == pytest.approx(least, abs=1e-6)
     near = clearance(first, second, reach=0.2)
-    assert near == (pytest.approx(least, abs=1e-6) if least < 0.2 - 1e-6 else pytest.approx(max(0.2, near)))
+    assert near == (
+        pytest.approx(least, abs=1e-6) if least < 0.2 - 1e-6 else pytest.approx(max(0.2, near))
+    )
 
 
 def test_clearance_of_nothing() -> None:
@@ -106,7 +110,9 @@ def test_boxes_along_the_worlds_axes_hold_the_surface(seed: int) -> None:
     assert (high - low <= diagonal + 1e-9).all()
 
 
-@pytest.mark.parametrize(("value", "expected"), [(0.5, 0.5), (1.0 + LIMIT_SLACK / 2, 1.0), (-LIMIT_SLACK / 2, 0.0)])
+@pytest.mark.parametrize(
+    ("value", "expected"), [(0.5, 0.5), (1.0 + LIMIT_SLACK / 2, 1.0), (-LIMIT_SLACK / 2, 0.0)]
+)
 def test_values_outside_by_rounding_are_moved_to_the_limit(value: float, expected: float) -> None:
     assert within_limits(value, 0.0, 1.0, "joint") == expected
 
@@ -122,15 +128,26 @@ def test_copies_stand_in_the_world() -> None:
     shape = pin.GeometryObject("arm_3", 4, 7, pin.SE3.Random(), coal.Sphere(0.1))
     place = pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
     copy = copy_shape(shape, "cup.arm_3", place)
-    assert (copy.name, copy.parentJoint, copy.parentFrame, shape.name) == ("cup.arm_3", 0, 0, "arm_3")
+    assert (copy.name, copy.parentJoint, copy.parentFrame, shape.name) == (
+        "cup.arm_3",
+        0,
+        0,
+        "arm_3",
+    )
     assert copy.placement.isApprox(place)
-    assert (own_name(copy.name), link_name(own_name(copy.name)), link_name("upper_arm_link_12")) == (
+    assert (
+        own_name(copy.name),
+        link_name(own_name(copy.name)),
+        link_name("upper_arm_link_12"),
+    ) == (
         "arm_3",
         "arm",
         "upper_arm_link",
     )
     ((geometry, at),) = placed_shapes([copy])
-    assert shape_distance(geometry, at, coal.Sphere(0.1), pin.SE3.Identity()) == pytest.approx(np.sqrt(14) - 0.2)
+    assert shape_distance(geometry, at, coal.Sphere(0.1), pin.SE3.Identity()) == pytest.approx(
+        np.sqrt(14) - 0.2
+    )
 
 
 FIRST = """
@@ -150,7 +167,9 @@ def test_the_first_question_of_a_process_does_not_change_the_others() -> None:
     found = []
     for first in (False, True):
         command = [sys.executable, "-c", FIRST.format(first=first)]
-        found.append(subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout)
+        found.append(
+            subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+        )
     assert found[0] == found[1]
 
 
@@ -161,7 +180,9 @@ def test_distances_of_links_are_those_of_their_shapes(worth: float) -> None:
     shapes = robot.collision.geometryObjects
     groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for pair in robot.collision.collisionPairs:
-        groups.setdefault((robot.link_of(pair.first), robot.link_of(pair.second)), []).append((pair.first, pair.second))
+        groups.setdefault((robot.link_of(pair.first), robot.link_of(pair.second)), []).append(
+            (pair.first, pair.second)
+        )
     distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
     links, data = LinkDistances(distances, groups), robot.model.createData()
     assert links.links == list(groups)
@@ -169,8 +190,12 @@ def test_distances_of_links_are_those_of_their_shapes(worth: float) -> None:
         z = rng.uniform(-2.0, 2.0, len(robot.lower))
         distances.place(z)
         pin.forwardKinematics(robot.model, data, robot.coordinates.q(z))
-        placed = [(shape.geometry, data.oMi[shape.parentJoint] * shape.placement) for shape in shapes]
-        np.testing.assert_allclose(distances.lowest(), [world_box(*one)[0][2] for one in placed], atol=1e-12)
+        placed = [
+            (shape.geometry, data.oMi[shape.parentJoint] * shape.placement) for shape in shapes
+        ]
+        np.testing.assert_allclose(
+            distances.lowest(), [world_box(*one)[0][2] for one in placed], atol=1e-12
+        )
         bounds = links.bounds()
         for k, name in enumerate(links.links):
             exact = min(shape_distance(*placed[one], *placed[other]) for one, other in groups[name])

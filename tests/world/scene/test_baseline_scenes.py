@@ -20,7 +20,10 @@ from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 SCENES = ("corridor_door", "aisle_drawer")
 GOALS = {"corridor_door": ("door", {"hinge": 1.5}), "aisle_drawer": ("drawer", {"slide": 0.6})}
-RELEASED = {"corridor_door": {"knob": 0.52}, "aisle_drawer": {}}  # so far is the lever turned while the door moves
+RELEASED = {
+    "corridor_door": {"knob": 0.52},
+    "aisle_drawer": {},
+}  # so far is the lever turned while the door moves
 HELD = {"corridor_door": "lever", "aisle_drawer": "tray"}
 BLOCKS, WALLS = ("block_left", "block_right"), ("wall_north_left", "wall_north_right")
 DIST_SAFE = 0.02  # [m]
@@ -75,7 +78,10 @@ def test_robot_and_arena_are_the_papers(name: str) -> None:
     assert here.name == name
     assert (here.robot.name, here.robot.base) == ("husky_ur5e", "omni")
     np.testing.assert_array_equal(here.start[3:], [1.57, -0.8678, -2.2043, -0.0347, 1.6315, 0.0])
-    assert here.arena == {"corridor_door": (-5.0, 7.0, -5.0, 5.0), "aisle_drawer": (-5.0, 5.0, -5.0, 5.0)}[name]
+    assert (
+        here.arena
+        == {"corridor_door": (-5.0, 7.0, -5.0, 5.0), "aisle_drawer": (-5.0, 5.0, -5.0, 5.0)}[name]
+    )
     assert list(here.objects) == [GOALS[name][0]]
     assert here.start_clearance() >= START_CLEARANCE
 
@@ -83,10 +89,16 @@ def test_robot_and_arena_are_the_papers(name: str) -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_goal_is_within_limits_and_joints_have_rates(name: str) -> None:
     placed, (_, goal) = thing(name), GOALS[name]
-    assert placed.object.coordinates.names == {"corridor_door": ("hinge", "knob"), "aisle_drawer": ("slide",)}[name]
+    assert (
+        placed.object.coordinates.names
+        == {"corridor_door": ("hinge", "knob"), "aisle_drawer": ("slide",)}[name]
+    )
     assert thing(name, **goal).state[0] == next(iter(goal.values()))
     np.testing.assert_array_equal(placed.state, 0.0)
-    limits = {"corridor_door": [[-np.pi / 2, 0.0], [np.pi / 2, 0.8]], "aisle_drawer": [[0.0], [0.65]]}[name]
+    limits = {
+        "corridor_door": [[-np.pi / 2, 0.0], [np.pi / 2, 0.8]],
+        "aisle_drawer": [[0.0], [0.65]],
+    }[name]
     np.testing.assert_allclose([placed.object.lower, placed.object.upper], limits, atol=1e-6)
     rates = {"corridor_door": ([1.0, 2.0], [1.0, 4.0]), "aisle_drawer": ([0.5], [1.0])}[name]
     np.testing.assert_array_equal([placed.object.velocity, placed.object.acceleration], rates)
@@ -100,12 +112,17 @@ def test_goal_is_within_limits_and_joints_have_rates(name: str) -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_starts_lie_in_the_papers_region_and_are_free(name: str) -> None:
     here, rng = scene(name), np.random.default_rng(0)
-    low, high = {"corridor_door": ((-2.5, -3.0), (-0.5, 3.0)), "aisle_drawer": ((0.0, 0.0), (1.0, 5.0))}[name]
+    low, high = {
+        "corridor_door": ((-2.5, -3.0), (-0.5, 3.0)),
+        "aisle_drawer": ((0.0, 0.0), (1.0, 5.0)),
+    }[name]
     drawn = [here.sample_start(rng) for _ in range(30)]
     bases = np.array([each.start[:3] for each in drawn])
     assert (bases[:, :2] >= low).all()
     assert (bases[:, :2] <= high).all()
-    assert (np.ptp(bases[:, :2], axis=0) > 0.8 * np.subtract(high, low)).all(), "they fill the region"
+    assert (np.ptp(bases[:, :2], axis=0) > 0.8 * np.subtract(high, low)).all(), (
+        "they fill the region"
+    )
     assert np.ptp(bases[:, 2]) > 5.0, "any heading"
     assert min(each.start_clearance() for each in drawn) >= START_CLEARANCE
     if name == "aisle_drawer":  # before either end of the first counter
@@ -113,15 +130,24 @@ def test_starts_lie_in_the_papers_region_and_are_free(name: str) -> None:
         assert (np.abs(bases[:, 1] - 2.5) > 3.25 / 2 + 0.335).all()
 
 
-# --- the door ---------------------------------------------------------------------------------------------------------
+# --- the door
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_corridor_leads_to_the_door() -> None:
     name = "corridor_door"
-    assert clearance(standing(name, "block_left"), standing(name, "block_right")) == pytest.approx(2.0, abs=1e-6)
-    np.testing.assert_allclose(bounds(standing(name, "block_left")), [[0.0, 1.0, 0.0], [5.0, 5.0, 2.06]], atol=1e-9)
-    np.testing.assert_allclose(bounds(standing(name, "block_right")), [[0.0, -5.0, 0.0], [5.0, -1.0, 2.06]], atol=1e-9)
-    np.testing.assert_allclose(bounds(standing(name, "wall_south")), [[-5.05, -5, 0], [-4.95, 5, 2.06]], atol=1e-9)
+    assert clearance(standing(name, "block_left"), standing(name, "block_right")) == pytest.approx(
+        2.0, abs=1e-6
+    )
+    np.testing.assert_allclose(
+        bounds(standing(name, "block_left")), [[0.0, 1.0, 0.0], [5.0, 5.0, 2.06]], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        bounds(standing(name, "block_right")), [[0.0, -5.0, 0.0], [5.0, -1.0, 2.06]], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        bounds(standing(name, "wall_south")), [[-5.05, -5, 0], [-4.95, 5, 2.06]], atol=1e-9
+    )
     north = bounds(standing(name, *WALLS))
     np.testing.assert_allclose(north, [[4.95, -5, 0], [5.05, 5, 2.06]], atol=1e-9)
     assert {*scene(name).obstacle_names} == {*BLOCKS, *WALLS, "wall_south"}
@@ -129,15 +155,23 @@ def test_a_corridor_leads_to_the_door() -> None:
 
 def test_the_panel_is_as_wide_as_the_papers_opening_and_hangs_at_its_edge() -> None:
     placed = thing("corridor_door")
-    np.testing.assert_allclose(bounds(parts(placed, "panel")), [[4.975, -0.55, 0.01], [5.025, 0.55, 2.06]], atol=1e-9)
+    np.testing.assert_allclose(
+        bounds(parts(placed, "panel")), [[4.975, -0.55, 0.01], [5.025, 0.55, 2.06]], atol=1e-9
+    )
     model = placed.object.model
     assert model.names[1] == "hinge"
-    np.testing.assert_allclose((placed.placement * model.jointPlacements[1]).translation, [5.0, 0.55, 0.0], atol=1e-12)
+    np.testing.assert_allclose(
+        (placed.placement * model.jointPlacements[1]).translation, [5.0, 0.55, 0.0], atol=1e-12
+    )
     left, right = ([shape] for shape in parts(placed, "frame"))
     assert clearance(left, right) == pytest.approx(1.1 + 0.03 + 0.005, abs=1e-6)
     for post, wall in ((left, WALLS[0]), (right, WALLS[1])):
-        assert abs(clearance(post, standing("corridor_door", wall))) < 1e-6, "no gap beside the frame"
-        np.testing.assert_allclose(bounds(post)[:, [0, 2]], bounds(standing("corridor_door", wall))[:, [0, 2]], atol=1e-9)
+        assert abs(clearance(post, standing("corridor_door", wall))) < 1e-6, (
+            "no gap beside the frame"
+        )
+        np.testing.assert_allclose(
+            bounds(post)[:, [0, 2]], bounds(standing("corridor_door", wall))[:, [0, 2]], atol=1e-9
+        )
 
 
 def test_handle_is_where_the_papers_is() -> None:
@@ -150,9 +184,13 @@ def test_handle_is_where_the_papers_is() -> None:
     tool = placed.link_placement("lever") * placed.object.attachment().placement
     np.testing.assert_allclose(tool.translation[[0, 2]], bar[1].translation[[0, 2]], atol=1e-9)
     low, high = bounds([bar])[:, 1]
-    assert low + 0.011 < tool.translation[1] < high - 0.011, "the fingers, 0.022 wide, are on the bar"
+    assert low + 0.011 < tool.translation[1] < high - 0.011, (
+        "the fingers, 0.022 wide, are on the bar"
+    )
     turned = thing("corridor_door", knob=0.5)
-    assert (turned.link_placement("lever") * turned.object.attachment().placement).translation[2] < 0.95, "it is pressed down"
+    assert (turned.link_placement("lever") * turned.object.attachment().placement).translation[
+        2
+    ] < 0.95, "it is pressed down"
 
 
 def test_the_door_swings_free_of_walls_and_frame() -> None:
@@ -163,7 +201,9 @@ def test_the_door_swings_free_of_walls_and_frame() -> None:
         assert clearance(moving, world) > DIST_SAFE + 0.01
         assert clearance(moving, parts(placed, "frame")) > 0.004
     open_ = bounds(parts(thing("corridor_door", hinge=np.pi / 2), "panel"))
-    assert open_[1, 0] == pytest.approx(5.0 + 1.1, abs=1e-6), "hinge > 0 pushes it away from the corridor"
+    assert open_[1, 0] == pytest.approx(5.0 + 1.1, abs=1e-6), (
+        "hinge > 0 pushes it away from the corridor"
+    )
 
 
 def test_lever_holds_the_door_shut() -> None:
@@ -172,12 +212,17 @@ def test_lever_holds_the_door_shut() -> None:
     assert (latch.threshold, latch.engaged_within) == (0.5, 0.05)
 
 
-# --- the drawer -------------------------------------------------------------------------------------------------------
+# --- the drawer
+# -------------------------------------------------------------------------------------------------------
 
 
 def test_counters_leave_an_aisle() -> None:
     name = "aisle_drawer"
-    figures = {1: ((2.25, 3.25), (1.125, 2.5)), 2: ((1.0, 6.0), (4.0, 2.5)), 3: ((4.5, 1.0), (2.25, 6.0))}
+    figures = {
+        1: ((2.25, 3.25), (1.125, 2.5)),
+        2: ((1.0, 6.0), (4.0, 2.5)),
+        3: ((4.5, 1.0), (2.25, 6.0)),
+    }
     for number, (size, middle) in figures.items():
         top = bounds(standing(name, f"worktop_{number}"))
         np.testing.assert_allclose(np.ptp(top[:, :2], axis=0), size, atol=1e-9)
@@ -185,10 +230,19 @@ def test_counters_leave_an_aisle() -> None:
         body = bounds(standing(name, f"counter_{number}"))
         assert (top[1, 2], body[0, 2]) == pytest.approx((0.7, 0.0))
         assert body[1, 2] == pytest.approx(top[0, 2])
-        np.testing.assert_allclose([body[0, :2] - top[0, :2], top[1, :2] - body[1, :2]], 0.02, atol=1e-9)
-    assert clearance(standing(name, "worktop_1"), standing(name, "worktop_2")) == pytest.approx(1.25, abs=1e-6)
-    rest = {*scene(name).obstacle_names} - {f"{part}_{number}" for part in ("worktop", "counter") for number in figures}
-    assert bounds([each for one in rest - {"plant"} for each in standing(name, one)])[0, 2] >= 0.7 - 1e-9, "they stand on them"
+        np.testing.assert_allclose(
+            [body[0, :2] - top[0, :2], top[1, :2] - body[1, :2]], 0.02, atol=1e-9
+        )
+    assert clearance(standing(name, "worktop_1"), standing(name, "worktop_2")) == pytest.approx(
+        1.25, abs=1e-6
+    )
+    rest = {*scene(name).obstacle_names} - {
+        f"{part}_{number}" for part in ("worktop", "counter") for number in figures
+    }
+    assert (
+        bounds([each for one in rest - {"plant"} for each in standing(name, one)])[0, 2]
+        >= 0.7 - 1e-9
+    ), "they stand on them"
 
 
 def test_drawer_is_as_large_as_the_papers() -> None:
@@ -201,7 +255,9 @@ def test_drawer_is_as_large_as_the_papers() -> None:
     for wall in (front, left, right, back, bottom, *case):
         assert 2 * half_extents(wall[0]).min() == pytest.approx(0.02)
     assert bounds(parts(placed, "case"))[0, 2] == pytest.approx(0.7), "it stands on the counter"
-    assert around[0, 0] == pytest.approx(bounds(standing("aisle_drawer", "worktop_2"))[0, 0]), "flush with its edge"
+    assert around[0, 0] == pytest.approx(bounds(standing("aisle_drawer", "worktop_2"))[0, 0]), (
+        "flush with its edge"
+    )
     assert clearance([left, right, back, bottom], case) == pytest.approx(0.01, abs=1e-6)
     tool = placed.link_placement("tray") * placed.object.attachment().placement
     np.testing.assert_allclose(tool.translation, handle[0][1].translation, atol=1e-9)
@@ -212,15 +268,21 @@ def test_pulled_out_it_leaves_no_room_for_the_robot_before_it() -> None:
     name = "aisle_drawer"
     for slide in np.linspace(0.0, 0.65, 14):
         placed = thing(name, slide=float(slide))
-        assert clearance(parts(placed, "tray"), standing(name, *scene(name).obstacle_names)) > DIST_SAFE
+        assert (
+            clearance(parts(placed, "tray"), standing(name, *scene(name).obstacle_names))
+            > DIST_SAFE
+        )
         assert clearance(parts(placed, "tray"), parts(placed, "case")) > 0.004
     out = bounds(parts(thing(name, slide=0.6), "tray")[:1])
     shut = bounds(parts(thing(name), "tray")[:1])
     np.testing.assert_allclose(out - shut, [[-0.6, 0, 0]] * 2, atol=1e-9)
-    assert out[0, 0] - bounds(standing(name, "worktop_1"))[1, 0] == pytest.approx(0.65), "a Husky is 0.67 wide"
+    assert out[0, 0] - bounds(standing(name, "worktop_1"))[1, 0] == pytest.approx(0.65), (
+        "a Husky is 0.67 wide"
+    )
 
 
-# --- the robot at both ------------------------------------------------------------------------------------------------
+# --- the robot at both
+# ------------------------------------------------------------------------------------------------
 
 
 def robot_shapes(robot: Robot, z: np.ndarray) -> list[tuple[str, coal.CollisionGeometry, pin.SE3]]:
@@ -229,7 +291,9 @@ def robot_shapes(robot: Robot, z: np.ndarray) -> list[tuple[str, coal.CollisionG
     pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(z))
     return [
         (robot.link_of(index), shape.geometry, placement)
-        for index, (shape, placement) in enumerate(zip(robot.collision.geometryObjects, shapes.oMg, strict=True))
+        for index, (shape, placement) in enumerate(
+            zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
+        )
     ]
 
 
@@ -237,12 +301,18 @@ def tool_frame(robot: Robot) -> pin.Frame:
     return robot.model.frames[robot.model.getFrameId(robot.tool_frame)]
 
 
-def room(name: str, placed: PlacedObject, robot: list[tuple[str, coal.CollisionGeometry, pin.SE3]]) -> float:
+def room(
+    name: str, placed: PlacedObject, robot: list[tuple[str, coal.CollisionGeometry, pin.SE3]]
+) -> float:
     """Smallest distance [m] between the robot and the world, without that of the fingers to what they hold."""
     here = scene(name)
     labels = zip(here.obstacles, here.obstacle_labels, strict=True)
     world = placed_shapes([shape for shape, label in labels if label != FLOOR])
-    others = [link for link in {link_name(shape.name) for shape in standing_geometry(placed)} if link != HELD[name]]
+    others = [
+        link
+        for link in {link_name(shape.name) for shape in standing_geometry(placed)}
+        if link != HELD[name]
+    ]
     held, touch = parts(placed, HELD[name]), here.robot.touch_links
     everything = [(shape, placement) for _, shape, placement in robot]
     without_hand = [(shape, placement) for link, shape, placement in robot if link not in touch]
@@ -262,7 +332,9 @@ def solutions(name: str, placed: PlacedObject, *, count: int = 60) -> np.ndarray
     upper[:3] = [*np.minimum(arena[1::2], near + 1.2), np.pi]
     seeds = rng.uniform(lower, upper, (count, len(lower)))
     seeds[:, 3:] = robot.home + rng.uniform(-0.8, 0.8, (count, len(lower) - 3))
-    found, solved = solver.solve(seeds, target, lower=lower, upper=upper, weights=np.ones(len(lower)), iterations=40)
+    found, solved = solver.solve(
+        seeds, target, lower=lower, upper=upper, weights=np.ones(len(lower)), iterations=40
+    )
     return found[solved]
 
 
@@ -315,11 +387,26 @@ def test_the_robot_fits_through_door_and_aisle() -> None:
         goal = GOALS[name][1] if name == "corridor_door" else {}
         here = here.with_state(GOALS[name][0], goal)
         placed = thing(name, **goal)
-        world = [shape for shape, label in zip(here.obstacles, here.obstacle_labels, strict=True) if label != FLOOR]
-        arm = {"shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link"}
+        world = [
+            shape
+            for shape, label in zip(here.obstacles, here.obstacle_labels, strict=True)
+            if label != FLOOR
+        ]
+        arm = {
+            "shoulder_link",
+            "upper_arm_link",
+            "forearm_link",
+            "wrist_1_link",
+            "wrist_2_link",
+            "wrist_3_link",
+        }
         around = placed_shapes(world) + placed_shapes(standing_geometry(placed))
         for heading in headings:
             for x, y in path:
                 z = np.concatenate([[x, y, heading], here.robot.home])
-                base = [each[1:] for each in robot_shapes(here.robot, z) if each[0] not in {*arm, *here.robot.touch_links}]
+                base = [
+                    each[1:]
+                    for each in robot_shapes(here.robot, z)
+                    if each[0] not in {*arm, *here.robot.touch_links}
+                ]
                 assert clearance(base, around) > DIST_SAFE, (name, x, y)

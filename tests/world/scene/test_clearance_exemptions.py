@@ -24,20 +24,28 @@ from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene, load_scene
 
 SAFE = 0.02
-TRAY = 0.295  # y of the side of the drawer's front, which reaches from x = 1.885 to 1.903 when it is shut
+# y of the side of the drawer's front, which reaches from x = 1.885 to 1.903 when it is shut
+TRAY = 0.295
 HINGE = {"hinge": 1.2}
 
 
 def beside(gap: float, begin: float = 1.7) -> Scene:
     """Return the drawer's room with a panel beside the drawer's front, from x = `begin` on."""
     depth = 2.3 - begin
-    return with_boxes(drawer_scene(), side=((depth, 0.1, 0.9), (begin + depth / 2, TRAY + gap + 0.05, 0.45)))
+    return with_boxes(
+        drawer_scene(), side=((depth, 0.1, 0.9), (begin + depth / 2, TRAY + gap + 0.05, 0.45))
+    )
 
 
 def in_wall(depth: float = 0.05, **fields: Any) -> Scene:
     """Return a room with a door whose leaf stands in the wall on the side of its hinges, at y = 0."""
     walls = [
-        {"name": "wall", "type": "box", "size": [0.08, 1.2, 2.4], "position": [2.55, 0.6 - depth, 1.2]},
+        {
+            "name": "wall",
+            "type": "box",
+            "size": [0.08, 1.2, 2.4],
+            "position": [2.55, 0.6 - depth, 1.2],
+        },
         {"name": "other", "type": "box", "size": [0.08, 1.2, 2.4], "position": [2.55, -1.56, 1.2]},
     ]
     document = {
@@ -52,7 +60,9 @@ def in_wall(depth: float = 0.05, **fields: Any) -> Scene:
 
 @given(gap=st.floats(0.001, 0.018), begin=st.floats(1.4, 1.8))
 @settings(max_examples=20, deadline=None)
-def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(gap: float, begin: float) -> None:
+def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(
+    gap: float, begin: float
+) -> None:
     (close,) = close_pairs(beside(gap, begin), SAFE)
     assert close[:2] == ("drawer.tray", "side")
     assert close.distance == pytest.approx(gap, abs=1e-6)
@@ -60,23 +70,35 @@ def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(gap: float
     assert (one.margin, one.distance) == (0.0, close.distance)
     lower, upper = one.ranges["drawer.slide"]
     assert lower == -np.inf
-    # The front's back face leaves the panel's end; then both are √(gap² + way²) apart. What is behind the front is further away.
+    # The front's back face leaves the panel's end; then both are √(gap² + way²) apart. What is
+    # behind the front is further away.
     leaves = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
-    assert upper == (np.inf if leaves > drawer_scene().objects["drawer"].object.upper[0] else pytest.approx(leaves, abs=2e-4))
+    assert upper == (
+        np.inf
+        if leaves > drawer_scene().objects["drawer"].object.upper[0]
+        else pytest.approx(leaves, abs=2e-4)
+    )
 
 
 def test_the_distance_of_two_links_is_that_of_their_closest_shapes() -> None:
     scene = beside(0.012).with_state("drawer", {"slide": 0.2})
-    shapes = [(f"drawer.{link_name(shape.name)}", shape) for shape in standing_geometry(scene.objects["drawer"])]
+    shapes = [
+        (f"drawer.{link_name(shape.name)}", shape)
+        for shape in standing_geometry(scene.objects["drawer"])
+    ]
     moving = [shape for label, shape in shapes if label == "drawer.tray"]
     least: dict[str, float] = {}
     for label, other in zip(scene.obstacle_labels, scene.obstacles, strict=True):
         for shape in moving if label != FLOOR else ():
-            distance = shape_distance(shape.geometry, shape.placement, other.geometry, other.placement)
+            distance = shape_distance(
+                shape.geometry, shape.placement, other.geometry, other.placement
+            )
             least[label] = min(least.get(label, np.inf), distance)
     found = {pair.second: pair.distance for pair in close_pairs(scene, 0.6)}
     assert len(moving) > 3
-    assert found == pytest.approx({label: distance for label, distance in least.items() if distance < 0.6}, abs=1e-9)
+    assert found == pytest.approx(
+        {label: distance for label, distance in least.items() if distance < 0.6}, abs=1e-9
+    )
     assert {"side", "wall_east"} <= set(found)
 
 
@@ -84,7 +106,10 @@ def test_what_is_remembered_is_of_these_obstacles_and_states() -> None:
     scene = beside(0.004, 1.4)
     (one,) = allowances(scene, SAFE)
     kept = [k for k, label in enumerate(scene.obstacle_labels) if label != "side"]
-    parts = {name: tuple(getattr(scene, name)[k] for k in kept) for name in ("obstacles", "obstacle_labels")}
+    parts = {
+        name: tuple(getattr(scene, name)[k] for k in kept)
+        for name in ("obstacles", "obstacle_labels")
+    }
     assert allowances(dataclasses.replace(scene, **parts), SAFE) == ()
     assert allowances(scene.with_start(base=[0.0, 0.0, 0.0]), SAFE) == (one,)
     ahead = with_boxes(
@@ -94,14 +119,19 @@ def test_what_is_remembered_is_of_these_obstacles_and_states() -> None:
     met = allowances(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
     assert {(one.first, one.second) for one in met} == {("drawer.tray", "ahead")}
     assert -np.inf in {one.margin for one in met}
-    assert len({one.shapes for one in met}) == len(met)  # each shape of the tray that is close has its own
+    assert len({one.shapes for one in met}) == len(
+        met
+    )  # each shape of the tray that is close has its own
 
 
 def test_two_drawers_side_by_side_are_neighbours_until_either_is_past_the_other() -> None:
     gap, thick = 0.015, 0.018  # between the fronts, and of each
     drawer = {"type": "drawer", "position": [1.93, 0.0, 0.0]}
     at = [[1.93, y, 0.0] for y in (0.0, 2 * TRAY + gap)]
-    pair = [{**drawer, "name": name, "position": place} for name, place in zip(("near", "next"), at, strict=True)]
+    pair = [
+        {**drawer, "name": name, "position": place}
+        for name, place in zip(("near", "next"), at, strict=True)
+    ]
     scene = changed(drawer_scene(), objects=pair, obstacles=[])
     (one,) = allowances(scene, SAFE)
     assert one.between("near.tray", "next.tray")
@@ -121,7 +151,9 @@ def test_nothing_is_close_in_scenes_that_come_along() -> None:
 
 
 def test_a_leaf_in_its_wall_is_warned_of_by_name() -> None:
-    with pytest.warns(UserWarning, match=r"tight: .*door\.panel – wall overlap by 50\.0 mm.*`allow:`") as caught:
+    with pytest.warns(
+        UserWarning, match=r"tight: .*door\.panel – wall overlap by 50\.0 mm.*`allow:`"
+    ) as caught:
         scene = in_wall()
     assert len(caught) == 1
     (one,) = allowances(scene, SAFE)
@@ -135,7 +167,10 @@ def test_a_door_that_stands_open_is_still_built_into_its_wall() -> None:
         warnings.simplefilter("ignore")
         scene = in_wall(0.003)
     shut = allowances(scene, SAFE)
-    (ajar,) = {one.ranges["door.hinge"] for one in allowances(scene.with_state("door", {"hinge": 1.0}), SAFE)}
+    (ajar,) = {
+        one.ranges["door.hinge"]
+        for one in allowances(scene.with_state("door", {"hinge": 1.0}), SAFE)
+    }
     assert {one.ranges["door.hinge"] for one in shut} == {ajar}
 
 
@@ -143,19 +178,28 @@ def test_a_drawer_that_stands_open_is_a_neighbour_of_what_it_was_built_beside() 
     (one,) = allowances(beside(0.004), SAFE)
     assert close_pairs(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE) == []
     (other,) = allowances(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE)
-    assert (other.first, other.second, other.margin, other.ranges) == (one.first, one.second, one.margin, one.ranges)
+    assert (other.first, other.second, other.margin, other.ranges) == (
+        one.first,
+        one.second,
+        one.margin,
+        one.ranges,
+    )
 
 
 def test_what_is_in_the_hand_or_on_a_table_is_nobodys_neighbour() -> None:
     scene = load_scene("init_1")
     assert close_pairs(scene, 0.3) == []
     with pytest.warns(UserWarning, match="overlap by 10"):
-        sunk = changed(scene, objects=[{**scene.document["objects"][0], "position": [2.5, 1.0, 0.76]}])
+        sunk = changed(
+            scene, objects=[{**scene.document["objects"][0], "position": [2.5, 1.0, 0.76]}]
+        )
     (close,) = close_pairs(sunk, SAFE)
     assert close[:2] == ("stick.stick", "table_top")
     held = sunk.with_held({"stick": "grip"})
     assert close_pairs(held, SAFE) == []
-    assert allowances(sunk, SAFE) == ()  # it may leave when it is lifted; that is not told by joints
+    assert (
+        allowances(sunk, SAFE) == ()
+    )  # it may leave when it is lifted; that is not told by joints
 
 
 def test_holds_where_every_joint_is_within_its_range() -> None:
@@ -216,13 +260,21 @@ def test_a_file_that_is_missing_is_named_with_the_nearest_one(tmp_path: Path) ->
     for name in ("door.yaml", "door.yml", "oven.yaml"):
         (tmp_path / "mine" / name).touch()
     thing = {"name": "door", "type": "mine/dor.yaml", "position": [2.0, 0.0, 0.0]}
-    for missing, said in (("mine/dor.yaml", ", perhaps mine/door.yaml, got"), ("none/dor.yaml", rf"a file in {tmp_path}, got")):
+    for missing, said in (
+        ("mine/dor.yaml", ", perhaps mine/door.yaml, got"),
+        ("none/dor.yaml", rf"a file in {tmp_path}, got"),
+    ):
         with pytest.raises(InputError, match=said):
-            Scene.from_document({**in_wall(-0.03).document, "objects": [{**thing, "type": missing}], "allow": []}, tmp_path)
+            Scene.from_document(
+                {**in_wall(-0.03).document, "objects": [{**thing, "type": missing}], "allow": []},
+                tmp_path,
+            )
 
 
 def test_an_srdf_of_other_links_is_refused_by_line(tmp_path: Path) -> None:
-    (tmp_path / "home.srdf").write_text('<robot name="home">\n<disable_collisions link1="doro" link2="wall"/>\n</robot>')
+    (tmp_path / "home.srdf").write_text(
+        '<robot name="home">\n<disable_collisions link1="doro" link2="wall"/>\n</robot>'
+    )
     with pytest.raises(UnknownNameError, match=r"home\.srdf:2: .*did you mean 'door'"):
         Scene.from_document({**in_wall(-0.03).document, "allow": ["home.srdf"]}, tmp_path)
 
@@ -279,9 +331,13 @@ def test_a_leaf_whose_edge_swings_into_the_wall_is_proven_to() -> None:
     (note,) = plan.validation.notes
     overlap = float(note.rpartition("overlap by ")[2].removesuffix(" mm"))
     assert "door.panel – wall" in note
-    short = Scene.from_document({**scene.document, "allow": [{"pair": ["door", "wall"], "margin": -1e-3 * (overlap - 2.0)}]})
+    short = Scene.from_document(
+        {**scene.document, "allow": [{"pair": ["door", "wall"], "margin": -1e-3 * (overlap - 2.0)}]}
+    )
     assert vkc.plan(short, [vkc.Actuate("door", HINGE)]).status == "infeasible"
-    enough = Scene.from_document({**scene.document, "allow": [{"pair": ["door", "wall"], "margin": -1e-3 * (overlap + 0.2)}]})
+    enough = Scene.from_document(
+        {**scene.document, "allow": [{"pair": ["door", "wall"], "margin": -1e-3 * (overlap + 0.2)}]}
+    )
     assert vkc.plan(enough, [vkc.Actuate("door", HINGE)]).success
 
 
@@ -292,20 +348,32 @@ def test_a_robot_that_may_touch_starts_and_drives_in_what_it_may() -> None:
     assert refused.status == "infeasible"
     touching = sorted({v.subject.split(" – ")[0] for v in refused.validation.violations})
     assert touching
-    plan = vkc.plan(Scene.from_document({**document, "allow": [[link, "mat"] for link in touching]}), [vkc.GoTo(2.0, 0.0)])
+    plan = vkc.plan(
+        Scene.from_document({**document, "allow": [[link, "mat"] for link in touching]}),
+        [vkc.GoTo(2.0, 0.0)],
+    )
     assert plan.success, plan.report()
 
 
-def test_of_ten_thousand_obstacles_only_those_nearby_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_ten_thousand_obstacles_only_those_nearby_are_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rng = np.random.default_rng(0)
     boxes = [
-        {"name": f"b{k}", "type": "box", "size": [0.02, 0.02, 0.02], "position": [*rng.uniform(-4, 1.5, 2).tolist(), 1.0]}
+        {
+            "name": f"b{k}",
+            "type": "box",
+            "size": [0.02, 0.02, 0.02],
+            "position": [*rng.uniform(-4, 1.5, 2).tolist(), 1.0],
+        }
         for k in range(9_990)
     ]
     document = in_wall(-0.004).document
     asked = []
     measured = neighbours.shape_distance
-    monkeypatch.setattr(neighbours, "shape_distance", lambda *given: asked.append(given) or measured(*given))
+    monkeypatch.setattr(
+        neighbours, "shape_distance", lambda *given: asked.append(given) or measured(*given)
+    )
     scene = Scene.from_document({**document, "obstacles": [*document["obstacles"], *boxes]})
     assert [pair[:2] for pair in close_pairs(scene, SAFE)] == [("door.panel", "wall")]
     assert 1 <= len(asked) < 10
@@ -318,7 +386,11 @@ def test_what_a_link_does_not_reach_is_never_near() -> None:
     label, values = "refrigerator.door", np.linspace(0.0, 2.0, 9)
     reached = standing.reached(label, 0, values)
     others = {one for one in standing.labels if not one.startswith("refrigerator.")}
-    met = {one for one in others if standing.distances(label, 0, values, standing.of([one]), 0.0).min() < 0.0}
+    met = {
+        one
+        for one in others
+        if standing.distances(label, 0, values, standing.of([one]), 0.0).min() < 0.0
+    }
     assert met <= reached
     assert len(reached & others) < len(others) / 5
 
@@ -340,14 +412,22 @@ def hinged_at_post(folder: Path, *, block: bool) -> Scene:
     post, blocking = box("0.02 0.049 1", "0.1 0.1 2"), box("0.3 -0.25 0.3", "0.2 0.2 0.6")
     wall = f'<robot name="w"><link name="w">{post}{blocking if block else ""}</link></robot>'
     (folder / "wall.urdf").write_text(wall, encoding="utf-8")
-    attachment = {"name": "h", "link": "leaf", "position": [-0.07, -0.7, 1.0], "approach": [1, 0, 0], "closing": [0, 1, 0]}
+    attachment = {
+        "name": "h",
+        "link": "leaf",
+        "position": [-0.07, -0.7, 1.0],
+        "approach": [1, 0, 0],
+        "closing": [0, 1, 0],
+    }
     door = {"urdf": LEAF.format(leaf=box("0.02 -0.4 1", "0.04 0.8 2")), "attachments": [attachment]}
     document = {
         "name": "hinged",
         "robot": "husky_ur5e",
         "start": {"base": [-1.5, 0, 0]},
         "arena": {"x": [-4, 4], "y": [-4, 4]},
-        "obstacles": [{"name": "wall", "type": "urdf", "file": "wall.urdf", "position": [1.5, 0.4, 0]}],
+        "obstacles": [
+            {"name": "wall", "type": "urdf", "file": "wall.urdf", "position": [1.5, 0.4, 0]}
+        ],
         "objects": [{"name": "door", "position": [1.5, 0.4, 0], "type": door}],
     }
     with pytest.warns(UserWarning, match=r"door\.leaf – wall overlap by 1\.0 mm"):
@@ -368,7 +448,9 @@ def test_an_exemption_is_of_two_shapes_and_not_of_their_links(tmp_path: Path) ->
     assert "1.0 mm inside each other" in used.reason
     assert f"exempt      {used}" in opened.report()
     opened.save(tmp_path / "opened.npz")
-    assert vkc.Plan.load(tmp_path / "opened.npz").validation.exemptions == opened.validation.exemptions
+    assert (
+        vkc.Plan.load(tmp_path / "opened.npz").validation.exemptions == opened.validation.exemptions
+    )
 
     blocked = hinged_at_post(tmp_path / "blocked", block=True)
     (one,) = allowances(blocked, SAFE)
@@ -379,7 +461,9 @@ def test_an_exemption_is_of_two_shapes_and_not_of_their_links(tmp_path: Path) ->
     assert hit.amount == pytest.approx(0.161, abs=0.002)
     refused = vkc.plan(blocked, steps)
     assert refused.status == "infeasible"
-    assert any("door.leaf – wall overlap by 16" in note for note in refused.validation.notes), refused.report()
+    assert any("door.leaf – wall overlap by 16" in note for note in refused.validation.notes), (
+        refused.report()
+    )
 
 
 def test_shapes_that_two_joints_move_overlap_no_deeper_than_either_alone_takes_them() -> None:
@@ -389,12 +473,26 @@ def test_shapes_that_two_joints_move_overlap_no_deeper_than_either_alone_takes_t
         '<origin xyz="0.055 -0.4 1"/><axis xyz="1 0 0"/><limit lower="0" upper="0.5" velocity="1" effort="1"/></joint></robot>'
     ).format(box("0.025 0.1 0", "0.05 0.3 0.03"))
     urdf = LEAF.format(leaf=box("0.02 -0.4 1", "0.04 0.8 2")).replace("</robot>", lever)
-    attachment = {"name": "h", "link": "leaf", "position": [-0.07, -0.7, 1.0], "approach": [1, 0, 0], "closing": [0, 1, 0]}
+    attachment = {
+        "name": "h",
+        "link": "leaf",
+        "position": [-0.07, -0.7, 1.0],
+        "approach": [1, 0, 0],
+        "closing": [0, 1, 0],
+    }
     document = {
         "robot": "husky_ur5e",
         "start": {"base": [-1.5, 0, 0]},
-        "objects": [{"name": "door", "position": [1.5, 0.4, 0], "type": {"urdf": urdf, "attachments": [attachment]}}],
-        "obstacles": [{"name": "panel", "type": "box", "size": [0.06, 0.5, 0.5], "position": [1.63, 0.3, 1.0]}],
+        "objects": [
+            {
+                "name": "door",
+                "position": [1.5, 0.4, 0],
+                "type": {"urdf": urdf, "attachments": [attachment]},
+            }
+        ],
+        "obstacles": [
+            {"name": "panel", "type": "box", "size": [0.06, 0.5, 0.5], "position": [1.63, 0.3, 1.0]}
+        ],
     }
     with pytest.warns(UserWarning, match=r"door\.lever – panel overlap by 5"):
         scene = Scene.from_document(document)
@@ -402,8 +500,12 @@ def test_shapes_that_two_joints_move_overlap_no_deeper_than_either_alone_takes_t
     assert set(one.ranges) == {"door.hinge", "door.turn"}
     standing, least = neighbours.Standing(scene, scene.objects), 0.0
     for index, upper in ((0, 1.5), (1, 0.5)):
-        (alone,) = standing.distances("door.lever", index, np.linspace(0.0, upper, 2001), standing.of(["panel"]), 0.1).T
-        inside = alone[0][: int(np.argmax(alone[0] >= SAFE))] if (alone[0] >= SAFE).any() else alone[0]
+        (alone,) = standing.distances(
+            "door.lever", index, np.linspace(0.0, upper, 2001), standing.of(["panel"]), 0.1
+        ).T
+        inside = (
+            alone[0][: int(np.argmax(alone[0] >= SAFE))] if (alone[0] >= SAFE).any() else alone[0]
+        )
         least = min(least, float(inside.min()))
     assert one.margin == pytest.approx(least, abs=1e-4)
     assert one.margin < -0.004

@@ -83,7 +83,9 @@ def test_what_pushes_or_holds_through_another_needs_none_from_what_it_is_at() ->
 )
 def test_who_moves_as_one(attachment: str, contact: str, firm: bool, as_one: bool) -> None:
     scene = door(attachment, contact=contact, firm=firm)
-    assert bool(scene.objects["door"].object.attachments[attachment].freedoms) == (attachment == "handle_free")
+    assert bool(scene.objects["door"].object.attachments[attachment].freedoms) == (
+        attachment == "handle_free"
+    )
     assert moves_as_one(scene, Hold("door", attachment)) == as_one
 
 
@@ -115,4 +117,6 @@ def test_how_far_the_gripper_is_open(tmp_path: Path) -> None:
     assert opening_at_start(door_scene()) is None
     grip = scene.objects["drawer"].object.attachments["grip"]
     pushed = dataclasses.replace(grip, contact="push")
-    np.testing.assert_array_equal(hand_frame(scene.robot, pushed).translation, scene.robot.opened(0.04).front.translation)
+    np.testing.assert_array_equal(
+        hand_frame(scene.robot, pushed).translation, scene.robot.opened(0.04).front.translation
+    )

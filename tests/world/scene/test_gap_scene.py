@@ -24,9 +24,21 @@ def scene() -> Scene:
 
 def distance(first: str, second: str) -> float:
     """Return coal's distance between two obstacles [m]; the objects as they are, with no function of the package between."""
-    one, two = (next(shape for shape in scene().obstacles if shape.name == name) for name in (first, second))
-    places = [coal.Transform3s(shape.placement.rotation, shape.placement.translation) for shape in (one, two)]
-    return coal.distance(one.geometry, places[0], two.geometry, places[1], coal.DistanceRequest(), coal.DistanceResult())
+    one, two = (
+        next(shape for shape in scene().obstacles if shape.name == name) for name in (first, second)
+    )
+    places = [
+        coal.Transform3s(shape.placement.rotation, shape.placement.translation)
+        for shape in (one, two)
+    ]
+    return coal.distance(
+        one.geometry,
+        places[0],
+        two.geometry,
+        places[1],
+        coal.DistanceRequest(),
+        coal.DistanceResult(),
+    )
 
 
 def test_the_gap_is_as_wide_as_the_scene_says() -> None:
@@ -45,13 +57,27 @@ def test_the_robot_has_less_than_ten_centimetres_a_side() -> None:
     robot = scene().robot
     data, shapes = robot.model.createData(), robot.collision.createData()
     home = np.concatenate([np.zeros(3), scene().start[3:]])
-    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(home))
-    boxes = [world_box(shape.geometry, at) for shape, at in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)]
-    body = [box for shape, box in zip(robot.collision.geometryObjects, boxes, strict=True) if shape.name.startswith("base_link")]
-    width, whole = (np.max([box[1][1] for box in own]) - np.min([box[0][1] for box in own]) for own in (body, boxes))
+    pin.updateGeometryPlacements(
+        robot.model, data, robot.collision, shapes, robot.coordinates.q(home)
+    )
+    boxes = [
+        world_box(shape.geometry, at)
+        for shape, at in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
+    ]
+    body = [
+        box
+        for shape, box in zip(robot.collision.geometryObjects, boxes, strict=True)
+        if shape.name.startswith("base_link")
+    ]
+    width, whole = (
+        np.max([box[1][1] for box in own]) - np.min([box[0][1] for box in own])
+        for own in (body, boxes)
+    )
     assert width == pytest.approx(0.67, abs=0.005)
     assert 0.0 < (GAP - width) / 2.0 < 0.1
-    assert width < whole < GAP - 2 * 0.02, "with its arm at home it fits, too, with the least distance that is kept"
+    assert width < whole < GAP - 2 * 0.02, (
+        "with its arm at home it fits, too, with the least distance that is kept"
+    )
 
 
 def test_starts_are_west_of_the_gap_and_free() -> None:

@@ -25,16 +25,25 @@ FLY = Hold("fly", "leg", BALL, "ball")
 
 def test_the_tool_and_what_is_held_through_something() -> None:
     assert holds_of({}, {}) == ()
-    assert holds_of({"door": "handle", "drawer": "knob"}, {}) == (Hold("door", "handle"), Hold("drawer", "knob"))
+    assert holds_of({"door": "handle", "drawer": "knob"}, {}) == (
+        Hold("door", "handle"),
+        Hold("drawer", "knob"),
+    )
     assert (STICK.by, STICK.link, STICK.frame) == (None, None, None)
     assert (BALL.by, BALL.link, BALL.frame) == (STICK, "tip", "stick.tip")
-    assert [str(hold) for hold in (STICK, BALL, FLY)] == ["stick.grip", "ball.pull by stick.tip", "fly.leg by ball.ball"]
+    assert [str(hold) for hold in (STICK, BALL, FLY)] == [
+        "stick.grip",
+        "ball.pull by stick.tip",
+        "fly.leg by ball.ball",
+    ]
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(["stick", "ball", "fly", "door"])))
 def test_each_follows_the_one_it_depends_on(order: tuple[str, ...]) -> None:
     attachments = {"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}
-    found = holds_of({name: attachments[name] for name in order}, {"fly": "ball.ball", "ball": "stick.tip"})
+    found = holds_of(
+        {name: attachments[name] for name in order}, {"fly": "ball.ball", "ball": "stick.tip"}
+    )
     assert sorted(found, key=str) == sorted([STICK, BALL, FLY, Hold("door", "handle")], key=str)
     assert found.index(STICK) < found.index(BALL) < found.index(FLY)
 
@@ -53,15 +62,25 @@ def test_equal_holds_are_one_key() -> None:
     [
         ({}, {}),
         ({"stick": "grip"}, {}),
-        ({"fly": "leg", "stick": "grip", "ball": "pull"}, {"fly": "ball.ball", "ball": "stick.tip"}),
-        ({"ball": "pull", "fly": "leg", "stick": "grip"}, {"fly": "stick.tip", "ball": "stick.tip"}),
+        (
+            {"fly": "leg", "stick": "grip", "ball": "pull"},
+            {"fly": "ball.ball", "ball": "stick.tip"},
+        ),
+        (
+            {"ball": "pull", "fly": "leg", "stick": "grip"},
+            {"fly": "stick.tip", "ball": "stick.tip"},
+        ),
     ],
 )
 def test_mappings_round_trip(held: dict[str, str], by: dict[str, str]) -> None:
     found = holds_of(held, by)
     assert {hold.object: hold.attachment for hold in found} == held
     assert {hold.object: hold.frame for hold in found if hold.by} == by
-    assert holds_of({hold.object: hold.attachment for hold in found}, by) == in_order(iter(found)) == found
+    assert (
+        holds_of({hold.object: hold.attachment for hold in found}, by)
+        == in_order(iter(found))
+        == found
+    )
 
 
 def test_values_do_not_make_another_hold() -> None:
@@ -112,40 +131,76 @@ def described(path: Path, name: str, old: str, new: str) -> str:
     return str(path / f"{name}.yaml")
 
 
-def test_a_handle_that_would_be_taken_from_inside_is_taken_from_the_other_side(tmp_path: Path) -> None:
+def test_a_handle_that_would_be_taken_from_inside_is_taken_from_the_other_side(
+    tmp_path: Path,
+) -> None:
     right = drawer_scene()
-    item = {**right.document["objects"][0], "type": described(tmp_path, "drawer", "approach: [1, 0, 0]", "approach: [-1, 0, 0]")}
-    with pytest.warns(UserWarning, match=r"the hand would come to drawer\.handle out of the object") as caught:
+    item = {
+        **right.document["objects"][0],
+        "type": described(tmp_path, "drawer", "approach: [1, 0, 0]", "approach: [-1, 0, 0]"),
+    }
+    with pytest.warns(
+        UserWarning, match=r"the hand would come to drawer\.handle out of the object"
+    ) as caught:
         scene = Scene.from_document({**right.document, "objects": [item]}, right.folder)
-    assert sorted(str(one.message).split()[6] for one in caught) == ["drawer.handle", "drawer.handle_free"]
+    assert sorted(str(one.message).split()[6] for one in caught) == [
+        "drawer.handle",
+        "drawer.handle_free",
+    ]
     placed = scene.objects["drawer"]
     assert placed.reversed == ("handle", "handle_free")
     for name in placed.reversed:
         mine, given = (one.objects["drawer"].object.attachment(name) for one in (scene, right))
-        np.testing.assert_allclose(mine.tool(np.zeros(len(mine.freedoms))), given.tool(np.zeros(len(given.freedoms))), atol=1e-12)
+        np.testing.assert_allclose(
+            mine.tool(np.zeros(len(mine.freedoms))),
+            given.tool(np.zeros(len(given.freedoms))),
+            atol=1e-12,
+        )
     plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})])  # judged by the oracle as well
     assert plan.success, plan.report()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         again = Scene.from_document(scene.document, scene.folder)
     assert again.objects["drawer"].reversed == placed.reversed
-    np.testing.assert_array_equal(again.objects["drawer"].object.attachment().placement, placed.object.attachment().placement)
+    np.testing.assert_array_equal(
+        again.objects["drawer"].object.attachment().placement, placed.object.attachment().placement
+    )
 
 
 def test_what_is_right_or_wrong_from_both_sides_stays() -> None:
-    for name in ("drawer", "door", "household", "fetch", "tray", "init_1", "aisle_drawer", "corridor_door"):
+    for name in (
+        "drawer",
+        "door",
+        "household",
+        "fetch",
+        "tray",
+        "init_1",
+        "aisle_drawer",
+        "corridor_door",
+    ):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             scene = vkc.load_scene(name)
         assert all(placed.reversed == () for placed in scene.objects.values())
-    walls = [{"name": f"w{k}", "type": "box", "size": [3, 3, 0.1], "position": [0, 0, 0.5 + k]} for k in range(2)]
-    around = {**drawer_scene().document, "obstacles": walls}  # what others stand there is no matter of the object
+    walls = [
+        {"name": f"w{k}", "type": "box", "size": [3, 3, 0.1], "position": [0, 0, 0.5 + k]}
+        for k in range(2)
+    ]
+    around = {
+        **drawer_scene().document,
+        "obstacles": walls,
+    }  # what others stand there is no matter of the object
     assert Scene.from_document(around, drawer_scene().folder).objects["drawer"].reversed == ()
 
 
 def test_a_ball_on_the_floor_is_not_taken_from_below(tmp_path: Path) -> None:
     free = "\n    closing: [1, 0, 0]\n    joint: spherical\n    limits: [-1.5, 1.5]"
-    said = described(tmp_path, "ball", f"approach: [0, 0, -1]{free}", "approach: [0, 0, 1]\n    closing: [1, 0, 0]")
+    said = described(
+        tmp_path,
+        "ball",
+        f"approach: [0, 0, -1]{free}",
+        "approach: [0, 0, 1]\n    closing: [1, 0, 0]",
+    )
     document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}}
     ball = {"name": "ball", "type": said, "position": [1.2, 0.0, 0.036]}
     with pytest.warns(UserWarning, match=r"ball\.grip out of the object or from below the floor"):
@@ -159,7 +214,12 @@ def test_a_ball_on_the_floor_is_not_taken_from_below(tmp_path: Path) -> None:
 
 
 def test_a_stick_whose_frame_points_backwards_comes_from_the_other_side(tmp_path: Path) -> None:
-    fixed = described(tmp_path, "ball", "joint: spherical\n    standoff: 0.035", "joint: fixed\n    standoff: 0.035")
+    fixed = described(
+        tmp_path,
+        "ball",
+        "joint: spherical\n    standoff: 0.035",
+        "joint: fixed\n    standoff: 0.035",
+    )
     document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}}
     stick = {"name": "stick", "type": "stick", "position": [2.0, 0.0, 0.5]}
     ball = {"name": "ball", "type": fixed, "position": [1.2, 0.0, 0.036]}
@@ -167,11 +227,19 @@ def test_a_stick_whose_frame_points_backwards_comes_from_the_other_side(tmp_path
     hold = Hold("ball", "pull", STICK, "tip")
     assert scene.with_approaches([hold]) is scene
     backwards = scene.with_approaches([]).objects["ball"].with_reversed("pull")
-    from_below = Scene.from_document({**document, "objects": [stick, {**ball, "reversed": ["pull"]}]})
-    np.testing.assert_array_equal(
-        from_below.objects["ball"].object.attachment("pull").placement, backwards.object.attachment("pull").placement
+    from_below = Scene.from_document(
+        {**document, "objects": [stick, {**ball, "reversed": ["pull"]}]}
     )
-    up = described(tmp_path, "ball", "joint: spherical\n    standoff: 0.035", "joint: fixed\n    standoff: 0.035")
+    np.testing.assert_array_equal(
+        from_below.objects["ball"].object.attachment("pull").placement,
+        backwards.object.attachment("pull").placement,
+    )
+    up = described(
+        tmp_path,
+        "ball",
+        "joint: spherical\n    standoff: 0.035",
+        "joint: fixed\n    standoff: 0.035",
+    )
     text = Path(up).read_text()
     first, _, last = text.rpartition("approach: [0, 0, -1]")
     Path(up).write_text(f"{first}approach: [0, 0, 1]{last}")
@@ -187,17 +255,26 @@ def test_a_stick_whose_frame_points_backwards_comes_from_the_other_side(tmp_path
 @pytest.mark.parametrize("name", ["drawer", "door", "ball", "cup", "stick", "cabinet", "tray"])
 def test_from_the_other_side_and_back(name: str) -> None:
     placed = next(iter(drawer_scene().objects.values()))
-    placed = vkc.PlacedObject(name, load_object(name), placed.placement, np.zeros(load_object(name).coordinates.size))
+    placed = vkc.PlacedObject(
+        name, load_object(name), placed.placement, np.zeros(load_object(name).coordinates.size)
+    )
     for attachment, given in placed.object.attachments.items():
-        values = [0.3 * (freedom.lower + freedom.upper) + 0.1 * freedom.upper for freedom in given.freedoms]
+        values = [
+            0.3 * (freedom.lower + freedom.upper) + 0.1 * freedom.upper
+            for freedom in given.freedoms
+        ]
         turned = placed.with_reversed(attachment)
         there, here = turned.object.attachment(attachment).tool(values), given.tool(values)
-        np.testing.assert_allclose(there.rotation[:, 0], here.rotation[:, 0], atol=1e-12)  # fingers close along the same line
+        np.testing.assert_allclose(
+            there.rotation[:, 0], here.rotation[:, 0], atol=1e-12
+        )  # fingers close along the same line
         np.testing.assert_allclose(there.rotation[:, 2], -here.rotation[:, 2], atol=1e-12)
         centre = [one.translation + given.standoff * one.rotation[:, 2] for one in (there, here)]
         np.testing.assert_allclose(*centre, atol=1e-12)
         back = turned.with_reversed(attachment)
         assert back.reversed == ()
-        np.testing.assert_allclose(back.object.attachment(attachment).tool(values), here, atol=1e-12)
+        np.testing.assert_allclose(
+            back.object.attachment(attachment).tool(values), here, atol=1e-12
+        )
     with pytest.raises(UnknownNameError, match="there is no attachment"):
         placed.with_reversed("nowhere")

@@ -66,12 +66,16 @@ def thing(name: str) -> ArticulatedObject:
 
 def at_origin(name: str, **state: float) -> PlacedObject:
     """An object whose base link is at the world's origin."""
-    return PlacedObject(name, thing(name), pin.SE3.Identity(), np.zeros(len(JOINTS.get(name, ())))).with_state(state)
+    return PlacedObject(
+        name, thing(name), pin.SE3.Identity(), np.zeros(len(JOINTS.get(name, ())))
+    ).with_state(state)
 
 
 def parts(placed: PlacedObject, *links: str) -> Shapes:
     """Shapes of some of an object's links, or of all."""
-    return placed_shapes(shape for shape in standing_geometry(placed) if not links or link_name(shape.name) in links)
+    return placed_shapes(
+        shape for shape in standing_geometry(placed) if not links or link_name(shape.name) in links
+    )
 
 
 def obstacles(here: Scene, *, without: Iterable[str] = (FLOOR,)) -> Shapes:
@@ -81,14 +85,20 @@ def obstacles(here: Scene, *, without: Iterable[str] = (FLOOR,)) -> Shapes:
 
 def world(here: Scene, *, without: Iterable[str] = ()) -> Shapes:
     """Everything that stands in a scene but the floor and some objects."""
-    return obstacles(here) + [part for name, placed in here.objects.items() if name not in without for part in parts(placed)]
+    return obstacles(here) + [
+        part
+        for name, placed in here.objects.items()
+        if name not in without
+        for part in parts(placed)
+    ]
 
 
 def moving_links(obj: ArticulatedObject) -> list[str]:
     return [link for link in obj.links if link != obj.base_link]
 
 
-# --- the objects ------------------------------------------------------------------------------------------------------
+# --- the objects
+# ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", JOINTS)
@@ -119,14 +129,21 @@ def test_attachments_are_where_hands_can_be(name: str) -> None:
     for attachment in obj.attachments.values():
         if name == "litter" and attachment.name == "pull":  # for the broom
             continue
-        placed = at_origin(name, **({"door": np.pi / 2} if name == "dishwasher" and attachment.link == "rack" else {}))
+        placed = at_origin(
+            name,
+            **({"door": np.pi / 2} if name == "dishwasher" and attachment.link == "rack" else {}),
+        )
         tool = (
-            placed.link_placement(attachment.link) * attachment.placement * attachment.motion(np.zeros(len(attachment.freedoms)))
+            placed.link_placement(attachment.link)
+            * attachment.placement
+            * attachment.motion(np.zeros(len(attachment.freedoms)))
         )
         pushes = attachment.contact == "push"
         hand = moved_hand(tool * scene().robot.front.inverse() if pushes else tool)
         gap = clearance(hand, parts(placed, attachment.link))
-        assert gap > GRASP_CLEARANCE or (pushes and gap == pytest.approx(attachment.standoff, abs=1e-5)), attachment.name
+        assert gap > GRASP_CLEARANCE or (
+            pushes and gap == pytest.approx(attachment.standoff, abs=1e-5)
+        ), attachment.name
         others = [link for link in obj.links if link != attachment.link]
         assert not others or clearance(hand, parts(placed, *others)) > DIST_SAFE, attachment.name
 
@@ -134,7 +151,11 @@ def test_attachments_are_where_hands_can_be(name: str) -> None:
 def test_hand_on_the_dishwashers_door_can_stay_level_until_it_is_open() -> None:
     grasp = thing("dishwasher").attachment("door_handle")
     for angle in np.linspace(0.0, np.pi / 2, 5):
-        tool = at_origin("dishwasher", door=float(angle)).link_placement("door") * grasp.placement * grasp.motion([-angle])
+        tool = (
+            at_origin("dishwasher", door=float(angle)).link_placement("door")
+            * grasp.placement
+            * grasp.motion([-angle])
+        )
         np.testing.assert_allclose(tool.rotation[:, 2], [1.0, 0.0, 0.0], atol=1e-9)
         assert lowest(moved_hand(tool)) > DIST_SAFE, "it clears the floor"
 
@@ -149,7 +170,9 @@ def test_object_turned_round_is_the_same_object(name: str) -> None:
         z = [state[obj.coordinates.index(joint)] for joint in tree.coordinates.names]
         pin.framesForwardKinematics(tree.model, data, tree.coordinates.q(np.array(z)))
         base = data.oMf[tree.model.getFrameId(obj.base_link)]
-        np.testing.assert_allclose(base.homogeneous, obj.link_placement(link, state).inverse().homogeneous, atol=1e-12)
+        np.testing.assert_allclose(
+            base.homogeneous, obj.link_placement(link, state).inverse().homogeneous, atol=1e-12
+        )
         assert len(tree.collision.geometryObjects) == len(obj.collision.geometryObjects)
 
 
@@ -160,21 +183,33 @@ def test_parts_do_not_overlap_while_they_move(name: str) -> None:
     pairs = [pair for pair in combinations(obj.links, 2) if frozenset(pair) not in PINNED]
     ends = [np.linspace(0.0, upper, 11) for upper in obj.upper]
     for moving in range(len(ends)):
-        grid = np.meshgrid(*[end if index == moving else end[[0, -1]] for index, end in enumerate(ends)])
+        grid = np.meshgrid(
+            *[end if index == moving else end[[0, -1]] for index, end in enumerate(ends)]
+        )
         for state in np.stack([axis.ravel() for axis in grid], axis=1):
             if name == "dishwasher" and state[1] > 0.0 and state[0] < np.pi / 2:
                 continue
-            placed = at_origin(name, **dict(zip(obj.coordinates.names, state.tolist(), strict=True)))
+            placed = at_origin(
+                name, **dict(zip(obj.coordinates.names, state.tolist(), strict=True))
+            )
             for first, second in pairs:
-                assert clearance(parts(placed, first), parts(placed, second)) > 0.005, (first, second, state)
+                assert clearance(parts(placed, first), parts(placed, second)) > 0.005, (
+                    first,
+                    second,
+                    state,
+                )
 
 
 def test_carried_things_fit_the_hand_and_stand_on_their_origin() -> None:
     for name in ("cup", "broom"):
         lowest = min(bounds([part])[0, 2] for part in parts(at_origin(name)))
         assert lowest == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(np.ptp(bounds(parts(at_origin("cup"))), axis=0), [0.07, 0.07, 0.1], atol=1e-12)
-    np.testing.assert_allclose(np.ptp(bounds(parts(at_origin("broom"))), axis=0), [0.04, 0.28, 0.95], atol=1e-12)
+    np.testing.assert_allclose(
+        np.ptp(bounds(parts(at_origin("cup"))), axis=0), [0.07, 0.07, 0.1], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        np.ptp(bounds(parts(at_origin("broom"))), axis=0), [0.04, 0.28, 0.95], atol=1e-12
+    )
     np.testing.assert_allclose(np.ptp(bounds(parts(at_origin("litter"))), axis=0), 0.07, atol=1e-12)
     down = thing("broom").link_placement("bristles", [])
     np.testing.assert_allclose(down.rotation @ [0, 0, 1], [0, 0, -1], atol=1e-12)
@@ -186,14 +221,24 @@ def test_refrigerator_and_cabinet_have_room_for_cup_and_ball() -> None:
         shelf = {"refrigerator": 0.98, "cabinet": 0.81}[name]
         height = shelf + {"cup": 0.001, "ball": 0.036}[item]
         inside = placed_shapes(
-            standing_geometry(PlacedObject(item, thing(item), pin.SE3(np.eye(3), np.array([x, 0, height])), np.zeros(0)))
+            standing_geometry(
+                PlacedObject(
+                    item, thing(item), pin.SE3(np.eye(3), np.array([x, 0, height])), np.zeros(0)
+                )
+            )
         )
-        assert clearance(inside, body) == pytest.approx(1e-3, abs=1e-6), "it stands on the shelf, and on nothing else"
-        lifted = [(shape, pin.SE3(where.rotation, where.translation + np.array([0.0, 0.0, 0.1]))) for shape, where in inside]
+        assert clearance(inside, body) == pytest.approx(1e-3, abs=1e-6), (
+            "it stands on the shelf, and on nothing else"
+        )
+        lifted = [
+            (shape, pin.SE3(where.rotation, where.translation + np.array([0.0, 0.0, 0.1])))
+            for shape, where in inside
+        ]
         assert clearance(lifted, body) > 0.1, "there is air above it"
 
 
-# --- the home ---------------------------------------------------------------------------------------------------------
+# --- the home
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_home_is_as_large_and_full_as_the_papers() -> None:
@@ -207,7 +252,9 @@ def test_home_is_as_large_and_full_as_the_papers() -> None:
     for wall, (axis, side) in inner.items():
         (standing,) = [shape for shape in here.obstacles if shape.name == wall]
         assert abs(bounds(placed_shapes([standing]))[side, axis]) == pytest.approx(4.0)
-    shapes = len(obstacles(here)) + sum(len(placed.object.collision.geometryObjects) for placed in here.objects.values())
+    shapes = len(obstacles(here)) + sum(
+        len(placed.object.collision.geometryObjects) for placed in here.objects.values()
+    )
     assert shapes >= 120
     everything = bounds(world(here))
     np.testing.assert_allclose(everything, [[-4.1, -4.1, 0.0], [4.1, 4.1, 2.4]], atol=1e-9)
@@ -226,7 +273,9 @@ def test_nothing_stands_in_anything_else() -> None:
     """Furniture may touch walls and what stands on it; objects are clear of everything, things to carry by 1 mm."""
     here = scene()
     for name, placed in here.objects.items():
-        links = ("panel", "lever") if name == "door" else ()  # its frame fills an opening in the wall
+        links = (
+            ("panel", "lever") if name == "door" else ()
+        )  # its frame fills an opening in the wall
         assert clearance(parts(placed, *links), world(here, without={name}), reach=0.1) > 9e-4, name
     movable = {
         "chair",
@@ -240,8 +289,15 @@ def test_nothing_stands_in_anything_else() -> None:
         "bin",
     }
     for name in movable:
-        standing = [shape for shape, label in zip(here.obstacles, here.obstacle_labels, strict=True) if label == name]
-        assert clearance(placed_shapes(standing), obstacles(here, without={FLOOR, name}), reach=0.1) > 0.01, name
+        standing = [
+            shape
+            for shape, label in zip(here.obstacles, here.obstacle_labels, strict=True)
+            if label == name
+        ]
+        assert (
+            clearance(placed_shapes(standing), obstacles(here, without={FLOOR, name}), reach=0.1)
+            > 0.01
+        ), name
 
 
 @pytest.mark.parametrize("name", GOALS)
@@ -254,7 +310,10 @@ def test_moving_parts_keep_clear_of_the_home(name: str) -> None:
     assert upper >= GOALS[name][joint]
     for value in np.linspace(0.0, upper, 12):
         moved = placed.with_state({joint: float(value)})
-        assert clearance(parts(moved, *moving_links(placed.object)), rest, reach=0.1) > DIST_SAFE + 0.005, value
+        assert (
+            clearance(parts(moved, *moving_links(placed.object)), rest, reach=0.1)
+            > DIST_SAFE + 0.005
+        ), value
 
 
 def test_dishwasher_door_shuts_and_the_rack_comes_out_over_it() -> None:
@@ -262,7 +321,10 @@ def test_dishwasher_door_shuts_and_the_rack_comes_out_over_it() -> None:
     assert placed.state.tolist() == [1.57, 0.0]
     rest = world(scene(), without={"dishwasher"})
     for angle in np.linspace(0.0, np.pi / 2, 12):
-        assert clearance(parts(placed.with_state({"door": float(angle)}), "door"), rest, reach=0.1) > DIST_SAFE + 0.005
+        assert (
+            clearance(parts(placed.with_state({"door": float(angle)}), "door"), rest, reach=0.1)
+            > DIST_SAFE + 0.005
+        )
     out = placed.with_state({"rack": 0.5})
     rack = bounds(parts(out, "rack"))
     assert rack[0, 1] < placed.placement.translation[1] - 0.4, "most of it is before the face"
@@ -275,15 +337,28 @@ def test_furniture_is_as_its_colours_and_descriptions_say() -> None:
     files = sorted((folder("scenes") / "furniture").glob("*.urdf"))
     used = {item["file"] for item in scene().document["obstacles"] if item["type"] == "urdf"}
     assert {f"furniture/{file.name}" for file in files} | {"objects/low_drawer.urdf"} == used
-    heights = {"chair": 0.85, "dining_table": 0.75, "coffee_table": 0.45, "bar_table": 1.05, "desk": 0.74, "bin": 0.3}
+    heights = {
+        "chair": 0.85,
+        "dining_table": 0.75,
+        "coffee_table": 0.45,
+        "bar_table": 1.05,
+        "desk": 0.74,
+        "bin": 0.3,
+    }
     for name, height in heights.items():
-        item = {"name": name, "type": "urdf", "file": f"furniture/{name}.urdf", "position": [0, 0, 0]}
+        item = {
+            "name": name,
+            "type": "urdf",
+            "file": f"furniture/{name}.urdf",
+            "position": [0, 0, 0],
+        }
         robot = {"robot": "husky_ur5e", "start": {"base": [3, 3, 0]}, "obstacles": [item]}
         alone = obstacles(Scene.from_document(robot, folder("scenes")))
         np.testing.assert_allclose(bounds(alone)[:, 2], [0.0, height], atol=1e-9)
 
 
-# --- the robot in it --------------------------------------------------------------------------------------------------
+# --- the robot in it
+# --------------------------------------------------------------------------------------------------
 
 
 def test_robot_fits_through_the_open_door_and_nowhere_else_into_the_bedroom() -> None:
@@ -294,7 +369,9 @@ def test_robot_fits_through_the_open_door_and_nowhere_else_into_the_bedroom() ->
     for way in np.linspace(-1.4, 1.0, 25):
         x, y = np.array([1.584, 1.25]) + way * along
         assert clearance(body_at(here.robot, x, y, 1.52), around, reach=0.1) > DIST_SAFE, way
-    assert clearance(body_at(here.robot, 1.58, 1.25), world(scene()), reach=0.1) < 0.0, "the door is shut"
+    assert clearance(body_at(here.robot, 1.58, 1.25), world(scene()), reach=0.1) < 0.0, (
+        "the door is shut"
+    )
     left, right = (bounds([part]) for part in parts(here.objects["door"], "frame")[:2])
     panel = bounds(parts(scene().objects["door"].with_state({"hinge": 1.5707}), "panel"))
     assert min(abs(left - right)[:, 0]) > HUSKY[1]
@@ -315,7 +392,11 @@ def test_aisles_are_wide_enough_for_the_robot() -> None:
     for name, (begin, end) in ways.items():
         heading = float(np.arctan2(*np.subtract(end, begin)[::-1]))
         for x, y in np.linspace(begin, end, 20):
-            assert clearance(body_at(here.robot, x, y, heading), around, reach=0.1) > DIST_SAFE, (name, x, y)
+            assert clearance(body_at(here.robot, x, y, heading), around, reach=0.1) > DIST_SAFE, (
+                name,
+                x,
+                y,
+            )
     for yaw in np.linspace(-np.pi, np.pi, 24):
         assert clearance(body_at(here.robot, 1.3, -1.0, yaw), around, reach=0.1) > DIST_SAFE
 
@@ -335,7 +416,9 @@ REACHED = [
 
 
 @pytest.mark.parametrize(("name", "attachment", "moved"), REACHED)
-def test_the_arm_reaches_it_without_touching_anything(name: str, attachment: str, moved: bool) -> None:
+def test_the_arm_reaches_it_without_touching_anything(
+    name: str, attachment: str, moved: bool
+) -> None:
     here = scene()
     if name in GOALS and moved:
         here = here.with_state(name, {**RELEASED.get(name, {}), **GOALS[name]})
@@ -357,9 +440,13 @@ def test_the_arm_reaches_it_without_touching_anything(name: str, attachment: str
         target = placed.link_placement(grasp.link) * grasp.placement * grasp.motion(turn)
         for z in solutions(robot, target, rng):
             links = robot_shapes(robot, z)
-            near = clearance([part[1:] for part in links if part[0] == "base_link"], others, reach=DIST_SAFE)
+            near = clearance(
+                [part[1:] for part in links if part[0] == "base_link"], others, reach=DIST_SAFE
+            )
             q = robot.coordinates.q(z)
-            if near < DIST_SAFE or pin.computeCollisions(robot.model, data, robot.collision, shapes, q, True):
+            if near < DIST_SAFE or pin.computeCollisions(
+                robot.model, data, robot.collision, shapes, q, True
+            ):
                 continue
             away = [part[1:] for part in links if part[0] not in robot.touch_links]
             if clearance([part[1:] for part in links], others, reach=DIST_SAFE) < DIST_SAFE:
@@ -371,7 +458,8 @@ def test_the_arm_reaches_it_without_touching_anything(name: str, attachment: str
     pytest.fail("no free configuration")
 
 
-# --- helpers ----------------------------------------------------------------------------------------------------------
+# --- helpers
+# ----------------------------------------------------------------------------------------------------------
 
 
 def bounds(shapes: Iterable[tuple[coal.CollisionGeometry, pin.SE3]]) -> np.ndarray:
@@ -402,7 +490,9 @@ def robot_shapes(robot: Robot, z: np.ndarray) -> list[tuple[str, coal.CollisionG
     pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(z))
     return [
         (robot.link_of(index), shape.geometry, where)
-        for index, (shape, where) in enumerate(zip(robot.collision.geometryObjects, shapes.oMg, strict=True))
+        for index, (shape, where) in enumerate(
+            zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
+        )
     ]
 
 
@@ -423,14 +513,23 @@ def moved_hand(tool: pin.SE3) -> Shapes:
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
     back = tool * data.oMf[robot.model.getFrameId(robot.tool_frame)].inverse()
-    return [(shape, back * where) for link, shape, where in robot_shapes(robot, z) if link in robot.touch_links]
+    return [
+        (shape, back * where)
+        for link, shape, where in robot_shapes(robot, z)
+        if link in robot.touch_links
+    ]
 
 
 def turns(freedoms: Sequence[Freedom]) -> list[np.ndarray]:
     """Some values of a grasp's freedoms: all zero, and the last, its turn, half and all the way to either side."""
     rows = [np.zeros(len(freedoms))]
     if freedoms:
-        ends = (freedoms[-1].lower / 2, freedoms[-1].upper / 2, freedoms[-1].lower, freedoms[-1].upper)
+        ends = (
+            freedoms[-1].lower / 2,
+            freedoms[-1].upper / 2,
+            freedoms[-1].lower,
+            freedoms[-1].upper,
+        )
         rows += [np.append(np.zeros(len(freedoms) - 1), end) for end in ends]
     return rows
 
@@ -441,12 +540,16 @@ def solver(robot: Robot) -> PoseSolver:
     return PoseSolver(robot.model, PoseRow(frame.parentJoint, pin.SE3(frame.placement), ()))
 
 
-def solutions(robot: Robot, target: pin.SE3, rng: np.random.Generator, *, count: int = 800) -> np.ndarray:
+def solutions(
+    robot: Robot, target: pin.SE3, rng: np.random.Generator, *, count: int = 800
+) -> np.ndarray:
     """Configurations with the tool frame at `target`, from random ones near it."""
     lower, upper = robot.lower.copy(), robot.upper.copy()
     near = target.translation[:2]
     lower[:3], upper[:3] = [*(near - 1.2), -np.pi], [*(near + 1.2), np.pi]
     seeds = rng.uniform(lower, upper, (count, len(lower)))
     seeds[:, 3:] = robot.home + rng.uniform(-1.5, 1.5, (count, len(lower) - 3))
-    found, solved = solver(robot).solve(seeds, target, lower=lower, upper=upper, weights=np.ones(len(lower)), iterations=40)
+    found, solved = solver(robot).solve(
+        seeds, target, lower=lower, upper=upper, weights=np.ones(len(lower)), iterations=40
+    )
     return found[solved]

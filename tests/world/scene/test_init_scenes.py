@@ -44,7 +44,9 @@ def bounds(of: Scene, names: tuple[str, ...]) -> np.ndarray:
     halves = [np.asarray(shape.geometry.halfSide) for shape in shapes]
     middles = [shape.placement.translation for shape in shapes]
     corners = [(middle - half, middle + half) for middle, half in zip(middles, halves, strict=True)]
-    return np.array([np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)])
+    return np.array(
+        [np.min([low for low, _ in corners], axis=0), np.max([high for _, high in corners], axis=0)]
+    )
 
 
 def crosses(start: np.ndarray, end: np.ndarray, box: np.ndarray) -> bool:
@@ -84,13 +86,24 @@ def test_tables_cube_and_stick_are_where_the_paper_has_them(name: str) -> None:
 def test_the_scenes_differ_in_what_stands_in_the_way_alone() -> None:
     first = scene("init_1")
     for name in SCENES[1:]:
-        other = {key: value for key, value in scene(name).document.items() if key not in ("name", "obstacles")}
-        assert other == {key: value for key, value in first.document.items() if key not in ("name", "obstacles")}
-        assert scene(name).document["obstacles"][: len(first.obstacle_names)] == first.document["obstacles"]
+        other = {
+            key: value
+            for key, value in scene(name).document.items()
+            if key not in ("name", "obstacles")
+        }
+        assert other == {
+            key: value for key, value in first.document.items() if key not in ("name", "obstacles")
+        }
+        assert (
+            scene(name).document["obstacles"][: len(first.obstacle_names)]
+            == first.document["obstacles"]
+        )
 
 
 def test_the_block_is_as_large_as_the_papers() -> None:
-    np.testing.assert_allclose(bounds(scene("init_3"), ("block",)), [[1.0, -3.5, 0.0], [3.0, -0.5, 2.1]], atol=1e-12)
+    np.testing.assert_allclose(
+        bounds(scene("init_3"), ("block",)), [[1.0, -3.5, 0.0], [3.0, -0.5, 2.1]], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -102,29 +115,39 @@ def test_fifty_starts_can_be_drawn(name: str) -> None:
         assert interval[0] <= drawn[:, column].min() < drawn[:, column].max() <= interval[1]
         assert np.ptp(drawn[:, column]) > 0.9 * (interval[1] - interval[0]), "they fill the region"
     assert np.ptp(drawn[:, 2]) > 5.5, "any heading"
-    assert min(scene(name).with_start(base=base).start_clearance() for base in drawn) >= START_CLEARANCE
+    assert (
+        min(scene(name).with_start(base=base).start_clearance() for base in drawn)
+        >= START_CLEARANCE
+    )
 
 
 def test_the_straight_way_to_the_stick_leads_through_the_block() -> None:
     block, region = bounds(scene("init_3"), ("block",))[:, :2], scene("init_3").start_region
     assert region is not None
     corners = itertools.product(region.x, region.y)
-    assert all(crosses(np.array(corner), STICK, block) for corner in corners), "and so does that from any place between them"
+    assert all(crosses(np.array(corner), STICK, block) for corner in corners), (
+        "and so does that from any place between them"
+    )
     assert all(crosses(start[:2], STICK, block) for start in starts("init_3"))
 
 
 def test_nothing_is_in_the_way_of_the_first_scene() -> None:
     here = scene("init_1")
     for name in set(here.obstacle_names) - set(TABLES):
-        assert not any(crosses(start[:2], STICK, bounds(here, (name,))[:, :2]) for start in starts("init_1"))
+        assert not any(
+            crosses(start[:2], STICK, bounds(here, (name,))[:, :2]) for start in starts("init_1")
+        )
 
 
 def test_two_things_are_in_the_way_of_most_starts_of_the_second_scene() -> None:
     """Where the base's middle cannot pass, at any heading: half the robot's width round either thing."""
     around = np.array([[-1.0], [1.0]]) * HUSKY_WIDTH / 2
-    first, second = (bounds(scene("init_2"), (name,))[:, :2] + around for name in ("crate_1", "crate_2"))
+    first, second = (
+        bounds(scene("init_2"), (name,))[:, :2] + around for name in ("crate_1", "crate_2")
+    )
     assert 0.5 < np.mean([crosses(start[:2], STICK, first) for start in starts("init_2")]) <= 1.0
-    # From west of the stick's table, where the arm reaches the stick, to west of the low table, whence the stick the cube.
+    # From west of the stick's table, where the arm reaches the stick, to west of the low table,
+    # whence the stick the cube.
     for stood in np.linspace([1.45, 0.6], [1.45, 1.4], 9):
         assert crosses(stood, np.array([-2.6, 4.0]), second)
 
@@ -154,8 +177,12 @@ def test_the_stick_is_a_tenth_by_half_a_metre_and_its_tip_points_east() -> None:
     np.testing.assert_allclose(tip.translation, [2.75, 1.0, 0.771], atol=1e-12)
     np.testing.assert_allclose(tip.rotation[:, 2], [1.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(tip.rotation[:, 0], placed.placement.rotation[:, 0], atol=1e-12)
-    assert sum(inertia.mass for inertia in placed.object.model.inertias) == pytest.approx(0.39, abs=0.01)
-    drawn, solid = (geometry.geometryObjects for geometry in (placed.object.visual, placed.object.collision))
+    assert sum(inertia.mass for inertia in placed.object.model.inertias) == pytest.approx(
+        0.39, abs=0.01
+    )
+    drawn, solid = (
+        geometry.geometryObjects for geometry in (placed.object.visual, placed.object.collision)
+    )
     for picture, shape in zip(drawn, solid, strict=True):
         assert picture.placement == shape.placement
         assert type(picture.geometry) is type(shape.geometry)
@@ -170,10 +197,13 @@ def support(shape: pin.GeometryObject, direction: np.ndarray) -> float:
         return float(middle + shape.geometry.radius)
     assert isinstance(shape.geometry, coal.Cylinder)
     across = np.hypot(local[0], local[1])
-    return float(middle + shape.geometry.halfLength * abs(local[2]) + shape.geometry.radius * across)
+    return float(
+        middle + shape.geometry.halfLength * abs(local[2]) + shape.geometry.radius * across
+    )
 
 
-# --- the grasps ---------------------------------------------------------------------------------------------------
+# --- the grasps
+# ---------------------------------------------------------------------------------------------------
 
 
 def hand(robot: Robot, tool: pin.SE3) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
@@ -202,8 +232,15 @@ def test_the_hand_fits_round_the_stick_along_the_whole_range(turn: float, table:
     here = scene("init_1")
     placed = here.objects["stick"]
     grip = placed.object.attachments["grip"]
-    assert (grip.joint, grip.firm, grip.coordinates) == ("cylindrical", True, ("grip_slide", "grip_turn"))
-    assert [(freedom.lower, freedom.upper) for freedom in grip.freedoms] == [(-0.095, 0.095), (-1.2, 1.2)]
+    assert (grip.joint, grip.firm, grip.coordinates) == (
+        "cylindrical",
+        True,
+        ("grip_slide", "grip_turn"),
+    )
+    assert [(freedom.lower, freedom.upper) for freedom in grip.freedoms] == [
+        (-0.095, 0.095),
+        (-1.2, 1.2),
+    ]
     dowel, butt, front, *tip = placed_shapes(standing_geometry(placed))
     world = [shape for shape in here.obstacles if shape.name in (*TABLES, "floor")]
     for slide in SLIDES:
@@ -213,7 +250,8 @@ def test_the_hand_fits_round_the_stick_along_the_whole_range(turn: float, table:
         assert clearance(shapes, [dowel]) > 0.005
         assert clearance(shapes, [butt]) > 0.005
         assert clearance(shapes, [front, *tip]) > 0.05
-        # The dowel's axis runs between the pads, 0.01 in front of the tool frame and across the closing direction.
+        # The dowel's axis runs between the pads, 0.01 in front of the tool frame and across the
+        # closing direction.
         inside = tool.actInv(dowel[1])
         np.testing.assert_allclose(inside.translation[[0, 2]], [0.0, 0.01], atol=1e-9)
         np.testing.assert_allclose(np.abs(inside.rotation[:, 2]), [0.0, 1.0, 0.0], atol=1e-9)
@@ -221,8 +259,13 @@ def test_the_hand_fits_round_the_stick_along_the_whole_range(turn: float, table:
 
 def test_sliding_goes_towards_the_tip_and_stays_in_the_half_away_from_it() -> None:
     placed = scene("init_1").objects["stick"]
-    grip, tip = placed.object.attachments["grip"], placed.object.link_placement("tip", []).translation
-    low, high = ((grip.placement * grip.motion([freedom, 0.0])).translation for freedom in (-0.095, 0.095))
+    grip, tip = (
+        placed.object.attachments["grip"],
+        placed.object.link_placement("tip", []).translation,
+    )
+    low, high = (
+        (grip.placement * grip.motion([freedom, 0.0])).translation for freedom in (-0.095, 0.095)
+    )
     assert np.linalg.norm(low - tip) > np.linalg.norm(high - tip)
     np.testing.assert_allclose([low, high], [[0.0, -0.19, 0.01], [0.0, 0.0, 0.01]], atol=1e-12)
     end = placed.object.attachments["end"]
@@ -243,7 +286,10 @@ def test_in_the_air_the_hand_fits_at_the_ends_of_its_turn_too(turn: float) -> No
 LYING = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.036]))  # the ball, 1 mm above the floor
 
 
-@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (1.2, 0.0, 0.0), (-1.2, 0.0, 0.0), (0.0, 0.15, 0.7), (0.0, -0.15, -1.5)])
+@pytest.mark.parametrize(
+    "turn",
+    [(0.0, 0.0, 0.0), (1.2, 0.0, 0.0), (-1.2, 0.0, 0.0), (0.0, 0.15, 0.7), (0.0, -0.15, -1.5)],
+)
 def test_the_hand_fits_round_a_ball_on_the_floor(turn: tuple[float, float, float]) -> None:
     ball, here = load_object("ball"), scene("init_1")
     grip = ball.attachment()
@@ -265,15 +311,22 @@ def test_a_hand_never_takes_the_ball_from_below() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.tuples(*[st.floats(-np.pi, np.pi)] * 3))
-def test_a_sticks_tip_touches_the_ball_and_points_at_its_centre(turn: tuple[float, float, float]) -> None:
+def test_a_sticks_tip_touches_the_ball_and_points_at_its_centre(
+    turn: tuple[float, float, float],
+) -> None:
     ball, stick = load_object("ball"), scene("init_1").objects["stick"].object
     pull = ball.attachment("pull")
-    assert all(freedom.lower <= value <= freedom.upper for freedom, value in zip(pull.freedoms, turn, strict=True))
+    assert all(
+        freedom.lower <= value <= freedom.upper
+        for freedom, value in zip(pull.freedoms, turn, strict=True)
+    )
     tip = pull.placement * pull.motion(turn)
     np.testing.assert_allclose(tip.actInv(np.zeros(3)), [0.0, 0.0, 0.035], atol=1e-12)
     (round_,) = ball.collision.geometryObjects
     at = tip * stick.link_placement("tip", []).inverse()
-    dowel, butt, front, shaft, pole = [(shape.geometry, at * shape.placement) for shape in stick.collision.geometryObjects]
+    dowel, butt, front, shaft, pole = [
+        (shape.geometry, at * shape.placement) for shape in stick.collision.geometryObjects
+    ]
     around = [(round_.geometry, pin.SE3.Identity())]
     assert clearance([pole], around) == pytest.approx(0.0, abs=1e-6)
     assert clearance([dowel, butt, front, shaft], around) > 0.005

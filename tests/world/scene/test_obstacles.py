@@ -23,8 +23,12 @@ URDF = """<robot name="r"><link name="a"><collision><origin xyz="0 0 1"/><geomet
 <limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
 
 
-def described(folder: Path, **fields: Any) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
-    item = pydantic.TypeAdapter(ObstacleSchema).validate_python({"name": "thing", "position": [0, 0, 0], **fields})
+def described(
+    folder: Path, **fields: Any
+) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
+    item = pydantic.TypeAdapter(ObstacleSchema).validate_python(
+        {"name": "thing", "position": [0, 0, 0], **fields}
+    )
     return obstacle_shapes(item, POSE, folder)
 
 
@@ -38,13 +42,20 @@ def volume(shape: pin.GeometryObject) -> float:
         ({"type": "box", "size": [0.2, 0.3, 0.4]}, 0.024),
         ({"type": "sphere", "radius": 0.2}, 4 / 3 * np.pi * 0.008),
         ({"type": "cylinder", "radius": 0.2, "length": 0.5}, np.pi * 0.04 * 0.5),
-        ({"type": "capsule", "radius": 0.2, "length": 0.5}, np.pi * 0.04 * 0.5 + 4 / 3 * np.pi * 0.008),
+        (
+            {"type": "capsule", "radius": 0.2, "length": 0.5},
+            np.pi * 0.04 * 0.5 + 4 / 3 * np.pi * 0.008,
+        ),
         ({"type": "mesh", "file": "wedge.obj", "scale": [2.0, 1.0, 3.0]}, 6.0 / 6.0),
     ],
 )
-def test_every_kind_has_its_volume_and_place(fields: dict[str, Any], expected: float, tmp_path: Path) -> None:
+def test_every_kind_has_its_volume_and_place(
+    fields: dict[str, Any], expected: float, tmp_path: Path
+) -> None:
     """Round shapes are drawn with so many corners that a few percent of the volume are missing."""
-    (tmp_path / "wedge.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    (tmp_path / "wedge.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    )
     (drawn,), (solid,) = described(tmp_path, colour=[0.1, 0.2, 0.3, 0.4], **fields)
     assert 0.95 * expected <= volume(solid) <= expected * (1 + 1e-9)
     for shape in (drawn, solid):
@@ -61,7 +72,10 @@ def test_a_urdf_stands_with_its_joints_at_zero(tmp_path: Path) -> None:
     _, solid = described(tmp_path, type="urdf", file="r.urdf", colour=[1, 0, 0, 1])
     assert [shape.name for shape in solid] == ["thing_0", "thing_1"]
     assert all(shape.parentJoint == 0 for shape in solid)
-    where = [pin.SE3(np.eye(3), np.array([0, 0, 1.0])), pin.SE3(pin.rpy.rpyToMatrix(0, 0, 0.4), np.array([0.5, 0, 0]))]
+    where = [
+        pin.SE3(np.eye(3), np.array([0, 0, 1.0])),
+        pin.SE3(pin.rpy.rpyToMatrix(0, 0, 0.4), np.array([0.5, 0, 0])),
+    ]
     for shape, local in zip(solid, where, strict=True):
         assert shape.placement.isApprox(POSE * local, 1e-12)
         np.testing.assert_array_equal(shape.meshColor, [1, 0, 0, 1])

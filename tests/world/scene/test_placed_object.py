@@ -21,7 +21,9 @@ def test_standing_objects_are_where_their_joints_put_them(tmp_path: Path) -> Non
     np.testing.assert_allclose(shapes["panel_0"].placement.translation, middle, atol=1e-12)
     assert {s.parentJoint for s in shapes.values()} == {0}
     assert len(standing_geometry(placed, visual=True)) == len(placed.object.visual.geometryObjects)
-    np.testing.assert_allclose(placed.link_placement("panel").rotation, pin.utils.rotate("z", 0.3), atol=1e-12)
+    np.testing.assert_allclose(
+        placed.link_placement("panel").rotation, pin.utils.rotate("z", 0.3), atol=1e-12
+    )
 
 
 def test_joints_are_set_by_name_within_their_limits(tmp_path: Path) -> None:

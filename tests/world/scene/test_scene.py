@@ -48,11 +48,17 @@ def test_moving_parts_keep_clear_of_the_room_over_the_whole_range(name: str, joi
     scene = load_scene(name)
     placed = scene.objects[name]
     index = placed.object.coordinates.index(joint)
-    room = placed_shapes(s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR)
+    room = placed_shapes(
+        s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR
+    )
     nearest = np.inf
     for value in np.linspace(placed.object.lower[index], placed.object.upper[index], 80):
         moved = standing_geometry(placed.with_state({joint: value}))
-        moving = [s for s, original in zip(moved, placed.object.collision.geometryObjects, strict=True) if original.parentJoint]
+        moving = [
+            s
+            for s, original in zip(moved, placed.object.collision.geometryObjects, strict=True)
+            if original.parentJoint
+        ]
         nearest = min(nearest, clearance(placed_shapes(moving), room))
     assert nearest >= 0.03
 
@@ -80,7 +86,10 @@ def test_with_methods_refuse_what_does_not_fit(door: Scene) -> None:
     with pytest.raises(UnknownNameError) as caught:
         door.with_state("door", {"hing": 0.0})
     assert caught.value.nearest == "hinge"
-    with pytest.raises(InputError, match=r"door\.hinge: outside the joint's limits \(expected -1\.57 to 1\.57, got 2\)"):
+    with pytest.raises(
+        InputError,
+        match=r"door\.hinge: outside the joint's limits \(expected -1\.57 to 1\.57, got 2\)",
+    ):
         door.with_state("door", {"hinge": 2.0})
 
 
@@ -112,7 +121,10 @@ def test_random_starts_are_free_in_the_region_at_any_heading_and_repeatable(door
 
 def test_a_fixed_base_may_stand_anywhere_in_the_arena(tmp_path: Path) -> None:
     scene = load(
-        tmp_path, TINY.replace("husky_ur5e", "{name: husky_ur5e, base: fixed}").replace("0.0, 0.0, 0.5", "0.5, 0.2, 0.5")
+        tmp_path,
+        TINY.replace("husky_ur5e", "{name: husky_ur5e, base: fixed}").replace(
+            "0.0, 0.0, 0.5", "0.5, 0.2, 0.5"
+        ),
     )
     np.testing.assert_array_equal(scene.start[:3], [0.5, 0.2, 0.5])
     np.testing.assert_array_equal(scene.with_start(base=[0.1, 0.2, 0.3]).start[:3], [0.1, 0.2, 0.3])
@@ -146,16 +158,25 @@ def test_what_is_free_and_held_is_in_the_hand(tmp_path: Path) -> None:
     attachment = "attachments: [{name: end, link: stick, position: [-0.2, 0, 0], approach: [1, 0, 0], closing: [0, 0, 1]}]"
     (tmp_path / "stick.yaml").write_text(f"urdf: stick.urdf\nfree: true\n{attachment}\n")
     text = TINY.replace("  arm: home\n", "  arm: home\n  held: {pole: end}\n")
-    text = text.replace("objects:\n", "objects:\n  - {name: pole, type: stick.yaml, position: [0, 0, 0]}\n")
+    text = text.replace(
+        "objects:\n", "objects:\n  - {name: pole, type: stick.yaml, position: [0, 0, 0]}\n"
+    )
     scene = load(tmp_path, text)
     assert dict(scene.held) == {"pole": "end"}
     for moved in (scene, scene.with_start(base=[0.4, 0.2, 2.0])):
-        grasp = moved.objects["pole"].placement * scene.objects["pole"].object.attachment("end").placement
-        np.testing.assert_allclose(grasp.homogeneous, moved.tool_placement().homogeneous, atol=1e-12)
+        grasp = (
+            moved.objects["pole"].placement
+            * scene.objects["pole"].object.attachment("end").placement
+        )
+        np.testing.assert_allclose(
+            grasp.homogeneous, moved.tool_placement().homogeneous, atol=1e-12
+        )
     tip = moved.objects["pole"].placement.act(np.array([0.25, 0.0, 0.0]))
     crate = {"name": "crate2", "type": "sphere", "radius": 0.05, "position": tip.tolist()}
     document = {**moved.document, "obstacles": [*moved.document["obstacles"], crate]}
-    assert Scene.from_document(document, tmp_path).start_clearance() < 0.0, "what is held collides, too"
+    assert Scene.from_document(document, tmp_path).start_clearance() < 0.0, (
+        "what is held collides, too"
+    )
     moved.sample_start(np.random.default_rng(0))
 
     holds_the_door = TINY.replace("  arm: home\n", "  arm: home\n  held: {front: handle}\n")

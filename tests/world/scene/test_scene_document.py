@@ -23,7 +23,9 @@ def full() -> Scene:
     """Return a scene with a stick, a ball, and a door that stands where its description says so by yaw."""
     scene = room(table(), objects=FREE)
     door = {"name": "door", "type": "door", "position": [3.0, 1.0, 0.0], "yaw": 0.7}
-    return Scene.from_document({**scene.document, "objects": [*scene.document["objects"], door]}, scene.folder)
+    return Scene.from_document(
+        {**scene.document, "objects": [*scene.document["objects"], door]}, scene.folder
+    )
 
 
 def started(draw: st.DrawFn, scene: Scene) -> Scene:
@@ -37,15 +39,24 @@ def opened(draw: st.DrawFn, scene: Scene) -> Scene:
 
 def put(draw: st.DrawFn, scene: Scene) -> Scene:
     """Return the scene with something put anywhere, upside down and upright too."""
-    turn = pin.rpy.rpyToMatrix(*draw(st.tuples(angles, st.sampled_from([0.0, np.pi / 2]) | angles, angles)))
-    return scene.with_placement(draw(st.sampled_from([*FREE, "door"])), pin.SE3(turn, np.array(draw(st.tuples(*[lengths] * 3)))))
+    turn = pin.rpy.rpyToMatrix(
+        *draw(st.tuples(angles, st.sampled_from([0.0, np.pi / 2]) | angles, angles))
+    )
+    return scene.with_placement(
+        draw(st.sampled_from([*FREE, "door"])),
+        pin.SE3(turn, np.array(draw(st.tuples(*[lengths] * 3)))),
+    )
 
 
 def holding(draw: st.DrawFn, scene: Scene) -> Scene:
     values = draw(st.none() | st.tuples(st.floats(-0.09, 0.09), st.floats(-1.0, 1.0)))
     at = {} if values is None else {"stick": values}
     both = {"stick": "grip", "ball": "pull"}
-    held, by = draw(st.sampled_from([({}, {}), ({"stick": "grip"}, {}), (both, {}), (both, {"ball": "stick.tip"})]))
+    held, by = draw(
+        st.sampled_from(
+            [({}, {}), ({"stick": "grip"}, {}), (both, {}), (both, {"ball": "stick.tip"})]
+        )
+    )
     return scene.with_held(held, by=by, at={name: row for name, row in at.items() if name in held})
 
 
@@ -65,14 +76,21 @@ def test_a_changed_scene_comes_back(scene: Scene) -> None:
     np.testing.assert_array_equal(again.start, scene.start)
     for name, placed in scene.objects.items():
         np.testing.assert_array_equal(again.objects[name].state, placed.state)
-        atol = 0.0 if name in scene.held or placed.placement == full().objects[name].placement else 1e-12
+        atol = (
+            0.0
+            if name in scene.held or placed.placement == full().objects[name].placement
+            else 1e-12
+        )
         where = again.objects[name].placement.homogeneous
         np.testing.assert_allclose(where, placed.placement.homogeneous, rtol=0.0, atol=atol)
     assert again.document == scene.document
 
 
 def test_what_was_not_moved_keeps_the_words_of_its_description() -> None:
-    entries = {entry["name"]: entry for entry in full().with_start(base=[1.0, 0.0, 0.0]).document["objects"]}
+    entries = {
+        entry["name"]: entry
+        for entry in full().with_start(base=[1.0, 0.0, 0.0]).document["objects"]
+    }
     assert entries["door"]["yaw"] == 0.7
     moved = full().with_placement("door", pin.SE3(np.eye(3), np.array([3.0, 1.0, 0.0])))
     entries = {entry["name"]: entry for entry in moved.document["objects"]}

@@ -56,19 +56,29 @@ def same(first: Scene, second: Scene) -> None:
     assert grips(first) == grips(second)
     np.testing.assert_array_equal(first.start, second.start)
     for name, placed in first.objects.items():
-        np.testing.assert_allclose(placed.placement.homogeneous, second.objects[name].placement.homogeneous, atol=1e-9)
+        np.testing.assert_allclose(
+            placed.placement.homogeneous, second.objects[name].placement.homogeneous, atol=1e-9
+        )
 
 
 def assert_same(one: pin.SE3, other: pin.SE3) -> None:
     np.testing.assert_allclose(one.homogeneous, other.homogeneous, atol=1e-9)
 
 
-# --- elsewhere --------------------------------------------------------------------------------------------------------
+# --- elsewhere
+# --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "rpy",
-    [(0.0, 0.0, 0.0), (0.3, -0.7, 2.0), (0.0, np.pi / 2, 0.4), (1.0, -np.pi / 2, 0.0), (np.pi, 0.0, 0.0), (0.0, 0.0, -np.pi)],
+    [
+        (0.0, 0.0, 0.0),
+        (0.3, -0.7, 2.0),
+        (0.0, np.pi / 2, 0.4),
+        (1.0, -np.pi / 2, 0.0),
+        (np.pi, 0.0, 0.0),
+        (0.0, 0.0, -np.pi),
+    ],
 )
 def test_put_elsewhere(hall: Scene, rpy: tuple[float, float, float]) -> None:
     """Upright, lying and standing on its tip, where roll and yaw are one."""
@@ -77,7 +87,9 @@ def test_put_elsewhere(hall: Scene, rpy: tuple[float, float, float]) -> None:
     assert moved.objects["cane"].placement == placement
     same(moved, again(moved))
     assert_same(moved.objects["fruit"].placement, hall.objects["fruit"].placement)
-    np.testing.assert_array_equal(hall.objects["cane"].placement.translation, [2.0, 0.0, 0.05])  # the old one stays as it was
+    np.testing.assert_array_equal(
+        hall.objects["cane"].placement.translation, [2.0, 0.0, 0.05]
+    )  # the old one stays as it was
     assert again(hall).document == hall.document
 
 
@@ -89,8 +101,12 @@ def test_the_scene_keeps_its_own_copy(hall: Scene) -> None:
 
 
 def test_what_is_fixed_can_be_put_elsewhere_too(hall: Scene) -> None:
-    moved = hall.with_placement("front", pin.SE3(pin.utils.rotate("z", 1.0), np.array([4.0, 1.0, 0.0])))
-    np.testing.assert_allclose(moved.objects["front"].link_placement("frame").translation, [4.0, 1.0, 0.0])
+    moved = hall.with_placement(
+        "front", pin.SE3(pin.utils.rotate("z", 1.0), np.array([4.0, 1.0, 0.0]))
+    )
+    np.testing.assert_allclose(
+        moved.objects["front"].link_placement("frame").translation, [4.0, 1.0, 0.0]
+    )
     same(moved, again(moved))
 
 
@@ -110,26 +126,39 @@ def test_there_is_no_such_object(hall: Scene) -> None:
     assert caught.value.nearest == "cane"
 
 
-# --- in the hand ------------------------------------------------------------------------------------------------------
+# --- in the hand
+# ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.05, -0.4), (-0.095, 1.2)])
 def test_held_at_some_values_of_the_grasp(hall: Scene, values: tuple[float, float]) -> None:
     held = hall.with_held({"cane": "grip"}, at={"cane": values})
     assert grips(held) == {Hold("cane", "grip"): values}
-    for scene in (held, again(held), held.with_start(base=[1.0, 2.0, -2.0]), held.with_state("front", {"hinge": 0.5})):
+    for scene in (
+        held,
+        again(held),
+        held.with_start(base=[1.0, 2.0, -2.0]),
+        held.with_state("front", {"hinge": 0.5}),
+    ):
         expected = scene.tool_placement() * tool_at(pin.SE3.Identity(), values=values).inverse()
         assert_same(scene.objects["cane"].placement, expected)
         assert grips(scene) == {Hold("cane", "grip"): values}
     same(held, again(held))
     if values == (0.0, 0.0):
-        assert_same(held.objects["cane"].placement, hall.with_held({"cane": "grip"}).objects["cane"].placement)
+        assert_same(
+            held.objects["cane"].placement,
+            hall.with_held({"cane": "grip"}).objects["cane"].placement,
+        )
     assert hall.holds == ()
 
 
 def test_held_through_something(hall: Scene) -> None:
     values, roll = (0.05, -0.4), (0.3, 0.2, 0.1)
-    held = hall.with_held({"fruit": "pull", "cane": "grip"}, by={"fruit": "cane.tip"}, at={"cane": values, "fruit": roll})
+    held = hall.with_held(
+        {"fruit": "pull", "cane": "grip"},
+        by={"fruit": "cane.tip"},
+        at={"cane": values, "fruit": roll},
+    )
     for scene in (held, again(held), held.with_start(base=[1.0, 2.0, -2.0])):
         cane = scene.tool_placement() * tool_at(pin.SE3.Identity(), values=values).inverse()
         assert_same(scene.objects["cane"].placement, cane)
@@ -143,7 +172,9 @@ def test_held_through_something(hall: Scene) -> None:
 
 
 def test_holding_anew_forgets_how_it_was_held(hall: Scene) -> None:
-    held = hall.with_held({"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"}, at={"cane": (0.05, 0.1)})
+    held = hall.with_held(
+        {"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"}, at={"cane": (0.05, 0.1)}
+    )
     other = held.with_held({"cane": "end"})
     assert grips(other) == {Hold("cane", "end"): ()}
     assert other.document["start"]["held"] == {"cane": {"attachment": "end"}}
@@ -156,21 +187,32 @@ def test_files_say_it_as_documents_do(tmp_path: Path, hall: Scene) -> None:
     same(short, hall.with_held({"cane": "end"}))
     long = load(tmp_path, FETCHING)
     expected = hall.with_held(
-        {"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"}, at={"cane": (0.05, -0.4), "fruit": (0.3, 0.2, 0.1)}
+        {"cane": "grip", "fruit": "pull"},
+        by={"fruit": "cane.tip"},
+        at={"cane": (0.05, -0.4), "fruit": (0.3, 0.2, 0.1)},
     )
     same(long, expected)
     assert long.document["start"]["held"] == expected.document["start"]["held"]
     same(long, again(long))
     reversed_order = load(tmp_path, "{fruit: {attachment: pull, by: cane.tip}, cane: grip}")
-    same(reversed_order, hall.with_held({"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"}))
+    same(
+        reversed_order, hall.with_held({"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"})
+    )
 
 
-def test_the_start_is_clear_of_what_is_carried_and_samples_carry_it(hall: Scene, tmp_path: Path) -> None:
-    text = HALL.replace("held: {}", f"held: {FETCHING}") + "start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n"
+def test_the_start_is_clear_of_what_is_carried_and_samples_carry_it(
+    hall: Scene, tmp_path: Path
+) -> None:
+    text = (
+        HALL.replace("held: {}", f"held: {FETCHING}")
+        + "start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n"
+    )
     (tmp_path / "hall.yaml").write_text(text)
     scene = load_scene(tmp_path / "hall.yaml").sample_start(np.random.default_rng(0))
     tip = scene.objects["cane"].link_placement("tip").translation
-    assert np.linalg.norm(tip - scene.objects["fruit"].placement.translation) == pytest.approx(0.035)
+    assert np.linalg.norm(tip - scene.objects["fruit"].placement.translation) == pytest.approx(
+        0.035
+    )
     here = hall.with_held({"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"})
     ball = here.objects["fruit"].placement.translation
     crate = {"name": "crate", "type": "sphere", "radius": 0.01, "position": ball.tolist()}
@@ -178,7 +220,8 @@ def test_the_start_is_clear_of_what_is_carried_and_samples_carry_it(hall: Scene,
     assert Scene.from_document(document).start_clearance() < 0.0
 
 
-# --- what is wrong ----------------------------------------------------------------------------------------------------
+# --- what is wrong
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -194,7 +237,12 @@ def test_the_start_is_clear_of_what_is_carried_and_samples_carry_it(hall: Scene,
     ],
 )
 def test_names_that_do_not_exist(
-    hall: Scene, held: Mapping[str, str], by: Mapping[str, str], at: Mapping[str, Any], field: str | None, nearest: str | None
+    hall: Scene,
+    held: Mapping[str, str],
+    by: Mapping[str, str],
+    at: Mapping[str, Any],
+    field: str | None,
+    nearest: str | None,
 ) -> None:
     with pytest.raises(UnknownNameError) as caught:
         hall.with_held(held, by=by, at=at)
@@ -209,9 +257,19 @@ def test_names_that_do_not_exist(
         ({"cane": "grip"}, {}, {"cane": (0.1, 0.0)}, "outside"),
         ({"cane": "grip"}, {}, {"cane": (0.0, np.nan)}, "not a finite number"),
         ({"cane": "grip", "fruit": "pull"}, {"fruit": "tip"}, {}, "not a link of an object"),
-        ({"cane": "grip", "fruit": "pull"}, {"fruit": "cane.tip", "cane": "fruit.ball"}, {}, "in a circle"),
+        (
+            {"cane": "grip", "fruit": "pull"},
+            {"fruit": "cane.tip", "cane": "fruit.ball"},
+            {},
+            "in a circle",
+        ),
         ({"cane": "grip", "front": "handle"}, {"front": "cane.tip"}, {}, "only a free object"),
-        ({"fruit": "pull", "front": "handle"}, {"fruit": "front.lever"}, {}, "only through a free one"),
+        (
+            {"fruit": "pull", "front": "handle"},
+            {"fruit": "front.lever"},
+            {},
+            "only through a free one",
+        ),
     ],
 )
 def test_holds_that_cannot_be(
@@ -226,17 +284,62 @@ def test_holds_that_cannot_be(
     [
         ("{cane: gripp}", UnknownNameError, "start.held.cane", "did you mean 'grip'?"),
         ("{cana: grip}", UnknownNameError, "start.held.cana", "did you mean 'cane'?"),
-        ("{cane: {attachment: gripp}}", UnknownNameError, "start.held.cane", "did you mean 'grip'?"),
-        ("{cane: {attachement: grip}}", UnknownNameError, "start.held.cane.attachement", "did you mean 'attachment'?"),
+        (
+            "{cane: {attachment: gripp}}",
+            UnknownNameError,
+            "start.held.cane",
+            "did you mean 'grip'?",
+        ),
+        (
+            "{cane: {attachement: grip}}",
+            UnknownNameError,
+            "start.held.cane.attachement",
+            "did you mean 'attachment'?",
+        ),
         ("{cane: {at: [0.0, 0.0]}}", InputError, "start.held.cane.attachment", "missing"),
-        ("{cane: {attachment: grip, at: [0.0]}}", InputError, "start.held.cane", "wrong number of values"),
-        ("{cane: {attachment: grip, at: [0.2, 0.0]}}", InputError, "start.held.cane", "outside the joint's limits"),
-        ("{cane: {attachment: grip, at: [0.0, .nan]}}", InputError, "start.held.cane.at[1]", "a finite number"),
-        ("{cane: {attachment: grip, at: [0.0, yes]}}", InputError, "start.held.cane.at[1]", "a number"),
+        (
+            "{cane: {attachment: grip, at: [0.0]}}",
+            InputError,
+            "start.held.cane",
+            "wrong number of values",
+        ),
+        (
+            "{cane: {attachment: grip, at: [0.2, 0.0]}}",
+            InputError,
+            "start.held.cane",
+            "outside the joint's limits",
+        ),
+        (
+            "{cane: {attachment: grip, at: [0.0, .nan]}}",
+            InputError,
+            "start.held.cane.at[1]",
+            "a finite number",
+        ),
+        (
+            "{cane: {attachment: grip, at: [0.0, yes]}}",
+            InputError,
+            "start.held.cane.at[1]",
+            "a number",
+        ),
         ("{fruit: {attachment: pull, by: cane.tip}}", UnknownNameError, "start.held.fruit", "cane"),
-        ("{cane: grip, fruit: {attachment: pull, by: cane.tap}}", UnknownNameError, "start.held.fruit", "did you mean 'tip'?"),
-        ("{cane: grip, fruit: {attachment: pull, by: tip}}", InputError, "start.held.fruit", "not a link of an object"),
-        ("{front: handle, fruit: {attachment: pull, by: front.lever}}", InputError, "start.held.fruit", "through a free one"),
+        (
+            "{cane: grip, fruit: {attachment: pull, by: cane.tap}}",
+            UnknownNameError,
+            "start.held.fruit",
+            "did you mean 'tip'?",
+        ),
+        (
+            "{cane: grip, fruit: {attachment: pull, by: tip}}",
+            InputError,
+            "start.held.fruit",
+            "not a link of an object",
+        ),
+        (
+            "{front: handle, fruit: {attachment: pull, by: front.lever}}",
+            InputError,
+            "start.held.fruit",
+            "through a free one",
+        ),
         (
             "{cane: {attachment: grip, by: fruit.ball}, fruit: {attachment: pull, by: cane.tip}}",
             InputError,
@@ -245,7 +348,9 @@ def test_holds_that_cannot_be(
         ),
     ],
 )
-def test_files_with_holds_that_cannot_be(tmp_path: Path, held: str, error: type[InputError], field: str, details: str) -> None:
+def test_files_with_holds_that_cannot_be(
+    tmp_path: Path, held: str, error: type[InputError], field: str, details: str
+) -> None:
     with pytest.raises(error) as caught:
         load(tmp_path, held)
     assert caught.value.file == tmp_path / "hall.yaml"

@@ -17,7 +17,9 @@ def test_draws_fill_the_region_and_nothing_else(yaw: tuple[float, float] | None)
     if yaw is not None:
         low[2], high[2] = yaw
     rng = np.random.default_rng(0)
-    drawn = np.array(list(itertools.islice(RegionSchema(x=(-1.0, 3.0), y=(2.0, 2.5), yaw=yaw).draws(rng), 2000)))
+    drawn = np.array(
+        list(itertools.islice(RegionSchema(x=(-1.0, 3.0), y=(2.0, 2.5), yaw=yaw).draws(rng), 2000))
+    )
     assert ((drawn >= low) & (drawn <= high)).all()
     shares = (drawn - low) / (high - low)
     counts = np.array([np.histogram(column, 4, (0.0, 1.0))[0] for column in shares.T])

@@ -26,7 +26,8 @@ def on(scene: Scene, name: str = "cup") -> set[str]:
 
 
 @pytest.mark.parametrize(
-    ("gap", "stands"), [(-2e-3, True), (0.0, True), (1e-3, True), (2.4e-3, True), (2.6e-3, False), (0.1, False)]
+    ("gap", "stands"),
+    [(-2e-3, True), (0.0, True), (1e-3, True), (2.4e-3, True), (2.6e-3, False), (0.1, False)],
 )
 def test_a_cup_on_a_plate_or_above_it(gap: float, stands: bool) -> None:
     assert on(plates(gap=gap)) == ({"plate.plate"} if stands else set())
@@ -39,7 +40,10 @@ def test_what_is_beside_bears_nothing(apart: float) -> None:
 
 def test_the_floor_and_two_tables() -> None:
     size = [0.2, 0.5, 0.5]
-    tables = [{"name": f"table_{k}", "type": "box", "size": size, "position": [0.2 * k, 0.0, 0.25]} for k in range(3)]
+    tables = [
+        {"name": f"table_{k}", "type": "box", "size": size, "position": [0.2 * k, 0.0, 0.25]}
+        for k in range(3)
+    ]
     assert on(scene_of([cup(at=(0.1, 0.0, 0.5))], tables)) == {"table_0", "table_1"}
     assert on(scene_of([cup(at=(0.1, 0.0, 0.0))])) == {"floor"}
 
@@ -47,12 +51,19 @@ def test_the_floor_and_two_tables() -> None:
 def test_what_stands_on_what_stands_on_what_moves() -> None:
     scene = plates(cups=1)
     upper = cup("upper", at=(0.8, 0.06, TOP + 0.1))
-    stacked = Scene.from_document({**scene.document, "objects": [*scene.document["objects"], upper]}, folder())
+    stacked = Scene.from_document(
+        {**scene.document, "objects": [*scene.document["objects"], upper]}, folder()
+    )
     assert on(stacked, "upper") == {"cup.cup"}
-    assert borne(stacked.objects, {"plate": {"plate"}}, ["cup", "upper"]) == {"cup": "plate.plate", "upper": "plate.plate"}
+    assert borne(stacked.objects, {"plate": {"plate"}}, ["cup", "upper"]) == {
+        "cup": "plate.plate",
+        "upper": "plate.plate",
+    }
     assert borne(stacked.objects, {"cup": {"cup"}}, ["cup", "upper"]) == {"upper": "cup.cup"}
     assert borne(stacked.objects, {"plate": {"post"}}, ["cup", "upper"]) == {}
-    assert borne(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}  # what is between is held by somebody
+    assert (
+        borne(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}
+    )  # what is between is held by somebody
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.1, 1.5, 3.0])
@@ -66,7 +77,9 @@ def test_tilt_is_the_angle_of_the_vertical_whatever_the_heading(angle: float) ->
 
 def test_how_far_it_is_lowered_is_more_than_rounding_and_less_than_a_shelf() -> None:
     assert 1e-3 < RESTING < 0.02
-    thin = [{"name": "sheet", "type": "box", "size": [0.3, 0.3, 0.002], "position": [0.0, 0.0, 0.499]}]
+    thin = [
+        {"name": "sheet", "type": "box", "size": [0.3, 0.3, 0.002], "position": [0.0, 0.0, 0.499]}
+    ]
     for at, stands in ((0.5, True), (0.502, True), (0.51, False)):
         assert on(scene_of([cup(at=(0.0, 0.0, at))], thin)) == ({"sheet"} if stands else set())
     assert lifted(pin.SE3.Identity()).translation[2] > RESTING

@@ -44,7 +44,16 @@ def test_what_is_done_with_one_thing_is_one_action() -> None:
 
 
 def test_no_step_is_lost() -> None:
-    steps = [vkc.Release(), vkc.Release(), G("cup"), vkc.GoTo(1, 0), G("door"), OPEN, OPEN, vkc.Release()]
+    steps = [
+        vkc.Release(),
+        vkc.Release(),
+        G("cup"),
+        vkc.GoTo(1, 0),
+        G("door"),
+        OPEN,
+        OPEN,
+        vkc.Release(),
+    ]
     actions = actions_of(steps)
     assert [step for action in actions for step in action] == steps
     assert len(actions) == 6  # a grasp of one thing is no part of what is done with another
@@ -79,7 +88,9 @@ def test_what_is_foreseen_is_what_each_step_asks_for_where_it_stands() -> None:
         ([OPEN, G("no_cup")], "steps[1].object", "no object"),
     ],
 )
-def test_the_first_step_that_cannot_be_done_is_named(steps: list[vkc.Step], field: str, problem: str) -> None:
+def test_the_first_step_that_cannot_be_done_is_named(
+    steps: list[vkc.Step], field: str, problem: str
+) -> None:
     with pytest.raises(vkc.InputError, match=problem) as caught:
         foresee(vkc.load_scene("household"), steps, vkc.Options())
     assert str(caught.value.field).startswith(field)
@@ -89,12 +100,19 @@ def test_the_first_step_that_cannot_be_done_is_named(steps: list[vkc.Step], fiel
 def test_a_free_object_is_taken_anew_where_it_stands_only(stands: bool) -> None:
     """In the air, it would fall."""
     x, y, z = littered().with_held({"litter": "grip"}).objects["litter"].placement.translation
-    table = {"name": "table", "type": "box", "size": [0.2, 0.2, 0.02], "position": [x, y, z - AT[2] - 0.01]}
+    table = {
+        "name": "table",
+        "type": "box",
+        "size": [0.2, 0.2, 0.02],
+        "position": [x, y, z - AT[2] - 0.01],
+    }
     scene = littered(*[table] * stands).with_held({"litter": "grip"})
     place = vkc.Place("litter", BIN)
     task = compile_task(scene, [place], vkc.Options())
     again = (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
-    assert list(alternatives(scene, task, anew=True)) == [("litter.grip, taken anew", again)] * stands
+    assert (
+        list(alternatives(scene, task, anew=True)) == [("litter.grip, taken anew", again)] * stands
+    )
     assert not list(alternatives(scene, task)), "only where phases may be more"
 
 
@@ -103,4 +121,8 @@ def test_where_it_stands_is_known_if_nothing_has_moved_before() -> None:
     scene = littered().with_held({"litter": "grip"})
     compile_task(scene, [vkc.Release("litter"), vkc.Place("litter", BIN)], vkc.Options())
     with pytest.raises(vkc.InputError, match="known only after planning"):
-        compile_task(scene, [vkc.GoTo(0.0, 1.0), vkc.Release("litter"), vkc.Place("litter", BIN)], vkc.Options())
+        compile_task(
+            scene,
+            [vkc.GoTo(0.0, 1.0), vkc.Release("litter"), vkc.Place("litter", BIN)],
+            vkc.Options(),
+        )

@@ -30,7 +30,10 @@ def moved(placed: PlacedObject, attachment: Attachment, joint: str, values: list
     for freedom, value in zip(attachment.freedoms, values, strict=True):
         touched = touched * freedom.motion(value)
     now = float(placed.state[placed.object.coordinates.index(joint)])
-    ahead, behind, here = (placed.with_state({joint: v}).link_placement(attachment.link) for v in (now + STEP, now - STEP, now))
+    ahead, behind, here = (
+        placed.with_state({joint: v}).link_placement(attachment.link)
+        for v in (now + STEP, now - STEP, now)
+    )
     shift = (ahead.act(touched.translation) - behind.act(touched.translation)) / (2 * STEP)
     return float((here * attachment.placement).rotation[:, 2] @ shift)
 
@@ -47,23 +50,39 @@ def test_the_advance_is_that_of_finite_differences(
 ) -> None:
     """Of a face of a tray that slides on an arm that swings: every point of the region is between the extremes, two are they."""
     arm = full_scene().objects["cabinet"].with_state({"swing": state[0], "slide": state[1]})
-    slides = [Freedom(f"_{k}", "prismatic", axis, -0.1, 0.2) for k, axis in enumerate(np.eye(3)[:2])]
+    slides = [
+        Freedom(f"_{k}", "prismatic", axis, -0.1, 0.2) for k, axis in enumerate(np.eye(3)[:2])
+    ]
     tilt = Freedom("_tilt", "revolute", np.array([1.0, 0.0, 0.0]), -0.5, 0.5)
     placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(at))
-    face = Attachment(name="face", link="tray", placement=placement, freedoms=(*slides, tilt), standoff=0.01, contact="push")
+    face = Attachment(
+        name="face",
+        link="tray",
+        placement=placement,
+        freedoms=(*slides, tilt),
+        standoff=0.01,
+        contact="push",
+    )
     for joint in ("swing", "slide"):
         least, most = advance(arm, face, joint)
         corners = [moved(arm, face, joint, [x, y, 0.3]) for x in (-0.1, 0.2) for y in (-0.1, 0.2)]
         np.testing.assert_allclose([least, most], [min(corners), max(corners)], rtol=0.0, atol=1e-8)
-        inside = [own.lower + share * (own.upper - own.lower) for own, share in zip(face.freedoms, where, strict=True)]
+        inside = [
+            own.lower + share * (own.upper - own.lower)
+            for own, share in zip(face.freedoms, where, strict=True)
+        ]
         assert least - 1e-8 <= moved(arm, face, joint, inside) <= most + 1e-8
 
 
 def test_a_rim_is_looked_at_all_along() -> None:
     """A wheel that is pushed along its axis, off the hinge: at one side of the rim the lever is longer than at the other."""
     arm = full_scene().objects["cabinet"]
-    around = Freedom("_around", "revolute", np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, np.array([-0.1, 0.0, 0.0]))
-    rim = Attachment(name="rim", link="tray", placement=pin.SE3.Identity(), freedoms=(around,), contact="push")
+    around = Freedom(
+        "_around", "revolute", np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, np.array([-0.1, 0.0, 0.0])
+    )
+    rim = Attachment(
+        name="rim", link="tray", placement=pin.SE3.Identity(), freedoms=(around,), contact="push"
+    )
     least, most = advance(arm, rim, "swing")
     every = [moved(arm, rim, "swing", [value]) for value in np.linspace(-np.pi, np.pi, 200)]
     assert most - least > 0.1
@@ -80,9 +99,12 @@ def at(hinge: float) -> Scene:
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "face", "way"), [(-1.2, 0.0, "push", 1), (1.2, 0.0, "push_back", -1), (0.3, 0.9, "push", 1)]
+    ("begin", "end", "face", "way"),
+    [(-1.2, 0.0, "push", 1), (1.2, 0.0, "push_back", -1), (0.3, 0.9, "push", 1)],
 )
-def test_a_door_is_pushed_shut_or_further_open(begin: float, end: float, face: str, way: int) -> None:
+def test_a_door_is_pushed_shut_or_further_open(
+    begin: float, end: float, face: str, way: int
+) -> None:
     reach, move = compiled(at(begin), {"hinge": end}, face).phases
     assert (reach.pushed, move.pushed, move.name) == ({}, {"door.hinge": way}, "move door.hinge")
 
@@ -93,36 +115,64 @@ def test_a_goal_beyond_the_limit_is_the_limit() -> None:
     assert move.pushed == {"door.hinge": -1}
 
 
-def test_which_way_a_push_moves_a_joint_is_asked_where_the_steps_before_have_left_the_others() -> None:
+def test_which_way_a_push_moves_a_joint_is_asked_where_the_steps_before_have_left_the_others() -> (
+    None
+):
     """A face on a tray that slides on an arm: pulled out, it is on the other side of the axis about which the arm swings."""
     scene, slides = full_scene(), (0.0, 0.3)
-    normal, along = np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0), np.array([0.0, -1.0, 0.0])  # the tray slides along its -y axis
+    normal, along = (
+        np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0),
+        np.array([0.0, -1.0, 0.0]),
+    )  # the tray slides along its -y axis
 
     def face(shift: float) -> Attachment:
-        placement = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), normal).matrix(), shift * along)
+        placement = pin.SE3(
+            pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), normal).matrix(), shift * along
+        )
         return Attachment(name="face", link="tray", placement=placement, contact="push")
 
     def yields(value: float, shift: float) -> float:
-        return advance(scene.objects["cabinet"].with_state({"slide": value}), face(shift), "swing")[0]
+        return advance(scene.objects["cabinet"].with_state({"slide": value}), face(shift), "swing")[
+            0
+        ]
 
-    root = yields(0.0, 0.0) / (yields(0.0, 0.0) - yields(0.0, 1.0))  # the lever is linear along the axis
+    root = yields(0.0, 0.0) / (
+        yields(0.0, 0.0) - yields(0.0, 1.0)
+    )  # the lever is linear along the axis
     middle = face(root - sum(slides) / 2.0)
-    signs = [np.sign(advance(scene.objects["cabinet"].with_state({"slide": value}), middle, "swing")[0]) for value in slides]
+    signs = [
+        np.sign(advance(scene.objects["cabinet"].with_state({"slide": value}), middle, "swing")[0])
+        for value in slides
+    ]
     assert signs[0] == -signs[1] != 0.0
-    there = with_objects(scene, {"cabinet": with_attachment(scene.objects["cabinet"].with_state({"slide": 0.0}), middle)})
+    there = with_objects(
+        scene,
+        {"cabinet": with_attachment(scene.objects["cabinet"].with_state({"slide": 0.0}), middle)},
+    )
     swing_by = 0.3 + 0.2 * signs[1]
-    steps = [vkc.Actuate("cabinet", {"slide": 0.3}, "face"), vkc.Actuate("cabinet", {"swing": swing_by}, "face")]
+    steps = [
+        vkc.Actuate("cabinet", {"slide": 0.3}, "face"),
+        vkc.Actuate("cabinet", {"swing": swing_by}, "face"),
+    ]
     assert compile_task(there, steps, Options()).phases[-1].pushed == {"cabinet.swing": signs[1]}
     with pytest.raises(InputError, match="cannot pull"):
         compile_task(there, steps[1:], Options())
 
 
 def test_a_hand_that_takes_hold_may_go_any_way() -> None:
-    assert [phase.pushed for phase in compiled(at(0.0), {"hinge": 1.0}, "handle").phases] == [{}, {}, {}]
+    assert [phase.pushed for phase in compiled(at(0.0), {"hinge": 1.0}, "handle").phases] == [
+        {},
+        {},
+        {},
+    ]
 
 
-@pytest.mark.parametrize(("begin", "end", "face", "way"), [(-0.5, -1.0, "push", "up"), (0.5, 1.0, "push_back", "down")])
-def test_what_would_have_to_be_pulled_is_refused(begin: float, end: float, face: str, way: str) -> None:
+@pytest.mark.parametrize(
+    ("begin", "end", "face", "way"), [(-0.5, -1.0, "push", "up"), (0.5, 1.0, "push_back", "down")]
+)
+def test_what_would_have_to_be_pulled_is_refused(
+    begin: float, end: float, face: str, way: str
+) -> None:
     said = f"pushing 'door' at '{face}' moves 'hinge' {way} only: a hand that pushes cannot pull"
     with pytest.raises(InputError, match=said) as caught:
         compiled(at(begin), {"hinge": end}, face)
@@ -140,7 +190,9 @@ def test_a_drawer_is_not_pulled_out_at_its_front() -> None:
     scene = vkc.load_scene("drawer")
     with pytest.raises(InputError, match="moves 'slide' down only"):
         compiled(scene, {"slide": 0.3}, "push", "drawer")
-    (_, move) = compiled(scene.with_state("drawer", {"slide": 0.3}), {"slide": 0.0}, "push", "drawer").phases
+    (_, move) = compiled(
+        scene.with_state("drawer", {"slide": 0.3}), {"slide": 0.0}, "push", "drawer"
+    ).phases
     assert move.pushed == {"drawer.slide": -1}
 
 
@@ -156,9 +208,13 @@ def test_a_face_whose_joint_does_not_yield_is_refused(
     link: str, position: list[float], approach: list[float], joint: str
 ) -> None:
     z = np.array(approach)
-    placement = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), z).matrix(), np.array(position))
+    placement = pin.SE3(
+        pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), z).matrix(), np.array(position)
+    )
     face = Attachment(name="face", link=link, placement=placement, contact="push")
-    scene = with_objects(door_scene(), {"cabinet": with_attachment(full_scene().objects["cabinet"], face)})
+    scene = with_objects(
+        door_scene(), {"cabinet": with_attachment(full_scene().objects["cabinet"], face)}
+    )
     with pytest.raises(InputError, match=f"does not move '{joint}' one way") as caught:
         compiled(scene, {joint: 0.2}, "face", "cabinet")
     assert "one side of the joint's axis" in str(caught.value)
@@ -173,4 +229,6 @@ def test_a_face_on_both_sides_of_the_hinge_is_refused() -> None:
     )
     both = dataclasses.replace(placed.object.attachments["push"], name="both", freedoms=wide)
     with pytest.raises(InputError, match="does not move 'hinge' one way"):
-        compiled(with_objects(at(-1.0), {"door": with_attachment(placed, both)}), {"hinge": 0.0}, "both")
+        compiled(
+            with_objects(at(-1.0), {"door": with_attachment(placed, both)}), {"hinge": 0.0}, "both"
+        )

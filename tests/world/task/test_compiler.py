@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import CABINET_STATE, door_scene, full_scene, with_attachment, with_objects
+from helpers.small_problems import (
+    CABINET_STATE,
+    door_scene,
+    full_scene,
+    with_attachment,
+    with_objects,
+)
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
@@ -36,22 +42,37 @@ def phases(steps: Sequence[Step], scene: Scene | None = None) -> Task:
 def with_link(scene: Scene, name: str, link: str) -> Scene:
     """Return the scene with one more attachment of the door, at the origin of `link`."""
     placed = scene.objects["door"]
-    attachment = dataclasses.replace(placed.object.attachment(), name=name, link=link, placement=pin.SE3.Identity())
-    thing = dataclasses.replace(placed.object, attachments={**placed.object.attachments, name: attachment})
-    return dataclasses.replace(scene, objects={**scene.objects, "door": dataclasses.replace(placed, object=thing)})
+    attachment = dataclasses.replace(
+        placed.object.attachment(), name=name, link=link, placement=pin.SE3.Identity()
+    )
+    thing = dataclasses.replace(
+        placed.object, attachments={**placed.object.attachments, name: attachment}
+    )
+    return dataclasses.replace(
+        scene, objects={**scene.objects, "door": dataclasses.replace(placed, object=thing)}
+    )
 
 
 def with_link_of(scene: Scene, owner: str, link: str) -> Scene:
     """Return the scene with one more attachment of an object, named after its link and like the first."""
     placed = scene.objects[owner]
     return with_objects(
-        scene, {owner: with_attachment(placed, dataclasses.replace(placed.object.attachment(), name=link, link=link))}
+        scene,
+        {
+            owner: with_attachment(
+                placed, dataclasses.replace(placed.object.attachment(), name=link, link=link)
+            )
+        },
     )
 
 
 def test_opening_a_door_is_reaching_turning_and_moving() -> None:
     task = phases([OPEN])
-    assert [phase.name for phase in task.phases] == ["reach door.handle", "turn door.knob", "move door.hinge, door.knob"]
+    assert [phase.name for phase in task.phases] == [
+        "reach door.handle",
+        "turn door.knob",
+        "move door.hinge, door.knob",
+    ]
     assert [phase.segments for phase in task.phases] == [10, 3, 7]
     assert task.segments == 20
     assert task.holds == task.after == (HANDLE,)
@@ -70,7 +91,10 @@ def test_opening_a_door_is_reaching_turning_and_moving() -> None:
 
 def test_a_knob_that_is_turned_already() -> None:
     task = phases([OPEN], door_scene().with_state("door", {"knob": 0.6}))
-    assert [phase.name for phase in task.phases] == ["reach door.handle", "move door.hinge, door.knob"]
+    assert [phase.name for phase in task.phases] == [
+        "reach door.handle",
+        "move door.hinge, door.knob",
+    ]
     assert task.phases[1].ranges["door.knob"] == (TURNED, KNOB[1])
     assert task.phases[1].before == {"door.hinge": 0.0, "door.knob": 0.6}
 
@@ -80,7 +104,11 @@ def test_a_door_that_is_ajar() -> None:
     task = phases([OPEN], door_scene().with_state("door", {"hinge": 0.3}))
     assert [phase.name for phase in task.phases] == ["reach door.handle", "move door.hinge"]
     task = phases([OPEN], door_scene().with_state("door", {"hinge": 0.03}))
-    assert [phase.name for phase in task.phases] == ["reach door.handle", "turn door.knob", "move door.hinge, door.knob"]
+    assert [phase.name for phase in task.phases] == [
+        "reach door.handle",
+        "turn door.knob",
+        "move door.hinge, door.knob",
+    ]
 
 
 def test_a_joint_that_is_where_it_should_be_needs_no_turned_knob() -> None:
@@ -97,11 +125,18 @@ def test_the_knob_alone() -> None:
 def test_hinge_and_knob_together() -> None:
     """The latch is released first, and the knob goes where it was asked to once the door is open."""
     far = phases([Actuate("door", {"hinge": 1.2, "knob": 0.7})])
-    assert [phase.name for phase in far.phases] == ["reach door.handle", "turn door.knob", "move door.hinge, door.knob"]
+    assert [phase.name for phase in far.phases] == [
+        "reach door.handle",
+        "turn door.knob",
+        "move door.hinge, door.knob",
+    ]
     assert far.phases[2].values == {"door.hinge": 1.2, "door.knob": 0.7}
     assert far.phases[2].ranges["door.knob"] == (TURNED, KNOB[1])
     back = phases([Actuate("door", {"hinge": 1.2, "knob": 0.0})])
-    assert [phase.name for phase in back.phases][2:] == ["move door.hinge, door.knob", "turn door.knob"]
+    assert [phase.name for phase in back.phases][2:] == [
+        "move door.hinge, door.knob",
+        "turn door.knob",
+    ]
     assert back.phases[2].values == {"door.hinge": 1.2, "door.knob": TURNED}
     assert back.phases[3].values == {"door.knob": 0.0}
     assert back.phases[3].ranges == {"door.knob": KNOB}
@@ -118,7 +153,10 @@ def test_a_held_object_needs_no_reaching() -> None:
 
 def test_twice_the_same_object_is_grasped_once() -> None:
     task = phases([Grasp("door"), OPEN, Actuate("door", {"hinge": 0.5})])
-    assert [phase.name for phase in task.phases][2:] == ["move door.hinge, door.knob", "move door.hinge"]
+    assert [phase.name for phase in task.phases][2:] == [
+        "move door.hinge, door.knob",
+        "move door.hinge",
+    ]
     assert task.phases[3].before == {"door.hinge": 1.2, "door.knob": TURNED}
 
 
@@ -129,14 +167,20 @@ def test_the_task_of_the_first_steps_is_as_if_there_were_no_others() -> None:
     for count in range(1, len(steps) + 1):
         part, alone = whole.until(count), phases(steps[:count], full_scene())
         assert part == alone
-        assert [list(phase.before) for phase in part.phases] == [list(phase.before) for phase in alone.phases]
+        assert [list(phase.before) for phase in part.phases] == [
+            list(phase.before) for phase in alone.phases
+        ]
         assert list(part.state) == list(alone.state)
 
 
 def test_grasp_only() -> None:
     task = phases([Grasp("door", "handle_free")])
     (phase,) = task.phases
-    assert (phase.name, phase.held, phase.grasps) == ("reach door.handle_free", (), (Hold("door", "handle_free"),))
+    assert (phase.name, phase.held, phase.grasps) == (
+        "reach door.handle_free",
+        (),
+        (Hold("door", "handle_free"),),
+    )
     assert task.holds == (Hold("door", "handle_free"),)
 
 
@@ -171,7 +215,13 @@ def test_go_to_lets_go() -> None:
 def test_one_object_after_another() -> None:
     """The second stands still until it is grasped, the first stays as it was left."""
     task = phases([OPEN, Actuate("drawer", {"slide": 0.2})], full_scene())
-    names = ["reach door.handle", "turn door.knob", "move door.hinge, door.knob", "reach drawer.handle", "move drawer.slide"]
+    names = [
+        "reach door.handle",
+        "turn door.knob",
+        "move door.hinge, door.knob",
+        "reach drawer.handle",
+        "move drawer.slide",
+    ]
     assert [phase.name for phase in task.phases] == names
     drawer = Hold("drawer", "handle")
     assert task.holds == (HANDLE, drawer)
@@ -240,7 +290,10 @@ def test_nothing_to_do(steps: list[Step]) -> None:
     assert caught.value.field == "steps"
 
 
-@pytest.mark.parametrize(("steps", "field"), [(OPEN, "steps"), (["open"], "steps[0]"), ([GoTo(0.0, 0.0), None], "steps[1]")])
+@pytest.mark.parametrize(
+    ("steps", "field"),
+    [(OPEN, "steps"), (["open"], "steps[0]"), ([GoTo(0.0, 0.0), None], "steps[1]")],
+)
 def test_what_is_no_step(steps: Any, field: str) -> None:
     with pytest.raises(InputError) as caught:
         phases(steps)
@@ -250,22 +303,42 @@ def test_what_is_no_step(steps: Any, field: str) -> None:
 def test_what_is_left_open_is_the_first_attachment_that_moves_the_joints() -> None:
     """The first of all moves only some of them."""
     placed = full_scene().objects["cabinet"]
-    named = {name: dataclasses.replace(placed.object.attachment(), name=name, link=name) for name in ("case", "arm", "lid")}
+    named = {
+        name: dataclasses.replace(placed.object.attachment(), name=name, link=name)
+        for name in ("case", "arm", "lid")
+    }
     thing = dataclasses.replace(placed.object, attachments={**named, **placed.object.attachments})
     scene = with_objects(full_scene(), {"cabinet": dataclasses.replace(placed, object=thing)})
-    for joints, taken in (({"swing": 0.5}, "arm"), ({"lid_hinge": 0.2}, "lid"), ({"swing": 0.5, "slide": 0.2}, "grip")):
+    for joints, taken in (
+        ({"swing": 0.5}, "arm"),
+        ({"lid_hinge": 0.2}, "lid"),
+        ({"swing": 0.5, "slide": 0.2}, "grip"),
+    ):
         task = phases([Actuate("cabinet", joints)], scene)
         assert task.holds == (Hold("cabinet", taken),)
-        assert task == dataclasses.replace(phases([Actuate("cabinet", joints, taken)], scene), steps=task.steps)
+        assert task == dataclasses.replace(
+            phases([Actuate("cabinet", joints, taken)], scene), steps=task.steps
+        )
     assert phases([Grasp("cabinet")], scene).holds == (Hold("cabinet", "case"),)
-    with pytest.raises(InputError, match="no attachment of 'cabinet' can bring 'swing' and 'lid_hinge' there") as caught:
+    with pytest.raises(
+        InputError, match="no attachment of 'cabinet' can bring 'swing' and 'lid_hinge' there"
+    ) as caught:
         phases([Actuate("cabinet", {"swing": 0.5, "lid_hinge": 0.2})], scene)
     assert caught.value.field == "steps[0].joints"
-    assert "case moves nothing; arm moves swing; lid moves lid_hinge; grip moves swing, slide" in str(caught.value.expected)
+    assert (
+        "case moves nothing; arm moves swing; lid moves lid_hinge; grip moves swing, slide"
+        in str(caught.value.expected)
+    )
 
 
 def test_what_the_hand_has_is_taken_before_what_comes_first() -> None:
-    task = phases([Actuate("door", {"hinge": 1.2}, "handle_free"), GoTo(0.0, 0.0), Actuate("door", {"hinge": 0.5})])
+    task = phases(
+        [
+            Actuate("door", {"hinge": 1.2}, "handle_free"),
+            GoTo(0.0, 0.0),
+            Actuate("door", {"hinge": 0.5}),
+        ]
+    )
     assert task.holds == (Hold("door", "handle_free"),)
     task = phases([OPEN], door_scene().with_held({"door": "handle_free"}))
     assert task.holds == (Hold("door", "handle_free"),)
@@ -275,10 +348,14 @@ def test_what_holds_a_latch_is_passed_over() -> None:
     """The plate moves the hinge, and no knob: while the latch is shut, it will not do."""
     scene = with_link(door_scene(), "plate", "panel")
     attachments = scene.objects["door"].object.attachments
-    thing = dataclasses.replace(scene.objects["door"].object, attachments={"plate": attachments["plate"], **attachments})
+    thing = dataclasses.replace(
+        scene.objects["door"].object, attachments={"plate": attachments["plate"], **attachments}
+    )
     scene = with_objects(scene, {"door": dataclasses.replace(scene.objects["door"], object=thing)})
     assert phases([OPEN], scene).holds == (HANDLE,)
-    assert phases([OPEN], scene.with_state("door", {"hinge": 0.2})).holds == (Hold("door", "plate"),)
+    assert phases([OPEN], scene.with_state("door", {"hinge": 0.2})).holds == (
+        Hold("door", "plate"),
+    )
 
 
 def test_one_object_held_here_and_then_there() -> None:
@@ -295,7 +372,11 @@ def test_one_object_held_here_and_then_there() -> None:
     ]
     assert [phase.held for phase in task.phases] == [(), (grip,), (), (other,)]
     assert task.phases[2].leaves == (grip,)
-    assert task.phases[3].before == {"cabinet.swing": 0.5, "cabinet.slide": 0.1, "cabinet.lid_hinge": -0.4}
+    assert task.phases[3].before == {
+        "cabinet.swing": 0.5,
+        "cabinet.slide": 0.1,
+        "cabinet.lid_hinge": -0.4,
+    }
     assert clash(lid, task.holds) is None
     both = phases([OPEN, Actuate("door", {"hinge": 0.5}, "handle_free")])
     assert both.holds == (HANDLE, Hold("door", "handle_free"))
@@ -305,9 +386,14 @@ def test_one_object_held_here_and_then_there() -> None:
 def test_what_the_start_holds_is_let_go_of_where_another_hold_moves_the_same() -> None:
     """With the joints that the new one does not move, which then are none of the task."""
     scene = (
-        with_link(door_scene(), "plate", "panel").with_state("door", {"hinge": 0.4, "knob": 0.6}).with_held({"door": "handle"})
+        with_link(door_scene(), "plate", "panel")
+        .with_state("door", {"hinge": 0.4, "knob": 0.6})
+        .with_held({"door": "handle"})
     )
-    for steps in ([Actuate("door", {"hinge": 0.9}, "plate")], [GoTo(0.0, 0.0), Actuate("door", {"hinge": 0.9}, "plate")]):
+    for steps in (
+        [Actuate("door", {"hinge": 0.9}, "plate")],
+        [GoTo(0.0, 0.0), Actuate("door", {"hinge": 0.9}, "plate")],
+    ):
         task = phases(steps, scene)
         assert task.holds == (Hold("door", "plate"),)
         assert task.state == {"door.hinge": 0.4}

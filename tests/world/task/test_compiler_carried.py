@@ -47,7 +47,8 @@ def held(task: Task) -> list[tuple[Hold, ...]]:
     return [phase.held for phase in task.phases]
 
 
-# --- touching ---------------------------------------------------------------------------------------------------------
+# --- touching
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_touching_with_a_stick_is_taking_it_and_carrying_it() -> None:
@@ -94,7 +95,11 @@ def test_what_stands_where_before_and_after_it_is_taken() -> None:
 def test_a_stick_in_the_hand_is_used_at_once() -> None:
     for attachment, hold in (("grip", GRIP), ("end", END)):
         task = phases(Touch("stick.tip", POINT), of=scene().with_held({"stick": attachment}))
-        assert (names(task), held(task), task.holds) == (["touch with stick.tip"], [(hold,)], (hold,))
+        assert (names(task), held(task), task.holds) == (
+            ["touch with stick.tip"],
+            [(hold,)],
+            (hold,),
+        )
         assert task.phases[0].leaves == ()
         assert "stick" not in task.phases[0].standing
         assert task.phases[0].lifted == {}
@@ -103,7 +108,8 @@ def test_a_stick_in_the_hand_is_used_at_once() -> None:
     assert taken.holds == (END,)
 
 
-# --- putting down, letting go -----------------------------------------------------------------------------------------
+# --- putting down, letting go
+# -----------------------------------------------------------------------------------------
 
 
 def test_placing_is_taking_bringing_and_letting_go() -> None:
@@ -111,7 +117,13 @@ def test_placing_is_taking_bringing_and_letting_go() -> None:
     assert names(task) == ["reach stick.grip", "place stick", "go to"]
     reach, place, leave = task.phases
     (goal,) = place.frames
-    assert (goal.frame, goal.kind, goal.hold, goal.touches, goal.placement) == ("stick", "pose", GRIP, False, POSE)
+    assert (goal.frame, goal.kind, goal.hold, goal.touches, goal.placement) == (
+        "stick",
+        "pose",
+        GRIP,
+        False,
+        POSE,
+    )
     assert (place.held, place.lifted, place.lowered) == ((GRIP,), {GRIP: STICK}, {GRIP: POSE})
     assert (leave.held, leave.leaves) == ((), (GRIP,))
     assert leave.standing["stick"] == POSE
@@ -136,7 +148,11 @@ def test_placing_at_another_attachment() -> None:
     assert phases(Place("stick", POSE, "end")).holds == (END,)
     with pytest.raises(InputError, match="held elsewhere") as caught:
         phases(Grasp("stick"), Place("stick", POSE, "end"))
-    assert (caught.value.field, caught.value.expected, caught.value.got) == ("steps[1].attachment", "grip", "end")
+    assert (caught.value.field, caught.value.expected, caught.value.got) == (
+        "steps[1].attachment",
+        "grip",
+        "end",
+    )
 
 
 def test_releasing() -> None:
@@ -154,8 +170,12 @@ def test_releasing_what_is_held_at_the_start() -> None:
     assert (names(task), held(task), task.after) == (["stand still"], [(GRIP,)], ())
     later = phases(Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"}))
     assert later.phases[1].leaves == (GRIP,)
-    assert not later.phases[1].left, "where it stands is known: it is let go of before anything has moved"
-    moved = phases(GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"}))
+    assert not later.phases[1].left, (
+        "where it stands is known: it is let go of before anything has moved"
+    )
+    moved = phases(
+        GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"})
+    )
     assert moved.phases[1].left == {"stick": (GRIP, 0)}
 
 
@@ -170,12 +190,25 @@ def test_what_cannot_be_released() -> None:
         phases(Place("stick", POSE), Release())
 
 
-# --- holding through what is held -------------------------------------------------------------------------------------
+# --- holding through what is held
+# -------------------------------------------------------------------------------------
 
 
 def test_a_ball_is_fetched_with_the_stick() -> None:
-    task = phases(Grasp("stick"), Grasp("ball", by="stick.tip"), GoTo(0.0, 0.0), Place("ball", POINT), Place("stick", POSE))
-    assert names(task) == ["reach stick.grip", "reach ball.grip by stick.tip", "go to", "place ball", "place stick"]
+    task = phases(
+        Grasp("stick"),
+        Grasp("ball", by="stick.tip"),
+        GoTo(0.0, 0.0),
+        Place("ball", POINT),
+        Place("stick", POSE),
+    )
+    assert names(task) == [
+        "reach stick.grip",
+        "reach ball.grip by stick.tip",
+        "go to",
+        "place ball",
+        "place stick",
+    ]
     assert held(task) == [(), (GRIP,), (GRIP, PULLED), (GRIP, PULLED), (GRIP,)]
     assert task.holds == (GRIP, PULLED)
     assert [phase.grasps for phase in task.phases] == [(GRIP,), (PULLED,), (), (), ()]
@@ -232,7 +265,8 @@ def test_only_what_is_carried_can_hold_something() -> None:
         phases(Grasp("stick"), Grasp("stick", by="stick.tip"))
 
 
-# --- one hand ---------------------------------------------------------------------------------------------------------
+# --- one hand
+# ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -246,7 +280,9 @@ def test_only_what_is_carried_can_hold_something() -> None:
     ],
     ids=lambda step: f"{type(step).__name__} {getattr(step, 'object', 'ball')}",
 )
-@pytest.mark.parametrize("first", [Grasp("stick"), Touch("stick.tip", POINT)], ids=["taken", "used"])
+@pytest.mark.parametrize(
+    "first", [Grasp("stick"), Touch("stick.tip", POINT)], ids=["taken", "used"]
+)
 def test_a_hand_that_carries_something_takes_nothing_else(first: Step, second: Step) -> None:
     with pytest.raises(InputError, match="one hand") as caught:
         phases(GoTo(0.0, 0.0), first, second)
@@ -269,7 +305,12 @@ def test_the_same_thing_is_not_taken_twice() -> None:
 
 
 def test_what_is_carried_comes_along_and_a_door_does_not() -> None:
-    for step in (Reach(POSE), Reach(POSE, "forearm_link"), GoTo(0.0, 0.0), Touch("forearm_link", POINT)):
+    for step in (
+        Reach(POSE),
+        Reach(POSE, "forearm_link"),
+        GoTo(0.0, 0.0),
+        Touch("forearm_link", POINT),
+    ):
         carried = phases(Grasp("stick"), step)
         assert held(carried) == [(), (GRIP,)]
         assert (carried.phases[1].leaves, carried.after) == ((), (GRIP,))
@@ -277,18 +318,27 @@ def test_what_is_carried_comes_along_and_a_door_does_not() -> None:
         assert held(shut) == [(), ()]
         assert (shut.phases[1].leaves, shut.after) == ((HANDLE,), ())
     drawer = Actuate("drawer", {"slide": 0.2})
-    after = phases(Actuate("door", {"knob": 0.1}), Grasp("stick"), GoTo(0.0, 0.0), Place("stick", POSE), drawer)
+    after = phases(
+        Actuate("door", {"knob": 0.1}), Grasp("stick"), GoTo(0.0, 0.0), Place("stick", POSE), drawer
+    )
     assert [len(phase.held) for phase in after.phases] == [0, 1, 0, 1, 1, 0, 1]
     assert after.phases[2].leaves == (HANDLE,)
     assert after.phases[5].leaves == (GRIP,)
 
 
-# --- again ------------------------------------------------------------------------------------------------------------
+# --- again
+# ------------------------------------------------------------------------------------------------------------
 
 
 def test_what_was_placed_can_be_taken_again() -> None:
     task = phases(Place("stick", POSE), GoTo(0.0, 0.0), Touch("stick.tip", POINT))
-    assert names(task) == ["reach stick.grip", "place stick", "go to", "reach stick.grip", "touch with stick.tip"]
+    assert names(task) == [
+        "reach stick.grip",
+        "place stick",
+        "go to",
+        "reach stick.grip",
+        "touch with stick.tip",
+    ]
     assert task.holds == (GRIP,)
     again, touch = task.phases[3:]
     assert again.grasps == (GRIP,)
@@ -322,7 +372,8 @@ def test_what_stands_somewhere_cannot_be_taken_before_that_is_known(before: Sequ
     assert other.phases[-1].grasps == (Hold("ball", "grip"),)
 
 
-# --- what is wrong ----------------------------------------------------------------------------------------------------
+# --- what is wrong
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -352,7 +403,9 @@ def test_names_that_do_not_exist(step: Step, field: str, nearest: str | None) ->
         (Actuate("stick", {"tip_joint": 0.0}), "steps[0].joints"),
     ],
 )
-def test_what_stands_fixed_is_not_carried_and_what_is_free_not_driven(step: Step, field: str) -> None:
+def test_what_stands_fixed_is_not_carried_and_what_is_free_not_driven(
+    step: Step, field: str
+) -> None:
     with pytest.raises(InputError) as caught:
         phases(step)
     assert caught.value.field == field
@@ -388,7 +441,11 @@ def test_every_phase_says_where_everything_is() -> None:
         assert set(phase.left) <= standing
     for before, after in zip(task.phases[:-1], task.phases[1:], strict=True):
         assert set(after.held) == ({*before.held, *before.grasps} - set(after.leaves))
-        assert set(after.lifted) == {hold for hold in before.grasps if hold in after.held and hold.object in ("stick", "ball")}
+        assert set(after.lifted) == {
+            hold
+            for hold in before.grasps
+            if hold in after.held and hold.object in ("stick", "ball")
+        }
 
 
 def test_a_door_is_not_held_through_a_stick() -> None:

@@ -26,7 +26,12 @@ def numbers(formula: Formula, count: int = 5) -> np.ndarray:
 
 def test_a_state_gives_what_it_says() -> None:
     s = state()
-    parts = [s.rotation("cup.cup")[0, 1], s.rotation("cup.cup")[1, 0], s.position("cup.cup"), s.velocity("tool")]
+    parts = [
+        s.rotation("cup.cup")[0, 1],
+        s.rotation("cup.cup")[1, 0],
+        s.position("cup.cup"),
+        s.velocity("tool"),
+    ]
     formula = s.formula(ca.vertcat(*parts, s.coordinate("door.hinge"), s.rate("elbow_joint")))
     assert formula.frames == ("cup.cup", "tool")
     assert formula.coordinates == ("door.hinge", "elbow_joint")
@@ -34,7 +39,12 @@ def test_a_state_gives_what_it_says() -> None:
     x = numbers(formula)
     before = x[:, 26:]
     rotation = x[:, :9].reshape(5, 3, 3).swapaxes(1, 2)  # by columns
-    expected = [rotation[:, 0, 1], rotation[:, 1, 0], *x[:, 9:12].T, *((x[:, 21:24] - before[:, 21:24]) / DT).T]
+    expected = [
+        rotation[:, 0, 1],
+        rotation[:, 1, 0],
+        *x[:, 9:12].T,
+        *((x[:, 21:24] - before[:, 21:24]) / DT).T,
+    ]
     expected += [x[:, 24], (x[:, 25] - before[:, 25]) / DT]
     np.testing.assert_allclose(formula.values(x), np.stack(expected, axis=1), atol=1e-12)
 
@@ -54,8 +64,15 @@ def test_what_a_formula_depends_on() -> None:
     [
         lambda x, y: ca.if_else(x > 0.2, ca.exp(y), -ca.fabs(x)) + ca.fmax(x, y) ** 3,
         lambda x, y: ca.atan2(y, x) / (2.0 + ca.cos(y)) - ca.tanh(x) * 1.5,
-        lambda x, y: ca.vertcat(x * y, 7.0, ca.fmin(x, 0.1), ca.sign(y) + ca.floor(x), -x, x**2, 1 / (3 + y)),
-        lambda x, y: ca.logic_or(x > 0, y > 0) * x + ca.sqrt(x**2 + y**2 + 1) + ca.log(2 + x**2) + ca.acos(0.3 * ca.sin(y)),
+        lambda x, y: ca.vertcat(
+            x * y, 7.0, ca.fmin(x, 0.1), ca.sign(y) + ca.floor(x), -x, x**2, 1 / (3 + y)
+        ),
+        lambda x, y: (
+            ca.logic_or(x > 0, y > 0) * x
+            + ca.sqrt(x**2 + y**2 + 1)
+            + ca.log(2 + x**2)
+            + ca.acos(0.3 * ca.sin(y))
+        ),
     ],
 )
 def test_a_formula_computes_what_was_written(expression) -> None:  # type: ignore[no-untyped-def]
@@ -77,7 +94,10 @@ def test_formulas_are_equal_if_they_compute_the_same_way_and_survive_json() -> N
     assert hash(make(0.5)) == hash(make(0.5))
     assert make(0.5) != make(0.6)
     formula = make(0.1)  # no binary fraction
-    code = tuple((name, tuple(read), to, value) for name, read, to, value in json.loads(json.dumps(formula.code)))
+    code = tuple(
+        (name, tuple(read), to, value)
+        for name, read, to, value in json.loads(json.dumps(formula.code))
+    )
     assert Formula(formula.frames, formula.coordinates, formula.rows, code) == formula
 
 

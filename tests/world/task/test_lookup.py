@@ -10,7 +10,14 @@ import pytest
 from helpers.small_problems import CABINET_STATE, full_scene
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.task.lookup import attachment_of, check_link, joint_limits, path_joints, placed_object, robot_frame
+from vkc_pin.world.task.lookup import (
+    attachment_of,
+    check_link,
+    joint_limits,
+    path_joints,
+    placed_object,
+    robot_frame,
+)
 
 
 def test_objects_attachments_links_and_frames() -> None:
@@ -57,7 +64,9 @@ def test_the_joints_on_the_path_are_those_that_move_the_attachment() -> None:
                     moving.append(name)
             assert sorted(path_joints(placed, attachment)) == sorted(moving)
     cabinet = full_scene().objects["cabinet"]
-    assert path_joints(cabinet, cabinet.object.attachments["grip"]) == ["swing", "slide"], "base first"
+    assert path_joints(cabinet, cabinet.object.attachments["grip"]) == ["swing", "slide"], (
+        "base first"
+    )
 
 
 def test_limits_of_joints_are_those_of_the_file() -> None:

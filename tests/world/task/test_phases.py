@@ -15,7 +15,12 @@ from vkc_pin.world.task.phases import FrameGoal, Phase, Task, stretches
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
-FURNITURE: list[Step] = [GoTo(0.5, 0.0), Actuate("drawer", {"slide": 0.2}), Reach(POSE), Actuate("door", {"hinge": 1.0})]
+FURNITURE: list[Step] = [
+    GoTo(0.5, 0.0),
+    Actuate("drawer", {"slide": 0.2}),
+    Reach(POSE),
+    Actuate("door", {"hinge": 1.0}),
+]
 CARRYING: list[Step] = [
     Grasp("stick", "grip"),
     Touch("stick.tip", (0.8, 0.9, 0.7)),
@@ -57,7 +62,12 @@ def test_a_task_that_is_cut_off_is_that_of_the_first_steps(steps: list[Step]) ->
     for count in range(1, len(steps) + 1):
         part, alone = whole.until(count), compile_task(scene, steps[:count], SHORT)
         assert told(part) == told(alone)
-        assert (part.steps, part.holds, part.after, part.segments) == (alone.steps, alone.holds, alone.after, alone.segments)
+        assert (part.steps, part.holds, part.after, part.segments) == (
+            alone.steps,
+            alone.holds,
+            alone.after,
+            alone.segments,
+        )
         assert dict(part.state) == dict(alone.state)
         assert part.marks == alone.marks
     assert whole.segments == sum(phase.segments for phase in whole.phases)
@@ -66,7 +76,13 @@ def test_a_task_that_is_cut_off_is_that_of_the_first_steps(steps: list[Step]) ->
 
 def test_phases_are_called_after_what_happens_in_them() -> None:
     names = [phase.name for phase in compile_task(scene_for(CARRYING), CARRYING, SHORT).phases]
-    assert names == ["reach stick.grip", "touch with stick.tip", "reach ball.pull by stick.tip", "place ball", "go to"]
+    assert names == [
+        "reach stick.grip",
+        "touch with stick.tip",
+        "reach ball.pull by stick.tip",
+        "place ball",
+        "go to",
+    ]
     assert Phase("turn", ("door.knob",), 3).name == "turn door.knob"
     assert Phase("move", ("door.hinge", "door.knob"), 3).name == "move door.hinge, door.knob"
     assert Phase("stand", (), 1).name == "stand still"

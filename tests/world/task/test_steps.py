@@ -29,7 +29,9 @@ from vkc_pin.world.task.steps import (
 TURN = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([1.0, 2.0, 3.0]))
 
 
-@pytest.mark.parametrize("pose", [TURN, TURN.homogeneous, TURN.homogeneous.tolist(), [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]])
+@pytest.mark.parametrize(
+    "pose", [TURN, TURN.homogeneous, TURN.homogeneous.tolist(), [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]]
+)
 def test_poses(pose: Any) -> None:
     np.testing.assert_allclose(as_placement(pose).homogeneous, TURN.homogeneous, atol=1e-15)
     np.testing.assert_allclose(Reach(pose).pose.homogeneous, TURN.homogeneous, atol=1e-15)
@@ -97,16 +99,26 @@ def test_what_cannot_be_actuated(joints: Any, field: str) -> None:
     assert caught.value.field == field
 
 
-@pytest.mark.parametrize("point", [(1.0, -2.0, 3.0), [1, -2, 3], np.array([1.0, -2.0, 3.0]), np.array([1, -2, 3])])
+@pytest.mark.parametrize(
+    "point", [(1.0, -2.0, 3.0), [1, -2, 3], np.array([1.0, -2.0, 3.0]), np.array([1, -2, 3])]
+)
 def test_points(point: Any) -> None:
-    for target in (as_target(point, name="p"), Touch("stick.tip", point).target, Place("stick", point).pose):
+    for target in (
+        as_target(point, name="p"),
+        Touch("stick.tip", point).target,
+        Place("stick", point).pose,
+    ):
         assert target == (1.0, -2.0, 3.0)
         assert [type(value) for value in target] == [float] * 3
 
 
 @pytest.mark.parametrize("pose", [TURN, TURN.homogeneous, [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]])
 def test_targets_that_are_poses(pose: Any) -> None:
-    for target in (as_target(pose, name="p"), Touch("stick.tip", pose).target, Place("stick", pose).pose):
+    for target in (
+        as_target(pose, name="p"),
+        Touch("stick.tip", pose).target,
+        Place("stick", pose).pose,
+    ):
         assert isinstance(target, pin.SE3)
         np.testing.assert_allclose(target.homogeneous, TURN.homogeneous, atol=1e-15)
 
@@ -128,7 +140,10 @@ def test_targets_that_are_poses(pose: Any) -> None:
     ],
 )
 def test_what_is_neither_point_nor_pose(target: Any, problem: str) -> None:
-    for make, field in ((lambda: Touch("stick.tip", target), "Touch.target"), (lambda: Place("stick", target), "Place.pose")):
+    for make, field in (
+        (lambda: Touch("stick.tip", target), "Touch.target"),
+        (lambda: Place("stick", target), "Place.pose"),
+    ):
         with pytest.raises(InputError, match=problem) as caught:
             make()
         assert caught.value.field == field
@@ -163,7 +178,9 @@ def test_only_the_heading_may_be_left_open() -> None:
 def test_numbers_become_plain() -> None:
     step = GoTo(np.float32(1.0), np.int64(2), np.float64(3.0))  # type: ignore[arg-type]
     assert [type(value) for value in vars(step).values()] == [float] * 3
-    assert {type(value) for value in Actuate("door", {"hinge": np.float32(1.0)}).joints.values()} == {float}
+    assert {
+        type(value) for value in Actuate("door", {"hinge": np.float32(1.0)}).joints.values()
+    } == {float}
     json.dumps([step_to_dict(step)])
 
 
@@ -217,7 +234,9 @@ def test_steps_of_earlier_plans() -> None:
         ({"step": "Release", "objects": "stick"}, "Release.objects", "object"),
     ],
 )
-def test_data_with_names_that_do_not_exist(data: dict[str, Any], field: str, nearest: str | None) -> None:
+def test_data_with_names_that_do_not_exist(
+    data: dict[str, Any], field: str, nearest: str | None
+) -> None:
     with pytest.raises(UnknownNameError) as caught:
         step_from_dict(data)
     assert (caught.value.field, caught.value.nearest) == (field, nearest)

@@ -26,11 +26,17 @@ def rides(task: Task) -> list[list[tuple[str, str]]]:
 
 
 def test_a_cup_rides_on_the_plate_and_stands_elsewhere_then() -> None:
-    task = compiled(plates(cups=2), vkc.Actuate("plate", {"slide": 0.4}), vkc.Grasp("cup"), vkc.GoTo(0.0, 0.0))
+    task = compiled(
+        plates(cups=2), vkc.Actuate("plate", {"slide": 0.4}), vkc.Grasp("cup"), vkc.GoTo(0.0, 0.0)
+    )
     assert rides(task) == [[], [("cup", "plate.plate"), ("cup_1", "plate.plate")], [], []]
     for name, y in (("cup", 0.05), ("cup_1", -0.07)):
-        np.testing.assert_allclose(task.phases[1].standing[name].translation, [0.8, y, TOP], rtol=0.0, atol=1e-12)
-        np.testing.assert_allclose(task.phases[2].standing[name].translation, [0.4, y, TOP], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(
+            task.phases[1].standing[name].translation, [0.8, y, TOP], rtol=0.0, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            task.phases[2].standing[name].translation, [0.4, y, TOP], rtol=0.0, atol=1e-12
+        )
     assert [hold.object for hold in task.phases[3].held] == ["cup"]
 
 
@@ -39,9 +45,15 @@ def test_what_hovers_or_stands_on_the_post_does_not() -> None:
 
 
 def test_a_turntable_stays_level_and_a_flap_does_not() -> None:
-    assert rides(compiled(plates("turntable"), vkc.Actuate("plate", {"turn": 0.5})))[1] == [("cup", "plate.plate")]
-    assert rides(compiled(plates("flap"), vkc.Actuate("plate", {"tip": 0.09})))[1] == [("cup", "plate.plate")]
-    with pytest.raises(InputError, match=r"'cup' stands on 'plate\.plate', which would tip") as caught:
+    assert rides(compiled(plates("turntable"), vkc.Actuate("plate", {"turn": 0.5})))[1] == [
+        ("cup", "plate.plate")
+    ]
+    assert rides(compiled(plates("flap"), vkc.Actuate("plate", {"tip": 0.09})))[1] == [
+        ("cup", "plate.plate")
+    ]
+    with pytest.raises(
+        InputError, match=r"'cup' stands on 'plate\.plate', which would tip"
+    ) as caught:
         compiled(plates("flap"), vkc.Actuate("plate", {"tip": 0.5}))
     assert caught.value.field == "steps[0]"
     assert "0.50 rad" in str(caught.value)
@@ -49,10 +61,21 @@ def test_a_turntable_stays_level_and_a_flap_does_not() -> None:
 
 def test_what_stands_on_two_things_of_which_one_moves() -> None:
     scene = plates(cups=0)
-    shelf = {"name": "shelf", "type": "box", "size": [0.2, 0.4, 0.02], "position": [1.1, 0.0, TOP - 0.01]}
-    document = {**scene.document, "objects": [*scene.document["objects"], cup(at=(1.0, 0.0, TOP))], "obstacles": [shelf]}
+    shelf = {
+        "name": "shelf",
+        "type": "box",
+        "size": [0.2, 0.4, 0.02],
+        "position": [1.1, 0.0, TOP - 0.01],
+    }
+    document = {
+        **scene.document,
+        "objects": [*scene.document["objects"], cup(at=(1.0, 0.0, TOP))],
+        "obstacles": [shelf],
+    }
     between = Scene.from_document(document, folder())
-    with pytest.raises(InputError, match=r"stands on what moves and on what does not: 'plate\.plate' and 'shelf'"):
+    with pytest.raises(
+        InputError, match=r"stands on what moves and on what does not: 'plate\.plate' and 'shelf'"
+    ):
         compiled(between, vkc.Actuate("plate", {"slide": 0.4}))
     assert rides(compiled(between, vkc.GoTo(0.0, 0.0))) == [[]]
 
@@ -70,7 +93,9 @@ def test_a_cup_rides_on_the_tray_in_the_hand() -> None:
     task = compiled(trays(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
     assert rides(task) == [[], [("cup", "tray.tray")], []]
     left = task.phases[2].standing["cup"].translation
-    np.testing.assert_allclose(left, THERE.translation + np.array([0.02, 0.05, 0.02]), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        left, THERE.translation + np.array([0.02, 0.05, 0.02]), rtol=0.0, atol=1e-12
+    )
 
 
 def test_what_rides_cannot_be_taken() -> None:

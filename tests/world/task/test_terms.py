@@ -19,15 +19,33 @@ SHORT = vkc.Options(reach_waypoints=3)
 
 
 def tilt(**fields: Any) -> vkc.Constraint:
-    return vkc.Constraint("upright", lambda s: s.rotation("stick.stick")[2, 2], **{"lower": 0.98, **fields})
+    return vkc.Constraint(
+        "upright", lambda s: s.rotation("stick.stick")[2, 2], **{"lower": 0.98, **fields}
+    )
 
 
 def three() -> list[vkc.Constraint | vkc.Cost]:
     slow = vkc.Constraint(
-        "slow", lambda s: ca.norm_2(s.velocity("tool")) - 0.2 - 0.5 * ca.norm_2(PERSON - s.position("tool")), upper=0.0
+        "slow",
+        lambda s: (
+            ca.norm_2(s.velocity("tool")) - 0.2 - 0.5 * ca.norm_2(PERSON - s.position("tool"))
+        ),
+        upper=0.0,
     )
-    within = vkc.Constraint("within", lambda s: s.position("tool"), lower=[-1, -2, 0], upper=[1, 2, np.inf], tolerance=1e-2)
-    return [slow, within, vkc.Cost("elbow", lambda s: (s.coordinate("elbow_joint") - 1.5) ** 2, weight=0.1, holding="stick")]
+    within = vkc.Constraint(
+        "within",
+        lambda s: s.position("tool"),
+        lower=[-1, -2, 0],
+        upper=[1, 2, np.inf],
+        tolerance=1e-2,
+    )
+    return [
+        slow,
+        within,
+        vkc.Cost(
+            "elbow", lambda s: (s.coordinate("elbow_joint") - 1.5) ** 2, weight=0.1, holding="stick"
+        ),
+    ]
 
 
 def test_terms_become_data_and_back() -> None:
@@ -55,10 +73,20 @@ def test_bounds() -> None:
 def test_when_terms_are_active() -> None:
     always, placing, carrying = tilt(), tilt(during="place stick"), tilt(holding="stick")
     assert placing.during == ("place stick",)
-    assert [term.active("place stick", ()) for term in (always, placing, carrying)] == [True, True, False]
-    assert [term.active("go to", ("stick",)) for term in (always, placing, carrying)] == [True, False, True]
+    assert [term.active("place stick", ()) for term in (always, placing, carrying)] == [
+        True,
+        True,
+        False,
+    ]
+    assert [term.active("go to", ("stick",)) for term in (always, placing, carrying)] == [
+        True,
+        False,
+        True,
+    ]
     both = tilt(during=["place stick", "go to"], holding="stick")
-    assert [both.active(*when) for when in (("go to", ()), ("go to", ["stick"]), ("move", ["stick"]))] == [False, True, False]
+    assert [
+        both.active(*when) for when in (("go to", ()), ("go to", ["stick"]), ("move", ["stick"]))
+    ] == [False, True, False]
 
 
 @pytest.mark.parametrize(
@@ -116,7 +144,10 @@ def own(s: vkc.State) -> Any:
         (lambda s: ca.SX(0, 1), "wrong shape"),
         (lambda s: s.coordinate("base_x") >= 1.0, "a comparison"),
         (lambda s: s.coordinate("base_x") + ca.SX.sym("mine"), "it has symbols of its own"),
-        (lambda s: s.coordinate("base_x") if s.coordinate("base_y") > 0 else 0.0, "it cannot be evaluated"),
+        (
+            lambda s: s.coordinate("base_x") if s.coordinate("base_y") > 0 else 0.0,
+            "it cannot be evaluated",
+        ),
         (own, "it cannot be evaluated.*mine"),
         (lambda s: s.position("tool")[7], "it cannot be evaluated"),
     ],
@@ -167,7 +198,10 @@ def test_phases_that_there_are_not() -> None:
     check_active([tilt(), tilt(during="place stick"), tilt(holding="stick")], phases)
     with pytest.raises(vkc.UnknownNameError, match="there is no phase 'place stik'") as caught:
         check_active([tilt(during=["place stick", "place stik"])], phases)
-    assert (caught.value.nearest, caught.value.choices) == ("place stick", ("reach stick.grip", "place stick"))
+    assert (caught.value.nearest, caught.value.choices) == (
+        "place stick",
+        ("reach stick.grip", "place stick"),
+    )
     for wrong in (tilt(holding="ball"), tilt(holding="stick", during="reach stick.grip")):
         with pytest.raises(vkc.InputError, match="never held in these phases"):
             check_active([wrong], phases)
@@ -177,7 +211,10 @@ def test_phases_that_there_are_not() -> None:
 def test_wrong_terms_are_found_before_anything_is_planned(function: Callable[..., Any]) -> None:
     steps = [vkc.Place("stick", (0.8, 0.5, 0.56)), vkc.GoTo(0.0, 0.0)]
     for terms, message in (
-        ([tilt(during="plaice stick")], "there is no phase 'plaice stick'; did you mean 'place stick'"),
+        (
+            [tilt(during="plaice stick")],
+            "there is no phase 'plaice stick'; did you mean 'place stick'",
+        ),
         ([vkc.Cost("far", lambda s: s.position("too")[0])], "there is no frame 'too'"),
         ([tilt(lower=[0, 0])], "wrong number of bounds"),
         (tilt(), "terms: not a list"),
@@ -211,7 +248,12 @@ def test_saved_expressions_that_are_damaged_are_refused(wrong: dict[str, Any]) -
 def test_saved_terms_that_are_damaged_are_refused() -> None:
     (term,) = traced(room(table()), [tilt()])
     data = term_to_dict(term)
-    for broken in ({**data, "term": "Wish"}, {**data, "colour": 3}, {}, {k: v for k, v in data.items() if k != "name"}):
+    for broken in (
+        {**data, "term": "Wish"},
+        {**data, "colour": 3},
+        {},
+        {k: v for k, v in data.items() if k != "name"},
+    ):
         with pytest.raises(vkc.InputError, match="not a saved term"):
             term_from_dict(broken)
     with pytest.raises(vkc.InputError, match="lower is more than upper"):

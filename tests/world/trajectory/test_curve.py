@@ -53,9 +53,17 @@ def test_extremes_and_speeds_are_those_of_many_moments(seed: int, even: bool) ->
     fastest, strongest = curve.speeds()
     for k, (begin, end) in enumerate(zip(curve.times, curve.times[1:], strict=False)):
         moments = np.linspace(begin, end, 2001)[:-1]
-        places, velocities, changes = curve.at(moments), np.abs(curve.velocity(moments)), np.abs(curve.acceleration(moments))
-        np.testing.assert_allclose(low[k], np.minimum(places.min(axis=0), curve.positions[k + 1]), atol=1e-5)
-        np.testing.assert_allclose(high[k], np.maximum(places.max(axis=0), curve.positions[k + 1]), atol=1e-5)
+        places, velocities, changes = (
+            curve.at(moments),
+            np.abs(curve.velocity(moments)),
+            np.abs(curve.acceleration(moments)),
+        )
+        np.testing.assert_allclose(
+            low[k], np.minimum(places.min(axis=0), curve.positions[k + 1]), atol=1e-5
+        )
+        np.testing.assert_allclose(
+            high[k], np.maximum(places.max(axis=0), curve.positions[k + 1]), atol=1e-5
+        )
         assert (low[k] <= places.min(axis=0) + 1e-12).all()
         assert (high[k] >= places.max(axis=0) - 1e-12).all()
         np.testing.assert_allclose(fastest[k], velocities.max(axis=0), rtol=2e-2, atol=1e-9)
@@ -67,11 +75,15 @@ def test_extremes_and_speeds_are_those_of_many_moments(seed: int, even: bool) ->
 def test_parts_put_together_are_the_whole() -> None:
     curve = some(3)
     middle = float(curve.times[3])
-    whole = joined([curve.part(curve.times[0], middle), curve.part(middle, curve.times[-1]).shifted(5.0)])
+    whole = joined(
+        [curve.part(curve.times[0], middle), curve.part(middle, curve.times[-1]).shifted(5.0)]
+    )
     np.testing.assert_allclose(whole.times, curve.times, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(whole.positions, curve.positions)
     np.testing.assert_array_equal(whole.rates, curve.rates)
-    np.testing.assert_array_equal(curve.part(curve.times[1], middle, [2, 0]).positions, curve.positions[1:4][:, [2, 0]])
+    np.testing.assert_array_equal(
+        curve.part(curve.times[1], middle, [2, 0]).positions, curve.positions[1:4][:, [2, 0]]
+    )
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,10 @@ PULL = (np.pi / 2, 0.0, 0.0)  # how the ball lies on the tip that comes from the
 def placements(scene: Scene, motion: Trajectory, name: str, times: np.ndarray) -> list[pin.SE3]:
     """Return where a free object is at some times, as the world says."""
     world = World(scene)
-    return [pin.XYZQUATToSE3(row) for row in world.positions(motion, times)[:, world.placement_columns(name)]]
+    return [
+        pin.XYZQUATToSE3(row)
+        for row in world.positions(motion, times)[:, world.placement_columns(name)]
+    ]
 
 
 def tools(scene: Scene, motion: Trajectory, times: np.ndarray) -> list[pin.SE3]:
@@ -54,7 +57,9 @@ def tools(scene: Scene, motion: Trajectory, times: np.ndarray) -> list[pin.SE3]:
 
 def inside(motion: Trajectory, phase: int, count: int = 40) -> np.ndarray:
     """Return times of a phase, both ends among them."""
-    return np.linspace(motion.times[motion.phases[phase].first], motion.times[motion.phases[phase].last], count)
+    return np.linspace(
+        motion.times[motion.phases[phase].first], motion.times[motion.phases[phase].last], count
+    )
 
 
 def assert_same(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-9) -> None:
@@ -86,9 +91,14 @@ def test_it_moves_rigidly_with_the_hand() -> None:
     scene, motion = carried()
     for phase in (2, 3, 4):
         times = inside(motion, phase)
-        for at, tool in zip(placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True):
+        for at, tool in zip(
+            placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True
+        ):
             assert_same(at.inverse() * tool, tool_at(pin.SE3.Identity(), values=(0.03, 0.2)))
-    lowest, highest = (placements(scene, motion, "stick", np.array([motion.times[motion.phases[k].last]]))[0] for k in (1, 2))
+    lowest, highest = (
+        placements(scene, motion, "stick", np.array([motion.times[motion.phases[k].last]]))[0]
+        for k in (1, 2)
+    )
     np.testing.assert_allclose(highest.translation - lowest.translation, UP, atol=1e-9)
 
 
@@ -99,24 +109,40 @@ def test_the_hand_closes_a_hair_beside_the_attachment() -> None:
     motion = carried_over(scene, off=off).motion()
     for phase in (2, 3, 4):
         times = inside(motion, phase)
-        for at, tool in zip(placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True):
+        for at, tool in zip(
+            placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True
+        ):
             assert_same(at.inverse() * tool, tool_at(pin.SE3.Identity()) * off)
-    assert_same(placements(scene, motion, "stick", np.array([motion.times[motion.phases[2].first]]))[0], STICK, 1e-12)
+    assert_same(
+        placements(scene, motion, "stick", np.array([motion.times[motion.phases[2].first]]))[0],
+        STICK,
+        1e-12,
+    )
 
 
 def test_a_hand_that_slides_and_turns_on_it() -> None:
     scene = room(table())
     script = carried_over(scene)
     count = len(script.rows)
-    slide, turn = 0.05 * np.sin(np.linspace(0.0, 9.0, count)), 0.3 * np.sin(np.linspace(0.0, 5.0, count))
+    slide, turn = (
+        0.05 * np.sin(np.linspace(0.0, 9.0, count)),
+        0.3 * np.sin(np.linspace(0.0, 5.0, count)),
+    )
     motion = script.motion(stick__grip_slide=slide, stick__grip_turn=turn)
     first = motion.phases[2].first
-    # Where the hand closes the stick lies as it lies, whatever the coordinates say; from then on they count.
-    offset = tool_at(pin.SE3.Identity(), values=(slide[first], turn[first])) * tool_at(STICK).inverse() * STICK
+    # Where the hand closes the stick lies as it lies, whatever the coordinates say; from then on
+    # they count.
+    offset = (
+        tool_at(pin.SE3.Identity(), values=(slide[first], turn[first]))
+        * tool_at(STICK).inverse()
+        * STICK
+    )
     assert np.abs(pin.log6(offset).vector).max() > 1e-2
     for phase in (2, 3, 4):
         times = inside(motion, phase, 23)
-        values = np.column_stack([np.interp(times, motion.times, column) for column in (slide, turn)])
+        values = np.column_stack(
+            [np.interp(times, motion.times, column) for column in (slide, turn)]
+        )
         sticks = placements(scene, motion, "stick", times)
         for at, tool, (s, t) in zip(sticks, tools(scene, motion, times), values, strict=True):
             assert_same(at, tool * tool_at(pin.SE3.Identity(), values=(s, t)).inverse() * offset)
@@ -125,11 +151,19 @@ def test_a_hand_that_slides_and_turns_on_it() -> None:
 def fetched() -> tuple[Scene, Script]:
     """Return stick in hand, its tip by the ball; they carry it up, to the left, and down, and leave it there."""
     scene = room(stand(), objects=("stick", "ball"))
-    south = pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0]))  # of the stick when its tip is at the ball
+    south = pin.SE3(
+        STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0])
+    )  # of the stick when its tip is at the ball
     touch = reaching(tool_at(south), above(STICK))
     up = reaching(tool_at(lifted(south, UP / 4)), touch)
     scene = scene.with_held({"stick": "grip"}).with_start(arm=up[3:])
-    script = Script(scene).go(touch).take("ball", "pull", PULL, by="stick.tip").go(up).go(moved_base(up, y=0.3))
+    script = (
+        Script(scene)
+        .go(touch)
+        .take("ball", "pull", PULL, by="stick.tip")
+        .go(up)
+        .go(moved_base(up, y=0.3))
+    )
     script.go(moved_base(touch, y=0.3)).let_go("ball").go(moved_base(touch, y=0.1))
     return scene, script
 
@@ -137,13 +171,24 @@ def fetched() -> tuple[Scene, Script]:
 def test_what_is_held_through_a_stick_follows_its_tip() -> None:
     scene, script = fetched()
     motion = script.motion()
-    assert [phase["by"] for phase in motion.to_dict()["phases"]] == [{}, *[{"ball": "stick.tip"}] * 3, {}]
+    assert [phase["by"] for phase in motion.to_dict()["phases"]] == [
+        {},
+        *[{"ball": "stick.tip"}] * 3,
+        {},
+    ]
     on_tip = (freedom("pull", PULL) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.035]))).inverse()
-    flipped = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # of the ball's attachment, which looks down
+    flipped = pin.SE3(
+        np.diag([1.0, -1.0, -1.0]), np.zeros(3)
+    )  # of the ball's attachment, which looks down
     for phase in (1, 2, 3):
         times = inside(motion, phase)
         sticks = placements(scene, motion, "stick", times)
-        for ball, stick, tool in zip(placements(scene, motion, "ball", times), sticks, tools(scene, motion, times), strict=True):
+        for ball, stick, tool in zip(
+            placements(scene, motion, "ball", times),
+            sticks,
+            tools(scene, motion, times),
+            strict=True,
+        ):
             assert_same(ball, stick * TIP * on_tip * flipped)
             assert_same(stick, tool * tool_at(pin.SE3.Identity()).inverse())
             assert_same(stick.inverse() * ball, pin.SE3(np.eye(3), np.array([0.0, 0.285, 0.0])))
@@ -156,7 +201,10 @@ def test_a_ball_that_rolls_on_the_tip() -> None:
     """About its own centre: the tip stays on it, wherever the stick's own frame is."""
     scene, script = fetched()
     roll, count = np.pi / 2, len(script.rows)
-    angles = [roll + 0.4 * np.sin(np.linspace(0.0, 3.0, count)), 0.3 * np.sin(np.linspace(0.0, 2.0, count))]
+    angles = [
+        roll + 0.4 * np.sin(np.linspace(0.0, 3.0, count)),
+        0.3 * np.sin(np.linspace(0.0, 2.0, count)),
+    ]
     motion = script.motion(ball__pull_x=angles[0], ball__pull_y=angles[1])
     first = motion.phases[1].first
 
@@ -181,7 +229,9 @@ def test_what_is_held_at_the_start_is_where_the_hand_has_it() -> None:
     assert_same(pin.XYZQUATToSE3(world.start[world.placement_columns("stick")]), expected, 1e-12)
     motion = Script(scene).go(moved_base(scene.start, x=-1.0, yaw=2.0)).motion()
     times = inside(motion, 0)
-    for at, tool in zip(placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True):
+    for at, tool in zip(
+        placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True
+    ):
         assert_same(at, tool * tool_at(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse())
 
 
@@ -216,11 +266,21 @@ def test_the_numbers_of_an_orientation_do_not_jump_either() -> None:
     np.testing.assert_allclose(np.linalg.norm(rows[:, 3:], axis=1), 1.0, atol=1e-12)
     assert np.einsum("kc,kc->k", rows[1:, 3:], rows[:-1, 3:]).min() > 0.999
     assert np.abs(np.diff(rows, axis=0)).max() < 0.02
-    assert (rows[:, 3:].min(axis=0) < -0.3).sum() >= 2  # it does come round to where the first choice would flip
-    half = World(scene).positions(motion, (times[1:] + times[:-1]) / 2)[:, world.placement_columns("stick")]
+    assert (
+        rows[:, 3:].min(axis=0) < -0.3
+    ).sum() >= 2  # it does come round to where the first choice would flip
+    half = World(scene).positions(motion, (times[1:] + times[:-1]) / 2)[
+        :, world.placement_columns("stick")
+    ]
     for between, before, after in zip(half[::50], rows[:-1:50], rows[1::50], strict=True):
-        middle = pin.XYZQUATToSE3(np.concatenate([np.zeros(3), (before + after)[3:] / np.linalg.norm((before + after)[3:])]))
-        assert np.linalg.norm(pin.log3(middle.rotation.T @ pin.XYZQUATToSE3(between).rotation)) < 2e-3
+        middle = pin.XYZQUATToSE3(
+            np.concatenate(
+                [np.zeros(3), (before + after)[3:] / np.linalg.norm((before + after)[3:])]
+            )
+        )
+        assert (
+            np.linalg.norm(pin.log3(middle.rotation.T @ pin.XYZQUATToSE3(between).rotation)) < 2e-3
+        )
 
 
 @settings(max_examples=30, deadline=None)
@@ -251,10 +311,15 @@ def test_coordinates_frames_and_shapes_of_what_is_free() -> None:
     world = World(scene)
     robot = scene.robot.coordinates.names
     parts = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    assert world.coordinates.names == (*robot, *(f"{n}.placement_{part}" for n in ("stick", "ball") for part in parts))
+    assert world.coordinates.names == (
+        *robot,
+        *(f"{n}.placement_{part}" for n in ("stick", "ball") for part in parts),
+    )
     for name in ("stick", "ball"):
         columns = world.placement_columns(name)
-        assert world.coordinates.names[columns] == tuple(f"{name}.placement_{part}" for part in parts)
+        assert world.coordinates.names[columns] == tuple(
+            f"{name}.placement_{part}" for part in parts
+        )
         np.testing.assert_allclose(world.start[columns], as_numbers(scene.objects[name].placement))
         (joint,) = world.joints_of(name)
         assert world.model.names[joint] == f"{name}.placement"
@@ -267,7 +332,10 @@ def test_coordinates_frames_and_shapes_of_what_is_free() -> None:
     columns = world.placement_columns("stick")
     unit = z[columns] / np.r_[1.0, 1.0, 1.0, np.full(4, np.linalg.norm(z[columns][3:]))]
     assert_same(data.oMf[world.model.getFrameId("stick.tip")], pin.XYZQUATToSE3(unit) * TIP)
-    own = {shape.name: shape.placement for shape in scene.objects["stick"].object.collision.geometryObjects}
+    own = {
+        shape.name: shape.placement
+        for shape in scene.objects["stick"].object.collision.geometryObjects
+    }
     for shape, where in zip(world.collision.geometryObjects, shapes.oMg, strict=True):
         if shape.name.startswith("stick."):
             assert_same(where, pin.XYZQUATToSE3(unit) * own.pop(shape.name.removeprefix("stick.")))

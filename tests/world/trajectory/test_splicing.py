@@ -15,7 +15,9 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 def test_what_is_not_known_is_as_it_was_or_as_it_will_be() -> None:
     nan = np.nan
-    table = np.array([[nan, 1.0, nan], [2.0, nan, nan], [nan, nan, nan], [3.0, 4.0, nan], [nan, nan, nan]])
+    table = np.array(
+        [[nan, 1.0, nan], [2.0, nan, nan], [nan, nan, nan], [3.0, 4.0, nan], [nan, nan, nan]]
+    )
     expected = [[2.0, 1.0, nan], [2.0, 1.0, nan], [2.0, 1.0, nan], [3.0, 4.0, nan], [3.0, 4.0, nan]]
     np.testing.assert_array_equal(filled(table), expected)
     assert np.isnan(table[0, 0])  # what was given is left alone
@@ -25,9 +27,17 @@ def parts() -> tuple[Trajectory, Trajectory, Trajectory]:
     """Reach for the door, open it, and go on, holding what was held; only the second knows the door's hinge."""
     robot = NAMES[:5]
     held = (Hold("door", "handle"),)
-    reach = Trajectory(robot, np.array([0.0, 1.0, 3.0]), ROWS[:3, :5], (PhaseSpan("a", 0, 1), PhaseSpan("b", 1, 2)), 5)
+    reach = Trajectory(
+        robot,
+        np.array([0.0, 1.0, 3.0]),
+        ROWS[:3, :5],
+        (PhaseSpan("a", 0, 1), PhaseSpan("b", 1, 2)),
+        5,
+    )
     opens = Trajectory(NAMES, np.array([7.0, 8.0]), ROWS[2:], (PhaseSpan("c", 0, 1, held),), 5)
-    after = Trajectory(robot, np.array([0.0, 0.5]), ROWS[[3, 0], :5], (PhaseSpan("d", 0, 1, held),), 5)
+    after = Trajectory(
+        robot, np.array([0.0, 0.5]), ROWS[[3, 0], :5], (PhaseSpan("d", 0, 1, held),), 5
+    )
     return reach, opens, after
 
 
@@ -37,9 +47,16 @@ def test_motions_are_joined() -> None:
     assert whole.names == NAMES
     np.testing.assert_allclose(whole.times, [0.0, 1.0, 3.0, 3.25, 4.25, 4.75])
     np.testing.assert_array_equal(whole.positions[:, :5], ROWS[[0, 1, 2, 2, 3, 0], :5])
-    np.testing.assert_array_equal(whole.positions[:, 5], [0.0, 0.0, 0.0, 0.0, 1.2, 1.2])  # as it will be, or as it was
+    np.testing.assert_array_equal(
+        whole.positions[:, 5], [0.0, 0.0, 0.0, 0.0, 1.2, 1.2]
+    )  # as it will be, or as it was
     # Waiting belongs to what follows.
-    assert [(p.name, p.first, p.last) for p in whole.phases] == [("a", 0, 1), ("b", 1, 2), ("c", 2, 4), ("d", 4, 5)]
+    assert [(p.name, p.first, p.last) for p in whole.phases] == [
+        ("a", 0, 1),
+        ("b", 1, 2),
+        ("c", 2, 4),
+        ("d", 4, 5),
+    ]
     assert [dict(p.held) for p in whole.phases] == [{}, {}, {"door": "handle"}, {"door": "handle"}]
     assert whole.robot_size == 5
 

@@ -18,7 +18,9 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 def test_efforts() -> None:
     assert example().base_effort() == pytest.approx(5.0 + 1.0)
     assert example().base_effort_l1() == pytest.approx(3.0 + 4.0 + 1.0)
-    assert example().arm_effort() == pytest.approx(0.1 + 0.2 + 0.4 + 0.1)  # neither the heading nor the door counts
+    assert example().arm_effort() == pytest.approx(
+        0.1 + 0.2 + 0.4 + 0.1
+    )  # neither the heading nor the door counts
 
 
 def test_velocities() -> None:
@@ -37,7 +39,9 @@ def test_accelerations() -> None:
 def test_at() -> None:
     motion = example()
     np.testing.assert_allclose(motion.at(1.0), ROWS[1] / 2 + ROWS[0] / 2)
-    np.testing.assert_allclose(motion.at([3.5, 6.5])[0], 0.75 * ROWS[2] + 0.25 * ROWS[3], atol=1e-15)
+    np.testing.assert_allclose(
+        motion.at([3.5, 6.5])[0], 0.75 * ROWS[2] + 0.25 * ROWS[3], atol=1e-15
+    )
     np.testing.assert_array_equal(motion.at(TIMES), ROWS)
     np.testing.assert_array_equal(motion.at([-1.0, 7.0]), ROWS[[0, -1]])
     assert motion.at(np.zeros((2, 3))).shape == (2, 3, 6)
@@ -75,7 +79,11 @@ def test_round_trip() -> None:
     again = Trajectory.from_dict(json.loads(json.dumps(motion.to_dict())))
     np.testing.assert_array_equal(again.positions, motion.positions)
     np.testing.assert_array_equal(again.times, motion.times)
-    assert (again.names, again.phases, again.robot_size) == (motion.names, motion.phases, motion.robot_size)
+    assert (again.names, again.phases, again.robot_size) == (
+        motion.names,
+        motion.phases,
+        motion.robot_size,
+    )
 
 
 def test_what_is_held_through_something_is_kept_too() -> None:
@@ -109,7 +117,10 @@ def test_data_that_lacks_something(key: str) -> None:
         ("Trajectory.positions", {"positions": ROWS[:3]}),
         ("Trajectory.positions", {"positions": ROWS[:, :5]}),
         ("Trajectory.positions", {"positions": [[0.0], [1.0, 2.0]]}),
-        ("Trajectory.positions[2, 1]", {"positions": np.where(np.arange(24).reshape(4, 6) == 13, np.nan, ROWS)}),
+        (
+            "Trajectory.positions[2, 1]",
+            {"positions": np.where(np.arange(24).reshape(4, 6) == 13, np.nan, ROWS)},
+        ),
         ("Trajectory.names", {"names": (*NAMES[:5], "elbow")}),
         ("Trajectory.robot_size", {"robot_size": 7}),
         ("Trajectory.robot_size", {"robot_size": 2}),

@@ -18,7 +18,10 @@ def driven(speeds: list[tuple[float, float]]) -> np.ndarray:
     poses = [np.array([0.3, -0.2, 0.9])]
     for length, turn in speeds:
         heading = poses[-1][2] + turn * (np.arange(2000) + 0.5) / 2000
-        poses.append(poses[-1] + np.array([np.cos(heading).mean() * length, np.sin(heading).mean() * length, turn]))
+        poses.append(
+            poses[-1]
+            + np.array([np.cos(heading).mean() * length, np.sin(heading).mean() * length, turn])
+        )
     return np.array(poses)
 
 
@@ -64,9 +67,12 @@ def test_the_limits_are_the_robots() -> None:
     assert rolling_of(hall().robot) is ANYWHERE
     assert rolling_of(hall(base="fixed").robot) is ANYWHERE
     tank, car = (
-        rolling_of(hall(**robot).robot) for robot in ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8})
+        rolling_of(hall(**robot).robot)
+        for robot in ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8})
     )
     assert (tank.radius, car.radius) == (0.0, 0.8)
     assert (
-        (tank.track, tank.rim) == (car.track, car.rim) == (pytest.approx(0.5708 * 1.875, abs=1e-3), pytest.approx(1.0, rel=1e-3))
+        (tank.track, tank.rim)
+        == (car.track, car.rim)
+        == (pytest.approx(0.5708 * 1.875, abs=1e-3), pytest.approx(1.0, rel=1e-3))
     )

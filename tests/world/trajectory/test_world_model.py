@@ -44,7 +44,9 @@ def test_every_frame_is_where_it_is_alone(seed: int) -> None:
     alone = robot.model.createData()
     pin.framesForwardKinematics(robot.model, alone, robot.coordinates.q(z[:n]))
     for index, frame in enumerate(robot.model.frames[1:], 1):
-        np.testing.assert_allclose(where(frame.name, frame.type), alone.oMf[index].homogeneous, atol=1e-12)
+        np.testing.assert_allclose(
+            where(frame.name, frame.type), alone.oMf[index].homogeneous, atol=1e-12
+        )
         seen += 1
     for name, placed in scene.objects.items():
         item, state = placed.object, z[n : n + placed.object.coordinates.size]
@@ -53,7 +55,9 @@ def test_every_frame_is_where_it_is_alone(seed: int) -> None:
         pin.framesForwardKinematics(item.model, alone, item.coordinates.q(state))
         for index, frame in enumerate(item.model.frames[1:], 1):
             expected = (placed.placement * alone.oMf[index]).homogeneous
-            np.testing.assert_allclose(where(f"{name}.{frame.name}", frame.type), expected, atol=1e-12)
+            np.testing.assert_allclose(
+                where(f"{name}.{frame.name}", frame.type), expected, atol=1e-12
+            )
             seen += 1
     assert seen == world.model.nframes
     assert n == world.coordinates.size == world.model.nv
@@ -65,7 +69,10 @@ def test_every_shape_is_where_it_is_alone(world: World, kind: str) -> None:
     geometry = getattr(world, kind)
     data, shapes = world.model.createData(), geometry.createData()
     pin.updateGeometryPlacements(world.model, data, geometry, shapes, world.coordinates.q(z))
-    found = {shape.name: (shape, where) for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)}
+    found = {
+        shape.name: (shape, where)
+        for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+    }
     expected: dict[str, tuple[pin.GeometryObject, pin.SE3]] = {}
     robot, n = scene.robot, scene.robot.coordinates.size
     source = getattr(robot, kind)
@@ -82,7 +89,9 @@ def test_every_shape_is_where_it_is_alone(world: World, kind: str) -> None:
     obstacles = scene.obstacles if kind == "collision" else scene.obstacle_visual
     for shape in obstacles:
         expected[shape.name] = shape, shape.placement
-    assert list(found) == list(expected)  # none lost, none twice, robot before objects before obstacles
+    assert list(found) == list(
+        expected
+    )  # none lost, none twice, robot before objects before obstacles
     assert len(geometry.geometryObjects) == len(expected)
     for name, (shape, where) in expected.items():
         twin, there = found[name]
@@ -113,13 +122,26 @@ def test_labels(world: World) -> None:
 
 def test_coordinates_and_start(world: World) -> None:
     scene = world.scene
-    objects = [f"{name}.{joint}" for name, placed in scene.objects.items() for joint in placed.object.coordinates.names]
+    objects = [
+        f"{name}.{joint}"
+        for name, placed in scene.objects.items()
+        for joint in placed.object.coordinates.names
+    ]
     assert world.coordinates.names == (*scene.robot.coordinates.names, *objects)
     np.testing.assert_array_equal(world.start[: len(scene.start)], scene.start)
-    np.testing.assert_array_equal(world.start[len(scene.start) :], np.concatenate([p.state for p in scene.objects.values()]))
-    lower = np.concatenate([scene.robot.coordinates.lower, *(p.object.coordinates.lower for p in scene.objects.values())])
+    np.testing.assert_array_equal(
+        world.start[len(scene.start) :], np.concatenate([p.state for p in scene.objects.values()])
+    )
+    lower = np.concatenate(
+        [
+            scene.robot.coordinates.lower,
+            *(p.object.coordinates.lower for p in scene.objects.values()),
+        ]
+    )
     np.testing.assert_array_equal(world.coordinates.lower, lower)
-    velocity = np.concatenate([scene.robot.coordinates.velocity, *(p.object.velocity for p in scene.objects.values())])
+    velocity = np.concatenate(
+        [scene.robot.coordinates.velocity, *(p.object.velocity for p in scene.objects.values())]
+    )
     np.testing.assert_array_equal(world.coordinates.velocity, velocity)
 
 
@@ -128,7 +150,9 @@ def test_positions_along_a_motion(world: World) -> None:
     robot = world.scene.robot.coordinates.names
     names = (*robot, "drawer.slide", "door.handle_free", "door.hinge")
     values = np.random.default_rng(0).normal(size=(3, len(names)))
-    motion = Trajectory(names, np.array([0.0, 1.0, 3.0]), values, (PhaseSpan("all", 0, 2),), len(robot))
+    motion = Trajectory(
+        names, np.array([0.0, 1.0, 3.0]), values, (PhaseSpan("all", 0, 2),), len(robot)
+    )
     rows, half = world.positions(motion), world.positions(motion, [0.5])
     for k, name in enumerate(world.coordinates.names):
         if name in names:

@@ -31,9 +31,11 @@ class Found:
     """What a planner came to.
 
     Attributes:
-        path: Its waypoints from the start on, straight lines between them, shape (K, n); None: it has none.
+        path: Its waypoints from the start on, straight lines between them, shape (K, n); None: it
+            has none.
         own: CPU time of its solver alone [s].
-        first: CPU time from the call to its first motion, everything included [s]; None: it has none.
+        first: CPU time from the call to its first motion, everything included [s]; None: it has
+            none.
         status: "found", or why not: "timed out", or its own word.
         about: What else is kept.
     """
@@ -76,7 +78,15 @@ Peer = Callable[[Given, TrajectoryProblem, int, Clock, Callable[[Floats], bool]]
 """What plans: takes a problem, the same as a program, a random seed, the clock, and what tells whether a path is accepted."""
 
 
-def judged(own: Given, problem: TrajectoryProblem, path: Floats | None, status: str, *, name: str, seed: int) -> Plan:
+def judged(
+    own: Given,
+    problem: TrajectoryProblem,
+    path: Floats | None,
+    status: str,
+    *,
+    name: str,
+    seed: int,
+) -> Plan:
     """Return a path as a plan: timed as those of this package are, and checked by the independent validation.
 
     Args:
@@ -98,11 +108,21 @@ def judged(own: Given, problem: TrajectoryProblem, path: Floats | None, status: 
         (phase,) = problem.task.phases
         span = PhaseSpan(phase.name, 0, len(path) - 1, phase.held, phase.opening)
         times = np.linspace(0.0, problem.options.dt * (len(path) - 1), len(path))
-        waypoints = Trajectory(problem.chain.names, times, path, (span,), problem.chain.robot.coordinates.size)
+        waypoints = Trajectory(
+            problem.chain.names, times, path, (span,), problem.chain.robot.coordinates.size
+        )
         trajectory, report = accepted(own.scene, waypoints, check)
     said = "success" if report.ok else "rejected" if path is not None else status
     return outcome(
-        own.scene, own.steps, problem.options, trajectory, report, said, took=spent(), random_seed=seed, initialization=name
+        own.scene,
+        own.steps,
+        problem.options,
+        trajectory,
+        report,
+        said,
+        took=spent(),
+        random_seed=seed,
+        initialization=name,
     )
 
 

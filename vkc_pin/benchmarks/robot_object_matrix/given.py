@@ -64,12 +64,22 @@ def parsed(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Giv
     for text in (one for given in texts for one in (default if given == DEFAULT else [str(given)])):
         match = _GIVEN.fullmatch(text)
         if match is None:
-            raise InputError("not a choice", field=field, expected="a name, a path, name=path or name=path#link", got=text)
+            raise InputError(
+                "not a choice",
+                field=field,
+                expected="a name, a path, name=path or name=path#link",
+                got=text,
+            )
         called, path, link = match["called"], match["path"], match["link"]
         found.append(Given(called or link or _name(path), path, link))
     names = [one.called for one in found]
     if not names or len(set(names)) < len(names):
-        raise InputError("not a choice", field=field, expected="names, each once", got=" ".join(map(str, texts)) or "none")
+        raise InputError(
+            "not a choice",
+            field=field,
+            expected="names, each once",
+            got=" ".join(map(str, texts)) or "none",
+        )
     return found
 
 
@@ -110,7 +120,12 @@ def ready_object(one: Given, folder: Path) -> str:
     """
     if not one.imported:
         if one.link is not None:
-            raise InputError("only a link of a file can be imported", field="objects", expected=" ".join(_FILES), got=one.path)
+            raise InputError(
+                "only a link of a file can be imported",
+                field="objects",
+                expected=" ".join(_FILES),
+                got=one.path,
+            )
         description_of(one.path)
         return one.path
     name = check_name(one.called, "objects")
@@ -129,7 +144,13 @@ def ready_object(one: Given, folder: Path) -> str:
 def _name(path: str) -> str:
     """Return what to call something without a name of its own: its name, or that of its folder or file."""
     file = Path(path) / "robot.yaml" if Path(path).is_dir() else Path(path)
-    return file.resolve().parent.name if file.name == "robot.yaml" else file.stem if len(file.parts) > 1 or file.suffix else path
+    return (
+        file.resolve().parent.name
+        if file.name == "robot.yaml"
+        else file.stem
+        if len(file.parts) > 1 or file.suffix
+        else path
+    )
 
 
 def _face(imported: ImportedObject) -> None:
@@ -147,7 +168,10 @@ def _face(imported: ImportedObject) -> None:
     front = "front"
     while root.find(f"link[@name='{front}']") is not None:
         front += "_"
-    link, joint = ElementTree.Element("link", name=front), ElementTree.Element("joint", name=front, type="fixed")
+    link, joint = (
+        ElementTree.Element("link", name=front),
+        ElementTree.Element("joint", name=front, type="fixed"),
+    )
     ElementTree.SubElement(joint, "parent", link=front)
     ElementTree.SubElement(joint, "child", link=item.base_link)
     ElementTree.SubElement(joint, "origin", xyz="0 0 0", rpy=f"0 0 {quarters * np.pi / 2.0:.12g}")

@@ -47,7 +47,9 @@ def report(result: Mapping[str, Any]) -> str:
         f"{about['share']:.0%} of its range, by whichever proposed attachment leads there; within reach is what the hand gets to "
         "both shut and open by so much. Success is the word of the independent validation. "
         "Times are those of all plans; loading again is the median over all combinations of a robot.",
-        markdown(_SUMMARY, [*(_summary(robot, groups) for robot in robots), _summary(_ALL, groups)]),
+        markdown(
+            _SUMMARY, [*(_summary(robot, groups) for robot in robots), _summary(_ALL, groups)]
+        ),
         "## Every combination",
         "How many starts succeed; – is out of reach, ! could not be tried.",
         markdown(["object", *robots], rows),
@@ -113,11 +115,21 @@ def _summary(robot: str, groups: Mapping[tuple[str, str], Sequence[Record]]) -> 
     chosen = [own for key, own in groups.items() if robot in (key[0], _ALL)]
     reached = [own for own in chosen if all(map(_reached, own))]
     flat = [record for own in chosen for record in own]
-    some = [all(r["success"] for r in own) for own in reached], [any(r["success"] for r in own) for own in reached]
+    some = (
+        [all(r["success"] for r in own) for own in reached],
+        [any(r["success"] for r in own) for own in reached],
+    )
     shares = (f"{sum(good)} ({sum(good) / max(len(reached), 1):.0%})" for good in some)
     loads = values(flat, "load_time")
     again = decimal(float(np.median(loads))) if loads else "–"
-    return [robot, str(len(chosen)), str(len(reached)), *shares, *map(decimal, distribution(flat, "planning_time")), again]
+    return [
+        robot,
+        str(len(chosen)),
+        str(len(reached)),
+        *shares,
+        *map(decimal, distribution(flat, "planning_time")),
+        again,
+    ]
 
 
 def _listed(title: str, records: Sequence[Record]) -> list[str]:
@@ -127,6 +139,16 @@ def _listed(title: str, records: Sequence[Record]) -> list[str]:
     rows: Counter[tuple[str, ...]] = Counter()
     for r in records:
         why = r.get("because") or "; ".join(r.get("violations", ())[:1])
-        rows[r["robot"], "every object" if r["status"] == "no hand" else r["object"], str(r["status"]), why] += 1
-    body = [[robot, name, status, str(count), why] for (robot, name, status, why), count in rows.items()]
-    return [f"## {title}", markdown(["robot", "object", "status", "trials", "because"], body, text=5)]
+        rows[
+            r["robot"],
+            "every object" if r["status"] == "no hand" else r["object"],
+            str(r["status"]),
+            why,
+        ] += 1
+    body = [
+        [robot, name, status, str(count), why] for (robot, name, status, why), count in rows.items()
+    ]
+    return [
+        f"## {title}",
+        markdown(["robot", "object", "status", "trials", "because"], body, text=5),
+    ]

@@ -33,11 +33,32 @@ from vkc_pin.world.task.steps import Actuate
 
 __all__ = ["OBJECTS", "ROBOTS", "SHARE", "Pair", "description_of", "hall", "kind_of", "pair"]
 
-ROBOTS = ("husky_ur5e", "panda", "tiago_pro", "pr2", "kinova", "ur5_gripper", "ur3_gripper", "tiago", "tiago_dual", "baxter")
+ROBOTS = (
+    "husky_ur5e",
+    "panda",
+    "tiago_pro",
+    "pr2",
+    "kinova",
+    "ur5_gripper",
+    "ur3_gripper",
+    "tiago",
+    "tiago_dual",
+    "baxter",
+)
 """Mobile manipulators, and arms that ride on the virtual base, by the names that `load_robot` knows."""
 OBJECTS = (
     *(f"{kind}_{number}" for kind in KINDS for number in range(2)),
-    *("door", "narrow_door", "wide_door", "drawer", "low_drawer", "counter_drawer", "cabinet", "dishwasher", "refrigerator"),
+    *(
+        "door",
+        "narrow_door",
+        "wide_door",
+        "drawer",
+        "low_drawer",
+        "counter_drawer",
+        "cabinet",
+        "dishwasher",
+        "refrigerator",
+    ),
 )
 """Two of every kind of `random_object`, as `<kind>_<seed>`, and what stands fixed in scenes/objects."""
 SHARE = 0.5
@@ -47,9 +68,20 @@ _IT = "it"  # what the object is called in its hall
 _SIZE, _HEIGHT = 8.0, 2.4  # inner length of the walls, and their height [m]
 _FRONT = 3.0  # depth of the floor before the object that stays free [m]
 _BEYOND = 2.0  # of floor beyond a wall with a door [m]
-_START: Mapping[str, Any] = {"x": [-2.0, 1.0], "y": [-2.0, 2.0]}  # the object is at x = 4 m at most; any heading
-_LOW, _COUNTER = 0.6, 0.8  # [m]: what is lower than the one and nobody says where it stands, stands on a counter so high
-_DEPTH, _BESIDE, _MARGIN, _AIR = 0.5, 0.2, 0.03, 0.001  # [m] of it: its depth, beside, before and behind what stands there, below
+_START: Mapping[str, Any] = {
+    "x": [-2.0, 1.0],
+    "y": [-2.0, 2.0],
+}  # the object is at x = 4 m at most; any heading
+_LOW, _COUNTER = (
+    0.6,
+    0.8,
+)  # [m]: what is lower than the one and nobody says where it stands, stands on a counter so high
+_DEPTH, _BESIDE, _MARGIN, _AIR = (
+    0.5,
+    0.2,
+    0.03,
+    0.001,
+)  # [m] of it: its depth, beside, before and behind what stands there, below
 _OF_KIND = re.compile(r"(?P<kind>[a-z]+)_(?P<seed>\d+)")
 _SAME = 1e-6  # [rad] or [m]
 
@@ -79,7 +111,8 @@ def description_of(name: str) -> dict[str, Any]:
     """Return the description of an object, which does not depend on where it is read from.
 
     Args:
-        name: `<kind>_<seed>` of `random_object`, a name in scenes/objects, or the path of a description (.yaml).
+        name: `<kind>_<seed>` of `random_object`, a name in scenes/objects, or the path of a
+            description (.yaml).
 
     Raises:
         UnknownNameError: There is no such object.
@@ -94,7 +127,9 @@ def description_of(name: str) -> dict[str, Any]:
     file = located(name, "scenes", "objects/*.yaml", what="object")
     data = read_yaml(file).data
     if not isinstance(data, dict) or not isinstance(data.get("urdf"), str):
-        raise InputError("not an object", file=file, field="urdf", expected="the path of a URDF, or what it says")
+        raise InputError(
+            "not an object", file=file, field="urdf", expected="the path of a URDF, or what it says"
+        )
     plain = data["urdf"].lstrip().startswith("<")
     return data if plain else {**data, "urdf": str((file.parent / data["urdf"]).resolve())}
 
@@ -129,7 +164,8 @@ def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
 def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
     """Return what is asked: to open the object by whichever proposed attachment leads there.
 
-    The first is the best one that the hand gets to, shut and open by so much; the others of that joint are left to planning.
+    The first is the best one that the hand gets to, shut and open by so much; the others of that
+    joint are left to planning.
 
     Args:
         robot: The robot.
@@ -155,17 +191,25 @@ def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
             said.append(f"{step.attachment}: {blocked}")
             continue
         first = str(step.attachment)
-        others = [str(other.attachment) for other in asked if other.joints == step.joints and other.attachment != first]
+        others = [
+            str(other.attachment)
+            for other in asked
+            if other.joints == step.joints and other.attachment != first
+        ]
         entries = {entry["name"]: entry for entry in taken}
         left = [entries[attachment] for attachment in (first, *others)]
-        return Pair(hall(called, name, {**description, "attachments": left}), Actuate(_IT, step.joints))
+        return Pair(
+            hall(called, name, {**description, "attachments": left}), Actuate(_IT, step.joints)
+        )
     return Pair(scene, None, "; ".join(said))
 
 
 def _blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None:
     """Return at the end of which phase no free configuration is found, and why not; None if there is one at all of them."""
     options = Options()
-    problem = TrajectoryProblem(scene, compile_task(scene, [step], options), options, (), cache=cache)
+    problem = TrajectoryProblem(
+        scene, compile_task(scene, [step], options), options, (), cache=cache
+    )
     return next((goal.text for goal in explain(problem, seed)), None)
 
 
@@ -173,7 +217,10 @@ def _asked(scene: Scene, proposals: Proposals) -> list[Actuate]:
     """Return the steps that open a joint on the object's base, each by another attachment, the best one first."""
     placed = scene.objects[_IT]
     goal = {
-        joint: value for step in goals(scene, share=SHARE) if isinstance(step, Actuate) for joint, value in step.joints.items()
+        joint: value
+        for step in goals(scene, share=SHARE)
+        if isinstance(step, Actuate)
+        for joint, value in step.joints.items()
     }
     steps = []
     for proposal in proposals.found:
@@ -197,7 +244,10 @@ def _why_not(proposals: Proposals) -> str:
 def _on_a_counter(own: Fixture) -> Fixture:
     """Return something low as it stands on a counter that is deep enough for it."""
     setback = round(float(-own.low[0]) + _MARGIN, 3)
-    depth, width = max(_DEPTH, setback + float(own.high[0]) + _MARGIN), float(own.high[1] - own.low[1]) + 2.0 * _BESIDE
+    depth, width = (
+        max(_DEPTH, setback + float(own.high[0]) + _MARGIN),
+        float(own.high[1] - own.low[1]) + 2.0 * _BESIDE,
+    )
     counter = Counter((round(depth, 2), round(width, 2), _COUNTER), setback)
     return replace(own, counter=counter, lift=own.lift + _AIR)
 

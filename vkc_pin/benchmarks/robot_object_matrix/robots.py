@@ -30,15 +30,42 @@ from vkc_pin.world.task.steps import Reach
 __all__ = ["ROBOTS", "report", "run"]
 
 ROBOTS = (
-    *("tiago", "tiago_no_hand", "tiago_dual", "tiago_pro", "pr2", "baxter", "centauro", "anymal-kinova", "b1-z1"),
+    *(
+        "tiago",
+        "tiago_no_hand",
+        "tiago_dual",
+        "tiago_pro",
+        "pr2",
+        "baxter",
+        "centauro",
+        "anymal-kinova",
+        "b1-z1",
+    ),
     *("panda", "panda_collision", "xarm7", "kinova", "z1", "so100", "so101", "talos_left_arm"),
-    *("ur3", "ur3_joint_limited", "ur3_gripper", "ur5", "ur5_joint_limited", "ur5_gripper", "ur10", "ur10_joint_limited"),
+    *(
+        "ur3",
+        "ur3_joint_limited",
+        "ur3_gripper",
+        "ur5",
+        "ur5_joint_limited",
+        "ur5_gripper",
+        "ur10",
+        "ur10_joint_limited",
+    ),
 )
 """The mobile manipulators and the arms of example-robot-data."""
 _FORMATS = (".urdf", ".xacro", ".xml", ".mjcf")
 _NOT_IMPORTED = ("not imported", "hardly free")
 _HEAD = (
-    *("robot", "planned joints", "pairs", "import [s]", "load again [s]", "room at home [mm]", "reached"),
+    *(
+        "robot",
+        "planned joints",
+        "pairs",
+        "import [s]",
+        "load again [s]",
+        "room at home [mm]",
+        "reached",
+    ),
     *("time, median [s]", "95th percentile [s]"),
 )
 _LOAD = """
@@ -64,33 +91,58 @@ def run(
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
 
     Args:
-        out: The folder; if it has trials of the same settings already, they are not run again. Robots are imported into
-            `out`/robots.
+        out: The folder; if it has trials of the same settings already, they are not run again.
+            Robots are imported into `out`/robots.
         goals: How many poses each robot is to reach, at least 1.
         seed: Of the poses, of importing and of planning.
         robots: Names of example-robot-data, or paths of URDF, xacro and MJCF files.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`. A robot that cannot be imported has one record, of status
-        "not imported", one that is hardly ever free of collision one of status "hardly free"; `because` says why.
+        {"meta": ..., "trials": [...]}; see `runner.run`. A robot that cannot be imported has one
+        record, of status "not imported", one that is hardly ever free of collision one of status
+        "hardly free"; `because` says why.
 
     Raises:
-        InputError: No goals, the same robot twice, no such file, or `out` has trials of other settings.
+        InputError: No goals, the same robot twice, no such file, or `out` has trials of other
+            settings.
         UnknownNameError: There is no such robot.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
     if goals < 1:
         raise InputError("out of range", field="goals", expected="at least 1", got=goals)
     files = _files(robots)
-    settings = {"benchmark": "robots", "seed": seed, "goals": goals, "robots": list(files), **LIMITS}
+    settings = {
+        "benchmark": "robots",
+        "seed": seed,
+        "goals": goals,
+        "robots": list(files),
+        **LIMITS,
+    }
     specs = [
-        {"key": name, "robot": name, "file": str(file), "out": str(out), "goals": goals, "seed": seed}
+        {
+            "key": name,
+            "robot": name,
+            "file": str(file),
+            "out": str(out),
+            "goals": goals,
+            "seed": seed,
+        }
         for name, file in files.items()
     ]
-    return runner.run(specs, _records, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        _records,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:
@@ -112,7 +164,11 @@ def report(result: Mapping[str, Any]) -> str:
         "the word of the independent validation. Importing, and loading again in a new process, are in processor time. Room at "
         "home is the least distance between links that are not neighbours, and of the arm to the floor.",
         markdown(_HEAD, lines),
-        *(["## What failed", markdown(("robot", "status", "because"), failed, text=3)] if failed else []),
+        *(
+            ["## What failed", markdown(("robot", "status", "because"), failed, text=3)]
+            if failed
+            else []
+        ),
     ]
     return "\n\n".join([*parts, foot(about)]) + "\n"
 
@@ -125,7 +181,9 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
     reached = "–" if first["status"] in _NOT_IMPORTED else f"{good}/{len(own)}"
     times = map(decimal, distribution(own, "planning_time"))
     loads = (decimal(first[field]) for field in ("import_time", "load_time"))
-    room = "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"  # nothing that could come close
+    room = (
+        "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"
+    )  # nothing that could come close
     return [name, str(first["joints"]), str(first["pairs"]), *loads, room, reached, *times]
 
 
@@ -136,15 +194,28 @@ def _files(robots: Sequence[str]) -> dict[str, Path]:
         path = Path(robot)
         if path.suffix.lower() in _FORMATS:
             if not path.is_file():
-                raise InputError("there is no such file", file=path, field="robots", expected="a URDF, xacro or MJCF file")
+                raise InputError(
+                    "there is no such file",
+                    file=path,
+                    field="robots",
+                    expected="a URDF, xacro or MJCF file",
+                )
             found.append((path.name.split(".")[0], path.resolve()))
         else:
             names = {name: file for name, file in known.items() if file.suffix == ".urdf"}
             found += [(name, names[name]) for name in runner.chosen("robot", [robot], names)]
     stems = [name for name, _ in found]
-    named = {name if stems.count(name) == 1 else f"{file.parent.name}_{name}": file for name, file in found}
+    named = {
+        name if stems.count(name) == 1 else f"{file.parent.name}_{name}": file
+        for name, file in found
+    }
     if not named or len(named) < len(found):
-        raise InputError("not a choice", field="robots", expected="names or files, each once", got=" ".join(stems) or "none")
+        raise InputError(
+            "not a choice",
+            field="robots",
+            expected="names or files, each once",
+            got=" ".join(stems) or "none",
+        )
     return named
 
 
@@ -160,30 +231,59 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
             imported = import_robot(spec["file"], folder, seed=seed, force=True)
             about["import_time"] = time.process_time() - began
         except InputError as error:
-            because = str(error).replace(str(Path(spec["file"]).parent), "").lstrip("/")  # the same wherever packages are
-            return [{**about, "success": False, "status": "not imported", "seed": seed, "because": because}]
+            because = (
+                str(error).replace(str(Path(spec["file"]).parent), "").lstrip("/")
+            )  # the same wherever packages are
+            return [
+                {
+                    **about,
+                    "success": False,
+                    "status": "not imported",
+                    "seed": seed,
+                    "because": because,
+                }
+            ]
         about |= _facts(imported.robot, folder)
         try:
             poses = random_poses(imported.robot, name, spec["goals"], seed=seed)
         except VkcError as error:
-            return [{**about, "success": False, "status": "hardly free", "seed": seed, "because": str(error)}]
-        document = {"name": f"{name}_reach", "robot": str(folder.resolve()), "start": {"base": [0.0, 0.0, 0.0]}}
+            return [
+                {
+                    **about,
+                    "success": False,
+                    "status": "hardly free",
+                    "seed": seed,
+                    "because": str(error),
+                }
+            ]
+        document = {
+            "name": f"{name}_reach",
+            "robot": str(folder.resolve()),
+            "start": {"base": [0.0, 0.0, 0.0]},
+        }
         scene, records = Scene.from_document(document), []
         for number, pose in enumerate(poses):
             one = plan(scene, [Reach(pose)], seed=seed, **LIMITS)
             because = "; ".join(one.validation.notes)
-            records.append(trial(one, method="VKC", seed=seed, number=number, **about, because=because))
+            records.append(
+                trial(one, method="VKC", seed=seed, number=number, **about, because=because)
+            )
     return records
 
 
 def _facts(robot: Robot, folder: Path) -> dict[str, Any]:
     """Return what is measured of an imported robot."""
-    said = subprocess.run([sys.executable, "-c", _LOAD, str(folder)], capture_output=True, text=True, check=True)
+    said = subprocess.run(
+        [sys.executable, "-c", _LOAD, str(folder)], capture_output=True, text=True, check=True
+    )
     every = load_robot(folder, pairs="all")
     (srdf,) = folder.glob("*.srdf")
     look = Clearances(with_collision_pairs(every, read_srdf(srdf, links=every.file.links).allowed))
     look.place(robot.home)  # also of pairs that loading exempts since they overlap there
-    links = {tuple(sorted((robot.link_of(pair.first), robot.link_of(pair.second)))) for pair in robot.collision.collisionPairs}
+    links = {
+        tuple(sorted((robot.link_of(pair.first), robot.link_of(pair.second))))
+        for pair in robot.collision.collisionPairs
+    }
     return {
         "load_time": float(said.stdout),
         "joints": len(robot.home),

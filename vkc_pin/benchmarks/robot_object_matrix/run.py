@@ -40,21 +40,26 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         starts: How many random starts of each robot at each object, at least 1.
         seed: Of the starts and of planning.
-        robots: What `load_robot` takes, or MJCF files, each as such or as "name=..."; "default" stands for `ROBOTS`. Those
-            without a description of their hand are imported into `out`/robots first, once.
-        objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, paths of descriptions, or of URDF, MJCF and SDF
-            files, each as such or as "name=..."; "...#link" is that link of a file alone, "default" stands for `OBJECTS`. Files
-            are imported into `out`/objects first, once.
+        robots: What `load_robot` takes, or MJCF files, each as such or as "name=..."; "default"
+            stands for `ROBOTS`. Those without a description of their hand are imported into
+            `out`/robots first, once.
+        objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, paths of descriptions,
+            or of URDF, MJCF and SDF files, each as such or as "name=..."; "...#link" is that link
+            of a file alone, "default" stands for `OBJECTS`. Files are imported into `out`/objects
+            first, once.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`. A combination that is out of reach has one record, of status
-        "unreachable", or "no hand" where the robot is to blame, whose `because` says why.
+        {"meta": ..., "trials": [...]}; see `runner.run`. A combination that is out of reach has one
+        record, of status "unreachable", or "no hand" where the robot is to blame, whose `because`
+        says why.
 
     Raises:
-        InputError: No starts, the same robot or object twice, or `out` has trials of other settings.
+        InputError: No starts, the same robot or object twice, or `out` has trials of other
+            settings.
         UnknownNameError: There is no such robot or object.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
@@ -64,13 +69,36 @@ def run(
     chosen = [parsed(robots, "robots", ROBOTS), parsed(objects, "objects", OBJECTS)]
     things = {one.called: ready_object(one, Path(out) / "objects") for one in chosen[1]}
     ready = {one.called: ready_robot(one, Path(out) / "robots") for one in chosen[0]}
-    settings = {"benchmark": "anything", "seed": seed, "starts": starts, "share": SHARE, "robots": list(ready), **LIMITS}
+    settings = {
+        "benchmark": "anything",
+        "seed": seed,
+        "starts": starts,
+        "share": SHARE,
+        "robots": list(ready),
+        **LIMITS,
+    }
     specs = [
-        {"key": f"{robot}/{thing}", "robot": robot, "object": thing, "files": [file, path], "starts": starts, "seed": seed}
+        {
+            "key": f"{robot}/{thing}",
+            "robot": robot,
+            "object": thing,
+            "files": [file, path],
+            "starts": starts,
+            "seed": seed,
+        }
         for robot, file in ready.items()
         for thing, path in things.items()
     ]
-    result = runner.run(specs, _records, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    result = runner.run(
+        specs,
+        _records,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
     chart(result["trials"], Path(out) / "success.png")
     return result
 
@@ -78,9 +106,15 @@ def run(
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a record of every start; a single one where the hand can take hold nowhere."""
     seed, (file, thing) = spec["seed"], spec["files"]
-    about: dict[str, Any] = {"robot": spec["robot"], "object": spec["object"], "kind": kind_of(spec["object"])}
+    about: dict[str, Any] = {
+        "robot": spec["robot"],
+        "object": spec["object"],
+        "kind": kind_of(spec["object"]),
+    }
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is said of a robot would be said again of every object
+        warnings.simplefilter(
+            "ignore"
+        )  # what is said of a robot would be said again of every object
         began = time.perf_counter()
         robot = load_robot(file)
         about["load_time"] = time.perf_counter() - began
@@ -89,7 +123,12 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
         about["look_time"] = time.perf_counter() - began
         if found.scene is None or found.step is None:
             status = "no hand" if found.scene is None else "unreachable"
-            out_of_reach = {"success": False, "status": status, "seed": seed, "because": found.because}
+            out_of_reach = {
+                "success": False,
+                "status": status,
+                "seed": seed,
+                "because": found.because,
+            }
             return [{**about, **out_of_reach}]
         ((joint, goal),) = found.step.joints.items()
         about |= {"joint": joint, "goal": goal}
@@ -99,5 +138,15 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
             one = plan(scene, [found.step], seed=seed, **LIMITS)
             because = "; ".join(one.validation.notes)
             taken = one.trajectory.phases[-1].held.get(found.step.object, "")
-            records.append(trial(one, method="VKC", seed=seed, number=number, **about, attachment=taken, because=because))
+            records.append(
+                trial(
+                    one,
+                    method="VKC",
+                    seed=seed,
+                    number=number,
+                    **about,
+                    attachment=taken,
+                    because=because,
+                )
+            )
     return records

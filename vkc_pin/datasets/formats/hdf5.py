@@ -1,8 +1,9 @@
 """Shards: many episodes in one HDF5 file, in groups as robomimic has them, with the exact motion beside the samples.
 
-The groups are those of robomimic's documentation (`data/demo_<k>` with `actions`, `states`, `obs`, `rewards`, `dones`; the
-attributes `total`, `env_args` and `num_samples`; `mask`). What is sampled is single precision; the motion itself, which is what
-can be validated again, is double precision under `motion`.
+The groups are those of robomimic's documentation (`data/demo_<k>` with `actions`, `states`, `obs`,
+`rewards`, `dones`; the attributes `total`, `env_args` and `num_samples`; `mask`). What is sampled
+is single precision; the motion itself, which is what can be validated again, is double precision
+under `motion`.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ def needed() -> Any:
 def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> Path:
     """Write episodes of one robot to a file, whole or not at all; the same episodes give the same bytes. Return the path.
 
-    They are copied as they are, which takes a fraction of a millisecond each; making a part takes twenty times as long, and is
-    done where the episode is made.
+    They are copied as they are, which takes a fraction of a millisecond each; making a part takes
+    twenty times as long, and is done where the episode is made.
 
     Args:
         path: The file.
@@ -78,7 +79,9 @@ def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> 
                 scene = check_name(data[name].attrs["scene"], f"demo_{place}: scene", file=source)
                 _keep_scene(found, scenes / f"{scene}.json")
             total += int(data[name].attrs["num_samples"])
-            masks["valid" if data[name].attrs["number"] % _HELD_OUT == _HELD_OUT - 1 else "train"].append(name)
+            masks[
+                "valid" if data[name].attrs["number"] % _HELD_OUT == _HELD_OUT - 1 else "train"
+            ].append(name)
         data.attrs["total"] = total
         for mask, names in masks.items():
             file.create_dataset(f"mask/{mask}", data=np.array(names, dtype="S"))
@@ -100,8 +103,15 @@ def part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes:
         data = file.create_group("data")
         _write(data.create_group("demo_0"), episode, robot, rate)
         data.attrs["options"] = json.dumps(asdict(episode.options), sort_keys=True)
-        settings = {"robot": robot.name, "rate": rate, "recipe": recipe, "scenes": "../../scenes/<scene>.json"}
-        data.attrs["env_args"] = json.dumps({"env_name": _ENVIRONMENT, "env_type": -1, "env_kwargs": settings})
+        settings = {
+            "robot": robot.name,
+            "rate": rate,
+            "recipe": recipe,
+            "scenes": "../../scenes/<scene>.json",
+        }
+        data.attrs["env_args"] = json.dumps(
+            {"env_name": _ENVIRONMENT, "env_type": -1, "env_kwargs": settings}
+        )
         scene = json.dumps(episode.document, sort_keys=True, separators=(",", ":")) + "\n"
         file.create_dataset("scene", data=np.frombuffer(scene.encode(), np.uint8))
     return buffer.getvalue()
@@ -122,7 +132,9 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> No
     _array(group, "actions", found["actions"], np.float32)
     _array(group, "states", found["states"], np.float32)
     images = episode.images()
-    for name, pixels in {} if images is None else images.pictures.items():  # a chunk each: loaders read single moments
+    for name, pixels in (
+        {} if images is None else images.pictures.items()
+    ):  # a chunk each: loaders read single moments
         squeezed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
         group.create_dataset(f"obs/{name}", data=pixels, chunks=(1, *pixels.shape[1:]), **squeezed)
     done = np.zeros(count, np.uint8)
@@ -172,7 +184,11 @@ def _among(curve: Mapping[str, Floats], waypoints: Mapping[str, Floats]) -> Ints
 
 def _array(group: h5py.Group, name: str, values: Any, kind: Any) -> None:
     values = np.asarray(values, kind)
-    squeezed = {"compression": "gzip", "compression_opts": 6, "shuffle": True} if values.nbytes > 512 else {}
+    squeezed = (
+        {"compression": "gzip", "compression_opts": 6, "shuffle": True}
+        if values.nbytes > 512
+        else {}
+    )
     group.create_dataset(name, data=values, chunks=values.shape if squeezed else None, **squeezed)
 
 
@@ -219,11 +235,19 @@ def episodes_of(path: Path, scenes: Path) -> Iterator[Episode]:
             except (LookupError, TypeError, OSError, ValueError) as error:
                 if isinstance(error, InputError):
                     raise
-                raise InputError("not a shard of episodes", file=path, field=f"demo_{k}", got=str(error)) from error
+                raise InputError(
+                    "not a shard of episodes", file=path, field=f"demo_{k}", got=str(error)
+                ) from error
             episode = made_of(
-                {**said, "options": options, "number": number, "scene": documents[name]}, arrays, scenes.parent / "robots"
+                {**said, "options": options, "number": number, "scene": documents[name]},
+                arrays,
+                scenes.parent / "robots",
             )
-            yield replace(episode, load_images=functools.partial(_images, path, k)) if "images" in said else episode
+            yield (
+                replace(episode, load_images=functools.partial(_images, path, k))
+                if "images" in said
+                else episode
+            )
 
 
 def _images(path: Path, k: int) -> Images:
@@ -236,16 +260,25 @@ def _images(path: Path, k: int) -> Images:
         try:
             group = file["data"][f"demo_{k}"]
             said = parse_json(str(group.attrs["episode"]), path)
-            return Images({name: group["obs"][name][:] for name in said["images"]}, tuple(said["segments"]))
+            return Images(
+                {name: group["obs"][name][:] for name in said["images"]}, tuple(said["segments"])
+            )
         except (LookupError, TypeError, OSError) as error:
-            raise InputError("images are missing or damaged", file=path, field=f"demo_{k}", got=str(error)) from error
+            raise InputError(
+                "images are missing or damaged", file=path, field=f"demo_{k}", got=str(error)
+            ) from error
 
 
 def _document(scenes: Path, name: str) -> Any:
     file = scenes / f"{name}.json"
     document = parse_json(read_text(file, "scene"), file)
     if scene_name(document) != name:
-        raise InputError("this scene is not what its name says", file=file, expected=name, got=scene_name(document))
+        raise InputError(
+            "this scene is not what its name says",
+            file=file,
+            expected=name,
+            got=scene_name(document),
+        )
     return document
 
 
@@ -254,4 +287,6 @@ def _opened(path: Path) -> Any:
     try:
         return h5py.File(path, "r")
     except OSError as error:
-        raise InputError("not an HDF5 file", file=path, expected="a shard of a dataset", got=str(error)) from error
+        raise InputError(
+            "not an HDF5 file", file=path, expected="a shard of a dataset", got=str(error)
+        ) from error

@@ -25,7 +25,10 @@ def parts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> l
             began, worked = time.perf_counter(), time.process_time()
             episode = unpacked(data, _folder(robots))
             data = part(episode, _robot(recipe.digest, episode), recipe.fields.rate, recipe.digest)
-            for name, spent in (("seconds", time.perf_counter() - began), ("cpu_time", time.process_time() - worked)):
+            for name, spent in (
+                ("seconds", time.perf_counter() - began),
+                ("cpu_time", time.process_time() - worked),
+            ):
                 record[name] = round(record[name] + spent, 4)
         found.append((record, data))
     return found

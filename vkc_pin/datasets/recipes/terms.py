@@ -14,7 +14,15 @@ from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.fields import Positive, Schema, Vector3, count, require
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.terms import Constraint, State, Term, as_data, renamed, term_from_dict, term_to_dict
+from vkc_pin.world.task.terms import (
+    Constraint,
+    State,
+    Term,
+    as_data,
+    renamed,
+    term_from_dict,
+    term_to_dict,
+)
 
 __all__ = [
     "OBJECT",
@@ -32,7 +40,10 @@ __all__ = [
 OBJECT = "object"
 """The link that an episode takes hold of, as a frame, and the object that it belongs to, in `holding`."""
 
-Axis = Annotated[Vector3, require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length")]
+Axis = Annotated[
+    Vector3,
+    require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length"),
+]
 Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
 
 
@@ -125,7 +136,9 @@ class TracedSchema(_Entry):
         return term_from_dict(self.traced)
 
 
-TermSchema = Annotated[UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema, Field(discriminator="type")]
+TermSchema = Annotated[
+    UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema, Field(discriminator="type")
+]
 Entry = UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema
 
 
@@ -137,7 +150,9 @@ def as_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
     """
     for term in (found := as_data(terms)):
         if term.during is not None:
-            expected = f"holding={OBJECT!r}, or nothing: phases are called after objects that are drawn"
+            expected = (
+                f"holding={OBJECT!r}, or nothing: phases are called after objects that are drawn"
+            )
             raise term.error("phases are not known yet", "during", expected, list(term.during))
     return [{"type": "traced", "traced": term_to_dict(term)} for term in found]
 
@@ -157,7 +172,9 @@ def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[
         with document.at(("terms", k)):
             (term,) = as_data([entry.term()])
         if term.name in names:
-            raise document.error(("terms", k), "two terms of one name", expected="another `name`", got=term.name)
+            raise document.error(
+                ("terms", k), "two terms of one name", expected="another `name`", got=term.name
+            )
         names.append(term.name)
 
 
@@ -167,7 +184,9 @@ def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
     Raises:
         UnknownNameError: It lacks one.
     """
-    frames = sorted({BASE, HAND, OBJECT, *(str(frame.name) for frame in robot.model.frames)} - {"universe"})
+    frames = sorted(
+        {BASE, HAND, OBJECT, *(str(frame.name) for frame in robot.model.frames)} - {"universe"}
+    )
     for term in terms:
         where = f"terms[{term.name!r}]"
         for frame in (name for name in term.formula.frames if "." not in name):
@@ -186,5 +205,7 @@ def meant(terms: Sequence[Term], scene: Scene, name: str, attachment: str) -> tu
         attachment: Where the hand takes hold of it.
     """
     link = scene.objects[name].object.attachments[attachment].link
-    frames = {word: frame_of(scene.robot, word) for word in (BASE, HAND)} | {OBJECT: f"{name}.{link}"}
+    frames = {word: frame_of(scene.robot, word) for word in (BASE, HAND)} | {
+        OBJECT: f"{name}.{link}"
+    }
     return tuple(renamed(term, frames, {OBJECT: name}) for term in terms)

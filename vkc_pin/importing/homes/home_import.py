@@ -47,8 +47,8 @@ class ImportedHome:
         file: The scene, which `load_scene` takes.
         scene: It, loaded.
         things: What moves, in the order of the scene's objects.
-        shapes: How many colliding shapes of the file became part of what: "floor", "obstacles" and "objects"; "file" is their sum
-            unless something was left out.
+        shapes: How many colliding shapes of the file became part of what: "floor", "obstacles" and
+            "objects"; "file" is their sum unless something was left out.
         reached: Before how many things the robot's start has free floor all the way.
         notes: What the file left out, and what was changed.
     """
@@ -92,13 +92,15 @@ def import_home(
 ) -> ImportedHome:
     """Make a scene that can be planned in of a URDF or MJCF file of a whole home.
 
-    What stands fixed becomes obstacles in convex pieces; a link that stands fixed and has joints on it becomes an object with
-    them, and attachments are proposed for each; what moves freely becomes objects to carry. The robot starts at a free place on
-    the floor from which it gets to most of that.
+    What stands fixed becomes obstacles in convex pieces; a link that stands fixed and has joints on
+    it becomes an object with them, and attachments are proposed for each; what moves freely becomes
+    objects to carry. The robot starts at a free place on the floor from which it gets to most of
+    that.
 
     Args:
         file: The file; its z points up.
-        folder: Where to write the scene, a new or empty folder; named like the file if it is not given.
+        folder: Where to write the scene, a new or empty folder; named like the file if it is not
+            given.
         floor: Height of the floor in the file [m].
         robot: Which robot is there: its name, or the path of a URDF or robot.yaml.
         options: Which clearances attachments must have.
@@ -107,8 +109,8 @@ def import_home(
         force: Whether to replace a folder that this made before.
 
     Raises:
-        InputError: The file cannot be read, is none of a home, or nothing in it can move; the folder holds something; an argument
-            is wrong; or the robot finds no place.
+        InputError: The file cannot be read, is none of a home, or nothing in it can move; the
+            folder holds something; an argument is wrong; or the robot finds no place.
         UnknownNameError: There is no such robot, or the file names something that does not exist.
     """
     path = file_path(file, "file", "a URDF or MJCF file")
@@ -120,14 +122,26 @@ def import_home(
     target = file_path(folder, "folder", "a folder") if folder is not None else Path(_name(path))
     check_target(target, _COMMAND, force=flag(force, "force"))
     if parse_xml(read_text(path, "URDF or MJCF"), path).tag == "sdf":
-        raise InputError("homes are read from URDF and MJCF alone", file=path, expected="<robot> or <mujoco>", got="<sdf>")
-    description = rooted(renamed(read_description(path, free=True)), pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor])))
+        raise InputError(
+            "homes are read from URDF and MJCF alone",
+            file=path,
+            expected="<robot> or <mujoco>",
+            got="<sdf>",
+        )
+    description = rooted(
+        renamed(read_description(path, free=True)), pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor]))
+    )
     low, high = bounds(description, surfaces(description))
     home = split(description)
     if not home.things:
-        expected = "joints that are revolute, continuous, prismatic or floating, with shapes on them"
+        expected = (
+            "joints that are revolute, continuous, prismatic or floating, with shapes on them"
+        )
         raise InputError(
-            "nothing in this file can move", file=path, expected=expected, got=f"{home.shapes} shapes that stand fixed"
+            "nothing in this file can move",
+            file=path,
+            expected=expected,
+            got=f"{home.shapes} shapes that stand fixed",
         )
     with folder_at_once(target, force=True) as made:  # what is there may be replaced
         known: Known = {}
@@ -154,8 +168,21 @@ def import_home(
         document["start"] = {"base": scene.start[:3].tolist()}
         _write(made / "scene.yaml", path, document)
     weight = (WEIGHTLESS,) if all(thing.description.weightless for thing in home.things) else ()
-    notes = (*home.notes, *weight, *_floor_notes(home), *changed, *(note for thing in things for note in thing.notes))
-    return ImportedHome(target / "scene.yaml", load_scene(target / "scene.yaml"), things, _counts(home), reached, notes)
+    notes = (
+        *home.notes,
+        *weight,
+        *_floor_notes(home),
+        *changed,
+        *(note for thing in things for note in thing.notes),
+    )
+    return ImportedHome(
+        target / "scene.yaml",
+        load_scene(target / "scene.yaml"),
+        things,
+        _counts(home),
+        reached,
+        notes,
+    )
 
 
 def _started(scene: Scene, path: Path, rng: np.random.Generator) -> tuple[Scene, int]:
@@ -163,7 +190,9 @@ def _started(scene: Scene, path: Path, rng: np.random.Generator) -> tuple[Scene,
     try:
         return free_start(scene, rng)
     except InputError as error:
-        raise InputError(error.problem, file=path, field=error.field, expected=error.expected, got=error.got) from None
+        raise InputError(
+            error.problem, file=path, field=error.field, expected=error.expected, got=error.got
+        ) from None
 
 
 def _interval(low: float, high: float) -> list[float]:
@@ -184,7 +213,12 @@ def _robot(robot: str | Path) -> str:
 
 def _write(file: Path, source: Path, document: Mapping[str, Any]) -> None:
     head = format_comment(f"Made of {source.name} {made_by(_COMMAND)}.")
-    write_atomically(file, (head + yaml.safe_dump(document, sort_keys=False, width=130, default_flow_style=None)).encode())
+    write_atomically(
+        file,
+        (
+            head + yaml.safe_dump(document, sort_keys=False, width=130, default_flow_style=None)
+        ).encode(),
+    )
 
 
 def _floor_notes(home: Home) -> list[str]:
@@ -196,6 +230,13 @@ def _floor_notes(home: Home) -> list[str]:
 
 def _counts(home: Home) -> dict[str, int]:
     """Return how many shapes of the file became part of what."""
-    objects = sum(len(link.solid) for thing in home.things for link in thing.description.links.values())
+    objects = sum(
+        len(link.solid) for thing in home.things for link in thing.description.links.values()
+    )
     obstacles = sum(len(link.solid) for link in (*home.building, *home.furniture))
-    return {"file": home.shapes, "obstacles": obstacles, "objects": objects, "floor": len(home.floor)}
+    return {
+        "file": home.shapes,
+        "obstacles": obstacles,
+        "objects": objects,
+        "floor": len(home.floor),
+    }

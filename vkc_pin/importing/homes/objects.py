@@ -33,7 +33,8 @@ class ImportedThing:
     Attributes:
         name: Its name in the scene.
         free: Whether it can be carried.
-        proposals: How good its attachments are, and which joints have none; those of what is carried are for lifting it.
+        proposals: How good its attachments are, and which joints have none; those of what is
+            carried are for lifting it.
         entry: It, as a scene's object.
         notes: What was changed.
     """
@@ -46,10 +47,17 @@ class ImportedThing:
 
     def report(self) -> str:
         """Return what can be done with it, as text."""
-        best = {joint: self.proposals.opening(joint) for joint in self.proposals.object.coordinates.names}
+        best = {
+            joint: self.proposals.opening(joint)
+            for joint in self.proposals.object.coordinates.names
+        }
         said = []
         for joint, found in best.items():
-            by = f"by {found[0].attachment.name}" if found else f"by no hand: {self.proposals.because.get(joint, 'nothing fits')}"
+            by = (
+                f"by {found[0].attachment.name}"
+                if found
+                else f"by no hand: {self.proposals.because.get(joint, 'nothing fits')}"
+            )
             said.append(f"carried {by}" if self.free else f"{joint} {by}")
         return f"{self.name}: {'; '.join(said)}"
 
@@ -96,8 +104,16 @@ def write_thing(
         write_urdf(_lifted(description), urdf)
     about = [f"Attachments as proposed for the hand of {proposals.hand.robot}, best first."]
     about += [f"No hand can move {joint}: {reason}." for joint, reason in proposals.because.items()]
-    write_description(yaml, urdf.name, [item.description() for item in proposals.found], about=about, free=thing.free)
-    proposals = dataclasses.replace(proposals, object=dataclasses.replace(proposals.object, urdf=None))  # its file does not stay
+    write_description(
+        yaml,
+        urdf.name,
+        [item.description() for item in proposals.found],
+        about=about,
+        free=thing.free,
+    )
+    proposals = dataclasses.replace(
+        proposals, object=dataclasses.replace(proposals.object, urdf=None)
+    )  # its file does not stay
     entry = {"name": thing.name, "type": address, "position": list(thing.position)}
     return ImportedThing(thing.name, thing.free, proposals, entry, description.notes)
 
@@ -107,9 +123,17 @@ def _standing(description: Description) -> Description:
     child = description.root
     base, up = f"{child}_stand", np.array([0.0, 0.0, 1.0])
     lift = Joint(
-        name="lift", kind="prismatic", parent=base, child=child, placement=pin.SE3.Identity(), axis=up, limits=(0.0, _LIFT)
+        name="lift",
+        kind="prismatic",
+        parent=base,
+        child=child,
+        placement=pin.SE3.Identity(),
+        axis=up,
+        limits=(0.0, _LIFT),
     )
-    return dataclasses.replace(description, links={base: Link(base), **description.links}, joints={child: lift})
+    return dataclasses.replace(
+        description, links={base: Link(base), **description.links}, joints={child: lift}
+    )
 
 
 def _lifted(description: Description) -> Description:

@@ -27,9 +27,9 @@ def write_obstacles(
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Write what stands fixed, and return it as a scene's obstacles, and what was changed.
 
-    A piece of furniture is one obstacle, so that reports name it; so is each shape of the building. Boxes and the like stay
-    what they are, in the scene itself. What else there is becomes a URDF with convex pieces; its origin is on the floor,
-    below its middle.
+    A piece of furniture is one obstacle, so that reports name it; so is each shape of the building.
+    Boxes and the like stay what they are, in the scene itself. What else there is becomes a URDF
+    with convex pieces; its origin is on the floor, below its middle.
 
     Args:
         home: The home.
@@ -57,7 +57,9 @@ def write_obstacles(
         notes += description.notes
         address = f"obstacles/{stems[name]}/{stems[name]}.urdf"
         write_urdf(description, folder / address)
-        entries.append({"name": name, "type": "urdf", "file": address, "position": _numbers(origin)})
+        entries.append(
+            {"name": name, "type": "urdf", "file": address, "position": _numbers(origin)}
+        )
     return entries, notes
 
 
@@ -67,7 +69,11 @@ def _alone(home: Home) -> Iterator[Link]:
         for number, part in enumerate(link.solid):
             colour = _colour(part, link.visual)
             seen = part if colour is None else _painted(part, colour)
-            yield Link(part.name or (link.name if len(link.solid) == 1 else f"{link.name}_{number}"), (seen,), (seen,))
+            yield Link(
+                part.name or (link.name if len(link.solid) == 1 else f"{link.name}_{number}"),
+                (seen,),
+                (seen,),
+            )
     yield from home.furniture
 
 
@@ -78,7 +84,12 @@ def _is_simple(link: Link) -> bool:
 def _simple(name: str, link: Link) -> dict[str, Any]:
     """Return the entry of a link that collides as a box, ball, cylinder or capsule."""
     (part,) = link.solid
-    keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}[part.kind]
+    keys = {
+        "box": ("size",),
+        "sphere": ("radius",),
+        "cylinder": ("radius", "length"),
+        "capsule": ("radius", "length"),
+    }[part.kind]
     size = [round(float(value), 6) for value in part.size]
     entry: dict[str, Any] = {"name": name, "type": part.kind}
     entry |= {"size": size} if part.kind == "box" else dict(zip(keys, size, strict=True))
@@ -86,7 +97,11 @@ def _simple(name: str, link: Link) -> dict[str, Any]:
     if not np.allclose(part.placement.rotation, np.eye(3), atol=1e-9):
         entry["rpy"] = _numbers(pin.rpy.matrixToRpy(part.placement.rotation), 9)
     colour = _colour(part, link.visual)
-    return entry if colour is None else {**entry, "colour": [round(float(value), 4) for value in colour]}
+    return (
+        entry
+        if colour is None
+        else {**entry, "colour": [round(float(value), 4) for value in colour]}
+    )
 
 
 def _colour(part: Part, looks: Iterable[Part]) -> Colour | None:
@@ -94,7 +109,14 @@ def _colour(part: Part, looks: Iterable[Part]) -> Colour | None:
     if part.colour is not None:
         return part.colour
     there = part.placement.homogeneous
-    return next((other.colour for other in looks if np.allclose(other.placement.homogeneous, there, atol=_ALIKE)), None)
+    return next(
+        (
+            other.colour
+            for other in looks
+            if np.allclose(other.placement.homogeneous, there, atol=_ALIKE)
+        ),
+        None,
+    )
 
 
 def _painted(part: Part, colour: Colour) -> Part:

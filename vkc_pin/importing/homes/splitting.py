@@ -26,8 +26,8 @@ class Thing:
 
     Attributes:
         name: What it is called in the scene, as the link that it hangs on.
-        description: Its links and joints. The axes of its root are the world's. The origin is below its middle, on the floor,
-            or at the lowest point of what is carried.
+        description: Its links and joints. The axes of its root are the world's. The origin is below
+            its middle, on the floor, or at the lowest point of what is carried.
         position: Of that origin in the world [m].
         free: Whether it can be carried away.
     """
@@ -62,8 +62,9 @@ class Home:
 def split(description: Description) -> Home:
     """Return what a home consists of.
 
-    A link that stands fixed and has joints on it becomes one thing with all that moves on it. On links of the building, each
-    joint starts a thing of its own, which has no shape that stands still: a door swings past walls as past anything else.
+    A link that stands fixed and has joints on it becomes one thing with all that moves on it. On
+    links of the building, each joint starts a thing of its own, which has no shape that stands
+    still: a door swings past walls as past anything else.
 
     Args:
         description: The home, with the floor at z = 0; names are those of scenes.
@@ -74,12 +75,23 @@ def split(description: Description) -> Home:
     now = description.placements(values)
     free = [child for child, joint in joints.items() if joint.kind == "floating"]
     fixed = {description.root}
-    while grown := {child for child, joint in joints.items() if joint.kind == "fixed" and joint.parent in fixed} - fixed:
+    while (
+        grown := {
+            child
+            for child, joint in joints.items()
+            if joint.kind == "fixed" and joint.parent in fixed
+        }
+        - fixed
+    ):
         fixed |= grown
     building, furniture, floor, things = list[Link](), list[Link](), list[str](), list[Thing]()
     for name in (name for name in description.links if name in fixed):
         link = description.links[name].placed(places[name])
-        moved = [child for child, joint in joints.items() if joint.parent == name and joint.kind in _MOVING]
+        moved = [
+            child
+            for child, joint in joints.items()
+            if joint.parent == name and joint.kind in _MOVING
+        ]
         large = name == description.root or _length(link) > _BUILDING
         if moved and not large:
             kept = {name}.union(*(_carried(description, child) for child in moved))
@@ -104,11 +116,17 @@ def split(description: Description) -> Home:
         for child, joint in part.joints.items():
             if joint.kind in _MOVING:
                 placement = joint.placement * joint.motion(values.get(joint.name, 0.0))
-                stiff[child] = dataclasses.replace(joint, kind="fixed", placement=placement, limits=None)
-                notes.append(f"joint '{joint.name}' belongs to '{name}', which is carried as it is: fixed")
+                stiff[child] = dataclasses.replace(
+                    joint, kind="fixed", placement=placement, limits=None
+                )
+                notes.append(
+                    f"joint '{joint.name}' belongs to '{name}', which is carried as it is: fixed"
+                )
         things.append(_thing(name, dataclasses.replace(part, joints=stiff), now[name], free=True))
     shapes = sum(len(link.solid) for link in description.links.values())
-    return Home(tuple(building), tuple(furniture), tuple(floor), tuple(things), shapes, tuple(notes))
+    return Home(
+        tuple(building), tuple(furniture), tuple(floor), tuple(things), shapes, tuple(notes)
+    )
 
 
 def _unstuck(description: Description) -> Description:
@@ -119,9 +137,15 @@ def _unstuck(description: Description) -> Description:
             continue
         stuck = joint.limits is not None and joint.limits[0] == joint.limits[1]
         if stuck or not any(description.links[link].solid for link in description.below(child)):
-            notes.append(f"joint '{joint.name}' {'has one value only' if stuck else 'moves nothing that has a shape'}: fixed")
-            placement = joint.placement * joint.motion(joint.limits[0] if stuck and joint.limits else 0.0)
-            joints[child] = dataclasses.replace(joint, kind="fixed", placement=placement, limits=None)
+            notes.append(
+                f"joint '{joint.name}' {'has one value only' if stuck else 'moves nothing that has a shape'}: fixed"
+            )
+            placement = joint.placement * joint.motion(
+                joint.limits[0] if stuck and joint.limits else 0.0
+            )
+            joints[child] = dataclasses.replace(
+                joint, kind="fixed", placement=placement, limits=None
+            )
     return dataclasses.replace(description, joints=joints, notes=tuple(notes))
 
 
@@ -138,7 +162,11 @@ def _part(description: Description, root: str, kept: Collection[str]) -> Descrip
     """Return some links and the joints between them as a description, whose notes begin anew."""
     part = only(description, root)
     links = {name: link for name, link in part.links.items() if name in kept}
-    return Description(description.file, links, {child: joint for child, joint in part.joints.items() if child in kept})
+    return Description(
+        description.file,
+        links,
+        {child: joint for child, joint in part.joints.items() if child in kept},
+    )
 
 
 def _on_nothing(description: Description, child: str) -> Description:
@@ -147,7 +175,9 @@ def _on_nothing(description: Description, child: str) -> Description:
     while base in description.links:
         base += "_"
     joint: Joint = dataclasses.replace(description.joints[child], parent=base)
-    return Description(description.file, {base: Link(base), **part.links}, {child: joint, **part.joints})
+    return Description(
+        description.file, {base: Link(base), **part.links}, {child: joint, **part.joints}
+    )
 
 
 def _thing(name: str, description: Description, place: pin.SE3, *, free: bool = False) -> Thing:

@@ -27,7 +27,8 @@ _CHOICE = 12  # free places of which the clearest is taken
 def free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
     """Return the scene with a start that is free, on the floor from which most objects are reached, and how many these are.
 
-    All that moves counts as shut. The floor is judged by discs inside the base; the start with all of the robot.
+    All that moves counts as shut. The floor is judged by discs inside the base; the start with all
+    of the robot.
 
     Args:
         scene: The scene.
@@ -41,7 +42,11 @@ def free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
     robot, arena = scene.robot, scene.arena
     low, high = np.array([arena[0], arena[2]]), np.array([arena[1], arena[3]])
     base = [shape for shape in robot.collision.geometryObjects if shape.parentJoint == _BASE]
-    standing = [shape for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR]
+    standing = [
+        shape
+        for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True)
+        if label != FLOOR
+    ]
     for placed in scene.objects.values():
         standing += standing_geometry(placed)
     cells = Cells.over(low, high, _CELL)
@@ -60,19 +65,32 @@ def free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
     order = sorted(range(1, count + 1), key=lambda k: (-reached[k], -int((regions == k).sum())))
     for region in order:
         places = middles[regions == region]
-        draws = (scene.with_start(base=_drawn(places, rng, low, high)) for _ in range(_TRIES // len(order) + 1))
-        found = list(itertools.islice(((s, c) for s in draws if (c := s.start_clearance(reach=1.0)) >= START_CLEARANCE), _CHOICE))
+        draws = (
+            scene.with_start(base=_drawn(places, rng, low, high))
+            for _ in range(_TRIES // len(order) + 1)
+        )
+        found = list(
+            itertools.islice(
+                ((s, c) for s in draws if (c := s.start_clearance(reach=1.0)) >= START_CLEARANCE),
+                _CHOICE,
+            )
+        )
         if found:
             return max(found, key=lambda entry: entry[1])[0], int(reached[region])
     problem = f"no place on the floor is {START_CLEARANCE} m from everything for {robot.name}"
     expected = "a home with room for the robot, its floor at the height `floor`"
-    raise InputError(problem, field="robot, floor", expected=expected, got=f"none in {_TRIES} tries")
+    raise InputError(
+        problem, field="robot, floor", expected=expected, got=f"none in {_TRIES} tries"
+    )
 
 
 def _drawn(places: Floats, rng: np.random.Generator, low: Floats, high: Floats) -> list[float]:
     """Return a random place in one of some cells, and a heading."""
     place = places[int(rng.integers(len(places)))] + rng.uniform(-0.5, 0.5, 2) * _CELL
-    return [*np.clip(place, low, high).round(3).tolist(), round(float(rng.uniform(-np.pi, np.pi)), 3)]
+    return [
+        *np.clip(place, low, high).round(3).tolist(),
+        round(float(rng.uniform(-np.pi, np.pi)), 3),
+    ]
 
 
 def _fronts(scene: Scene) -> dict[str, list[Floats]]:

@@ -51,23 +51,39 @@ def only(description: Description, link: str) -> Description:
         raise UnknownNameError("link", link, description.links, file=description.file, field="link")
     kept = description.below(link)
     links = {name: found for name, found in description.links.items() if name in kept}
-    joints = {child: joint for child, joint in description.joints.items() if child in kept and child != link}
+    joints = {
+        child: joint
+        for child, joint in description.joints.items()
+        if child in kept and child != link
+    }
     return dataclasses.replace(description, links=links, joints=joints)
 
 
 def several(description: Description) -> tuple[str, ...]:
     """Return a note about a file that holds several things with joints of their own; none if it holds one.
 
-    They stand on a root without shapes, as of a whole scene; drawers that slide on one, all of them, are one chest of drawers.
+    They stand on a root without shapes, as of a whole scene; drawers that slide on one, all of
+    them, are one chest of drawers.
     """
     joints, root = description.joints, description.root
     hung = [child for child, joint in joints.items() if joint.parent == root]
-    counts = {link: sum(joints[child].kind != "fixed" for child in description.below(link)) for link in hung}
+    counts = {
+        link: sum(joints[child].kind != "fixed" for child in description.below(link))
+        for link in hung
+    }
     things = {link: count for link, count in counts.items() if count}
-    if len(things) < 2 or description.links[root].solid or all(joints[link].kind != "fixed" for link in things):
+    if (
+        len(things) < 2
+        or description.links[root].solid
+        or all(joints[link].kind != "fixed" for link in things)
+    ):
         return ()
-    listed = ", ".join(f"'{link}' ({count} joint{'s' * (count != 1)})" for link, count in things.items())
-    return (f"several things hang on its root: {listed}; to import one of them, name it (link, --link)",)
+    listed = ", ".join(
+        f"'{link}' ({count} joint{'s' * (count != 1)})" for link, count in things.items()
+    )
+    return (
+        f"several things hang on its root: {listed}; to import one of them, name it (link, --link)",
+    )
 
 
 def choose_name(wanted: str, taken: set[str]) -> str:
@@ -89,7 +105,10 @@ def renamed(description: Description) -> Description:
     """Return the object with names of links and joints that scenes and steps accept."""
     links_taken, joints_taken = set[str](), set[str]()
     names = {name: choose_name(name, links_taken) for name in description.links}
-    links = {names[name]: dataclasses.replace(link, name=names[name]) for name, link in description.links.items()}
+    links = {
+        names[name]: dataclasses.replace(link, name=names[name])
+        for name, link in description.links.items()
+    }
     joints = {
         names[child]: dataclasses.replace(
             joint,
@@ -105,18 +124,29 @@ def renamed(description: Description) -> Description:
 def tidied(description: Description) -> Description:
     """Return the same object with every link a body that moves: fixed links become part of what they are fixed to.
 
-    Links without any shape that nothing with a shape hangs on are left out, and noted. A joint with nowhere to go becomes fixed.
+    Links without any shape that nothing with a shape hangs on are left out, and noted. A joint with
+    nowhere to go becomes fixed.
     """
-    links, joints, notes = dict(description.links), dict(description.joints), list(description.notes)
+    links, joints, notes = (
+        dict(description.links),
+        dict(description.joints),
+        list(description.notes),
+    )
     for child in list(joints):
         below = description.below(child)
         if not any(links[name].solid for name in below if name in links):
-            notes.append(f"joint '{joints[child].name}' moves nothing that has a shape: left out with link '{child}'")
+            notes.append(
+                f"joint '{joints[child].name}' moves nothing that has a shape: left out with link '{child}'"
+            )
             for name in below:
                 links.pop(name, None)
                 joints.pop(name, None)
     for child, joint in joints.items():
-        if joint.kind != "fixed" and joint.limits is not None and joint.limits[0] == joint.limits[1] != 0.0:
+        if (
+            joint.kind != "fixed"
+            and joint.limits is not None
+            and joint.limits[0] == joint.limits[1] != 0.0
+        ):
             placement = joint.placement * joint.motion(joint.limits[0])
             joints[child] = dataclasses.replace(joint, placement=placement, limits=(0.0, 0.0))
     for child in list(joints):
@@ -126,34 +156,51 @@ def tidied(description: Description) -> Description:
             notes.append(f"joint '{joint.name}' has one value only: fixed")
         if joint.kind == "fixed" or stuck:
             above, gone = links[joint.parent], links.pop(child)
-            moved = (_moved(gone, parts, joint.placement) for parts in (gone.visual, gone.collision))
+            moved = (
+                _moved(gone, parts, joint.placement) for parts in (gone.visual, gone.collision)
+            )
             visual, collision = moved
-            if bool(above.collision) != bool(gone.collision):  # one of them collides as what it looks like
-                above, collision = dataclasses.replace(above, collision=above.solid), collision or visual
+            if bool(above.collision) != bool(
+                gone.collision
+            ):  # one of them collides as what it looks like
+                above, collision = (
+                    dataclasses.replace(above, collision=above.solid),
+                    collision or visual,
+                )
             inertia = above.inertia + joint.placement.act(gone.inertia)
-            links[joint.parent] = Link(above.name, (*above.visual, *visual), (*above.collision, *collision), inertia)
+            links[joint.parent] = Link(
+                above.name, (*above.visual, *visual), (*above.collision, *collision), inertia
+            )
             del joints[child]
             for name, other in joints.items():
                 if other.parent == child:
                     placement = joint.placement * other.placement
-                    joints[name] = dataclasses.replace(other, parent=joint.parent, placement=placement)
+                    joints[name] = dataclasses.replace(
+                        other, parent=joint.parent, placement=placement
+                    )
     return dataclasses.replace(description, links=links, joints=joints, notes=tuple(notes))
 
 
 def _moved(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Part, ...]:
     return tuple(
-        dataclasses.replace(part, name=f"{link.name}_{part.name}".rstrip("_"), placement=placement * part.placement)
+        dataclasses.replace(
+            part, name=f"{link.name}_{part.name}".rstrip("_"), placement=placement * part.placement
+        )
         for part in parts
     )
 
 
 def surfaces(description: Description) -> Surfaces:
     """Return the surfaces of all shapes, those that are seen and those that collide."""
-    parts = [part for link in description.links.values() for part in (*link.visual, *link.collision)]
+    parts = [
+        part for link in description.links.values() for part in (*link.visual, *link.collision)
+    ]
     return {id(part): part.mesh() for part in parts}
 
 
-def bounds(description: Description, meshes: Surfaces, values: Mapping[str, float] | None = None) -> tuple[Floats, Floats]:
+def bounds(
+    description: Description, meshes: Surfaces, values: Mapping[str, float] | None = None
+) -> tuple[Floats, Floats]:
     """Return the box around what collides, in the root's frame, [m], joints at `values` or at zero.
 
     Raises:
@@ -166,22 +213,35 @@ def bounds(description: Description, meshes: Surfaces, values: Mapping[str, floa
         for part in link.solid
     ]
     if not points:
-        raise InputError("nothing in this file has a shape", file=description.file, expected="<collision> or <visual> elements")
+        raise InputError(
+            "nothing in this file has a shape",
+            file=description.file,
+            expected="<collision> or <visual> elements",
+        )
     joined = np.vstack(points)
     return joined.min(axis=0), joined.max(axis=0)
 
 
 def closed(description: Description) -> dict[str, float]:
     """Return the values at which joints are closed, zero or the limit next to it, [rad] or [m]."""
-    return {joint.name: min(max(0.0, joint.limits[0]), joint.limits[1]) for joint in description.joints.values() if joint.limits}
+    return {
+        joint.name: min(max(0.0, joint.limits[0]), joint.limits[1])
+        for joint in description.joints.values()
+        if joint.limits
+    }
 
 
 def scaled(description: Description, factor: float) -> Description:
     """Return the object made larger by a factor: shapes, places of joints, and how far they slide; masses stay as stated."""
     links = {}
     for name, link in description.links.items():
-        looks, solid = (tuple(_scaled(part, factor) for part in parts) for parts in (link.visual, link.collision))
-        inertia = pin.Inertia(link.inertia.mass, factor * link.inertia.lever, factor**2 * link.inertia.inertia)
+        looks, solid = (
+            tuple(_scaled(part, factor) for part in parts)
+            for parts in (link.visual, link.collision)
+        )
+        inertia = pin.Inertia(
+            link.inertia.mass, factor * link.inertia.lever, factor**2 * link.inertia.inertia
+        )
         links[name] = Link(name, looks, solid, inertia)
     joints = {}
     for child, joint in description.joints.items():
@@ -195,7 +255,9 @@ def scaled(description: Description, factor: float) -> Description:
 
 def _scaled(part: Part, factor: float) -> Part:
     placement = pin.SE3(part.placement.rotation, factor * part.placement.translation)
-    return dataclasses.replace(part, placement=placement, size=tuple(factor * size for size in part.size))
+    return dataclasses.replace(
+        part, placement=placement, size=tuple(factor * size for size in part.size)
+    )
 
 
 def upright(description: Description, up: str) -> Description:
@@ -208,7 +270,9 @@ def rooted(description: Description, placement: pin.SE3) -> Description:
     links, root = dict(description.links), description.root
     links[root] = links[root].placed(placement)
     joints = {
-        child: dataclasses.replace(joint, placement=placement * joint.placement) if joint.parent == root else joint
+        child: dataclasses.replace(joint, placement=placement * joint.placement)
+        if joint.parent == root
+        else joint
         for child, joint in description.joints.items()
     }
     return dataclasses.replace(description, links=links, joints=joints)
@@ -217,8 +281,8 @@ def rooted(description: Description, placement: pin.SE3) -> Description:
 def with_limits(description: Description, meshes: Surfaces) -> Description:
     """Return the object with limits for hinges and slides that have none, each noted.
 
-    A hinge opens by a right angle, a drawer by most of its depth, in the direction that brings what moves away from the middle of
-    the object.
+    A hinge opens by a right angle, a drawer by most of its depth, in the direction that brings what
+    moves away from the middle of the object.
     """
     joints, notes = dict(description.joints), list(description.notes)
     places, (low, high) = description.placements(), bounds(description, meshes)
@@ -232,17 +296,27 @@ def with_limits(description: Description, meshes: Surfaces) -> Description:
         below = description.below(child)
         points = np.vstack(
             [
-                np.asarray(meshes[id(part)].vertices) @ places[name].rotation.T + places[name].translation
+                np.asarray(meshes[id(part)].vertices) @ places[name].rotation.T
+                + places[name].translation
                 for name in below
                 for part in description.links[name].solid
             ]
         )
-        centre, axis = (points.min(axis=0) + points.max(axis=0)) / 2.0, places[child].rotation @ joint.axis
-        way = axis if joint.kind == "prismatic" else np.cross(axis, centre - places[child].translation)
+        centre, axis = (
+            (points.min(axis=0) + points.max(axis=0)) / 2.0,
+            places[child].rotation @ joint.axis,
+        )
+        way = (
+            axis
+            if joint.kind == "prismatic"
+            else np.cross(axis, centre - places[child].translation)
+        )
         sign = 1.0 if way @ (centre - (low + high) / 2.0) >= 0.0 else -1.0
         far = _OPEN if joint.kind == "revolute" else _PULLED * float(np.ptp(points @ axis))
         limits = (0.0, far) if sign > 0.0 else (-far, 0.0)
         joints[child] = dataclasses.replace(joint, limits=limits)
         unit = "rad" if joint.kind == "revolute" else "m"
-        notes.append(f"joint '{joint.name}' states no limits: {limits[0]:.3g} to {limits[1]:.3g} {unit}, away from the middle")
+        notes.append(
+            f"joint '{joint.name}' states no limits: {limits[0]:.3g} to {limits[1]:.3g} {unit}, away from the middle"
+        )
     return dataclasses.replace(description, joints=joints, notes=tuple(notes))

@@ -63,7 +63,9 @@ class Part:
         elif self.kind == "sphere":
             mesh = trimesh.creation.icosphere(subdivisions=3, radius=self.size[0])
         elif self.kind == "capsule":
-            mesh = trimesh.creation.capsule(height=self.size[1], radius=self.size[0], count=[_SIDES, _SIDES])
+            mesh = trimesh.creation.capsule(
+                height=self.size[1], radius=self.size[0], count=[_SIDES, _SIDES]
+            )
         else:
             mesh = trimesh.creation.cylinder(self.size[0], height=self.size[1], sections=_SIDES)
         return mesh.apply_transform(self.placement.homogeneous)
@@ -86,7 +88,8 @@ class Link:
     def placed(self, placement: pin.SE3) -> Link:
         """Return the link as seen from a frame in which its own is at `placement`."""
         visual, collision = (
-            tuple(replace(part, placement=placement * part.placement) for part in kind) for kind in (self.visual, self.collision)
+            tuple(replace(part, placement=placement * part.placement) for part in kind)
+            for kind in (self.visual, self.collision)
         )
         return Link(self.name, visual, collision, placement.act(self.inertia))
 
@@ -175,7 +178,8 @@ def inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.In
 
     Args:
         mass: [kg].
-        moments: About the centre of mass [kg·m²], in the order of `vkc_pin.world.files.kinematic_tree.MOMENTS`.
+        moments: About the centre of mass [kg·m²], in the order of
+            `vkc_pin.world.files.kinematic_tree.MOMENTS`.
         placement: Of the centre of mass, and of the axes of the moments, in the link's frame.
 
     Raises:

@@ -15,7 +15,9 @@ from vkc_pin.utils.optional_imports import optional_package
 __all__ = ["read_object_mjcf"]
 
 _FREE = 0  # the type of a joint that leaves a body free
-_HIDDEN = 3  # MuJoCo's viewer hides groups from here on: by custom, what collides and is not to be seen
+_HIDDEN = (
+    3  # MuJoCo's viewer hides groups from here on: by custom, what collides and is not to be seen
+)
 
 
 def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
@@ -32,7 +34,9 @@ def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
     try:
         model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:
-        raise InputError(f"MuJoCo cannot read this: {error}", file=file, expected="an MJCF file") from error
+        raise InputError(
+            f"MuJoCo cannot read this: {error}", file=file, expected="an MJCF file"
+        ) from error
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
@@ -54,20 +58,27 @@ class _Reader:
         for body in range(model.nbody):
             name, parent = self.bodies[body], int(model.body_parentid[body])
             above = self.bodies[parent]
-            moving = range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + int(model.body_jntnum[body]))
+            moving = range(
+                int(model.body_jntadr[body]),
+                int(model.body_jntadr[body]) + int(model.body_jntnum[body]),
+            )
             if parent in left_out and body:
                 left_out.add(body)
                 continue
             here = _placement(self.data.xpos[body], self.data.xmat[body])
             floats = any(int(model.jnt_type[j]) == _FREE for j in moving)
             if floats and not free:
-                self.notes.append(f"body '{name}' moves freely, it is an object of its own: left out")
+                self.notes.append(
+                    f"body '{name}' moves freely, it is an object of its own: left out"
+                )
                 left_out.add(body)
                 continue
             if floats:  # has no other joints
                 moving = range(0)
             last = above
-            for count, j in enumerate(moving):  # several joints of one body: links without shapes between them
+            for count, j in enumerate(
+                moving
+            ):  # several joints of one body: links without shapes between them
                 link = name if count == len(moving) - 1 else self._add_name(f"{name}_{count}")
                 frames[link] = pin.SE3(here.rotation, np.array(self.data.xanchor[j]))
                 joints[link] = self._joint(j, last, link, frames)
@@ -78,9 +89,15 @@ class _Reader:
                 if body:
                     kind = "floating" if floats else "fixed"
                     joints[name] = Joint(
-                        name=f"{name}_{kind}", kind=kind, parent=above, child=name, placement=frames[above].inverse() * here
+                        name=f"{name}_{kind}",
+                        kind=kind,
+                        parent=above,
+                        child=name,
+                        placement=frames[above].inverse() * here,
                     )
-            links[name] = Link(name, *self._parts(body, frames[name]), self._inertia(body, frames[name]))
+            links[name] = Link(
+                name, *self._parts(body, frames[name]), self._inertia(body, frames[name])
+            )
         return Description(self.file, links, joints, tuple(self.notes))
 
     def _joint(self, number: int, parent: str, child: str, frames: dict[str, pin.SE3]) -> Joint:
@@ -92,7 +109,10 @@ class _Reader:
         limits = None
         if model.jnt_limited[number]:
             zero = float(model.qpos0[model.jnt_qposadr[number]])
-            limits = (float(model.jnt_range[number][0]) - zero, float(model.jnt_range[number][1]) - zero)
+            limits = (
+                float(model.jnt_range[number][0]) - zero,
+                float(model.jnt_range[number][1]) - zero,
+            )
         return Joint(
             name=name,
             kind="continuous" if kind == "revolute" and limits is None else kind,
@@ -109,16 +129,27 @@ class _Reader:
         """Return what a body weighs: as stated, or as MuJoCo takes it from its geoms and their densities."""
         if not self.model.body_mass[body] > 0.0:
             return pin.Inertia.Zero()
-        principal = pin.Inertia(float(self.model.body_mass[body]), np.zeros(3), np.diag(self.model.body_inertia[body]))
-        return (frame.inverse() * _placement(self.data.xipos[body], self.data.ximat[body])).act(principal)
+        principal = pin.Inertia(
+            float(self.model.body_mass[body]), np.zeros(3), np.diag(self.model.body_inertia[body])
+        )
+        return (frame.inverse() * _placement(self.data.xipos[body], self.data.ximat[body])).act(
+            principal
+        )
 
     def _parts(self, body: int, frame: pin.SE3) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
         """Return what a body looks like, and what collides."""
         model, kinds = self.model, self.mujoco.mjtGeom
         visual, collision = list[Part](), list[Part]()
-        for geom in range(int(model.body_geomadr[body]), int(model.body_geomadr[body]) + int(model.body_geomnum[body])):
+        for geom in range(
+            int(model.body_geomadr[body]),
+            int(model.body_geomadr[body]) + int(model.body_geomnum[body]),
+        ):
             kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-            rgba = model.geom_rgba[geom] if model.geom_matid[geom] < 0 else model.mat_rgba[model.geom_matid[geom]]
+            rgba = (
+                model.geom_rgba[geom]
+                if model.geom_matid[geom] < 0
+                else model.mat_rgba[model.geom_matid[geom]]
+            )
             shape: tuple[str, tuple[float, ...]] | None = {
                 int(kinds.mjGEOM_BOX): ("box", tuple(2.0 * float(s) for s in size)),
                 int(kinds.mjGEOM_SPHERE): ("sphere", (float(size[0]),)),
@@ -134,7 +165,8 @@ class _Reader:
                 continue
             part = Part(
                 name=name,
-                placement=frame.inverse() * _placement(self.data.geom_xpos[geom], self.data.geom_xmat[geom]),
+                placement=frame.inverse()
+                * _placement(self.data.geom_xpos[geom], self.data.geom_xmat[geom]),
                 kind=shape[0],
                 size=shape[1],
                 triangles=self._triangles(geom) if shape[0] == "mesh" else None,

@@ -51,7 +51,14 @@ from vkc_pin.world.models.robot_file import load_robot
 __all__ = ["ImportedObject", "import_object", "read_description"]
 
 _COMMAND = "import-object"
-_GENERAL = ("mobility", "model", "object", "scene", "index", "main")  # names of files that say nothing
+_GENERAL = (
+    "mobility",
+    "model",
+    "object",
+    "scene",
+    "index",
+    "main",
+)  # names of files that say nothing
 _SMALL, _LARGE = 0.02, 3.5  # [m]: heights of what is opened by hand
 
 
@@ -77,11 +84,19 @@ class ImportedObject:
 
     def report(self) -> str:
         """Return what came out, as text."""
-        pieces, joints = len(self.object.collision.geometryObjects), len(self.object.coordinates.names)
+        pieces, joints = (
+            len(self.object.collision.geometryObjects),
+            len(self.object.coordinates.names),
+        )
         size = " × ".join(f"{length:.2f}" for length in self.size)
         head = f"{self.object.name}: {size} m, {joints} joint{'s' * (joints != 1)}, {pieces} convex pieces"
         notes = [f"  {note}" for note in self.notes]
-        lines = [head, *notes, f"attachments for the hand of {self.proposals.hand.robot}, best first:", self.proposals.report()]
+        lines = [
+            head,
+            *notes,
+            f"attachments for the hand of {self.proposals.hand.robot}, best first:",
+            self.proposals.report(),
+        ]
         return "\n".join(lines)
 
 
@@ -124,8 +139,9 @@ def import_object(
 ) -> ImportedObject:
     """Make an object that can be planned with of a URDF, MJCF or SDF file.
 
-    Its shapes become convex pieces, fixed links part of what they are fixed to; links without shapes go, limits that nobody
-    states are chosen. Its lowest point is at z = 0, the origin below its middle. Attachments are proposed for every joint.
+    Its shapes become convex pieces, fixed links part of what they are fixed to; links without
+    shapes go, limits that nobody states are chosen. Its lowest point is at z = 0, the origin below
+    its middle. Attachments are proposed for every joint.
 
     Args:
         file: The file.
@@ -140,12 +156,16 @@ def import_object(
         force: Whether to replace a folder that this made before.
 
     Raises:
-        InputError: The file cannot be read or is no object, the folder holds something, or an argument is wrong.
-        UnknownNameError: There is no such link or robot, or the file names something that does not exist.
+        InputError: The file cannot be read or is no object, the folder holds something, or an
+            argument is wrong.
+        UnknownNameError: There is no such link or robot, or the file names something that does not
+            exist.
     """
     path = file_path(file, "file", "a URDF, MJCF or SDF file")
     if up not in ("y", "z"):
-        raise InputError("not an axis that can point up", field="up", expected='"y" or "z"', got=shown(up))
+        raise InputError(
+            "not an axis that can point up", field="up", expected='"y" or "z"', got=shown(up)
+        )
     for name, value in (("height", height), ("scale", scale)):
         if value is not None and quantity(value, name) <= 0.0:
             raise InputError("not a size", field=name, expected="a number above 0", got=value)
@@ -160,7 +180,9 @@ def import_object(
     check_target(target, _COMMAND, force=flag(force, "force"))
     description = read_description(path)
     description = (
-        only(description, link) if link else dataclasses.replace(description, notes=description.notes + several(description))
+        only(description, link)
+        if link
+        else dataclasses.replace(description, notes=description.notes + several(description))
     )
     description = upright(tidied(renamed(description)), up)
     description, size = _sized(description, height, scale)
@@ -178,12 +200,20 @@ def import_object(
         write_description(yaml, urdf.name, (), about=about)
         proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
         about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
-        about += [f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()]
-        write_description(yaml, urdf.name, [item.description() for item in proposals.found], about=about)
+        about += [
+            f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()
+        ]
+        write_description(
+            yaml, urdf.name, [item.description() for item in proposals.found], about=about
+        )
         plot_attachments(proposals, picture)
     done = load_object(target / yaml.name)
-    proposals = dataclasses.replace(proposals, object=dataclasses.replace(done, attachments={}))  # where its files are now
-    return ImportedObject(target / yaml.name, done, proposals, size, description.notes, target / picture.name)
+    proposals = dataclasses.replace(
+        proposals, object=dataclasses.replace(done, attachments={})
+    )  # where its files are now
+    return ImportedObject(
+        target / yaml.name, done, proposals, size, description.notes, target / picture.name
+    )
 
 
 def _name(path: Path, link: str | None) -> str:
@@ -194,11 +224,15 @@ def _name(path: Path, link: str | None) -> str:
     return name
 
 
-def _sized(description: Description, height: float | None, scale: float | None) -> tuple[Description, Floats]:
+def _sized(
+    description: Description, height: float | None, scale: float | None
+) -> tuple[Description, Floats]:
     """Return the object in its size, and that [m]; what is not plausible is noted."""
     low, high = bounds(description, surfaces(description))
     if not (high > low).all():
-        raise InputError("the object is flat", file=description.file, expected="shapes around a volume")
+        raise InputError(
+            "the object is flat", file=description.file, expected="shapes around a volume"
+        )
     factor = height / float(high[2] - low[2]) if height is not None else scale or 1.0
     size = factor * (high - low)
     if height is None and not _SMALL <= size[2] <= _LARGE:
@@ -210,4 +244,7 @@ def _sized(description: Description, height: float | None, scale: float | None) 
 def _settled(description: Description) -> Description:
     """Return the object with its root's frame on the floor, below its middle, joints closed."""
     low, high = bounds(description, surfaces(description), closed(description))
-    return rooted(description, pin.SE3(np.eye(3), -np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])))
+    return rooted(
+        description,
+        pin.SE3(np.eye(3), -np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])),
+    )

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Known", "with_pieces"]
 
-_FINE = 0.006  # [m]: how far pieces of what moves may stand out; a finger keeps about as much from a handle
+# [m]: how far pieces of what moves may stand out; a finger keeps about as much from a handle
+_FINE = 0.006
 _INSIDE = 1e-3  # [m]: what stands out of another piece by less is part of it
 
 
@@ -30,20 +31,27 @@ Known = dict[tuple[Path | None, tuple[float, ...], float], "Sequence[trimesh.Tri
 """Pieces of mesh files, in the frame of their mesh, by file, scale and error [m]."""
 
 
-def with_pieces(description: Description, meshes: Surfaces, known: Known | None = None) -> Description:
+def with_pieces(
+    description: Description, meshes: Surfaces, known: Known | None = None
+) -> Description:
     """Return the object with convex shapes alone to collide with, what is flat or lies inside of others noted.
 
     Args:
         description: The object.
         meshes: Its surfaces.
-        known: Pieces of files that were cut before, to which this adds: the chairs of a home are one file.
+        known: Pieces of files that were cut before, to which this adds: the chairs of a home are
+            one file.
 
     Raises:
         InputError: A mesh is concave, and CoACD is not installed.
     """
     notes, links = list(description.notes), dict[str, Link]()
     for name, link in description.links.items():
-        error, solids, thick = _FINE if name in description.joints else ERROR, list[Part](), list[str]()
+        error, solids, thick = (
+            _FINE if name in description.joints else ERROR,
+            list[Part](),
+            list[str](),
+        )
         for part in link.solid:
             mesh = meshes[id(part)]
             if part.kind != "mesh":
@@ -51,7 +59,11 @@ def with_pieces(description: Description, meshes: Surfaces, known: Known | None 
                 continue
             if flat(mesh.vertices):
                 thick.append(part.name or "a mesh")
-            found = _convex(mesh, error) if known is None or part.file is None else _placed(part, error, known)
+            found = (
+                _convex(mesh, error)
+                if known is None or part.file is None
+                else _placed(part, error, known)
+            )
             solids += [
                 Part(
                     name=part.name,
@@ -65,9 +77,13 @@ def with_pieces(description: Description, meshes: Surfaces, known: Known | None 
             ]
         kept = _without_inner(solids)
         if thick:
-            notes.append(f"link '{name}': flat shapes are {1e3 * THICKNESS:g} mm thick now: {', '.join(dict.fromkeys(thick))}")
+            notes.append(
+                f"link '{name}': flat shapes are {1e3 * THICKNESS:g} mm thick now: {', '.join(dict.fromkeys(thick))}"
+            )
         if link.visual and not link.collision:
-            notes.append(f"link '{name}' has nothing to collide with: it collides as what it looks like")
+            notes.append(
+                f"link '{name}' has nothing to collide with: it collides as what it looks like"
+            )
         links[name] = Link(name, link.visual or link.collision, tuple(kept), link.inertia)
     return dataclasses.replace(description, links=links, notes=tuple(notes))
 

@@ -35,26 +35,46 @@ def read_object_urdf(file: Path, *, free: bool = False) -> Description:
     notes = list[str]()
     stated = {joint.get("name", ""): _stated(file, joint, notes) for joint in root.findall("joint")}
     for joint in root.findall("joint"):
-        if joint.get("type") not in (*_KINDS, "floating") or (joint.get("type") == "floating" and not free):
+        if joint.get("type") not in (*_KINDS, "floating") or (
+            joint.get("type") == "floating" and not free
+        ):
             notes.append(f"joint '{joint.get('name')}' is {joint.get('type')}: taken as fixed")
             joint.set("type", "fixed")
         if (mimic := joint.find("mimic")) is not None:
-            notes.append(f"joint '{joint.get('name')}' mimics '{mimic.get('joint')}': it moves on its own now")
+            notes.append(
+                f"joint '{joint.get('name')}' mimics '{mimic.get('joint')}': it moves on its own now"
+            )
             joint.remove(mimic)
     check_tree(file, root)
     urdf = UrdfFile(file.resolve(), "", root)
     names = _names(root)
-    parts: dict[str, dict[str, list[Part]]] = {kind: {link: [] for link in urdf.links} for kind in ("visual", "collision")}
+    parts: dict[str, dict[str, list[Part]]] = {
+        kind: {link: [] for link in urdf.links} for kind in ("visual", "collision")
+    }
     for kind, of_links in parts.items():
         for shape in urdf.shapes(kind):
             name = names.get((kind, shape.name)) or names.get(("mesh", str(shape.file))) or ""
             of_links[shape.link].append(
-                Part(name=name, placement=shape.placement, kind=shape.kind, size=shape.size, file=shape.file, colour=shape.colour)
+                Part(
+                    name=name,
+                    placement=shape.placement,
+                    kind=shape.kind,
+                    size=shape.size,
+                    file=shape.file,
+                    colour=shape.colour,
+                )
             )
-            if name and shape.file is not None:  # PartNet-Mobility names what is seen; what collides are the same files
+            if (
+                name and shape.file is not None
+            ):  # PartNet-Mobility names what is seen; what collides are the same files
                 names["mesh", str(shape.file)] = name
     weight = {link.get("name", ""): _inertia(file, link, notes) for link in root.findall("link")}
-    links = {name: Link(name, tuple(parts["visual"][name]), tuple(parts["collision"][name]), weight[name]) for name in urdf.links}
+    links = {
+        name: Link(
+            name, tuple(parts["visual"][name]), tuple(parts["collision"][name]), weight[name]
+        )
+        for name in urdf.links
+    }
     joints = [_joint(file, joint, stated[joint.get("name", "")]) for joint in root.findall("joint")]
     return Description(file, links, {joint.child: joint for joint in joints}, tuple(notes))
 
@@ -77,9 +97,14 @@ def _stated(file: Path, joint: ElementTree.Element, notes: list[str]) -> tuple[f
         return None
     if limit.get("lower") is None and limit.get("upper") is None:
         return None
-    low, high = (numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)[0] for key in ("lower", "upper"))
+    low, high = (
+        numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)[0]
+        for key in ("lower", "upper")
+    )
     if low > high:
-        notes.append(f"joint '{name}' has its limits the wrong way round, {low:g} and {high:g}: exchanged")
+        notes.append(
+            f"joint '{name}' has its limits the wrong way round, {low:g} and {high:g}: exchanged"
+        )
         low, high = high, low
         limit.set("lower", str(low))
         limit.set("upper", str(high))
@@ -111,13 +136,22 @@ def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float]
     direction = np.array([1.0, 0.0, 0.0])
     if axis is not None and kind not in ("fixed", "floating"):
         direction = np.array(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name))
-    velocity = numbers_of(file, limit, "velocity", 1, default="0", where=name)[0] if limit is not None else 0.0
+    velocity = (
+        numbers_of(file, limit, "velocity", 1, default="0", where=name)[0]
+        if limit is not None
+        else 0.0
+    )
     dynamics = element.find("dynamics")
     resists = {
-        key: 0.0 if dynamics is None else max(0.0, numbers_of(file, dynamics, key, 1, default="0", where=name)[0])
+        key: 0.0
+        if dynamics is None
+        else max(0.0, numbers_of(file, dynamics, key, 1, default="0", where=name)[0])
         for key in ("damping", "friction")
     }
-    ends = [(found.get("link", "") if (found := element.find(key)) is not None else "") for key in ("parent", "child")]
+    ends = [
+        (found.get("link", "") if (found := element.find(key)) is not None else "")
+        for key in ("parent", "child")
+    ]
     return Joint(
         name=name,
         kind=kind,

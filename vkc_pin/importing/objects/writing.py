@@ -57,7 +57,12 @@ def write_urdf(description: Description, file: Path) -> None:
 
 
 def write_description(
-    file: Path, urdf: str, attachments: Sequence[Mapping[str, Any]], *, about: Sequence[str], free: bool = False
+    file: Path,
+    urdf: str,
+    attachments: Sequence[Mapping[str, Any]],
+    *,
+    about: Sequence[str],
+    free: bool = False,
 ) -> None:
     """Write the description of an object.
 
@@ -69,7 +74,11 @@ def write_description(
         free: Whether it can be carried away.
     """
     head = "".join(map(format_comment, about))
-    data = {"urdf": urdf, **({"free": True} if free else {}), "attachments": [dict(item) for item in attachments]}
+    data = {
+        "urdf": urdf,
+        **({"free": True} if free else {}),
+        "attachments": [dict(item) for item in attachments],
+    }
     body = yaml.safe_dump(data, sort_keys=False, width=130)
     write_atomically(file, (head + body).encode())
 
@@ -90,7 +99,9 @@ def _looks(link: Link) -> list[tuple[Part | None, trimesh.Trimesh | None, Colour
                 meshes.setdefault(coloured.colour or _GREY, []).append(mesh)
         else:
             meshes.setdefault(part.colour or _GREY, []).append(part.mesh())
-    return found + [(None, trimesh.util.concatenate(same), colour) for colour, same in meshes.items()]
+    return found + [
+        (None, trimesh.util.concatenate(same), colour) for colour, same in meshes.items()
+    ]
 
 
 def _plain_shapes(parts: Sequence[Part]) -> list[Part]:
@@ -113,12 +124,17 @@ def _mesh(urdf: Path, address: str, mesh: trimesh.Trimesh) -> str:
     return address
 
 
-def _element(kind: str, name: str, part: Part | None, address: str | None, colour: Colour | None) -> list[str]:
+def _element(
+    kind: str, name: str, part: Part | None, address: str | None, colour: Colour | None
+) -> list[str]:
     lines = [f"    <{kind}{f' name={quote(name)}' if name else ''}>"]
     if part is not None and address is None:
         lines.append(f"      {_origin(part.placement)}")
         keys = {"box": f'size="{_numbers(part.size)}"', "sphere": f'radius="{_numbers(part.size)}"'}
-        size = keys.get(part.kind) or f'radius="{_numbers(part.size[:1])}" length="{_numbers(part.size[1:])}"'
+        size = (
+            keys.get(part.kind)
+            or f'radius="{_numbers(part.size[:1])}" length="{_numbers(part.size[1:])}"'
+        )
         lines.append(f"      <geometry><{part.kind} {size}/></geometry>")
     else:
         lines.append(f"      <geometry><mesh filename={quote(address or '')}/></geometry>")
@@ -132,8 +148,15 @@ def _inertial(inertia: pin.Inertia) -> list[str]:
     """Return what a link weighs, about its centre of mass along the link's axes; nothing if it has no mass."""
     if not inertia.mass > 0.0:
         return []
-    entries = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{inertia.inertia[i, j]:.9g}"' for i in range(3) for j in range(i, 3))
-    origin, mass = f'<origin xyz="{_numbers(inertia.lever)}"/>', f'<mass value="{inertia.mass:.9g}"/>'
+    entries = " ".join(
+        f'i{"xyz"[i]}{"xyz"[j]}="{inertia.inertia[i, j]:.9g}"'
+        for i in range(3)
+        for j in range(i, 3)
+    )
+    origin, mass = (
+        f'<origin xyz="{_numbers(inertia.lever)}"/>',
+        f'<mass value="{inertia.mass:.9g}"/>',
+    )
     return [f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>"]
 
 
@@ -145,10 +168,20 @@ def _joint(joint: Joint) -> list[str]:
         f'    <axis xyz="{_numbers(joint.axis)}"/>',
     ]
     velocity = joint.velocity or DEFAULT_VELOCITY
-    ends = "" if joint.limits is None else f'lower="{_numbers(joint.limits[:1])}" upper="{_numbers(joint.limits[1:])}" '
+    ends = (
+        ""
+        if joint.limits is None
+        else f'lower="{_numbers(joint.limits[:1])}" upper="{_numbers(joint.limits[1:])}" '
+    )
     if joint.damping or joint.friction:
-        lines.append(f'    <dynamics damping="{_numbers([joint.damping])}" friction="{_numbers([joint.friction])}"/>')
-    return [*lines, f'    <limit {ends}velocity="{_numbers([velocity])}" effort="{_numbers([_EFFORT])}"/>', "  </joint>"]
+        lines.append(
+            f'    <dynamics damping="{_numbers([joint.damping])}" friction="{_numbers([joint.friction])}"/>'
+        )
+    return [
+        *lines,
+        f'    <limit {ends}velocity="{_numbers([velocity])}" effort="{_numbers([_EFFORT])}"/>',
+        "  </joint>",
+    ]
 
 
 def _origin(placement: pin.SE3) -> str:

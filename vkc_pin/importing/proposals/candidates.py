@@ -21,7 +21,9 @@ _TURNS = 8  # directions of approach around a bar: every 45°
 _LONG = 0.12  # [m]: longer ones are taken in several places
 _PLACES = (0.5, 0.3, 0.7, 0.1, 0.9)  # of the length of a long one
 _LEVEL = 0.3  # sine of the slope up to which a direction counts as level
-_ROUND = 1.5  # a hand may turn about a bar as long as that changes its thickness by no larger factor
+_ROUND = (
+    1.5  # a hand may turn about a bar as long as that changes its thickness by no larger factor
+)
 _ANGLES = np.arange(0.1, 1.61, 0.1)  # [rad]
 
 
@@ -32,10 +34,12 @@ class Candidate:
     Attributes:
         piece: What is grasped.
         kind: "bar", "knob" or "edge".
-        placement: The tool frame in the frame of the piece's joint, the grasped bar's middle in its origin.
+        placement: The tool frame in the frame of the piece's joint, the grasped bar's middle in its
+            origin.
         thickness: Of what is between the fingers [m].
         span: How far the piece goes on to both sides along the tool's y axis [m], lower and upper.
-        round: How far the hand may turn about that axis to either side for the piece's shape alone [rad].
+        round: How far the hand may turn about that axis to either side for the piece's shape alone
+            [rad].
     """
 
     piece: Piece
@@ -55,7 +59,9 @@ class Thickness:
     thinnest: float = np.inf
 
 
-def candidates(piece: Piece, hand: Hand, clearance: float, up: Floats, seen: Thickness) -> Iterator[Candidate]:
+def candidates(
+    piece: Piece, hand: Hand, clearance: float, up: Floats, seen: Thickness
+) -> Iterator[Candidate]:
     """Yield the grasps of a piece that its thickness allows.
 
     Args:
@@ -80,13 +86,19 @@ def candidates(piece: Piece, hand: Hand, clearance: float, up: Floats, seen: Thi
                     continue
                 centre, thickness, deep = found
                 placement = pin.SE3(_tool(section.axes, approach, up), section.point(centre))
-                ends = (low - at, high - at) if (placement.rotation[:, 1] @ piece.axes[axis]) > 0.0 else (at - high, at - low)
+                ends = (
+                    (low - at, high - at)
+                    if (placement.rotation[:, 1] @ piece.axes[axis]) > 0.0
+                    else (at - high, at - low)
+                )
                 kind = "edge" if deep else "bar" if high - low > DEEP else "knob"
                 turned = 0.0 if deep else _round(section, approach, thickness, widest)
                 yield Candidate(piece, kind, placement, thickness, ends, turned)
 
 
-def _grasp(section: Section, approach: Floats, hand: Hand, widest: float, seen: Thickness) -> tuple[Floats, float, bool] | None:
+def _grasp(
+    section: Section, approach: Floats, hand: Hand, widest: float, seen: Thickness
+) -> tuple[Floats, float, bool] | None:
     """Return where in a section the hand's origin is, how thick that is, and whether it is an edge; None if it does not fit."""
     closing = np.array([-approach[1], approach[0]])
     near, far = section.extent(approach)
@@ -106,7 +118,8 @@ def _grasp(section: Section, approach: Floats, hand: Hand, widest: float, seen: 
 def _tool(axes: Floats, approach: Floats, up: Floats) -> Floats:
     """Return the tool's axes as columns, shape (3, 3), for a direction of approach in the plane of two axes.
 
-    Of the two ways to hold a hand, half a turn apart, it is the one with the closing, or else the bar, pointing upwards.
+    Of the two ways to hold a hand, half a turn apart, it is the one with the closing, or else the
+    bar, pointing upwards.
     """
     z, x = approach @ axes, np.array([-approach[1], approach[0]]) @ axes
     y = np.cross(z, x)

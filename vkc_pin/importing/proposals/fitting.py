@@ -20,8 +20,8 @@ class Blocked:
     """Why a hand has no room.
 
     Attributes:
-        what: "fingers": the held link is too close to them; "others": another link is; "floor": it would be below what the
-            object stands on.
+        what: "fingers": the held link is too close to them; "others": another link is; "floor": it
+            would be below what the object stands on.
         link: The object's link that is in the way.
     """
 
@@ -39,7 +39,9 @@ class Fitting:
         grasp_clearance: but its touch links from the link that they hold [m].
     """
 
-    def __init__(self, item: ArticulatedObject, hand: Hand, dist_safe: float, grasp_clearance: float) -> None:
+    def __init__(
+        self, item: ArticulatedObject, hand: Hand, dist_safe: float, grasp_clearance: float
+    ) -> None:
         self.item, self.hand = item, hand
         self._safe, self._close = dist_safe, grasp_clearance
         self._shapes = list(item.collision.geometryObjects)
@@ -48,7 +50,9 @@ class Fitting:
         self._boxes = [bounding_box(shape) for shape in self._shapes]
         self._touch = np.array([True] * len(hand.touch) + [False] * len(hand.others))
         self._hand = [*hand.touch, *hand.others]
-        self._hand_boxes = [bounding_box(pin.GeometryObject("", 0, where, shape)) for shape, where in self._hand]
+        self._hand_boxes = [
+            bounding_box(pin.GeometryObject("", 0, where, shape)) for shape, where in self._hand
+        ]
         self._data = item.model.createData()
         self.place(np.clip(np.zeros(len(item.lower)), item.lower, item.upper))
         self.floor = float(self._low[:, 2].min()) if len(self._shapes) else -np.inf
@@ -57,8 +61,13 @@ class Fitting:
         """Put the object's joints at some values, shape (n,), [rad] or [m]."""
         self.state = np.array(state, float)
         pin.forwardKinematics(self.item.model, self._data, self.item.coordinates.q(self.state))
-        self._at = [self._data.oMi[joint] * shape.placement for joint, shape in zip(self._joints, self._shapes, strict=True)]
-        corners = np.array([_world_box(box, where) for box, where in zip(self._boxes, self._at, strict=True)]).reshape(-1, 2, 3)
+        self._at = [
+            self._data.oMi[joint] * shape.placement
+            for joint, shape in zip(self._joints, self._shapes, strict=True)
+        ]
+        corners = np.array(
+            [_world_box(box, where) for box, where in zip(self._boxes, self._at, strict=True)]
+        ).reshape(-1, 2, 3)
         self._low, self._high = corners[:, 0], corners[:, 1]
 
     def joint(self, number: int) -> pin.SE3:
@@ -74,7 +83,9 @@ class Fitting:
             more: What it must keep beyond the least clearance from other links than this one [m].
         """
         mine = self.links == held
-        for (shape, where), box, touches in zip(self._hand, self._hand_boxes, self._touch, strict=True):
+        for (shape, where), box, touches in zip(
+            self._hand, self._hand_boxes, self._touch, strict=True
+        ):
             placed = tool * where
             low, high = _world_box(box, placed)
             if low[2] < self.floor:
@@ -82,8 +93,13 @@ class Fitting:
             margins = np.where(mine & touches, self._close, self._safe + more)
             gaps = np.maximum(self._low - high, low - self._high).max(axis=1)
             for k in np.flatnonzero(gaps < margins).tolist():
-                if shape_distance(shape, placed, self._shapes[k].geometry, self._at[k]) < margins[k]:
-                    return Blocked("fingers" if mine[k] and touches else "others", str(self.links[k]))
+                if (
+                    shape_distance(shape, placed, self._shapes[k].geometry, self._at[k])
+                    < margins[k]
+                ):
+                    return Blocked(
+                        "fingers" if mine[k] and touches else "others", str(self.links[k])
+                    )
         return None
 
 

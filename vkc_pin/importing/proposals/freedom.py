@@ -36,11 +36,15 @@ class Grip:
         self._fitting, self._grasp = fitting, grasp
         self._offset = pin.SE3(np.eye(3), np.array([0.0, 0.0, -standoff]))
         self._state = fitting.state.copy()
-        self._joint = int(fitting.item.model.frames[fitting.item.link_frame(grasp.piece.link)].parentJoint)
+        self._joint = int(
+            fitting.item.model.frames[fitting.item.link_frame(grasp.piece.link)].parentJoint
+        )
         self._angles = _TURN * np.arange(-round(1.6 / _TURN), round(1.6 / _TURN) + 1)
         self._angles = self._angles[np.abs(self._angles) <= grasp.round + 1e-9]
         half = fitting.hand.width / 2.0
-        self._low = 0.0 - _marched(lambda way: self._free(-way, 0.0), min(_LONGEST, -grasp.span[0] - half))
+        self._low = 0.0 - _marched(
+            lambda way: self._free(-way, 0.0), min(_LONGEST, -grasp.span[0] - half)
+        )
         self._high = _marched(lambda way: self._free(way, 0.0), min(_LONGEST, grasp.span[1] - half))
         self._turned = self._connected(self._all_free(), self._angles == 0.0)
 
@@ -77,7 +81,11 @@ class Grip:
         return ("revolute", (Freedom("", "revolute", _BAR, low, high),)) if turns else ("fixed", ())
 
     def _free(self, slide: float, turn: float) -> bool:
-        tool = self._fitting.joint(self._joint) * self._grasp.placement * pin.SE3(pin.exp3(_BAR * turn), _BAR * slide)
+        tool = (
+            self._fitting.joint(self._joint)
+            * self._grasp.placement
+            * pin.SE3(pin.exp3(_BAR * turn), _BAR * slide)
+        )
         return self._fitting.blocked(tool * self._offset, self._grasp.piece.link) is None
 
     def _all_free(self) -> Bools:

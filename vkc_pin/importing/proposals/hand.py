@@ -24,9 +24,11 @@ class Hand:
 
     Attributes:
         robot: The robot's name.
-        touch: Shapes of the links that may touch what is grasped, with their placements in the tool frame.
+        touch: Shapes of the links that may touch what is grasped, with their placements in the tool
+            frame.
         others: Those of the other links behind them that move with the tool.
-        opening: How wide a bar between the fingers may be, at the tool's origin along its x axis [m].
+        opening: How wide a bar between the fingers may be, at the tool's origin along its x axis
+            [m].
         tip: How far the fingers reach beyond the tool's origin, along its z axis [m].
         width: How wide the fingers are, along the tool's y axis [m].
     """
@@ -43,14 +45,22 @@ def hand_of(robot: Robot) -> Hand:
     """Return the hand of a robot, open as the robot's description has it.
 
     Raises:
-        InputError: The description names no touch links, or they leave no room around the tool frame's origin.
+        InputError: The description names no touch links, or they leave no room around the tool
+            frame's origin.
     """
     if not robot.touch_links:
         problem = f"the hand of '{robot.name}' is not known"
         expected = "touch_links in a robot.yaml, such as `vkc-pin import-robot` writes"
-        raise InputError(problem, file=robot.urdf, field="touch_links", expected=expected, got="none")
-    data, frame = robot.model.createData(), robot.model.frames[robot.model.getFrameId(robot.tool_frame)]
-    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), robot.home])))
+        raise InputError(
+            problem, file=robot.urdf, field="touch_links", expected=expected, got="none"
+        )
+    data, frame = (
+        robot.model.createData(),
+        robot.model.frames[robot.model.getFrameId(robot.tool_frame)],
+    )
+    pin.framesForwardKinematics(
+        robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
+    )
     tool = data.oMi[frame.parentJoint] * frame.placement
     touch, others = list[pin.GeometryObject](), list[pin.GeometryObject]()
     for number, shape in enumerate(robot.collision.geometryObjects):
@@ -71,4 +81,11 @@ def hand_of(robot: Robot) -> Hand:
     ]  # what reaches past the origin
     ends = beside or [world_box(geometry, where) for geometry, where in fingers]
     width = max(high[1] for _, high in ends) - min(low[1] for low, _ in ends)
-    return Hand(robot.name, fingers, rest, opening, max(0.0, float(max(high[2] for _, high in ends))), float(width))
+    return Hand(
+        robot.name,
+        fingers,
+        rest,
+        opening,
+        max(0.0, float(max(high[2] for _, high in ends))),
+        float(width),
+    )

@@ -28,7 +28,11 @@ _WIDTH = 3.2  # [inch] of a panel
 _FACET = 0.05  # [m]: edges of what is drawn, about
 _OPEN = 0.35  # of the way that the joint opens: how it is drawn
 _LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
-_STILL, _MOVING, _HELD = np.array([0.83, 0.83, 0.81]), np.array([0.93, 0.80, 0.62]), np.array([0.82, 0.29, 0.36])
+_STILL, _MOVING, _HELD = (
+    np.array([0.83, 0.83, 0.81]),
+    np.array([0.93, 0.80, 0.62]),
+    np.array([0.82, 0.29, 0.36]),
+)
 
 
 def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Figure:
@@ -53,15 +57,22 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
             joint = list(proposal.opens)[-1]
             _draw(axes, proposals, proposal, joint)
             opened = ", ".join(f"{name} to {value:.2g}" for name, value in proposal.opens.items())
-            axes.set_title(f"{proposal.attachment.name}  {proposal.score:.2f}\n{opened}", fontsize=8)
+            axes.set_title(
+                f"{proposal.attachment.name}  {proposal.score:.2f}\n{opened}", fontsize=8
+            )
         if proposals.because or not shown:
             words: Any = figure.add_subplot(rows, columns, panels)
             words.axis("off")
-            said = "\n\n".join(f"{joint}: {reason}" for joint, reason in proposals.because.items()) or "it has no joints"
+            said = (
+                "\n\n".join(f"{joint}: {reason}" for joint, reason in proposals.because.items())
+                or "it has no joints"
+            )
             words.text(0.0, 1.0, "No hand can open\n\n" + said, va="top", wrap=True, fontsize=8)
         more = len(proposals.found) - len(shown)
         figure.suptitle(
-            f"{proposals.object.name}, hand of {proposals.hand.robot}" + (f" ({more} more)" if more else ""), fontsize=10
+            f"{proposals.object.name}, hand of {proposals.hand.robot}"
+            + (f" ({more} more)" if more else ""),
+            fontsize=10,
         )
     return save_figure(figure, path)
 
@@ -80,18 +91,30 @@ def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> No
     for shape in item.collision.geometryObjects:
         base = _MOVING if link_name(shape.name) in moving else _STILL
         _add(faces, colours, shape.geometry, data.oMi[shape.parentJoint] * shape.placement, base)
-    tool = item.link_placement(attachment.link, state) * attachment.tool(np.zeros(len(attachment.freedoms)))
+    tool = item.link_placement(attachment.link, state) * attachment.tool(
+        np.zeros(len(attachment.freedoms))
+    )
     for geometry, where in (*proposals.hand.touch, *proposals.hand.others):
         _add(faces, colours, geometry, tool * where, np.array(_rgb(COLOURS[0])))
     _show(axes, faces, colours, tool)
 
 
-def _add(faces: list[Floats], colours: list[Floats], geometry: coal.CollisionGeometry, where: pin.SE3, base: Floats) -> None:
+def _add(
+    faces: list[Floats],
+    colours: list[Floats],
+    geometry: coal.CollisionGeometry,
+    where: pin.SE3,
+    base: Floats,
+) -> None:
     import trimesh
 
     vertices, corners = triangles(geometry)
-    if (size := float(np.ptp(vertices, axis=0).max())) > _FACET:  # large triangles are drawn in the wrong order
-        vertices, corners = trimesh.remesh.subdivide_to_size(vertices, corners, max(_FACET, size / 12.0), max_iter=20)
+    if (
+        size := float(np.ptp(vertices, axis=0).max())
+    ) > _FACET:  # large triangles are drawn in the wrong order
+        vertices, corners = trimesh.remesh.subdivide_to_size(
+            vertices, corners, max(_FACET, size / 12.0), max_iter=20
+        )
     placed = (vertices @ where.rotation.T + where.translation)[corners]
     normals = np.cross(placed[:, 1] - placed[:, 0], placed[:, 2] - placed[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
@@ -102,13 +125,17 @@ def _add(faces: list[Floats], colours: list[Floats], geometry: coal.CollisionGeo
 
 def _show(axes: Any, faces: Iterable[Floats], colours: Iterable[Floats], tool: pin.SE3) -> None:
     """Put triangles into axes, seen from where the hand comes from."""
-    collection = importlib.import_module("mpl_toolkits.mplot3d.art3d").Poly3DCollection  # it has no types
+    collection = importlib.import_module(
+        "mpl_toolkits.mplot3d.art3d"
+    ).Poly3DCollection  # it has no types
 
     joined, shades = np.concatenate(list(faces)), np.concatenate(list(colours))
     axes.add_collection3d(collection(joined, facecolors=shades, edgecolors="none", shade=False))
     low, high = joined.reshape(-1, 3).min(axis=0), joined.reshape(-1, 3).max(axis=0)
     middle, half = (low + high) / 2.0, float((high - low).max()) / 2.0
-    for set_limits, centre in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True):
+    for set_limits, centre in zip(
+        (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True
+    ):
         set_limits(centre - half, centre + half)
     back = -tool.rotation[:, 2]
     azimuth = np.degrees(np.arctan2(back[1], back[0])) if np.linalg.norm(back[:2]) > 0.3 else -120.0

@@ -28,7 +28,8 @@ class Proposal:
         named: Whether a name says that it is a handle.
         thickness: Of what is between the fingers [m].
         score: How good it is, from 0 to 1.
-        opens: Joint → how far it can be opened so, [rad] or [m], before the hand meets the rest of the object.
+        opens: Joint → how far it can be opened so, [rad] or [m], before the hand meets the rest of
+            the object.
         when: Joint → value of others that must be open for the hand to get there.
     """
 
@@ -100,10 +101,21 @@ class Proposals:
             lines.append(f"{joint}, {low:.3g} to {high:.3g} {unit}")
             for proposal in self.opening(joint):
                 name = f"{proposal.attachment.name} ({proposal.kind}{', called a handle' if proposal.named else ''})"
-                slide = next((freedom for freedom in proposal.attachment.freedoms if freedom.kind == "prismatic"), None)
-                free = f", {1e3 * (slide.upper - slide.lower):.0f} mm to slide along" if slide else ""
+                slide = next(
+                    (
+                        freedom
+                        for freedom in proposal.attachment.freedoms
+                        if freedom.kind == "prismatic"
+                    ),
+                    None,
+                )
+                free = (
+                    f", {1e3 * (slide.upper - slide.lower):.0f} mm to slide along" if slide else ""
+                )
                 freedom = proposal.attachment.joint
-                when = _listed([f"{other} is at {value:.3g}" for other, value in proposal.when.items()])
+                when = _listed(
+                    [f"{other} is at {value:.3g}" for other, value in proposal.when.items()]
+                )
                 wide = proposal.attachment.opening
                 narrow = "" if wide is None else f", fingers {1e3 * wide:.0f} mm apart"
                 lines.append(

@@ -29,9 +29,16 @@ __all__ = ["propose_attachments"]
 _TRIED = 600  # of one body, the best ones by geometry: the hand is not put to more
 _WAY = 0.25  # [m]: how far a hand must be able to draw back straight
 _STEP = 0.015  # [m]: of that way
-_HELD = 0.005  # [m]: what is in the fingers at least goes so far beyond its middle, if they take it with their tips
-_NEAR, _ALIKE = 0.06, 0.5  # [m], cosine: grasps closer together than that, turned by less than 60°, are one
-_TURNED = 0.5  # of the rank of a hand that only is turned about its approach, where a better one is proposed: what one
+# [m]: what is in the fingers at least goes so far beyond its middle, if they take it with their
+# tips
+_HELD = 0.005
+_NEAR, _ALIKE = (
+    0.06,
+    0.5,
+)  # [m], cosine: grasps closer together than that, turned by less than 60°, are one
+# of the rank of a hand that only is turned about its approach, where a better one is proposed: what
+# one
+_TURNED = 0.5
 # of the two cannot reach, the other mostly cannot either
 _ROOM = (0.02, 0.01)  # [m]: more clearance than needed is better, up to this
 _SLACK = 0.05  # [m]: to either side; so is more of a bar to hold on to, up to this
@@ -60,10 +67,12 @@ def propose_attachments(
 ) -> Proposals:
     """Propose where a robot's hand can take hold of an object.
 
-    Every convex piece of a link that moves is looked at in cross-section. Where its thickness fits between the open fingers,
-    and their pads meet faces that they do not slip off from, is a bar, a knob or an edge. The hand is put there, fingers open,
-    and drawn back straight, among all shapes of the closed object; then it goes along as the joint opens. Where fingers that are
-    fully open have no room, those of a gripper that opens are tried closer together; the attachment has that `opening` then.
+    Every convex piece of a link that moves is looked at in cross-section. Where its thickness fits
+    between the open fingers, and their pads meet faces that they do not slip off from, is a bar, a
+    knob or an edge. The hand is put there, fingers open, and drawn back straight, among all shapes
+    of the closed object; then it goes along as the joint opens. Where fingers that are fully open
+    have no room, those of a gripper that opens are tried closer together; the attachment has that
+    `opening` then.
 
     Args:
         item: The object, standing upright on what its lowest point touches.
@@ -76,7 +85,8 @@ def propose_attachments(
         The attachments, best first, and why a joint has none.
 
     Raises:
-        InputError: The robot's description names no touch links, or they leave no room at its tool frame; wrong arguments.
+        InputError: The robot's description names no touch links, or they leave no room at its tool
+            frame; wrong arguments.
         UnknownNameError: There is no such robot.
     """
     instance(item, ArticulatedObject, "object")
@@ -85,7 +95,9 @@ def propose_attachments(
     for name, value in (("dist_safe", dist_safe), ("grasp_clearance", grasp_clearance)):
         number(value, name, "a distance [m]", low=0.0, high=1.0)
     search = _Search(item, robot, dist_safe, grasp_clearance, most)
-    found = [proposal for number in range(1, item.model.njoints) for proposal in search.body(number)]
+    found = [
+        proposal for number in range(1, item.model.njoints) for proposal in search.body(number)
+    ]
     found = search.named(sorted(found, key=lambda proposal: -proposal.score))
     because = {
         opening.joint: search.because(opening)
@@ -96,7 +108,14 @@ def propose_attachments(
 
 
 class _Search:
-    def __init__(self, item: ArticulatedObject, robot: Robot, dist_safe: float, grasp_clearance: float, most: int) -> None:
+    def __init__(
+        self,
+        item: ArticulatedObject,
+        robot: Robot,
+        dist_safe: float,
+        grasp_clearance: float,
+        most: int,
+    ) -> None:
         self.item, self.robot, self.hand, self.most = item, robot, hand_of(robot), most
         self.safe, self.close = dist_safe, grasp_clearance
         self.pieces: dict[int, list[Piece]] = {}
@@ -112,13 +131,18 @@ class _Search:
     def body(self, number: int) -> list[Proposal]:
         """Return the proposals for what joint `number` moves itself, best first.
 
-        If a part that another joint moves is in the way, as the door of a dishwasher is before its rack, that one is opened.
+        If a part that another joint moves is in the way, as the door of a dishwasher is before its
+        rack, that one is opened.
         """
         found = self._placed(number, {})
         if not found:
-            links = {blocked.link for blocked in self.tallies[number].blocked if blocked.what == "others"}
+            links = {
+                blocked.link for blocked in self.tallies[number].blocked if blocked.what == "others"
+            }
             above = {k for link in links for k in self.item.model.supports[self._joint_of(link)]}
-            own = {k for k in self.openings if number in self.item.model.supports[k]} | set(self.item.model.supports[number])
+            own = {k for k in self.openings if number in self.item.model.supports[k]} | set(
+                self.item.model.supports[number]
+            )
             others = [self.openings[k] for k in sorted(above - own - {0})]
             if others:
                 before = self.tallies[number]
@@ -143,7 +167,9 @@ class _Search:
             for named in (self._handles.get(piece.name, False),)
             for grasp in candidates(piece, self.hand, self.close, at.rotation[2], tally.thickness)
         ]
-        ranked.sort(key=lambda entry: -entry[0])  # stable: the order of the file where they are alike
+        ranked.sort(
+            key=lambda entry: -entry[0]
+        )  # stable: the order of the file where they are alike
         kept = list[tuple[Proposal, Candidate]]()
         for best, grasp, named in ranked[:_TRIED]:
             ranks = _ranks(kept)
@@ -152,8 +178,13 @@ class _Search:
             if any(best <= other.score and _alike(taken, other, grasp) for other, taken in kept):
                 continue
             self.fitting.place(state)
-            proposal = self._tried(best, grasp, opening, tally, named) or self._tried_narrower(best, grasp, opening, named, state)
-            if proposal is None or any(_alike(taken, other, grasp) and other.score >= proposal.score for other, taken in kept):
+            proposal = self._tried(best, grasp, opening, tally, named) or self._tried_narrower(
+                best, grasp, opening, named, state
+            )
+            if proposal is None or any(
+                _alike(taken, other, grasp) and other.score >= proposal.score
+                for other, taken in kept
+            ):
                 continue
             proposal = dataclasses.replace(proposal, when=when)
             kept = [(other, taken) for other, taken in kept if not _alike(grasp, proposal, taken)]
@@ -161,23 +192,31 @@ class _Search:
         chosen = [proposal for _, proposal in _ranks(kept)[: self.most]]
         return [proposal for proposal in chosen if proposal.score >= _WORTH * chosen[0].score]
 
-    def _tried_narrower(self, best: float, grasp: Candidate, opening: Opening, named: bool, state: Floats) -> Proposal | None:
+    def _tried_narrower(
+        self, best: float, grasp: Candidate, opening: Opening, named: bool, state: Floats
+    ) -> Proposal | None:
         """Return what becomes of a grasp with the fingers no further apart than it takes; None if they do not come closer."""
         room = _ROUND * float(np.ceil((grasp.thickness + 2.0 * self.close) / _ROUND - 1e-9))
         wide = self.robot.opening(room)
         if wide is None or not room <= wide <= self.hand.opening - _ROUND:
             return None
         if wide not in self.narrower:
-            self.narrower[wide] = Fitting(self.item, hand_of(self.robot.opened(wide)), self.safe, self.close)
+            self.narrower[wide] = Fitting(
+                self.item, hand_of(self.robot.opened(wide)), self.safe, self.close
+            )
         open_, self.fitting = self.fitting, self.narrower[wide]
         try:
             self.fitting.place(state)
             found = self._tried(best, grasp, opening, _Tally(), named)
         finally:
             self.fitting = open_
-        return found and dataclasses.replace(found, attachment=dataclasses.replace(found.attachment, opening=wide))
+        return found and dataclasses.replace(
+            found, attachment=dataclasses.replace(found.attachment, opening=wide)
+        )
 
-    def _tried(self, best: float, grasp: Candidate, opening: Opening, tally: _Tally, named: bool) -> Proposal | None:
+    def _tried(
+        self, best: float, grasp: Candidate, opening: Opening, tally: _Tally, named: bool
+    ) -> Proposal | None:
         """Return what becomes of a grasp when the hand is put there; None if there is no room, which `tally` gets to know."""
         link, at = grasp.piece.link, self.fitting.joint(opening.number)
         furthest = max(0.0, self.fitting.hand.tip - _HELD) if grasp.kind != "edge" else 0.0
@@ -191,7 +230,9 @@ class _Search:
         else:
             tally.blocked[reasons[0]] += 1
             return None
-        room = next((room for room in _ROOM if self.fitting.blocked(tool, link, more=room) is None), 0.0)
+        room = next(
+            (room for room in _ROOM if self.fitting.blocked(tool, link, more=room) is None), 0.0
+        )
         grip, opens = Grip(self.fitting, grasp, standoff), dict[str, float]()
         for joint in self.item.model.supports[opening.number]:
             if joint:
@@ -203,13 +244,27 @@ class _Search:
             tally.cramped += 1
             return None
         kind, freedom = grip.freedoms()
-        share = abs(opens[opening.joint] - opening.closed) / max(abs(opening.opened - opening.closed), 1e-9)
-        score = best * min(share, 1.0) * (0.5 + 0.5 * min(grip.slack / _SLACK, 1.0)) * (0.7 + 0.3 * room / _ROOM[0])
+        share = abs(opens[opening.joint] - opening.closed) / max(
+            abs(opening.opened - opening.closed), 1e-9
+        )
+        score = (
+            best
+            * min(share, 1.0)
+            * (0.5 + 0.5 * min(grip.slack / _SLACK, 1.0))
+            * (0.7 + 0.3 * room / _ROOM[0])
+        )
         score *= 1.0 - 0.2 * standoff / max(furthest, 1e-9) if standoff else 1.0
         frame = self.item.model.frames[self.item.link_frame(link)]
         placement = frame.placement.inverse() * grasp.placement
         return Proposal(
-            Attachment(name=link, link=link, placement=placement, joint=kind, freedoms=freedom, standoff=standoff),
+            Attachment(
+                name=link,
+                link=link,
+                placement=placement,
+                joint=kind,
+                freedoms=freedom,
+                standoff=standoff,
+            ),
             grasp.kind,
             named,
             grasp.thickness,
@@ -230,11 +285,19 @@ class _Search:
         for proposal in found:
             stem, number = f"{proposal.attachment.link}_{proposal.kind}", 1
             while not taken.isdisjoint(
-                names := {(name := stem if number == 1 else f"{stem}_{number}"), f"{name}_slide", f"{name}_turn"}
+                names := {
+                    (name := stem if number == 1 else f"{stem}_{number}"),
+                    f"{name}_slide",
+                    f"{name}_turn",
+                }
             ):
                 number += 1
             taken |= names
-            out.append(dataclasses.replace(proposal, attachment=dataclasses.replace(proposal.attachment, name=name)))
+            out.append(
+                dataclasses.replace(
+                    proposal, attachment=dataclasses.replace(proposal.attachment, name=name)
+                )
+            )
         return out
 
     def because(self, opening: Opening) -> str:
@@ -247,9 +310,15 @@ class _Search:
             return "its limits leave it no way to go"
         fits = seen.tried - seen.too_thick
         if not fits:
-            thinnest = f", it is {1e3 * seen.thinnest:.0f} mm at its thinnest" if np.isfinite(seen.thinnest) else ""
+            thinnest = (
+                f", it is {1e3 * seen.thinnest:.0f} mm at its thinnest"
+                if np.isfinite(seen.thinnest)
+                else ""
+            )
             clear = 1e3 * self.close
-            between = f"the fingers, {1e3 * hand.opening:.0f} mm apart, with {clear:.0f} mm on both sides"
+            between = (
+                f"the fingers, {1e3 * hand.opening:.0f} mm apart, with {clear:.0f} mm on both sides"
+            )
             return f"nothing of it fits between {between}{thinnest}"
         said = []
         for blocked, count in given_up[:3]:
@@ -261,7 +330,9 @@ class _Search:
             )
             said.append(f"{count} {near}")
         if tally.cramped:
-            said.append(f"{tally.cramped} let it open by less than a tenth before the hand meets the rest")
+            said.append(
+                f"{tally.cramped} let it open by less than a tenth before the hand meets the rest"
+            )
         return f"of {min(fits, _TRIED)} places that are thin enough, " + ", ".join(said)
 
 

@@ -31,8 +31,10 @@ class Opening:
         number: Its number in the object's model.
         coordinate: Its number among the object's coordinates.
         turns: Whether it turns; otherwise it slides.
-        closed, opened: Its values, [rad] or [m]: zero, or the limit next to it, and the limit that is further from there.
-        axis: Unit direction in which it slides, or about which it turns (by the right hand) as it opens, in the base's frame.
+        closed, opened: Its values, [rad] or [m]: zero, or the limit next to it, and the limit that
+            is further from there.
+        axis: Unit direction in which it slides, or about which it turns (by the right hand) as it
+            opens, in the base's frame.
         origin: A point on the axis, in the base's frame [m].
         low, high: A box around all that it moves, in the base's frame [m], shape (3,) each.
         reach: How far that is from the axis at most [m].
@@ -63,14 +65,26 @@ def openings(item: ArticulatedObject, pieces: dict[int, list[Piece]]) -> dict[in
     pin.computeJointJacobians(item.model, data, item.coordinates.q(state))
     for number in range(1, item.model.njoints):
         name = str(item.model.names[number])
-        coordinate, closed = item.coordinates.index(name), float(state[item.coordinates.index(name)])
+        coordinate, closed = (
+            item.coordinates.index(name),
+            float(state[item.coordinates.index(name)]),
+        )
         low, high = float(item.lower[coordinate]), float(item.upper[coordinate])
-        low, high = max(low, closed - _TURN) if np.isinf(low) else low, min(high, closed + _TURN) if np.isinf(high) else high
+        low, high = (
+            max(low, closed - _TURN) if np.isinf(low) else low,
+            min(high, closed + _TURN) if np.isinf(high) else high,
+        )
         opened = high if high - closed >= closed - low else low
-        jacobian = np.reshape(pin.getJointJacobian(item.model, data, number, pin.LOCAL), (6, -1))  # of one joint, it is a vector
+        jacobian = np.reshape(
+            pin.getJointJacobian(item.model, data, number, pin.LOCAL), (6, -1)
+        )  # of one joint, it is a vector
         column = jacobian[:, item.model.joints[number].idx_v]
         turns = bool(np.linalg.norm(column[3:]) > 0.5)
-        axis = data.oMi[number].rotation @ (column[3:] if turns else column[:3]) * np.sign(opened - closed or 1.0)
+        axis = (
+            data.oMi[number].rotation
+            @ (column[3:] if turns else column[:3])
+            * np.sign(opened - closed or 1.0)
+        )
         moved = [
             piece.vertices @ data.oMi[k].rotation.T + data.oMi[k].translation
             for k, mine in pieces.items()
@@ -84,15 +98,18 @@ def openings(item: ArticulatedObject, pieces: dict[int, list[Piece]]) -> dict[in
         reach = float(np.linalg.norm(away, axis=1).max(initial=0.0))
         corners = points if len(points) else origin[None]
         ends = corners.min(axis=0), corners.max(axis=0)
-        found[number] = Opening(name, number, coordinate, turns, closed, opened, axis, origin, ends[0], ends[1], reach)
+        found[number] = Opening(
+            name, number, coordinate, turns, closed, opened, axis, origin, ends[0], ends[1], reach
+        )
     return found
 
 
 def worth(grasp: Candidate, tool: pin.SE3, opening: Opening, *, named: bool) -> float:
     """Return how good a grasp is for opening a joint, from 0 to 1.
 
-    A product: of its kind; its name; its leverage; how near to the middle it pulls, where off it would jam; whether the pull goes
-    against the fingers instead of along the bar, on which they slip; and whether the hand comes from where the part moves to.
+    A product: of its kind; its name; its leverage; how near to the middle it pulls, where off it
+    would jam; whether the pull goes against the fingers instead of along the bar, on which they
+    slip; and whether the hand comes from where the part moves to.
 
     Args:
         grasp: The grasp.
@@ -106,7 +123,10 @@ def worth(grasp: Candidate, tool: pin.SE3, opening: Opening, *, named: bool) -> 
     if opening.turns:
         arm = place - opening.origin
         arm -= (arm @ opening.axis) * opening.axis
-        pull, leverage = np.cross(opening.axis, arm), float(np.linalg.norm(arm)) / max(opening.reach, 1e-3)
+        pull, leverage = (
+            np.cross(opening.axis, arm),
+            float(np.linalg.norm(arm)) / max(opening.reach, 1e-3),
+        )
         pull /= max(float(np.linalg.norm(pull)), 1e-9)
         aside = abs(off @ opening.axis) / (np.abs(opening.axis) @ size / 2.0)
     else:

@@ -14,8 +14,12 @@ from vkc_pin.world.models.shapes import link_name, triangles
 
 __all__ = ["Piece", "Section"]
 
-_ALIKE = 0.03  # widths that differ by less are the same: then the frame's own axes are taken, as round bars have any
-_SLIP = np.radians(20.0)  # between a finger and the face below it: what rubber on smooth paint holds (friction 0.36)
+# widths that differ by less are the same: then the frame's own axes are taken, as round bars have
+# any
+_ALIKE = 0.03
+_SLIP = np.radians(
+    20.0
+)  # between a finger and the face below it: what rubber on smooth paint holds (friction 0.36)
 _SAME = 1e-9  # [m]
 
 
@@ -24,7 +28,8 @@ class Section:
     """A plane cut of a convex piece.
 
     Attributes:
-        centre: The point of the plane that the other coordinates start from, in the frame of the piece's joint, shape (3,) [m].
+        centre: The point of the plane that the other coordinates start from, in the frame of the
+            piece's joint, shape (3,) [m].
         axes: Two directions that span the plane, shape (2, 3).
         polygon: Corners of the cut in order, along the two axes, shape (n, 2) [m].
     """
@@ -45,7 +50,10 @@ class Section:
             if here <= 0.0:
                 kept.append(self.polygon[k])
             if here * there < 0.0:
-                kept.append(self.polygon[k] + here / (here - there) * (self.polygon[(k + 1) % len(along)] - self.polygon[k]))
+                kept.append(
+                    self.polygon[k]
+                    + here / (here - there) * (self.polygon[(k + 1) % len(along)] - self.polygon[k])
+                )
         return Section(self.centre, self.axes, np.array(kept)) if len(kept) > 2 else None
 
     def holds(self, closing: Floats) -> bool:
@@ -53,8 +61,12 @@ class Section:
         edges = np.roll(self.polygon, -1, axis=0) - self.polygon
         lengths = np.linalg.norm(edges, axis=1)
         edges = edges[lengths > 1e-5] / lengths[lengths > 1e-5, None]
-        facing = np.column_stack([edges[:, 1], -edges[:, 0]]) @ closing  # outwards, if the corners go round to the left
-        return bool(len(facing) and facing.max() >= np.cos(_SLIP) and facing.min() <= -np.cos(_SLIP))
+        facing = (
+            np.column_stack([edges[:, 1], -edges[:, 0]]) @ closing
+        )  # outwards, if the corners go round to the left
+        return bool(
+            len(facing) and facing.max() >= np.cos(_SLIP) and facing.min() <= -np.cos(_SLIP)
+        )
 
     def point(self, place: Floats) -> Floats:
         """Return a point of the plane, shape (2,), in the frame of the joint, shape (3,) [m]."""
@@ -102,7 +114,9 @@ class Piece:
     def _narrowest(self, directions: Floats) -> Floats:
         """Return the first of some directions, shape (n, 3), along which it is about as thin as along any."""
         widths = np.ptp(self.vertices @ directions.T, axis=0)
-        return np.asarray(directions[int(np.argmax(widths <= (1.0 + _ALIKE) * widths.min() + _SAME))])
+        return np.asarray(
+            directions[int(np.argmax(widths <= (1.0 + _ALIKE) * widths.min() + _SAME))]
+        )
 
     @cached_property
     def extents(self) -> Floats:
@@ -112,7 +126,9 @@ class Piece:
 
     @cached_property
     def _edges(self) -> NDArray[np.int64]:
-        pairs = np.sort(np.vstack([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]), axis=1)
+        pairs = np.sort(
+            np.vstack([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]), axis=1
+        )
         return np.unique(pairs, axis=0)
 
     def section(self, axis: int, at: float) -> Section | None:

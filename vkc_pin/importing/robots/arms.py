@@ -20,7 +20,9 @@ _FINGER = 7  # joints in the longest finger of a hand
 _ARM = 3  # joints, at least, that carry a hand; one more without a hand
 _PARALLEL = 1.0 - 1e-6  # cosine between axes along which the segments of a telescope slide
 _HAND_WORDS = re.compile(r"finger|thumb|gripper|jaw|knuckle|claw|fngr|grip", re.IGNORECASE)
-_ARM_WORDS = re.compile(r"arm|shoulder|elbow|wrist|hand|gripper|ur\d|panda|lift|flange", re.IGNORECASE)
+_ARM_WORDS = re.compile(
+    r"arm|shoulder|elbow|wrist|hand|gripper|ur\d|panda|lift|flange", re.IGNORECASE
+)
 _TRUNK_WORDS = re.compile(r"shoulder|elbow|arm(?!ature)|neck|head|hip", re.IGNORECASE)
 _WRIST_WORDS = re.compile(r"wrist|yaw|roll|pitch", re.IGNORECASE)
 _OTHER_WORDS = re.compile(
@@ -58,7 +60,11 @@ class Body:
     @property
     def plans(self) -> bool:
         """Whether the joint above can be planned: it moves by one coordinate, of its own."""
-        return self.joint is not None and self.joint.get("type") in _MOVING and self.joint.find("mimic") is None
+        return (
+            self.joint is not None
+            and self.joint.get("type") in _MOVING
+            and self.joint.find("mimic") is None
+        )
 
     def path(self) -> list[Body]:
         """Return the bodies from below the root to this one."""
@@ -78,7 +84,8 @@ class Arm:
     """An arm.
 
     Attributes:
-        name: "left", "right", the group's name in an SRDF, or that of the body that carries the hand.
+        name: "left", "right", the group's name in an SRDF, or that of the body that carries the
+            hand.
         joints: The joints that are planned, from the root on; not those of an own planar base.
         palm: The body at its end, which fingers hang on.
         fingers: The first body of each finger.
@@ -139,7 +146,11 @@ def own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
 
 def base_kind(root: ElementTree.Element) -> tuple[str, str]:
     """Return how a base moves, by its wheels, and what speaks for it."""
-    turning = [joint.get("name", "").lower() for joint in root.findall("joint") if joint.get("type") == "continuous"]
+    turning = [
+        joint.get("name", "").lower()
+        for joint in root.findall("joint")
+        if joint.get("type") == "continuous"
+    ]
     wheels = [name for name in turning if "wheel" in name]
     names = " ".join(link.get("name", "").lower() for link in root.findall("link"))
     casters = "caster" in names
@@ -149,15 +160,20 @@ def base_kind(root: ElementTree.Element) -> tuple[str, str]:
         return "omni", "wheels on casters that turn"
     if wheels:
         return "differential", f"{len(wheels)} wheels"
-    return "omni", "no wheels: a base that can go anywhere is put under it; `fixed` for an arm on a table"
+    return (
+        "omni",
+        "no wheels: a base that can go anywhere is put under it; `fixed` for an arm on a table",
+    )
 
 
-def find_arms(file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], solid: Set[str]) -> list[Arm]:
+def find_arms(
+    file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], solid: Set[str]
+) -> list[Arm]:
     """Return the arms of a robot, the best first.
 
-    A hand is a body below at least three joints from which fingers branch: at least two of at most seven joints each, or
-    one whose name says that it is a jaw. Chains without a hand are arms if they have four joints and their names are not those of
-    legs, heads and wheels.
+    A hand is a body below at least three joints from which fingers branch: at least two of at most
+    seven joints each, or one whose name says that it is a jaw. Chains without a hand are arms if
+    they have four joints and their names are not those of legs, heads and wheels.
 
     Args:
         file: The robot.
@@ -177,7 +193,11 @@ def find_arms(file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], s
     carrying = {id(above) for palm in palms for above in palm.path()}
     tips = [body for body in everything if not body.children and id(body) not in inside | carrying]
     for body in palms + tips:
-        fingers = tuple(child for child in body.children if any(solid & set(below.links) for below in child.below()))
+        fingers = tuple(
+            child
+            for child in body.children
+            if any(solid & set(below.links) for below in child.below())
+        )
         joints = _planned(body, base)
         own = [*joints[-5:], *body.links[:2]]
         other = sum(bool(_OTHER_WORDS.search(name)) for name in own)
@@ -185,7 +205,13 @@ def find_arms(file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], s
         if not joints or other > words or (body in tips and (len(joints) <= _ARM or other)):
             continue
         score = 3.0 * bool(fingers) + 2.0 * bool(words) + min(len(joints), 7) / 7.0
-        sure = "sure" if fingers and words and len(joints) > _ARM else "likely" if fingers or words else "guess"
+        sure = (
+            "sure"
+            if fingers and words and len(joints) > _ARM
+            else "likely"
+            if fingers or words
+            else "guess"
+        )
         why = f"{len(joints)} joints, " + (f"{len(fingers)} fingers" if fingers else "no fingers")
         why += ", named like an arm" if words else ""
         found.append(Arm(_named(joints, body, groups), joints, body, fingers, sure, why, score))
@@ -193,10 +219,14 @@ def find_arms(file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], s
         found = [arm for arm in found if arm.sure != "guess"]
     found.sort(key=lambda arm: -arm.score)
     names = [arm.name for arm in found]
-    return [arm if names.count(arm.name) == 1 else Arm(arm.palm.links[0], *_rest(arm)) for arm in found]
+    return [
+        arm if names.count(arm.name) == 1 else Arm(arm.palm.links[0], *_rest(arm)) for arm in found
+    ]
 
 
-def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mapping[str, Sequence[str]]) -> Arm:
+def choose(
+    arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mapping[str, Sequence[str]]
+) -> Arm:
     """Return the arm of a name, or that a group of this name has the last joints of, or whose name contains it, or the best one.
 
     Raises:
@@ -204,7 +234,9 @@ def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mappin
         UnknownNameError: There is none of that name.
     """
     if not arms:
-        expected = "at least four joints one after the other, or a hand on three; or tool_frame, its name"
+        expected = (
+            "at least four joints one after the other, or a hand on three; or tool_frame, its name"
+        )
         raise InputError("no arm was found", file=file.path, expected=expected)
     if name is None:
         return arms[0]
@@ -212,8 +244,18 @@ def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mappin
     fitting = fitting or [arm for arm in arms if _last(arm.joints) <= set(groups.get(name, ()))]
     fitting = fitting or [arm for arm in arms if name.lower() in arm.name.lower()]
     if not fitting:
-        also = [group for group, joints in groups.items() if any(_last(arm.joints) <= set(joints) for arm in arms)]
-        raise UnknownNameError("arm", name, dict.fromkeys([*(arm.name for arm in arms), *also]), file=file.path, field="arm")
+        also = [
+            group
+            for group, joints in groups.items()
+            if any(_last(arm.joints) <= set(joints) for arm in arms)
+        ]
+        raise UnknownNameError(
+            "arm",
+            name,
+            dict.fromkeys([*(arm.name for arm in arms), *also]),
+            file=file.path,
+            field="arm",
+        )
     return fitting[0]
 
 
@@ -231,12 +273,17 @@ def telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, ...]]:
     before, along = 0, np.zeros(3)
     for name in joints:
         number = full.getJointId(name)
-        axis = data.oMi[number].rotation @ np.asarray(data.joints[number].S, float).ravel()[:3]  # 0 of one that turns
+        axis = (
+            data.oMi[number].rotation @ np.asarray(data.joints[number].S, float).ravel()[:3]
+        )  # 0 of one that turns
         bounds = (full.lowerPositionLimit, full.upperPositionLimit)
         if (
             full.parents[number] == before
             and axis @ along > _PARALLEL
-            and all(np.isclose(bound[full.joints[number].idx_q], bound[full.joints[before].idx_q]) for bound in bounds)
+            and all(
+                np.isclose(bound[full.joints[number].idx_q], bound[full.joints[before].idx_q])
+                for bound in bounds
+            )
         ):
             found[-1].append(name)
         else:
@@ -256,13 +303,21 @@ def _rest(arm: Arm) -> tuple[tuple[str, ...], Body, tuple[Body, ...], str, str, 
 
 def _is_palm(body: Body) -> bool:
     """Return whether fingers hang on a body: two or more, or one jaw that is called so."""
-    if not body.children or body.depth() > _FINGER or not any(below.plans for below in body.below()[1:]):
+    if (
+        not body.children
+        or body.depth() > _FINGER
+        or not any(below.plans for below in body.below()[1:])
+    ):
         return False
     if any(_TRUNK_WORDS.search(f"{child.name} {child.links[0]}") for child in body.children):
         return False
     if len(body.children) == 1:
         jaw = body.children[0]
-        return bool(_HAND_WORDS.search(jaw.name)) and not _WRIST_WORDS.search(jaw.name) and not jaw.children
+        return (
+            bool(_HAND_WORDS.search(jaw.name))
+            and not _WRIST_WORDS.search(jaw.name)
+            and not jaw.children
+        )
     named = [bool(_HAND_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
     other = [bool(_OTHER_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
     return any(named) or not any(other)

@@ -60,7 +60,11 @@ class Diagnosis:
 
     def __post_init__(self) -> None:
         order = ("fault", "warning", "note")
-        object.__setattr__(self, "findings", tuple(sorted(self.findings, key=lambda finding: order.index(finding.level))))
+        object.__setattr__(
+            self,
+            "findings",
+            tuple(sorted(self.findings, key=lambda finding: order.index(finding.level))),
+        )
 
     @property
     def healthy(self) -> bool:
@@ -68,7 +72,10 @@ class Diagnosis:
         return all(finding.level != "fault" for finding in self.findings)
 
     def __str__(self) -> str:
-        counts = {level: sum(finding.level == level for finding in self.findings) for level in ("fault", "warning")}
+        counts = {
+            level: sum(finding.level == level for finding in self.findings)
+            for level in ("fault", "warning")
+        }
         said = ", ".join(f"{count} {level}{'s' * (count != 1)}" for level, count in counts.items())
         lines = [f"{self.name}: {said}"]
         for finding in self.findings:
@@ -78,12 +85,18 @@ class Diagnosis:
         return "\n".join(lines)
 
 
-def doctor(robot: str | Path | Robot, *, margin: float | None = None, samples: int = _SAMPLES, seed: int = 0) -> Diagnosis:
+def doctor(
+    robot: str | Path | Robot,
+    *,
+    margin: float | None = None,
+    samples: int = _SAMPLES,
+    seed: int = 0,
+) -> Diagnosis:
     """Examine a robot.
 
-    Looked at are home (collisions, pairs closer than the margin, the floor), pairs of links that random configurations never
-    bring apart by the margin, limits, efforts and masses that the files do not name, the hand, and meshes that are far
-    from convex.
+    Looked at are home (collisions, pairs closer than the margin, the floor), pairs of links that
+    random configurations never bring apart by the margin, limits, efforts and masses that the files
+    do not name, the hand, and meshes that are far from convex.
 
     Args:
         robot: A robot, or what `load_robot` takes.
@@ -95,12 +108,24 @@ def doctor(robot: str | Path | Robot, *, margin: float | None = None, samples: i
         InputError: The robot cannot be loaded, or an argument is wrong.
     """
     whole(samples, "samples", low=1)
-    kept = Options().dist_safe if margin is None else number(margin, "margin", "a clearance [m]", low=0.0, above=True)
+    kept = (
+        Options().dist_safe
+        if margin is None
+        else number(margin, "margin", "a clearance [m]", low=0.0, above=True)
+    )
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         examined = robot if isinstance(robot, Robot) else load_robot(robot)
-    findings = [*_home(examined, kept), *_pairs(examined, kept, samples, seed), *_numbers(examined), *_hand(examined)]
-    findings += [*_shapes(examined), *(Finding("warning", "loading", str(one.message)) for one in told)]
+    findings = [
+        *_home(examined, kept),
+        *_pairs(examined, kept, samples, seed),
+        *_numbers(examined),
+        *_hand(examined),
+    ]
+    findings += [
+        *_shapes(examined),
+        *(Finding("warning", "loading", str(one.message)) for one in told),
+    ]
     return Diagnosis(examined.name, tuple(findings))
 
 
@@ -116,9 +141,18 @@ def _home(robot: Robot, margin: float) -> list[Finding]:
     low = [(link, height) for link, height in look.floor() if height < margin]
     if low:
         text = ", ".join(f"{link} ({1e3 * height:.0f} mm)" for link, height in low[:_LISTED])
-        found.append(Finding("fault", "home", f"at home below the floor, or less than the margin above it: {text}", hint))
+        found.append(
+            Finding(
+                "fault",
+                "home",
+                f"at home below the floor, or less than the margin above it: {text}",
+                hint,
+            )
+        )
     if not found:
-        text = f"free: {1e3 * look.least():.0f} mm between links that are kept apart, and to the floor"
+        text = (
+            f"free: {1e3 * look.least():.0f} mm between links that are kept apart, and to the floor"
+        )
         found.append(Finding("note", "home", text))
     return found
 
@@ -126,10 +160,18 @@ def _home(robot: Robot, margin: float) -> list[Finding]:
 def _pairs(robot: Robot, margin: float, samples: int, seed: int) -> list[Finding]:
     hint = "if they are neighbours by design, allow them in the SRDF: `vkc-pin srdf`, `<disable_collisions>`"
     found = [
-        Finding("fault", "pairs", f"{one} and {other} were never more than {1e3 * furthest:.1f} mm apart", hint)
+        Finding(
+            "fault",
+            "pairs",
+            f"{one} and {other} were never more than {1e3 * furthest:.1f} mm apart",
+            hint,
+        )
         for (one, other), furthest in never_apart(robot, margin, samples=samples, seed=seed).items()
     ]
-    pairs = [(robot.link_of(pair.first), robot.link_of(pair.second)) for pair in robot.collision.collisionPairs]
+    pairs = [
+        (robot.link_of(pair.first), robot.link_of(pair.second))
+        for pair in robot.collision.collisionPairs
+    ]
     count = f"{len(set(pairs))} pairs of links are kept apart ({len(pairs)} of convex pieces)"
     return [*found, Finding("note", "pairs", count)]
 
@@ -153,15 +195,34 @@ def _numbers(robot: Robot) -> list[Finding]:
     if speed:
         used = ", ".join(f"{robot.velocity[planned[name]]:.3g}" for name in speed)
         hint = "`joints: {NAME: {velocity: ...}}` in robot.yaml, from the data sheet"
-        found.append(Finding("warning", "limits", f"no speed in the file: {_list(speed)} (taken: {used})", hint))
+        found.append(
+            Finding(
+                "warning", "limits", f"no speed in the file: {_list(speed)} (taken: {used})", hint
+            )
+        )
     if turning:
         found.append(Finding("note", "limits", f"turn without end: {_list(turning)}"))
     if effort:
         hint = "`joints: {NAME: {effort: ...}}` in robot.yaml"
-        found.append(Finding("note", "effort", f"no effort: {_list(effort)} (their torques are not limited)", hint))
-    found += [Finding("note", "effort", note) for note in robot.efforts.notes if "no effort" not in note]
+        found.append(
+            Finding(
+                "note",
+                "effort",
+                f"no effort: {_list(effort)} (their torques are not limited)",
+                hint,
+            )
+        )
+    found += [
+        Finding("note", "effort", note) for note in robot.efforts.notes if "no effort" not in note
+    ]
     if light:
-        found.append(Finding("note", "mass", f"links with a shape but no mass: {_list(light)} (they weigh nothing)"))
+        found.append(
+            Finding(
+                "note",
+                "mass",
+                f"links with a shape but no mass: {_list(light)} (they weigh nothing)",
+            )
+        )
     return found
 
 
@@ -180,7 +241,9 @@ def _hand(robot: Robot) -> list[Finding]:
     except InputError as error:
         if robot.touch_links:
             hint = f"attachments are proposed for {error.expected}, see docs/robots.md"
-            found.append(Finding("warning", "hand", f"{error.problem}: it takes hold of nothing", hint))
+            found.append(
+                Finding("warning", "hand", f"{error.problem}: it takes hold of nothing", hint)
+            )
     for link, share in envelopes(robot).items():
         text = f"{link} is a shape around the hand, {share:.0%} of which is in it: the fingers get at nothing"
         hint = "remove its <collision> from the URDF, as `vkc-pin import-robot` does"
@@ -197,9 +260,22 @@ def _hand(robot: Robot) -> list[Finding]:
             behind.append(float(frame.placement.actInv(centre)[2]))
     if behind and min(behind) > 0.0:
         hint = "z of the tool frame is the direction of approach, x the one in which the fingers close, see docs/robots.md"
-        found.append(Finding("fault", "hand", f"the hand lies in front of its tool frame {robot.tool_frame}", hint))
+        found.append(
+            Finding(
+                "fault",
+                "hand",
+                f"the hand lies in front of its tool frame {robot.tool_frame}",
+                hint,
+            )
+        )
     elif not behind:
-        found.append(Finding("warning", "hand", f"none of the touch_links moves with the tool frame {robot.tool_frame}"))
+        found.append(
+            Finding(
+                "warning",
+                "hand",
+                f"none of the touch_links moves with the tool frame {robot.tool_frame}",
+            )
+        )
     return found
 
 
@@ -214,9 +290,14 @@ def _shapes(robot: Robot) -> list[Finding]:
         if stands_out > _CONCAVE:
             deep.append((stands_out, link, file.name))
     if deep:
-        text = ", ".join(f"{link} ({1e3 * out:.0f} mm, {name})" for out, link, name in sorted(deep, reverse=True)[:_LISTED])
+        text = ", ".join(
+            f"{link} ({1e3 * out:.0f} mm, {name})"
+            for out, link, name in sorted(deep, reverse=True)[:_LISTED]
+        )
         hint = "`vkc-pin import-robot` cuts them into convex pieces"
-        found.append(Finding("warning", "shapes", f"hulls stand out far over their meshes: {text}", hint))
+        found.append(
+            Finding("warning", "shapes", f"hulls stand out far over their meshes: {text}", hint)
+        )
     return found
 
 

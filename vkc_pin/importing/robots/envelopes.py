@@ -21,11 +21,13 @@ _SLACK = 1e-3  # [m] by which a corner may lie beyond it
 def envelopes(robot: Robot) -> dict[str, float]:
     """Return the links that are nothing but a shape around the hand → how much of the hand is in it, from 0 to 1.
 
-    Such are links fixed to the tool frame that are not seen, while others there are, and in whose shapes most of the others is:
-    safety boxes, made for programs that do not know where the fingers are.
+    Such are links fixed to the tool frame that are not seen, while others there are, and in whose
+    shapes most of the others is: safety boxes, made for programs that do not know where the fingers
+    are.
 
     Args:
-        robot: The robot; its hand is its `touch_links`, or else all links that are fixed to its tool frame.
+        robot: The robot; its hand is its `touch_links`, or else all links that are fixed to its
+            tool frame.
     """
     joint = robot.model.frames[robot.model.getFrameId(robot.tool_frame)].parentJoint
     seen = {shape.link for shape in robot.file.shapes("visual")}
@@ -33,7 +35,9 @@ def envelopes(robot: Robot) -> dict[str, float]:
     for k, shape in enumerate(robot.collision.geometryObjects):
         if shape.parentJoint == joint:
             points, faces = triangles(shape.geometry)
-            placed = np.asarray(points @ shape.placement.rotation.T + shape.placement.translation, float)
+            placed = np.asarray(
+                points @ shape.placement.rotation.T + shape.placement.translation, float
+            )
             surfaces.setdefault(robot.link_of(k), []).append((placed, placed[faces]))
     corners = {link: np.vstack([points for points, _ in parts]) for link, parts in surfaces.items()}
     hand = [link for link in corners if link in (robot.touch_links or corners)]
@@ -59,6 +63,8 @@ def _inside(faces: Floats, points: Floats) -> Floats:
     normals = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     normals, base = normals[lengths > 0.0] / lengths[lengths > 0.0, None], faces[lengths > 0.0, 0]
-    normals *= np.sign(np.einsum("ij,ij->i", normals, base - faces.reshape(-1, 3).mean(axis=0)))[:, None]
+    normals *= np.sign(np.einsum("ij,ij->i", normals, base - faces.reshape(-1, 3).mean(axis=0)))[
+        :, None
+    ]
     beyond = (points @ normals.T - np.einsum("ij,ij->i", normals, base)).max(axis=1)
     return (beyond <= _SLACK).astype(float)

@@ -22,7 +22,9 @@ _POINTS = 120  # of a finger
 _TIP = 0.025  # [m] of a finger, from its end, that is its tip
 _PAD = 0.02  # [m] behind the fingertips is where things are held,
 _SHARE = 0.3  # but no more than this share of a finger's length
-_SNAP = np.cos(np.radians(12.0))  # directions closer than this to an axis of the hand are meant to be that axis
+_SNAP = np.cos(
+    np.radians(12.0)
+)  # directions closer than this to an axis of the hand are meant to be that axis
 _STUB = 0.3  # of the longest finger: what is shorter is a part of a drive, not a finger
 _GRIPPER = 3  # fingers at most of a gripper, all of which close together
 _LITTLE = 1e-6  # [m] or [rad]: less is no way between open and closed
@@ -35,9 +37,11 @@ class Hand:
 
     Attributes:
         link: The link of the palm that `tool` is placed on.
-        tool: z is the direction of approach, x the one in which the fingers close, the origin between the fingertips.
+        tool: z is the direction of approach, x the one in which the fingers close, the origin
+            between the fingertips.
         open: Finger joint → where it is open, [m] or [rad].
-        closed: Of these joints, those that close the hand → where it is closed; none if it is not clear how it closes.
+        closed: Of these joints, those that close the hand → where it is closed; none if it is not
+            clear how it closes.
         opening: Between the fingertips there, [m]; 0 without fingers.
         touch_links: Palm and fingers.
         sure: "sure", "likely" or "guess".
@@ -56,8 +60,13 @@ class Hand:
     def settings(self) -> dict[str, Any]:
         """Return what a robot.yaml says of the fingers: how they open, and where those are locked that do not."""
         opened = {joint: round(value, 6) for joint, value in self.open.items()}
-        gripper = {joint: {"closed": round(value, 6), "open": opened.pop(joint)} for joint, value in self.closed.items()}
-        return {key: said for key, said in (("locked_joints", opened), ("gripper", gripper)) if said}
+        gripper = {
+            joint: {"closed": round(value, 6), "open": opened.pop(joint)}
+            for joint, value in self.closed.items()
+        }
+        return {
+            key: said for key, said in (("locked_joints", opened), ("gripper", gripper)) if said
+        }
 
 
 def look_at(file: UrdfFile, full: pin.Model, arm: Arm) -> Hand:
@@ -81,8 +90,12 @@ class _Looker:
     def hand(self) -> Hand:
         """Return what was found."""
         reach = {finger: self._reach(finger) for finger in self._arm.fingers}
-        fingers = [finger for finger in self._arm.fingers if reach[finger] > _STUB * max(reach.values())]
-        touch = tuple(link for body in self._arm.palm.below() for link in body.links if link in self._points)
+        fingers = [
+            finger for finger in self._arm.fingers if reach[finger] > _STUB * max(reach.values())
+        ]
+        touch = tuple(
+            link for body in self._arm.palm.below() for link in body.links if link in self._points
+        )
         if not fingers or (len(fingers) == 1 and not len(self._of(self._arm.palm, {}, alone=True))):
             return self._flange(touch)
         first, second = self._sides(fingers)
@@ -102,12 +115,24 @@ class _Looker:
         place = inner * closing + across * side + depth * approach
         tool = pin.SE3(np.column_stack([closing, side, approach]), place)
         moves = gap - closed
-        sure = "sure" if len(fingers) == 2 and moves > 0.01 else "likely" if moves > 0.01 else "guess"
-        how = "two fingers" if len(fingers) == 2 else "one jaw and the hand" if len(fingers) == 1 else f"{len(fingers)} fingers"
+        sure = (
+            "sure" if len(fingers) == 2 and moves > 0.01 else "likely" if moves > 0.01 else "guess"
+        )
+        how = (
+            "two fingers"
+            if len(fingers) == 2
+            else "one jaw and the hand"
+            if len(fingers) == 1
+            else f"{len(fingers)} fingers"
+        )
         why = f"between {how}, which open from {1e3 * closed:.0f} to {1e3 * gap:.0f} mm"
-        closing_ones = {joint: value for joint, value in shut.items() if abs(value - opened[joint]) > _LITTLE}
+        closing_ones = {
+            joint: value for joint, value in shut.items() if abs(value - opened[joint]) > _LITTLE
+        }
         known = moves > 0.01 and len(fingers) <= _GRIPPER
-        return Hand(self._link, tool, opened, closing_ones if known else {}, float(gap), touch, sure, why)
+        return Hand(
+            self._link, tool, opened, closing_ones if known else {}, float(gap), touch, sure, why
+        )
 
     def _place(self, positions: Mapping[str, float]) -> pin.SE3:
         rest = rest_positions(self._full, self._file, positions)
@@ -121,7 +146,9 @@ class _Looker:
         for part in [body] if alone else body.below():
             for link in part.links:
                 if link in self._points:
-                    place = palm.actInv(self._data.oMf[self._full.getFrameId(link, pin.FrameType.BODY)])
+                    place = palm.actInv(
+                        self._data.oMf[self._full.getFrameId(link, pin.FrameType.BODY)]
+                    )
                     found.append(self._points[link] @ place.rotation.T + place.translation)
         return np.vstack(found)
 
@@ -129,7 +156,11 @@ class _Looker:
         """Return two groups of fingers that close against each other; the second is empty if the palm is the other side."""
         if len(fingers) == 1:
             return list(fingers), []
-        thumbs = [finger for finger in fingers if any("thumb" in link.lower() for body in finger.below() for link in body.links)]
+        thumbs = [
+            finger
+            for finger in fingers
+            if any("thumb" in link.lower() for body in finger.below() for link in body.links)
+        ]
         if thumbs and len(thumbs) < len(fingers):
             return thumbs, [finger for finger in fingers if finger not in thumbs]
         centres = np.array([self._of(finger, {}).mean(axis=0) for finger in fingers[:8]])
@@ -137,7 +168,10 @@ class _Looker:
         for size in range(1, len(centres) // 2 + 1):
             for group in itertools.combinations(range(len(centres)), size):
                 others = [k for k in range(len(centres)) if k not in group]
-                spread = sum(((centres[part] - centres[part].mean(axis=0)) ** 2).sum() for part in (list(group), others))
+                spread = sum(
+                    ((centres[part] - centres[part].mean(axis=0)) ** 2).sum()
+                    for part in (list(group), others)
+                )
                 if spread < best:
                     best, chosen = float(spread), group
         first = [finger for k, finger in enumerate(fingers) if k in chosen]
@@ -146,12 +180,16 @@ class _Looker:
     def _reach(self, finger: Body) -> float:
         """Return how far a finger reaches from its joint [m]; 0 without a shape."""
         points = self._of(finger, {})
-        return float(np.linalg.norm(points - self._base(finger), axis=1).max()) if len(points) else 0.0
+        return (
+            float(np.linalg.norm(points - self._base(finger), axis=1).max()) if len(points) else 0.0
+        )
 
     def _base(self, finger: Body) -> Floats:
         """Return where the first joint of a finger is, in the palm's frame, shape (3,); joints are where they were put last."""
         palm = self._data.oMf[self._palm]
-        return np.asarray(palm.actInv(self._data.oMi[self._full.getJointId(finger.name)]).translation)
+        return np.asarray(
+            palm.actInv(self._data.oMi[self._full.getJointId(finger.name)]).translation
+        )
 
     def _end(self, finger: Body, positions: Mapping[str, float]) -> Floats:
         """Return the points of a finger's last body that are furthest from its first joint, in the palm's frame."""
@@ -159,7 +197,9 @@ class _Looker:
         far = np.linalg.norm(points - self._base(finger), axis=1)
         return points[far >= far.max() - max(_TIP, _SHARE * (far.max() - far.min()))]
 
-    def _gap(self, first: Sequence[Body], second: Sequence[Body], positions: Mapping[str, float]) -> float:
+    def _gap(
+        self, first: Sequence[Body], second: Sequence[Body], positions: Mapping[str, float]
+    ) -> float:
         """Return the distance between the ends of the fingers of two groups [m]."""
         from scipy.spatial import cKDTree
 
@@ -186,14 +226,20 @@ class _Looker:
                     smallest = min(smallest, gap)
                     if gap > best + 1e-4:
                         best, chosen[joint] = gap, value
-        shut = {joint: max(values, key=lambda value: abs(value - chosen[joint])) for joint, values in choices.items()}
+        shut = {
+            joint: max(values, key=lambda value: abs(value - chosen[joint]))
+            for joint, values in choices.items()
+        }
         return chosen, shut, best, min(smallest, self._gap(first, second, shut))
 
     def _choices(self, joint: str, rest: float) -> list[float]:
         moving = self._full.joints[self._full.getJointId(joint)]
         if moving.nq == 2:
             return [rest]
-        low, high = self._full.lowerPositionLimit[moving.idx_q], self._full.upperPositionLimit[moving.idx_q]
+        low, high = (
+            self._full.lowerPositionLimit[moving.idx_q],
+            self._full.upperPositionLimit[moving.idx_q],
+        )
         if not (np.isfinite([low, high]).all() and high - low < 2.0 * np.pi):
             return [rest]
         return [rest, float(low), float(0.5 * (low + high)), float(high)]
@@ -202,12 +248,20 @@ class _Looker:
         """Return the direction from the last joint of the arm to the fingertips, in the palm's frame, shape (3,)."""
         tips = np.array([self._end(finger, {}).mean(axis=0) for finger in fingers])
         base = np.mean([self._base(finger) for finger in fingers], axis=0)
-        wrist = self._data.oMf[self._palm].actInv(self._data.oMi[self._full.getJointId(self._arm.joints[-1])]).translation
+        wrist = (
+            self._data.oMf[self._palm]
+            .actInv(self._data.oMi[self._full.getJointId(self._arm.joints[-1])])
+            .translation
+        )
         towards = tips.mean(axis=0) - (base if np.linalg.norm(base - wrist) < 0.01 else wrist)
         return _snapped(_unit(towards))
 
     def _tips(
-        self, first: Sequence[Body], second: Sequence[Body], positions: Mapping[str, float], approach: Floats
+        self,
+        first: Sequence[Body],
+        second: Sequence[Body],
+        positions: Mapping[str, float],
+        approach: Floats,
     ) -> tuple[Floats, Floats]:
         """Return the points of the tips of both sides, in the palm's frame."""
         a = np.vstack([self._of(finger, positions) for finger in first])
@@ -229,16 +283,27 @@ class _Looker:
         ends = np.array([palm.actInv(self._data.oMf[frame]).translation for frame in frames])
         end = ends[np.linalg.norm(ends - wrist.translation, axis=1).argmax()]
         axis = element.find("axis") if element is not None else None
-        along = np.array([float(v) for v in (axis.get("xyz", "1 0 0") if axis is not None else "1 0 0").split()])
+        along = np.array(
+            [float(v) for v in (axis.get("xyz", "1 0 0") if axis is not None else "1 0 0").split()]
+        )
         turn = _unit(wrist.rotation @ along)
         reach = (points.mean(axis=0) if len(points) else end) - wrist.translation
-        towards = end - wrist.translation if np.linalg.norm(end - wrist.translation) > 0.01 else reach
+        towards = (
+            end - wrist.translation if np.linalg.norm(end - wrist.translation) > 0.01 else reach
+        )
         before = palm.actInv(self._data.oMi[self._full.parents[joint]]).translation
-        if np.linalg.norm(end - wrist.translation) < 0.01 and abs((wrist.translation - before) @ turn) > 0.01:
-            towards = wrist.translation - before  # the frame of the last link is at its joint, and its shape may lie behind
+        if (
+            np.linalg.norm(end - wrist.translation) < 0.01
+            and abs((wrist.translation - before) @ turn) > 0.01
+        ):
+            towards = (
+                wrist.translation - before
+            )  # the frame of the last link is at its joint, and its shape may lie behind
         lined = abs(turn @ _unit(towards)) > 0.7
         approach = _snapped(turn * np.sign(turn @ towards) if lined else _unit(towards))
-        depth = max(float((points @ approach).max()) if len(points) else -np.inf, float(end @ approach))
+        depth = max(
+            float((points @ approach).max()) if len(points) else -np.inf, float(end @ approach)
+        )
         place = wrist.translation + (depth - wrist.translation @ approach) * approach
         closing = _unit(np.cross(np.eye(3)[np.abs(approach).argmin()], approach))
         tool = pin.SE3(np.column_stack([closing, np.cross(approach, closing), approach]), place)
@@ -257,7 +322,10 @@ def _points_of(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
                     mesh = shape.mesh()
                 except InputError:
                     continue
-                corners, sampled = np.asarray(mesh.vertices), np.asarray(mesh.sample(_POINTS, seed=0))
+                corners, sampled = (
+                    np.asarray(mesh.vertices),
+                    np.asarray(mesh.sample(_POINTS, seed=0)),
+                )
                 step = max(1, len(corners) // _POINTS)
                 new.setdefault(shape.link, []).append(np.vstack([corners[::step], sampled]))
         found.update({link: np.vstack(points) for link, points in new.items()})

@@ -45,13 +45,16 @@ class Piece:
     error: float
 
 
-def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[ElementTree.Element, list[Piece], list[str]]:
+def own_meshes(
+    file: UrdfFile, folder: Path, *, most_pieces: int
+) -> tuple[ElementTree.Element, list[Piece], list[str]]:
     """Return a URDF whose meshes are in `folder`, what became of those that collide, and notes of what was left out.
 
-    Meshes that collide are written as convex pieces, `collision/<link>_<k>.stl`; those that are seen are copied into `visual`.
-    `choose_file_names` chooses the names.
+    Meshes that collide are written as convex pieces, `collision/<link>_<k>.stl`; those that are
+    seen are copied into `visual`. `choose_file_names` chooses the names.
 
-    Links without anything to collide get what is seen of them; flat meshes, and visual ones that cannot be read, are left out.
+    Links without anything to collide get what is seen of them; flat meshes, and visual ones that
+    cannot be read, are left out.
 
     Args:
         file: The URDF.
@@ -68,7 +71,9 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
     shapes: dict[str, list[UrdfShape]] = {}
     for shape in file.shapes("collision"):
         shapes.setdefault(shape.link, []).append(shape)
-    done: dict[tuple[Path, tuple[float, ...]], tuple[Pieces, float]] = {}  # with the volume of the hull
+    done: dict[
+        tuple[Path, tuple[float, ...]], tuple[Pieces, float]
+    ] = {}  # with the volume of the hull
     for name, link in links.items():
         elements = link.findall("collision")
         written = 0
@@ -87,11 +92,20 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
             except InputError as error_:
                 if "flat" not in error_.problem:
                     raise
-                notes.append(f"{name}: {shape.file.name} is flat, and collides with nothing any more")
+                notes.append(
+                    f"{name}: {shape.file.name} is flat, and collides with nothing any more"
+                )
                 continue
             pieces, hull = done[key]
             found.append(
-                Piece(name, shape.file.name, len(pieces.meshes), pieces.overhead, hull / pieces.solid - 1.0, pieces.error)
+                Piece(
+                    name,
+                    shape.file.name,
+                    len(pieces.meshes),
+                    pieces.overhead,
+                    hull / pieces.solid - 1.0,
+                    pieces.error,
+                )
             )
             for mesh in pieces.meshes:
                 path = folder / "collision" / f"{stems[name]}_{written}.stl"
@@ -107,7 +121,9 @@ def own_meshes(file: UrdfFile, folder: Path, *, most_pieces: int) -> tuple[Eleme
     return root, found, notes
 
 
-def _copy_visual(file: UrdfFile, links: dict[str, ElementTree.Element], folder: Path, notes: list[str]) -> None:
+def _copy_visual(
+    file: UrdfFile, links: dict[str, ElementTree.Element], folder: Path, notes: list[str]
+) -> None:
     shown: dict[Path, list[ElementTree.Element]] = {}
     missing = []
     for name, link in links.items():
@@ -127,7 +143,9 @@ def _copy_visual(file: UrdfFile, links: dict[str, ElementTree.Element], folder: 
         for mesh in shown[path]:
             mesh.set("filename", f"visual/{copy_name}")
     if missing:
-        notes.append(f"what is seen of {', '.join(dict.fromkeys(missing))} is left out: its mesh cannot be read")
+        notes.append(
+            f"what is seen of {', '.join(dict.fromkeys(missing))} is left out: its mesh cannot be read"
+        )
 
 
 def _copy_meshes(paths: Sequence[Path], folder: Path) -> dict[Path, str]:

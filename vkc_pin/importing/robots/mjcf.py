@@ -1,6 +1,7 @@
 """Writes what MuJoCo makes of an MJCF file as a URDF.
 
-MuJoCo's compiler resolves includes, defaults, classes and units; what it makes is read here, not the file.
+MuJoCo's compiler resolves includes, defaults, classes and units; what it makes is read here, not
+the file.
 """
 
 from __future__ import annotations
@@ -42,17 +43,21 @@ class Converted:
 def convert(file: Path, folder: Path) -> Converted:
     """Return the largest tree of joints in an MJCF file as a URDF, with its meshes as STL files in `folder`.
 
-    Bodies become links, several joints of a body a chain of links. What cannot be said in a URDF is named in the notes: balls
-    and free joints below the root are locked, planes left out. What else stands in the world is left out.
+    Bodies become links, several joints of a body a chain of links. What cannot be said in a URDF is
+    named in the notes: balls and free joints below the root are locked, planes left out. What else
+    stands in the world is left out.
 
     Raises:
-        InputError: MuJoCo is not installed, or does not understand the file; the error says what it says.
+        InputError: MuJoCo is not installed, or does not understand the file; the error says what it
+            says.
     """
     mujoco = optional_package("mujoco", "import", what="an MJCF file", file=file)
     try:
         model = mujoco.MjModel.from_xml_path(str(file.resolve()))
     except (ValueError, RuntimeError) as error:
-        raise InputError(f"MuJoCo does not understand this: {' '.join(str(error).split())}", file=file) from error
+        raise InputError(
+            f"MuJoCo does not understand this: {' '.join(str(error).split())}", file=file
+        ) from error
     return _Converter(mujoco, model, file, folder).convert()
 
 
@@ -131,11 +136,15 @@ class _Converter:
         above = self._add_name(f"{name}_root") if root else self._name("body", parent)
         if root:
             ElementTree.SubElement(self._result.root, "link", name=above)
-        for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body])):
+        for joint in range(
+            int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body])
+        ):
             kind = int(model.jnt_type[joint])
             if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 if not root:
-                    self._result.notes.append(f"joint {self._name('joint', joint)} is locked: a URDF has no such joint")
+                    self._result.notes.append(
+                        f"joint {self._name('joint', joint)} is locked: a URDF has no such joint"
+                    )
                 elif kind == kinds.mjJNT_FREE:
                     placement = pin.SE3.Identity()  # it drives: where it stands is not part of it
                 continue
@@ -174,7 +183,10 @@ class _Converter:
         by_joint = model.actuator_trntype == int(self._mujoco.mjtTrn.mjTRN_JOINT)
         for actuator in np.flatnonzero(by_joint & (model.actuator_trnid[:, 0] == joint)):
             if model.actuator_forcelimited[actuator]:
-                return float(np.abs(model.actuator_forcerange[actuator]).max() * abs(model.actuator_gear[actuator, 0]))
+                return float(
+                    np.abs(model.actuator_forcerange[actuator]).max()
+                    * abs(model.actuator_gear[actuator, 0])
+                )
         return 0.0
 
     def _inertia(self, link: ElementTree.Element, body: int) -> None:
@@ -184,12 +196,20 @@ class _Converter:
         inertial = ElementTree.SubElement(link, "inertial")
         _origin(inertial, pin.SE3(_rotation(model.body_iquat[body]), model.body_ipos[body].copy()))
         ElementTree.SubElement(inertial, "mass", value=f"{model.body_mass[body]:.9g}")
-        moments = dict(zip(("ixx", "iyy", "izz"), (f"{moment:.9g}" for moment in model.body_inertia[body]), strict=True))
+        moments = dict(
+            zip(
+                ("ixx", "iyy", "izz"),
+                (f"{moment:.9g}" for moment in model.body_inertia[body]),
+                strict=True,
+            )
+        )
         ElementTree.SubElement(inertial, "inertia", {**moments, "ixy": "0", "ixz": "0", "iyz": "0"})
 
     def _shapes(self, link: ElementTree.Element, body: int) -> None:
         model = self._model
-        geoms = range(int(model.body_geomadr[body]), int(model.body_geomadr[body] + model.body_geomnum[body]))
+        geoms = range(
+            int(model.body_geomadr[body]), int(model.body_geomadr[body] + model.body_geomnum[body])
+        )
         solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
         seen = [g for g in geoms if g not in solid] or solid
         for kind, chosen in (("visual", seen), ("collision", solid)):
@@ -203,8 +223,14 @@ class _Converter:
         size, shape = model.geom_size[geom], int(model.geom_type[geom])
         shapes: dict[int, tuple[str, dict[str, str]]] = {
             int(types.mjGEOM_SPHERE): ("sphere", {"radius": f"{size[0]:.9g}"}),
-            int(types.mjGEOM_CAPSULE): ("capsule", {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"}),
-            int(types.mjGEOM_CYLINDER): ("cylinder", {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"}),
+            int(types.mjGEOM_CAPSULE): (
+                "capsule",
+                {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"},
+            ),
+            int(types.mjGEOM_CYLINDER): (
+                "cylinder",
+                {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"},
+            ),
             int(types.mjGEOM_BOX): ("box", {"size": _text(2.0 * size)}),
         }
         if shape == types.mjGEOM_MESH:
@@ -212,14 +238,20 @@ class _Converter:
             if data not in self._meshes:
                 vertices = model.mesh_vert[model.mesh_vertadr[data] :][: model.mesh_vertnum[data]]
                 faces = model.mesh_face[model.mesh_faceadr[data] :][: model.mesh_facenum[data]]
-                self._meshes[data] = self._write(self._name("mesh", data), trimesh.Trimesh(vertices, faces, process=False))
+                self._meshes[data] = self._write(
+                    self._name("mesh", data), trimesh.Trimesh(vertices, faces, process=False)
+                )
             shapes[shape] = ("mesh", {"filename": str(self._meshes[data])})
         elif shape == types.mjGEOM_ELLIPSOID:
             ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-            file = self._write(self._name("geom", geom), ball.apply_transform(np.diag([*size, 1.0])))
+            file = self._write(
+                self._name("geom", geom), ball.apply_transform(np.diag([*size, 1.0]))
+            )
             shapes[shape] = ("mesh", {"filename": str(file)})
         if shape not in shapes:
-            self._result.notes.append(f"a shape of {link.get('name')} is left out: neither a solid nor a mesh")
+            self._result.notes.append(
+                f"a shape of {link.get('name')} is left out: neither a solid nor a mesh"
+            )
             return
         element = ElementTree.SubElement(link, kind)
         _origin(element, pin.SE3(_rotation(model.geom_quat[geom]), model.geom_pos[geom].copy()))
@@ -240,25 +272,50 @@ class _Converter:
 
     def _couplings(self) -> None:
         """Write couplings of two joints as <mimic>: the first follows the second; if it does already, the other way round."""
-        model, joints = self._model, {joint.get("name", ""): joint for joint in self._result.root.findall("joint")}
+        model, joints = (
+            self._model,
+            {joint.get("name", ""): joint for joint in self._result.root.findall("joint")},
+        )
         leads: dict[str, str] = {}
-        for k in np.flatnonzero((model.eq_type == int(self._mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 > 0)):
-            names = [self._name("joint", int(ids[k])) for ids in (model.eq_obj1id, model.eq_obj2id) if ids[k] >= 0]
+        for k in np.flatnonzero(
+            (model.eq_type == int(self._mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 > 0)
+        ):
+            names = [
+                self._name("joint", int(ids[k]))
+                for ids in (model.eq_obj1id, model.eq_obj2id)
+                if ids[k] >= 0
+            ]
             if len(names) < 2 or not joints.keys() >= {*names}:
                 continue
-            (joint, leader), (offset, factor) = names, (float(value) for value in model.eq_data[k, :2])
+            (joint, leader), (offset, factor) = (
+                names,
+                (float(value) for value in model.eq_data[k, :2]),
+            )
             if model.eq_data[k, 2:5].any():
-                self._result.notes.append(f"joint {joint} follows {leader} along a curve: it is taken as a line")
+                self._result.notes.append(
+                    f"joint {joint} follows {leader} along a curve: it is taken as a line"
+                )
             if joint in leads and leader not in leads and factor:
-                (joint, leader), (offset, factor) = (leader, joint), (-offset / factor, 1.0 / factor)
+                (joint, leader), (offset, factor) = (
+                    (leader, joint),
+                    (-offset / factor, 1.0 / factor),
+                )
             last = leader
             while last in leads:
                 last = leads[last]
             if joint in leads or last == joint:
-                self._result.notes.append(f"joint {joint} follows {leads.get(joint, leader)}; another coupling of it is left out")
+                self._result.notes.append(
+                    f"joint {joint} follows {leads.get(joint, leader)}; another coupling of it is left out"
+                )
                 continue
             leads[joint] = leader
-            ElementTree.SubElement(joints[joint], "mimic", joint=leader, multiplier=f"{factor:.9g}", offset=f"{offset:.9g}")
+            ElementTree.SubElement(
+                joints[joint],
+                "mimic",
+                joint=leader,
+                multiplier=f"{factor:.9g}",
+                offset=f"{offset:.9g}",
+            )
 
 
 def _rotation(quaternion: Floats) -> Floats:
@@ -272,7 +329,10 @@ def _text(values: Any) -> str:
 
 def _origin(element: ElementTree.Element, placement: pin.SE3) -> None:
     ElementTree.SubElement(
-        element, "origin", xyz=_text(placement.translation), rpy=_text(pin.rpy.matrixToRpy(placement.rotation))
+        element,
+        "origin",
+        xyz=_text(placement.translation),
+        rpy=_text(pin.rpy.matrixToRpy(placement.rotation)),
     )
 
 

@@ -83,7 +83,9 @@ class Clearances:
             if distance < below:
                 names = (self._names[self.pairs[k][0]], self._names[self.pairs[k][1]])
                 found[names] = min(distance, found.get(names, np.inf))
-        return sorted(((*names, distance) for names, distance in found.items()), key=lambda item: item[2])
+        return sorted(
+            ((*names, distance) for names, distance in found.items()), key=lambda item: item[2]
+        )
 
     def by_links(self) -> LinkDistances:
         """Return distances of its pairs of links, where it is placed."""
@@ -95,14 +97,20 @@ class Clearances:
 
 def arm_at(robot: Robot, state: Mapping[str, float]) -> Floats:
     """Return where an arm is in a state of its joints, turned by 2π or else moved to the nearest limits, shape (n − 3,)."""
-    return np.array([nearest_position(robot.model, joint, state[joint]) for joint in robot.coordinates.names[3:]])
+    return np.array(
+        [
+            nearest_position(robot.model, joint, state[joint])
+            for joint in robot.coordinates.names[3:]
+        ]
+    )
 
 
 def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 0) -> Home:
     """Return where the arm rests.
 
-    That is the first of the `named` configurations with room around it, else the best one of random ones: with room first, then
-    near the middle of the joints' ranges, with the hand above the base rather than far out.
+    That is the first of the `named` configurations with room around it, else the best one of random
+    ones: with room first, then near the middle of the joints' ranges, with the hand above the base
+    rather than far out.
 
     Args:
         robot: The robot, with its collision pairs.
@@ -126,12 +134,18 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
     def cost(arm: Floats) -> tuple[float, float]:
         look.place(arm)
         clearance = look.least(HOME_ROOM)
-        pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), arm])))
+        pin.framesForwardKinematics(
+            robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
+        )
         out = float(np.hypot(*data.oMf[frame].translation[:2]))
-        return 100.0 * max(0.0, HOME_ROOM - clearance) + float((((arm - middle) / span) ** 2).mean()) + 0.3 * out, clearance
+        return 100.0 * max(0.0, HOME_ROOM - clearance) + float(
+            (((arm - middle) / span) ** 2).mean()
+        ) + 0.3 * out, clearance
 
     trials = [middle, *rng.uniform(low, high, (_SAMPLES, len(low)))]
-    value, clearance, chosen = min(((*cost(arm), k) for k, arm in enumerate(trials)), key=lambda item: item[0])
+    value, clearance, chosen = min(
+        ((*cost(arm), k) for k, arm in enumerate(trials)), key=lambda item: item[0]
+    )
     arm = trials[chosen]
     for width in np.geomspace(0.2, 0.01, _STEPS):
         trial = np.clip(arm + width * span * rng.standard_normal(len(arm)), low, high)
@@ -144,14 +158,17 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
     return Home(arm, look.least(), "searched for")
 
 
-def never_apart(robot: Robot, margin: float, *, samples: int, share: float = 1.0, seed: int = 0) -> dict[tuple[str, str], float]:
+def never_apart(
+    robot: Robot, margin: float, *, samples: int, share: float = 1.0, seed: int = 0
+) -> dict[tuple[str, str], float]:
     """Return the pairs of links that no random configuration brings apart by `margin` [m], with the furthest that one does.
 
     Args:
         robot: The robot, with its collision pairs and its home, which is looked at as well.
         margin: A distance [m].
         samples: How many configurations to look at.
-        share: Of these, so many have to leave a pair closer than the margin: less than 1 is for pairs that are hardly ever apart.
+        share: Of these, so many have to leave a pair closer than the margin: less than 1 is for
+            pairs that are hardly ever apart.
         seed: Of the random numbers.
     """
     look, rng = Clearances(robot), np.random.default_rng(seed)

@@ -14,12 +14,27 @@ import pinocchio as pin
 import yaml
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
+from vkc_pin.importing.robots.arms import (
+    Arm,
+    base_kind,
+    bodies,
+    choose,
+    find_arms,
+    own_base,
+    telescopes,
+)
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
 from vkc_pin.importing.robots.envelopes import envelopes, leave_out
 from vkc_pin.importing.robots.hands import Hand, look_at
 from vkc_pin.importing.robots.mesh_pieces import Piece, own_meshes
-from vkc_pin.importing.robots.rest_configuration import HOME_ROOM, Home, arm_at, find_home, never_apart, standing
+from vkc_pin.importing.robots.rest_configuration import (
+    HOME_ROOM,
+    Home,
+    arm_at,
+    find_home,
+    never_apart,
+    standing,
+)
 from vkc_pin.importing.robots.sources import Source, free_name, read_source
 from vkc_pin.importing.targets import check_target, format_comment, made_by
 from vkc_pin.options import Options
@@ -38,7 +53,9 @@ __all__ = ["ImportedRobot", "import_robot"]
 
 _SAMPLES, _PIECES = 2000, 8
 _NEAR, _MOSTLY = 300, 0.75  # of them, to find pairs that so many leave closer than
-_NEIGHBOURS = Options().dist_safe + 0.005  # [m]: neighbours by design, such as the segments of a telescope
+_NEIGHBOURS = (
+    Options().dist_safe + 0.005
+)  # [m]: neighbours by design, such as the segments of a telescope
 _STANDING = 0.005  # [m]: a root that is closer to the floor stands on it
 
 
@@ -80,14 +97,18 @@ def import_robot(
 ) -> ImportedRobot:
     """Make a robot's folder of a URDF, xacro or MJCF file.
 
-    The folder holds robot.yaml, a URDF with a frame `tool` where the hand grasps, an SRDF with sampled pairs that need no check,
-    and meshes, those that collide as convex pieces. What the file does not say is guessed from names and shapes, and told.
+    The folder holds robot.yaml, a URDF with a frame `tool` where the hand grasps, an SRDF with
+    sampled pairs that need no check, and meshes, those that collide as convex pieces. What the file
+    does not say is guessed from names and shapes, and told.
 
     Args:
         file: The file; its first element says what it is.
-        folder: Where to write, a new or empty folder; by default one of the file's name in the current one.
-        arm: Which arm to plan: a name of `ImportedRobot.arms`, or a part of one ("left"), or a group of the SRDF with its joints.
-        tool_frame: The frame that grasps, if it is not to be guessed; see docs/robots.md for how it has to lie.
+        folder: Where to write, a new or empty folder; by default one of the file's name in the
+            current one.
+        arm: Which arm to plan: a name of `ImportedRobot.arms`, or a part of one ("left"), or a
+            group of the SRDF with its joints.
+        tool_frame: The frame that grasps, if it is not to be guessed; see docs/robots.md for how it
+            has to lie.
         srdf: An SRDF; by default the one beside the file.
         packages: Folders for `package://` and `$(find ...)`; others are looked for around the file.
         arguments: Of a xacro file.
@@ -97,7 +118,8 @@ def import_robot(
         force: Whether to replace a folder that this made before.
 
     Raises:
-        InputError: The file cannot be read, no arm was found, the folder holds something, or the extra `import` is missing.
+        InputError: The file cannot be read, no arm was found, the folder holds something, or the
+            extra `import` is missing.
         UnknownNameError: There is no such arm or frame; the error names the nearest one.
     """
     path = file_path(file, "file", "a URDF, xacro or MJCF file")
@@ -108,15 +130,26 @@ def import_robot(
             text(given, field, "a name")
     whole(most_pieces, "most_pieces", low=1)
     whole(samples, "samples", low=1)
-    places = {key: file_path(place, f"packages.{key}") for key, place in mapping(packages or {}, "packages").items()}
-    given_arguments = {key: str(value) for key, value in mapping(arguments or {}, "arguments").items()}
+    places = {
+        key: file_path(place, f"packages.{key}")
+        for key, place in mapping(packages or {}, "packages").items()
+    }
+    given_arguments = {
+        key: str(value) for key, value in mapping(arguments or {}, "arguments").items()
+    }
     beside = None if srdf is None else file_path(srdf, "srdf")
     check_target(target, "import-robot", force=flag(force, "force"))
     with folder_at_once(target, force=True) as staging:  # what is there may be replaced
-        source = read_source(path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=beside)
+        source = read_source(
+            path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=beside
+        )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they name files that are gone soon; loading the whole folder warns of the same
-            made = _Importer(source, staging, target.resolve().name).make(arm, tool_frame, most_pieces, samples, seed)
+            warnings.simplefilter(
+                "ignore"
+            )  # they name files that are gone soon; loading the whole folder warns of the same
+            made = _Importer(source, staging, target.resolve().name).make(
+                arm, tool_frame, most_pieces, samples, seed
+            )
     return dataclasses.replace(made, folder=target, robot=load_robot(target / "robot.yaml"))
 
 
@@ -127,18 +160,26 @@ class _Importer:
         self._settings: dict[str, Any] = {"urdf": f"{stem}.urdf", "srdf": f"{stem}.srdf"}
         self._findings = [Finding("note", "file", note) for note in source.notes]
 
-    def make(self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int) -> ImportedRobot:
+    def make(
+        self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int
+    ) -> ImportedRobot:
         """Write everything into the folder."""
         solid = {shape.link for shape in self._file.shapes("collision")}
         if not solid:
             self._collide_as_seen()
             solid = {shape.link for shape in self._file.shapes("collision")}
         if tool_frame is not None and tool_frame not in (names := sorted(self._names())):
-            raise UnknownNameError("frame", tool_frame, names, file=self._file.path, field="tool_frame")
+            raise UnknownNameError(
+                "frame", tool_frame, names, file=self._file.path, field="tool_frame"
+            )
         tree = bodies(self._file)
         driving = own_base(tree, solid)
         arms = find_arms(self._file, tree, self._source.groups, solid)
-        chosen = None if tool_frame is not None and not arms else choose(arms, arm, self._file, self._source.groups)
+        chosen = (
+            None
+            if tool_frame is not None and not arms
+            else choose(arms, arm, self._file, self._source.groups)
+        )
         self._arm(chosen, arms, driving)
         root, pieces, notes = own_meshes(self._file, self._folder, most_pieces=most_pieces)
         self._findings += [Finding("warning", "shapes", note) for note in notes]
@@ -152,10 +193,18 @@ class _Importer:
         self._told(pieces, self._rest(robot, samples, seed))
         return self._result(load_robot(self._folder / "robot.yaml"), arms, chosen, pieces)
 
-    def _result(self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]) -> ImportedRobot:
+    def _result(
+        self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]
+    ) -> ImportedRobot:
         findings = (*doctor(robot).findings, *self._findings)
-        names = [] if chosen is None else [chosen.name, *(arm.name for arm in arms if arm is not chosen)]
-        return ImportedRobot(self._folder, robot, tuple(names), tuple(pieces), Diagnosis(self._name, findings))
+        names = (
+            []
+            if chosen is None
+            else [chosen.name, *(arm.name for arm in arms if arm is not chosen)]
+        )
+        return ImportedRobot(
+            self._folder, robot, tuple(names), tuple(pieces), Diagnosis(self._name, findings)
+        )
 
     def _collide_as_seen(self) -> None:
         """Let links collide as they are seen: nothing else is there."""
@@ -164,27 +213,46 @@ class _Importer:
                 element = ElementTree.SubElement(link, "collision")
                 element.extend(child for child in visual if child.tag in ("origin", "geometry"))
         if not self._file.shapes("collision"):
-            raise InputError("this robot has no shapes", file=self._file.path, expected="<collision> or <visual> elements")
+            raise InputError(
+                "this robot has no shapes",
+                file=self._file.path,
+                expected="<collision> or <visual> elements",
+            )
         self._guess("guess", "no link has a shape that collides: those that are seen do")
 
     def _guess(self, sure: str, text: str, hint: str = "") -> None:
-        self._findings.append(Finding("warning" if sure == "guess" else "note", "guessed", f"{text} [{sure}]", hint))
+        self._findings.append(
+            Finding("warning" if sure == "guess" else "note", "guessed", f"{text} [{sure}]", hint)
+        )
 
     def _arm(self, chosen: Arm | None, arms: list[Arm], driving: tuple[str, ...]) -> None:
         if driving:
             self._settings.setdefault("locked_joints", {}).update(dict.fromkeys(driving, 0.0))
-            self._guess("sure", f"the file has a base of its own, which the planner's replaces: {', '.join(driving)} are locked")
+            self._guess(
+                "sure",
+                f"the file has a base of its own, which the planner's replaces: {', '.join(driving)} are locked",
+            )
         kind, why = base_kind(self._file.root)
         sure = "likely" if kind != "omni" else "guess"
         self._guess(sure, f"base: {kind} ({why})", "scenes and `load_robot` choose it: `base: ...`")
         if chosen is not None:
             for leader, *others in telescopes(full_model(self._file), chosen.joints):
                 self._settings.setdefault("couplings", {}).update(dict.fromkeys(others, leader))
-                told = f"{', '.join(others)} slide along with {leader}, as a telescope: one coordinate"
-                self._guess("likely", told, "if each has a motor of its own: remove `couplings` from robot.yaml")
+                told = (
+                    f"{', '.join(others)} slide along with {leader}, as a telescope: one coordinate"
+                )
+                self._guess(
+                    "likely",
+                    told,
+                    "if each has a motor of its own: remove `couplings` from robot.yaml",
+                )
             others = [other.name for other in arms if other is not chosen]
             also = f"; others: {', '.join(others)}" if others else ""
-            self._guess(chosen.sure, f"arm: {chosen.name}, {chosen.why}{also}", "another one: arm=..., `--arm`" if others else "")
+            self._guess(
+                chosen.sure,
+                f"arm: {chosen.name}, {chosen.why}{also}",
+                "another one: arm=..., `--arm`" if others else "",
+            )
 
     def _hand(self, hand: Hand, tool_frame: str | None) -> None:
         links = [link for link in hand.touch_links if link in set(self._file.links)]
@@ -195,7 +263,11 @@ class _Importer:
             tool = free_name("tool", self._names())
             self._add_link(tool, hand.link, hand.tool)
             self._settings["tool_frame"] = tool
-            self._guess(hand.sure, f"hand: frame '{tool}' {hand.why}", "if it is wrong: `tool_frame`, see docs/robots.md")
+            self._guess(
+                hand.sure,
+                f"hand: frame '{tool}' {hand.why}",
+                "if it is wrong: `tool_frame`, see docs/robots.md",
+            )
 
     def _loaded(self) -> Robot:
         """Write what there is and return the robot; with fingers that are locked if the gripper, as guessed, does not open."""
@@ -206,25 +278,42 @@ class _Importer:
             if not str(error.field).startswith("gripper"):
                 raise
             fingers = self._settings.pop("gripper")
-            self._settings.setdefault("locked_joints", {}).update({joint: ends["open"] for joint, ends in fingers.items()})
-            self._guess("guess", f"the fingers stand still: {error.problem}, {error.got}", "`gripper`, see docs/robots.md")
+            self._settings.setdefault("locked_joints", {}).update(
+                {joint: ends["open"] for joint, ends in fingers.items()}
+            )
+            self._guess(
+                "guess",
+                f"the fingers stand still: {error.problem}, {error.got}",
+                "`gripper`, see docs/robots.md",
+            )
             return self._loaded()
 
     def _names(self) -> set[str]:
-        return {element.get("name", "") for tag in ("link", "joint") for element in self._file.root.findall(tag)}
+        return {
+            element.get("name", "")
+            for tag in ("link", "joint")
+            for element in self._file.root.findall(tag)
+        }
 
     def _add_link(self, name: str, parent: str, placement: pin.SE3) -> None:
         root = self._file.root
         ElementTree.SubElement(root, "link", name=name)
         joint = ElementTree.SubElement(root, "joint", name=f"{name}_joint", type="fixed")
         angles = pin.rpy.matrixToRpy(placement.rotation)
-        xyz, rpy = (" ".join(f"{value:.9g}" for value in values) for values in (placement.translation, angles))
+        xyz, rpy = (
+            " ".join(f"{value:.9g}" for value in values)
+            for values in (placement.translation, angles)
+        )
         ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
         ElementTree.SubElement(joint, "parent", link=parent)
         ElementTree.SubElement(joint, "child", link=name)
 
     def _write(self) -> None:
-        settings = {key: value for key, value in self._settings.items() if key != "srdf" or (self._folder / value).is_file()}
+        settings = {
+            key: value
+            for key, value in self._settings.items()
+            if key != "srdf" or (self._folder / value).is_file()
+        }
         ElementTree.indent(self._file.root)
         source = f"{self._source.file.path.name} ({self._source.kind}) {made_by('import-robot')}"
         head = format_comment(f"Made of {source}. Units: m, rad, s.")
@@ -238,8 +327,13 @@ class _Importer:
         if not (found := envelopes(robot)):
             return robot
         leave_out(self._file.root, found)
-        self._settings["touch_links"] = [link for link in self._settings.get("touch_links", ()) if link not in found]
-        told = [f"{link} is a shape around the hand, {share:.0%} of which is in it: left out" for link, share in found.items()]
+        self._settings["touch_links"] = [
+            link for link in self._settings.get("touch_links", ()) if link not in found
+        ]
+        told = [
+            f"{link} is a shape around the hand, {share:.0%} of which is in it: left out"
+            for link, share in found.items()
+        ]
         self._findings += [Finding("warning", "hand", text) for text in told]
         return self._loaded()
 
@@ -252,33 +346,57 @@ class _Importer:
             return robot
         floor, root = free_name("floor", self._names()), bodies(self._file).links[0]
         self._file.root.insert(0, ElementTree.Element("link", name=floor))
-        joint = ElementTree.SubElement(self._file.root, "joint", name=f"{floor}_joint", type="fixed")
+        joint = ElementTree.SubElement(
+            self._file.root, "joint", name=f"{floor}_joint", type="fixed"
+        )
         ElementTree.SubElement(joint, "origin", xyz=f"0 0 {lift + raised:.6g}", rpy="0 0 0")
         ElementTree.SubElement(joint, "parent", link=floor)
         ElementTree.SubElement(joint, "child", link=root)
-        why = f"{1e3 * raised:.0f} mm of it so that no link of the arm is always at the floor" if raised else ""
+        why = (
+            f"{1e3 * raised:.0f} mm of it so that no link of the arm is always at the floor"
+            if raised
+            else ""
+        )
         why = why or "it stands on what is lowest of it"
-        self._guess("likely", f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}")
+        self._guess(
+            "likely",
+            f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}",
+        )
         return self._loaded()
 
     def _rest(self, robot: Robot, samples: int, seed: int) -> Home:
         """Write SRDF and home of a robot that is loaded with all pairs, and return the home."""
-        allowed = {**self._source.srdf.allowed, **sample_allowed_pairs(robot, samples=samples, seed=seed)}
+        allowed = {
+            **self._source.srdf.allowed,
+            **sample_allowed_pairs(robot, samples=samples, seed=seed),
+        }
         sampled = with_collision_pairs(robot, allowed)
-        for one, other in never_apart(sampled, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed):
+        for one, other in never_apart(
+            sampled, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed
+        ):
             text = f"{one} and {other} are hardly ever {1e3 * _NEIGHBOURS:.0f} mm apart: they are not kept apart"
             self._findings.append(Finding("note", "pairs", text))
             allowed[min(one, other), max(one, other)] = "Near"
         apart, arm = with_collision_pairs(robot, allowed), robot.coordinates.names[3:]
-        states = [(name, state) for name, state in self._source.srdf.states.items() if set(arm) <= set(state)]
-        named = [(f"the state '{name}' of the file", arm_at(robot, state)) for name, state in states]
+        states = [
+            (name, state)
+            for name, state in self._source.srdf.states.items()
+            if set(arm) <= set(state)
+        ]
+        named = [
+            (f"the state '{name}' of the file", arm_at(robot, state)) for name, state in states
+        ]
         home = find_home(apart, [*named, ("joints at 0, or in the middle", robot.home)], seed=seed)
-        self._settings["home"] = {joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)}
+        self._settings["home"] = {
+            joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)
+        }
         self._write_srdf(self._folder / self._settings["srdf"], robot, home.positions, allowed)
         self._write()
         return home
 
-    def _write_srdf(self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]) -> None:
+    def _write_srdf(
+        self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]
+    ) -> None:
         root = ElementTree.Element("robot", name=replace_forbidden(self._name))
         arm = ElementTree.SubElement(root, "group", name="arm")
         state = ElementTree.SubElement(root, "group_state", name="home", group="arm")
@@ -286,7 +404,9 @@ class _Importer:
             ElementTree.SubElement(arm, "joint", name=joint)
             ElementTree.SubElement(state, "joint", name=joint, value=f"{value:.9g}")
         for (one, other), reason in sorted(allowed.items()):
-            ElementTree.SubElement(root, "disable_collisions", link1=one, link2=other, reason=reason)
+            ElementTree.SubElement(
+                root, "disable_collisions", link1=one, link2=other, reason=reason
+            )
         ElementTree.indent(root)
         ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
@@ -297,4 +417,10 @@ class _Importer:
         for piece in {piece.mesh: piece for piece in pieces if piece.count > 1}.values():
             what = f"{piece.mesh} in {piece.count} pieces, {100.0 * piece.overhead:.0f} % more than its volume"
             hull = f"its hull: {100.0 * piece.hull:.0f} %"
-            self._findings.append(Finding("note", "shapes", f"{piece.link}: {what} ({hull}), off by {1e3 * piece.error:.0f} mm"))
+            self._findings.append(
+                Finding(
+                    "note",
+                    "shapes",
+                    f"{piece.link}: {what} ({hull}), off by {1e3 * piece.error:.0f} mm",
+                )
+            )

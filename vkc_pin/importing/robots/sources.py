@@ -18,7 +18,11 @@ from vkc_pin.world.files.xml import parse_xml
 
 __all__ = ["Source", "free_name", "read_source"]
 
-_KEPT = ("link", "joint", "material")  # what a URDF consists of; all else belongs to simulators and controllers
+_KEPT = (
+    "link",
+    "joint",
+    "material",
+)  # what a URDF consists of; all else belongs to simulators and controllers
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,12 @@ class Source:
 
 
 def read_source(
-    file: Path, scratch: Path, *, packages: Mapping[str, Path], arguments: Mapping[str, str], srdf: Path | None = None
+    file: Path,
+    scratch: Path,
+    *,
+    packages: Mapping[str, Path],
+    arguments: Mapping[str, str],
+    srdf: Path | None = None,
 ) -> Source:
     """Read a URDF, xacro or MJCF file; which one it is, its first element says.
 
@@ -61,7 +70,12 @@ def read_source(
     states: dict[str, dict[str, float]] = {}
     if root.tag == "mujoco":
         converted = convert(file, scratch)
-        kind, notes, states, text = "MJCF", converted.notes, converted.states, _written(converted.root)
+        kind, notes, states, text = (
+            "MJCF",
+            converted.notes,
+            converted.states,
+            _written(converted.root),
+        )
     elif root.tag != "robot":
         expected = "<robot> (URDF or xacro) or <mujoco> (MJCF)"
         raise InputError("not a robot's file", file=file, expected=expected, got=f"<{root.tag}>")
@@ -81,14 +95,24 @@ def read_source(
         return Source(read, kind, Srdf({}, states), {}, tuple(notes))
     semantics = read_srdf(beside, links=read.links) if srdf is not None else _fitting(beside, read)
     if semantics is None:
-        notes.append(f"{beside.name} beside it is of another robot: it names links that are not here")
+        notes.append(
+            f"{beside.name} beside it is of another robot: it names links that are not here"
+        )
         return Source(read, kind, Srdf({}, states), {}, tuple(notes))
-    return Source(read, kind, Srdf(semantics.allowed, {**states, **semantics.states}), _joints(beside, read), tuple(notes))
+    return Source(
+        read,
+        kind,
+        Srdf(semantics.allowed, {**states, **semantics.states}),
+        _joints(beside, read),
+        tuple(notes),
+    )
 
 
 def free_name(name: str, taken: set[str]) -> str:
     """Return a name for a link that is none of those taken, nor is that of its joint, `<name>_joint`."""
-    return name if name not in taken and f"{name}_joint" not in taken else free_name(f"{name}_", taken)
+    return (
+        name if name not in taken and f"{name}_joint" not in taken else free_name(f"{name}_", taken)
+    )
 
 
 def _completed(root: ElementTree.Element) -> list[str]:
@@ -116,7 +140,11 @@ def _beside(file: Path) -> Path | None:
     """Return the SRDF that belongs to a file by its name."""
     name = file.name.split(".")[0]
     stems = dict.fromkeys((name, name.removesuffix("_robot")))
-    places = [folder / f"{stem}.srdf" for stem in stems for folder in (file.parent, file.parent.parent / "srdf")]
+    places = [
+        folder / f"{stem}.srdf"
+        for stem in stems
+        for folder in (file.parent, file.parent.parent / "srdf")
+    ]
     return next((place for place in places if place.is_file()), None)
 
 

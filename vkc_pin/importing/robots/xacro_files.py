@@ -20,14 +20,18 @@ def expand(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str
 
     Args:
         file: The file.
-        packages: Package name → folder, for `$(find NAME)`; others are looked for in the folders around the file.
+        packages: Package name → folder, for `$(find NAME)`; others are looked for in the folders
+            around the file.
         arguments: What `<xacro:arg>` get, instead of their defaults.
 
     Raises:
-        InputError: xacro is not installed, or the file is not understood; the error says what xacro says.
+        InputError: xacro is not installed, or the file is not understood; the error says what xacro
+            says.
     """
     xacro = optional_package("xacro", "import", what="a xacro file", file=file)
-    substitution = optional_package("xacro.substitution_args", "import", what="a xacro file", file=file)
+    substitution = optional_package(
+        "xacro.substitution_args", "import", what="a xacro file", file=file
+    )
     said = io.StringIO()
     try:
         with _finding(substitution, file, packages), contextlib.redirect_stderr(said):
@@ -35,7 +39,9 @@ def expand(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # of macros, Python expressions and XML: any kind
-        raise InputError(f"xacro does not understand this: {error or said.getvalue().strip()}", file=file) from error
+        raise InputError(
+            f"xacro does not understand this: {error or said.getvalue().strip()}", file=file
+        ) from error
     return str(document.toprettyxml(indent="  "))
 
 
@@ -51,7 +57,9 @@ def _finding(substitution: ModuleType, file: Path, packages: Mapping[str, Path])
             if place.is_dir():
                 return str(place)
         expected = f"a folder {name} around the file, or packages={{'{name}': folder}}"
-        raise InputError("there is no such package", file=file, field=f"$(find {name})", expected=expected)
+        raise InputError(
+            "there is no such package", file=file, field=f"$(find {name})", expected=expected
+        )
 
     module: Any = substitution
     before = module._eval_find

@@ -1,7 +1,8 @@
 """Paths that a base on wheels can drive: corners joined by arcs, which is what straight drives and turns in place are, too.
 
-From one corner to the next a pose (x, y, yaw) moves with a constant twist. Along such an arc the chord between any two poses
-points where the base heads half-way between them, so that steps of any size neither slip nor, by more than the arc itself, turn.
+From one corner to the next a pose (x, y, yaw) moves with a constant twist. Along such an arc the
+chord between any two poses points where the base heads half-way between them, so that steps of any
+size neither slip nor, by more than the arc itself, turn.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ class Curves:
     """The curves by which a base on wheels gets from one pose to another where nothing is in the way.
 
     Args:
-        radius: The least radius of its turns [m]; 0: it turns in place, drives straight, and turns in place again. Otherwise
-            curves are the shortest of Reeds and Shepp.
+        radius: The least radius of its turns [m]; 0: it turns in place, drives straight, and turns
+            in place again. Otherwise curves are the shortest of Reeds and Shepp.
         turning: How many metres of driving a radian of turning is worth [m/rad].
     """
 
@@ -47,7 +48,9 @@ class Curves:
     def corners(self, first: Floats, last: Floats) -> Floats:
         """Return the corners of the curve from one pose to another, both (3,), shape (K, 3): at the last all but whole turns."""
         if self.radius <= 0.0:
-            (turn, rest) = min(self._turns(first[None], last[None]), key=lambda turns: float(np.abs(turns).sum()))
+            (turn, rest) = min(
+                self._turns(first[None], last[None]), key=lambda turns: float(np.abs(turns).sum())
+            )
             ahead = float(first[2] + turn[0])
             found = [
                 first,
@@ -57,17 +60,26 @@ class Curves:
             ]
         else:
             found = [first]
-            for length, angle in shortest_words(_seen(first[None], last[None], self.radius)[0], self.radius):
+            for length, angle in shortest_words(
+                _seen(first[None], last[None], self.radius)[0], self.radius
+            ):
                 found.append(moved(found[-1], length, angle))
             if len(found) > 1:
                 found[-1] = np.array([*last[:2], found[-1][2] + wrapped(last[2] - found[-1][2])])
-        return np.array([pose for k, pose in enumerate(found) if k == 0 or np.abs(pose - found[k - 1]).max() > _SAME])
+        return np.array(
+            [
+                pose
+                for k, pose in enumerate(found)
+                if k == 0 or np.abs(pose - found[k - 1]).max() > _SAME
+            ]
+        )
 
     def through(self, path: Floats, free: Callable[[Floats], bool]) -> Floats:
         """Return the corners of curves along a path with turns in place, shape (K, 3), as few as are free, the first as it is.
 
-        From where it has come to, a curve leads to the furthest place on the path to which one is free, or else to the next, free
-        or not. Places are the middles of its straight parts, and others on them.
+        From where it has come to, a curve leads to the furthest place on the path to which one is
+        free, or else to the next, free or not. Places are the middles of its straight parts, and
+        others on them.
 
         Args:
             path: Its corners, shape (L, 3).
@@ -80,7 +92,9 @@ class Curves:
         while k < len(places):
             for last in range(len(places) - 1, k - 1, -1):
                 curve = self.corners(corners[-1], places[last])
-                if last == k or all(map(free, spread_along(curve, _looks(curve), turning=self.turning)[:-1])):
+                if last == k or all(
+                    map(free, spread_along(curve, _looks(curve), turning=self.turning)[:-1])
+                ):
                     corners, k = np.vstack([corners, curve[1:]]), last + 1
                     break
         return corners
@@ -100,17 +114,26 @@ class Curves:
 def moved(pose: Floats, length: float, turn: float) -> Floats:
     """Return the pose, shape (3,), at the end of an arc of a length [m, back < 0] that turns by an angle [rad]."""
     chord, heading = length * np.sinc(turn / (2 * np.pi)), pose[2] + turn / 2
-    return np.array([pose[0] + chord * np.cos(heading), pose[1] + chord * np.sin(heading), pose[2] + turn])
+    return np.array(
+        [pose[0] + chord * np.cos(heading), pose[1] + chord * np.sin(heading), pose[2] + turn]
+    )
 
 
 def between(first: Floats, last: Floats, share: Floats) -> Floats:
     """Return the poses at shares of the way between poses with a constant twist; all (B, 3), shares (B,)."""
     turn = (last - first)[:, 2]
-    # Chords of shares s of an arc that turns by δ are sin(s·δ/2) / sin(δ/2) of its own, and turned by (s − 1)·δ/2.
+    # Chords of shares s of an arc that turns by δ are sin(s·δ/2) / sin(δ/2) of its own, and turned
+    # by (s − 1)·δ/2.
     ratio = share * np.sinc(share * turn / (2 * np.pi)) / np.sinc(turn / (2 * np.pi))
     cos, sin = ratio * np.cos((share - 1.0) * turn / 2), ratio * np.sin((share - 1.0) * turn / 2)
     dx, dy = (last - first)[:, :2].T
-    return np.column_stack([first[:, 0] + cos * dx - sin * dy, first[:, 1] + sin * dx + cos * dy, first[:, 2] + share * turn])
+    return np.column_stack(
+        [
+            first[:, 0] + cos * dx - sin * dy,
+            first[:, 1] + sin * dx + cos * dy,
+            first[:, 2] + share * turn,
+        ]
+    )
 
 
 def nearest_arc(first: Floats, last: Floats, *, radius: float, turning: float) -> Floats:
@@ -127,8 +150,15 @@ def nearest_arc(first: Floats, last: Floats, *, radius: float, turning: float) -
     turn = np.concatenate([asked + off, 0.0 * asked], axis=1)
     dx, dy = (last - first)[:, 0:1], (last - first)[:, 1:2]
     heading = first[:, 2:] + turn / 2
-    along, aside = np.cos(heading) * dx + np.sin(heading) * dy, np.cos(heading) * dy - np.sin(heading) * dx
-    error = aside**2 + (turning * (turn - asked)) ** 2 + np.where(np.abs(along) + _SAME < radius * np.abs(turn), np.inf, 0.0)
+    along, aside = (
+        np.cos(heading) * dx + np.sin(heading) * dy,
+        np.cos(heading) * dy - np.sin(heading) * dx,
+    )
+    error = (
+        aside**2
+        + (turning * (turn - asked)) ** 2
+        + np.where(np.abs(along) + _SAME < radius * np.abs(turn), np.inf, 0.0)
+    )
     at = np.arange(len(first)), np.argmin(error, axis=1)
     step = np.column_stack([(along * np.cos(heading))[at], (along * np.sin(heading))[at], turn[at]])
     return np.asarray(first + step)
@@ -145,7 +175,9 @@ def spread_along(corners: Floats, steps: int, *, turning: float) -> Floats:
     change = np.diff(corners, axis=0)
     if not len(change):
         return np.tile(corners[-1], (steps, 1))
-    cost = np.hypot(change[:, 0], change[:, 1]) / np.sinc(change[:, 2] / (2 * np.pi)) + turning * np.abs(change[:, 2])
+    cost = np.hypot(change[:, 0], change[:, 1]) / np.sinc(
+        change[:, 2] / (2 * np.pi)
+    ) + turning * np.abs(change[:, 2])
     passed = np.concatenate([[0.0], np.cumsum(cost)]) / max(cost.sum(), _SAME)
     s = np.arange(steps + 1) / steps
     profile = (3.0 - 2.0 * s) * s**2
@@ -154,7 +186,9 @@ def spread_along(corners: Floats, steps: int, *, turning: float) -> Floats:
     else:
         when = _whole(np.interp(passed, profile, s) * steps, steps)
         legs = enumerate(itertools.pairwise(when.tolist()))
-        at = np.concatenate([np.interp(profile[a + 1 : b + 1], profile[[a, b]], [k, k + 1.0]) for k, (a, b) in legs])
+        at = np.concatenate(
+            [np.interp(profile[a + 1 : b + 1], profile[[a, b]], [k, k + 1.0]) for k, (a, b) in legs]
+        )
     piece = np.minimum(np.ceil(at - _SAME).astype(int), len(change)) - 1
     return between(corners[piece], corners[piece + 1], at - piece)
 
@@ -174,7 +208,9 @@ def _looks(curve: Floats) -> int:
 def _whole(when: Floats, steps: int) -> Ints:
     """Return ascending whole numbers near `when`, ascending itself, from 0 to `steps`, no two of them equal."""
     order = np.arange(len(when))
-    found = np.maximum.accumulate(np.rint(when).astype(int) - order)  # each at least 1 after the one before
+    found = np.maximum.accumulate(
+        np.rint(when).astype(int) - order
+    )  # each at least 1 after the one before
     found = np.minimum(found, steps - order[-1]) + order
     found[0] = 0
     return found

@@ -1,9 +1,10 @@
 """Whether shapes that ride on the base keep their distance from what stands in the world, all along a drive or a turn.
 
-Turning and driving keep every shape's height, so two shapes whose heights are far apart never meet. For the others, the plan view
-bounds the distance from below: along a direction u, they are u·p − h(u) apart, where p is the place of the base and h adds the
-support functions of both. One direction that leaves room during the whole motion is enough. Only for pairs without one is coal
-asked, and its normal says how far the motion may go until the next question.
+Turning and driving keep every shape's height, so two shapes whose heights are far apart never meet.
+For the others, the plan view bounds the distance from below: along a direction u, they are u·p −
+h(u) apart, where p is the place of the base and h adds the support functions of both. One direction
+that leaves room during the whole motion is enough. Only for pairs without one is coal asked, and
+its normal says how far the motion may go until the next question.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ __all__ = ["FAN", "Body", "Shape", "Standing", "hull_points"]
 Shape = tuple[coal.CollisionGeometry, pin.SE3]
 """A convex shape and where it is."""
 
-# Towards the neighbours of a cell and those a knight's move away, since bases and walls mostly have such sides; and between.
+# Towards the neighbours of a cell and those a knight's move away, since bases and walls mostly have
+# such sides; and between.
 _TOWARDS = np.arctan2([0, 1, 1, 2], [1, 2, 1, 1])
 _QUADRANT = np.column_stack([_TOWARDS, (_TOWARDS + np.append(_TOWARDS[1:], np.pi / 2)) / 2]).ravel()
 _ANGLES = np.concatenate([_QUADRANT + quarter * np.pi / 2 for quarter in range(4)])
@@ -32,10 +34,14 @@ FAN = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 _AXES = slice(0, len(FAN), len(FAN) // 4)  # of `FAN`, those along the axes of the world
 _RIM = 2 * np.pi * np.arange(16) / 16  # corners that stand for a circle
-_CORNERS = np.array(list(itertools.product((False, True), repeat=3)))  # of a box, whether they are its upper ends
+_CORNERS = np.array(
+    list(itertools.product((False, True), repeat=3))
+)  # of a box, whether they are its upper ends
 _STEP, _ARC = 0.25, 0.13  # [m], [rad]: longer motions are halved before coal is asked
 _LONG_ARC = 0.5  # [rad] that one row of bounds may sweep
-_BLINK = 2e-3  # [m] that a motion goes on at least before the next question: half of it is how far it may come too close
+# [m] that a motion goes on at least before the next question: half of it is how far it may come too
+# close
+_BLINK = 2e-3
 _ROUNDING = 1e-6  # [m] of coal
 _KEPT = 512  # tables
 
@@ -64,7 +70,8 @@ class Body:
     """Shapes that ride on the base together, and the pairs of them and of what stands in the world that share heights.
 
     Attributes:
-        span: How far a place must be from each standing shape that these can hit at no heading; -inf: never, shape (S,) [m].
+        span: How far a place must be from each standing shape that these can hit at no heading;
+            -inf: never, shape (S,) [m].
     """
 
     def __init__(self, shapes: Sequence[Shape], world: Standing, margin: float) -> None:
@@ -79,13 +86,21 @@ class Body:
         self.moving, self.standing = np.nonzero(apart < margin)
         self.span = np.full(len(world.shapes), -np.inf)
         np.maximum.at(self.span, self.standing, self.reach[self.moving] + margin)
-        self._points = np.concatenate([points[:, :2] for points, _ in outlines]) if outlines else np.empty((0, 2))
-        self._first = np.concatenate([[0], np.cumsum([len(points) for points, _ in outlines])[:-1]]).astype(int)
+        self._points = (
+            np.concatenate([points[:, :2] for points, _ in outlines])
+            if outlines
+            else np.empty((0, 2))
+        )
+        self._first = np.concatenate(
+            [[0], np.cumsum([len(points) for points, _ in outlines])[:-1]]
+        ).astype(int)
         self._radius = radius[:, None]
         self._tables: dict[tuple[float, float], Floats] = {}
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         order = np.argsort(self.standing, kind="stable")
-        self._of_standing = np.split(order, np.searchsorted(self.standing[order], np.arange(1, len(world.shapes))))
+        self._of_standing = np.split(
+            order, np.searchsorted(self.standing[order], np.arange(1, len(world.shapes)))
+        )
         self._margins = np.full(len(world.shapes), margin)
 
     def driven(self, a: Floats, b: Floats, yaw: float, margins: Floats | None = None) -> bool:
@@ -94,7 +109,9 @@ class Body:
             return True
         margins = self._margins if margins is None else margins
         rows = self._close(np.minimum(FAN @ a, FAN @ b))
-        return not len(rows) or self._drive(a, b, yaw, extents=self._extents(yaw, yaw, rows), rows=rows, margins=margins)
+        return not len(rows) or self._drive(
+            a, b, yaw, extents=self._extents(yaw, yaw, rows), rows=rows, margins=margins
+        )
 
     def turned(self, at: Floats, start: float, end: float, margins: Floats | None = None) -> bool:
         """Return whether the margins are kept while turning; see `BaseGrid.turned`."""
@@ -102,9 +119,14 @@ class Body:
             return True
         along = FAN @ at
         rows = self._close(along)
-        yaws = np.linspace(start, end, 1 + max(1, int(np.ceil(abs(end - start) / _LONG_ARC)))).tolist()
+        yaws = np.linspace(
+            start, end, 1 + max(1, int(np.ceil(abs(end - start) / _LONG_ARC)))
+        ).tolist()
         margins = self._margins if margins is None else margins
-        return not len(rows) or all(self._turn(at, along, p, q, rows=rows, margins=margins) for p, q in itertools.pairwise(yaws))
+        return not len(rows) or all(
+            self._turn(at, along, p, q, rows=rows, margins=margins)
+            for p, q in itertools.pairwise(yaws)
+        )
 
     def leaving(self, at: Floats, yaw: float) -> Floats:
         """Return the margins kept at a pose; see `BaseGrid.leaving`."""
@@ -120,13 +142,21 @@ class Body:
         world = self.world
         near = np.flatnonzero((along[_AXES] - world.extent).max(axis=1) < self.span)
         near = near[(along - world.support[near]).max(axis=1) < self.span[near]]
-        return np.sort(np.concatenate([self._of_standing[s] for s in near.tolist()])) if len(near) else near
+        return (
+            np.sort(np.concatenate([self._of_standing[s] for s in near.tolist()]))
+            if len(near)
+            else near
+        )
 
     def _extents(self, start: float, end: float, rows: Ints) -> Floats:
         """Return by how much pairs extend against the directions `FAN` while the base turns, at most: shape (n, 32) [m]."""
         moving = self.moving[rows]
         extents = self._table(start, end)[moving] + self.world.support[self.standing[rows]]
-        return extents if start == end else extents + (self.reach * (1.0 - np.cos((end - start) / 4)))[moving, None]
+        return (
+            extents
+            if start == end
+            else extents + (self.reach * (1.0 - np.cos((end - start) / 4)))[moving, None]
+        )
 
     def _table(self, start: float, end: float) -> Floats:
         """Return by how much each shape extends against `FAN` at both yaws and half-way, at most: shape (M, 32) [m]."""
@@ -134,8 +164,12 @@ class Body:
         if key not in self._tables:
             if start == end:
                 cosine, sine = np.cos(start), np.sin(start)
-                turned = FAN @ np.array([[-cosine, sine], [-sine, -cosine]])  # against u, in the base's frame
-                table = np.maximum.reduceat(self._points @ turned.T, self._first, axis=0) + self._radius
+                turned = FAN @ np.array(
+                    [[-cosine, sine], [-sine, -cosine]]
+                )  # against u, in the base's frame
+                table = (
+                    np.maximum.reduceat(self._points @ turned.T, self._first, axis=0) + self._radius
+                )
             else:
                 middle = (start + end) / 2
                 table = np.maximum(self._table(start, start), self._table(end, end))
@@ -145,7 +179,9 @@ class Body:
             self._tables[key] = table
         return self._tables[key]
 
-    def _drive(self, a: Floats, b: Floats, yaw: float, *, extents: Floats, rows: Ints, margins: Floats) -> bool:
+    def _drive(
+        self, a: Floats, b: Floats, yaw: float, *, extents: Floats, rows: Ints, margins: Floats
+    ) -> bool:
         """Return whether pairs (`rows`) keep their margins along a line; `extents` as from `_extents`."""
         near = (np.minimum(FAN @ a, FAN @ b) - extents).max(axis=1) < margins[self.standing[rows]]
         rows, extents = rows[near], extents[near]
@@ -154,7 +190,10 @@ class Body:
         length = float(np.hypot(*(b - a)))
         if length > _STEP:
             ends = itertools.pairwise((a, (a + b) / 2, b))
-            return all(self._drive(*half, yaw, extents=extents, rows=rows, margins=margins) for half in ends)
+            return all(
+                self._drive(*half, yaw, extents=extents, rows=rows, margins=margins)
+                for half in ends
+            )
         direction = (b - a) / max(length, 1e-12)
 
         def closing(row: int, at: float) -> tuple[float, float]:
@@ -163,7 +202,9 @@ class Body:
 
         return all(self._keeps(row, closing, length, _BLINK, margins) for row in rows.tolist())
 
-    def _turn(self, at: Floats, along: Floats, start: float, end: float, *, rows: Ints, margins: Floats) -> bool:
+    def _turn(
+        self, at: Floats, along: Floats, start: float, end: float, *, rows: Ints, margins: Floats
+    ) -> bool:
         """Return whether pairs (`rows`) keep their margins during a turn at a place, that is `along` in the directions `FAN`."""
         gaps = (along - self._extents(start, end, rows)).max(axis=1)
         rows = rows[gaps < margins[self.standing[rows]]]
@@ -178,10 +219,18 @@ class Body:
             room, normal = self._distance(row, at, start + np.copysign(turned, end - start))
             return room, float(self.reach[self.moving[row]] * np.hypot(*normal))
 
-        return all(self._keeps(row, closing, angle, _BLINK / self.reach[self.moving[row]], margins) for row in rows.tolist())
+        return all(
+            self._keeps(row, closing, angle, _BLINK / self.reach[self.moving[row]], margins)
+            for row in rows.tolist()
+        )
 
     def _keeps(
-        self, row: int, closing: Callable[[int, float], tuple[float, float]], end: float, blink: float, margins: Floats
+        self,
+        row: int,
+        closing: Callable[[int, float], tuple[float, float]],
+        end: float,
+        blink: float,
+        margins: Floats,
     ) -> bool:
         """Return whether a pair keeps its margin up to `end`; `closing` says how far it is and at most how fast it comes closer.
 
@@ -213,18 +262,29 @@ def _transform(placement: pin.SE3) -> coal.Transform3s:
     return coal.Transform3s(placement.rotation, placement.translation)
 
 
-def hull_points(shape: coal.CollisionGeometry, placement: pin.SE3, *, outer: bool) -> tuple[Floats, float]:
+def hull_points(
+    shape: coal.CollisionGeometry, placement: pin.SE3, *, outer: bool
+) -> tuple[Floats, float]:
     """Return points, shape (n, 3) [m], and a radius around them: their hull contains a shape or, if not `outer`, is inside it."""
-    rim = np.column_stack([np.cos(_RIM), np.sin(_RIM), np.zeros(len(_RIM))]) / (np.cos(_RIM[1] / 2) if outer else 1.0)
+    rim = np.column_stack([np.cos(_RIM), np.sin(_RIM), np.zeros(len(_RIM))]) / (
+        np.cos(_RIM[1] / 2) if outer else 1.0
+    )
     radius = shape.getSweptSphereRadius() if outer else 0.0
     if isinstance(shape, coal.Cylinder | coal.Cone):
         top = np.array([0.0, 0.0, shape.halfLength])
         points = np.concatenate(
-            [shape.radius * rim - top, shape.radius * rim + top if isinstance(shape, coal.Cylinder) else top[None]]
+            [
+                shape.radius * rim - top,
+                shape.radius * rim + top if isinstance(shape, coal.Cylinder) else top[None],
+            ]
         )
     elif isinstance(shape, coal.Sphere | coal.Capsule):
         top = np.array([0.0, 0.0, shape.halfLength if isinstance(shape, coal.Capsule) else 0.0])
-        balls = np.zeros((1, 3)) if outer else shape.radius * np.concatenate([rim, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+        balls = (
+            np.zeros((1, 3))
+            if outer
+            else shape.radius * np.concatenate([rim, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+        )
         points = np.concatenate([balls - top, balls + top])
         radius += shape.radius if outer else 0.0
     elif isinstance(shape, coal.ConvexBase):

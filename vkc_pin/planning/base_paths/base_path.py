@@ -25,10 +25,12 @@ class BasePath:
     """A path of the base: straight drives, forwards or backwards, with turns in place between them.
 
     Attributes:
-        poses: x, y [m] and yaw [rad, continuous] where a drive or turn begins or ends; from the start to the goal, shape (K, 3).
+        poses: x, y [m] and yaw [rad, continuous] where a drive or turn begins or ends; from the
+            start to the goal, shape (K, 3).
         goal: Which goal it reaches.
-        cost: Metres driven, backwards times `BACKWARDS`, sideways next to start or goal times `SIDEWAYS`, plus radians turned
-            times `BaseGrid.turning`, plus the goal's extra cost [m].
+        cost: Metres driven, backwards times `BACKWARDS`, sideways next to start or goal times
+            `SIDEWAYS`, plus radians turned times `BaseGrid.turning`, plus the goal's extra cost
+            [m].
     """
 
     poses: Floats
@@ -60,12 +62,20 @@ def shortest_path(
     """
     begin, ends = np.asarray(start, float), np.asarray(goals, float)
     extra = np.zeros(len(ends)) if costs is None else np.asarray(costs, float)
-    for field, value, shape in (("start", begin, (3,)), ("goals", ends, (len(ends), 3)), ("costs", extra, (len(ends),))):
+    for field, value, shape in (
+        ("start", begin, (3,)),
+        ("goals", ends, (len(ends), 3)),
+        ("costs", extra, (len(ends),)),
+    ):
         if value.shape != shape or not np.all(np.isfinite(value)):
             expected = f"finite numbers, shape {shape}"
-            raise InputError("not what the search needs", field=field, expected=expected, got=value.tolist())
+            raise InputError(
+                "not what the search needs", field=field, expected=expected, got=value.tolist()
+            )
     if np.any(extra < 0.0):
-        raise InputError("a cost is negative", field="costs", expected="numbers >= 0", got=extra.tolist())
+        raise InputError(
+            "a cost is negative", field="costs", expected="numbers >= 0", got=extra.tolist()
+        )
     ground = Ground(grid, begin, ends)
     found = cheapest(ground, extra)
     if found is None:
@@ -87,7 +97,9 @@ def poses_along(path: BasePath, steps: int, *, turning: float) -> Floats:
     if steps < 1:
         raise InputError("no waypoints", field="steps", expected="at least 1", got=steps)
     change = np.diff(path.poses, axis=0)
-    passed = np.concatenate([[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + turning * np.abs(change[:, 2]))])
+    passed = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + turning * np.abs(change[:, 2]))]
+    )
     u = np.arange(1, steps + 1) / steps
     at = passed[-1] * (3.0 - 2.0 * u) * u**2
     poses = np.column_stack([np.interp(at, passed, column) for column in path.poses.T])
@@ -112,7 +124,9 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
         tried = high
         while low < tried:
             turns_to, limit = float(yaws[tried + 1]), float(cost[tried - 1])
-            straight = _straight(ground, rest[0].a, rest[tried - 1].b, before=yaw, after=turns_to, limit=limit)
+            straight = _straight(
+                ground, rest[0].a, rest[tried - 1].b, before=yaw, after=turns_to, limit=limit
+            )
             if straight is None:
                 high = tried - 1
             else:
@@ -127,7 +141,9 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
     return result, last
 
 
-def _straight(ground: Ground, a: Floats, b: Floats, *, before: float, after: float, limit: float) -> tuple[Drive, float] | None:
+def _straight(
+    ground: Ground, a: Floats, b: Floats, *, before: float, after: float, limit: float
+) -> tuple[Drive, float] | None:
     """Return a straight drive, and the yaw after turning at its end, if these, and the turn before it, cost less than `limit`."""
     found = []
     if np.hypot(*(b - a)) < _SAME:
@@ -135,24 +151,44 @@ def _straight(ground: Ground, a: Floats, b: Floats, *, before: float, after: flo
     for backwards in (0.0, np.pi):
         yaw = float(before + wrapped(np.arctan2(b[1] - a[1], b[0] - a[0]) + backwards - before))
         drive, end = Drive(a, b, yaw), float(yaw + wrapped(after - yaw))
-        found.append((drive.cost + ground.grid.turning * (abs(yaw - before) + abs(end - yaw)), backwards, drive, end))
+        found.append(
+            (
+                drive.cost + ground.grid.turning * (abs(yaw - before) + abs(end - yaw)),
+                backwards,
+                drive,
+                end,
+            )
+        )
     cost, _, drive, end = min(found)
-    return (drive, end) if cost < limit - _SAME and ground.likely(drive) and ground.swept(before, drive, end) else None
+    return (
+        (drive, end)
+        if cost < limit - _SAME and ground.likely(drive) and ground.swept(before, drive, end)
+        else None
+    )
 
 
-def _assembled(ground: Ground, drives: list[Drive], last: float, goal: int, extra: float) -> BasePath:
+def _assembled(
+    ground: Ground, drives: list[Drive], last: float, goal: int, extra: float
+) -> BasePath:
     """Return the path through `drives`, which ends at the yaw `last` [rad]."""
     merged: list[Drive] = []
     for drive in drives:
         joined = Drive(merged[-1].a, drive.b, drive.yaw) if merged else drive
-        if merged and merged[-1].yaw == drive.yaw and joined.length >= merged[-1].length + drive.length - _SAME:
+        if (
+            merged
+            and merged[-1].yaw == drive.yaw
+            and joined.length >= merged[-1].length + drive.length - _SAME
+        ):
             merged[-1] = joined
         else:
             merged.append(drive)
     turns = float(np.rint((last - ground.goals[goal, 2]) / (2 * np.pi)))
     end = ground.goals[goal] + [0.0, 0.0, 2 * np.pi * turns]
     poses = [ground.start]
-    for pose in [*(np.array([*place, drive.yaw]) for drive in merged for place in (drive.a, drive.b)), end]:
+    for pose in [
+        *(np.array([*place, drive.yaw]) for drive in merged for place in (drive.a, drive.b)),
+        end,
+    ]:
         if np.abs(pose - poses[-1]).max() > _SAME:
             poses.append(pose)
     poses = [*poses[:-1], end] if len(poses) > 1 else [ground.start, end]

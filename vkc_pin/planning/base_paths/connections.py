@@ -15,9 +15,11 @@ class Query:
 
     Attributes:
         starts: Connections of the start with the cells around it.
-        ends: Connections of all goals that are not blocked, one goal after the other; their costs include the goals' own.
+        ends: Connections of all goals that are not blocked, one goal after the other; their costs
+            include the goals' own.
         goal: Which goal each of the `ends` leads to.
-        direct: Straight drives from the start to goals as cost [UNIT], goal and kind (see `Ground.direct`), the cheapest last.
+        direct: Straight drives from the start to goals as cost [UNIT], goal and kind (see
+            `Ground.direct`), the cheapest last.
     """
 
     def __init__(self, ground: Ground, extra: Floats) -> None:
@@ -26,15 +28,23 @@ class Query:
         goals = [g for g, goal in enumerate(ground.goals) if ground.clear(goal)]
         more = {goal: round(float(extra[goal]) / UNIT) for goal in goals}
         ends = {goal: ground.ends(goal) for goal in goals}
-        self.goal = np.concatenate([np.zeros(0, int), *(np.full(len(part.cell), goal) for goal, part in ends.items())])
+        self.goal = np.concatenate(
+            [np.zeros(0, int), *(np.full(len(part.cell), goal) for goal, part in ends.items())]
+        )
         self.ends = Connections(
             np.concatenate([np.zeros(0, int), *(part.cell for part in ends.values())]),
             np.concatenate([np.zeros(0, int), *(part.heading for part in ends.values())]),
             np.concatenate([np.zeros(0), *(part.yaw for part in ends.values())]),
-            np.concatenate([np.zeros(0, int), *(part.cost + more[goal] for goal, part in ends.items())]),
+            np.concatenate(
+                [np.zeros(0, int), *(part.cost + more[goal] for goal, part in ends.items())]
+            ),
         )
         drives = [(goal, how, ground.direct(goal, how)) for goal in goals for how in range(3)]
-        found = [(self._cost(*drive) + more[goal], goal, how) for goal, how, drive in drives if drive is not None]
+        found = [
+            (self._cost(*drive) + more[goal], goal, how)
+            for goal, how, drive in drives
+            if drive is not None
+        ]
         self.direct = sorted(found, reverse=True)
         self._turned: set[int] = set()  # goals at which it is known how far the base can turn
 
@@ -45,12 +55,16 @@ class Query:
     def begins(self, number: int) -> bool:
         """Return whether a connection from the start is free."""
         ground = self.ground
-        return ground.swept(float(ground.start[2]), *ground.begin(self.starts, number), ground.leaving)
+        return ground.swept(
+            float(ground.start[2]), *ground.begin(self.starts, number), ground.leaving
+        )
 
     def leads(self, goal: int, how: int) -> bool:
         """Return whether a straight drive from the start to a goal is free."""
         direct = self.ground.direct(goal, how)
-        return direct is not None and self.ground.swept(float(self.ground.start[2]), *direct, self.ground.leaving)
+        return direct is not None and self.ground.swept(
+            float(self.ground.start[2]), *direct, self.ground.leaving
+        )
 
     def barred(self, number: int) -> Ints:
         """Return which connections are not free if one to a goal is not; none if that is free."""
@@ -61,5 +75,7 @@ class Query:
         others = np.empty(0, int)
         if goal not in self._turned:
             self._turned.add(goal)
-            others = np.flatnonzero((self.goal == goal) & ~ground.turnable(ground.goals[goal], self.ends))
+            others = np.flatnonzero(
+                (self.goal == goal) & ~ground.turnable(ground.goals[goal], self.ends)
+            )
         return np.append(others, number)

@@ -42,15 +42,18 @@ class BaseGrid:
         cells: Number of cells along each side.
         origin: Centre of cell (0, 0) in the world, shape (2,) [m].
         step: Size of a cell, shape (2,) [m].
-        moves: Cells from one to the next when driving forwards at each heading, shape (HEADINGS, 2).
+        moves: Cells from one to the next when driving forwards at each heading, shape (HEADINGS,
+            2).
         yaws: The headings, ascending from 0, shape (HEADINGS,) [rad].
         lengths: Of the moves, shape (HEADINGS,) [m].
         near: Radius around the start and goals of a search in which only the base counts [m].
         turning: What turning costs beside driving [m/rad].
-        base, carried: The shapes of either, which can be asked about a drive or a turn on their own.
+        base, carried: The shapes of either, which can be asked about a drive or a turn on their
+            own.
         stuck: Where the base surely hits something, shape (cells, cells, HEADINGS).
         stuck_carrying: Where what is carried surely does, shape (cells, cells, HEADINGS).
-        turns: What is known of how far the base can turn where a path begins or ends, by pose; see `Ground.turnable`.
+        turns: What is known of how far the base can turn where a path begins or ends, by pose; see
+            `Ground.turnable`.
     """
 
     def __init__(
@@ -70,12 +73,14 @@ class BaseGrid:
 
         Args:
             base: Convex shapes of the chassis, placed in the base's frame.
-            carried: Convex shapes of the arm, and of what it holds, as they are carried; placed in the base's frame.
+            carried: Convex shapes of the arm, and of what it holds, as they are carried; placed in
+                the base's frame.
             standing: Convex obstacles without the floor, placed in the world.
             arena: x_min, x_max, y_min, y_max [m]; the base's origin stays inside.
             margin: Clearance to keep [m].
             cells: Number of cells along each side.
-            near: Radius around the start and goals of a search in which only `base` counts: there the arm reaches in and out [m].
+            near: Radius around the start and goals of a search in which only `base` counts: there
+                the arm reaches in and out [m].
             turning: What turning costs beside driving [m/rad].
             cache: Where what shapes look like from above is remembered; None: nowhere.
 
@@ -84,21 +89,36 @@ class BaseGrid:
         """
         low, high = np.array(arena[::2], float), np.array(arena[1::2], float)
         if not (len(arena) == 4 and np.all(np.isfinite(arena)) and np.all(high > low)):
-            raise InputError("the arena is empty", field="arena", expected="x_min < x_max and y_min < y_max", got=list(arena))
-        for field, value, least in (("margin", margin, 0.0), ("near", near, 0.0), ("cells", cells, 2)):
+            raise InputError(
+                "the arena is empty",
+                field="arena",
+                expected="x_min < x_max and y_min < y_max",
+                got=list(arena),
+            )
+        for field, value, least in (
+            ("margin", margin, 0.0),
+            ("near", near, 0.0),
+            ("cells", cells, 2),
+        ):
             if not (np.isfinite(value) and value >= least):
-                raise InputError("out of range", field=field, expected=f"at least {least:g}", got=value)
+                raise InputError(
+                    "out of range", field=field, expected=f"at least {least:g}", got=value
+                )
         self.cells, self.near, self.turning = int(cells), float(near), float(turning)
         self.step = (high - low) / cells
         self.origin = low + self.step / 2
         self.moves = _MOVES
-        self.yaws = np.arctan2(_MOVES[:, 1] * self.step[1], _MOVES[:, 0] * self.step[0]) % (2 * np.pi)
+        self.yaws = np.arctan2(_MOVES[:, 1] * self.step[1], _MOVES[:, 0] * self.step[0]) % (
+            2 * np.pi
+        )
         self.lengths = np.hypot(*(_MOVES * self.step).T)
         world = Standing(standing)
         self.base, self.carried = Body(base, world, margin), Body(carried, world, margin)
         views = (cache or Cache()).get("plan views", PlanViews)
         lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
-        self.stuck, self.stuck_carrying = stuck(base, carried, standing, lattice, margin, views=views)
+        self.stuck, self.stuck_carrying = stuck(
+            base, carried, standing, lattice, margin, views=views
+        )
         self.turns: dict[tuple[bytes, bool, bytes | None], tuple[float, float]] = {}
         # Whether these are free, with everything and for the base alone; -1: nobody has asked yet.
         self._known = np.full((3, 2, self.cells, self.cells, HEADINGS), -1, np.int8)
@@ -110,10 +130,25 @@ class BaseGrid:
 
     def around(self, x: float, y: float, radius: float) -> Ints:
         """Return the cells whose centres are within `radius` [m] of a place, shape (C, 2)."""
-        low = np.maximum(np.ceil((np.array([x, y]) - radius - self.origin) / self.step), 0).astype(int)
-        high = np.minimum(np.floor((np.array([x, y]) + radius - self.origin) / self.step), self.cells - 1).astype(int) + 1
-        i, j = (grid.ravel() for grid in np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij"))
-        inside = np.hypot(self.origin[0] + i * self.step[0] - x, self.origin[1] + j * self.step[1] - y) <= radius
+        low = np.maximum(np.ceil((np.array([x, y]) - radius - self.origin) / self.step), 0).astype(
+            int
+        )
+        high = (
+            np.minimum(
+                np.floor((np.array([x, y]) + radius - self.origin) / self.step), self.cells - 1
+            ).astype(int)
+            + 1
+        )
+        i, j = (
+            grid.ravel()
+            for grid in np.meshgrid(
+                np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij"
+            )
+        )
+        inside = (
+            np.hypot(self.origin[0] + i * self.step[0] - x, self.origin[1] + j * self.step[1] - y)
+            <= radius
+        )
         return np.column_stack([i[inside], j[inside]])
 
     def free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
@@ -124,7 +159,11 @@ class BaseGrid:
         key = (_FREE, int(reaching), i, j, heading)
         if self._known[key] < 0:
             roomy = self._roomy(i, j, reaching)
-            self._note(key, roomy or self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching))
+            self._note(
+                key,
+                roomy
+                or self.clear(*self.center(i, j), float(self.yaws[heading]), reaching=reaching),
+            )
         return bool(self._known[key])
 
     def clear(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
@@ -148,12 +187,24 @@ class BaseGrid:
             reaching: As in `clear`.
         """
         begin, end = np.asarray(a, float), np.asarray(b, float)
-        return self.base.driven(begin, end, yaw) and (reaching or self.carried.driven(begin, end, yaw))
+        return self.base.driven(begin, end, yaw) and (
+            reaching or self.carried.driven(begin, end, yaw)
+        )
 
-    def turned(self, at: ArrayLike, start: float, end: float, *, reaching: bool = False, margins: Floats | None = None) -> bool:
+    def turned(
+        self,
+        at: ArrayLike,
+        start: float,
+        end: float,
+        *,
+        reaching: bool = False,
+        margins: Floats | None = None,
+    ) -> bool:
         """Return whether everything keeps its margin while the base turns from one yaw to the other at a place [m], [rad]."""
         place = np.asarray(at, float)
-        return self.base.turned(place, start, end, margins) and (reaching or self.carried.turned(place, start, end))
+        return self.base.turned(place, start, end, margins) and (
+            reaching or self.carried.turned(place, start, end)
+        )
 
     def leaving(self, x: float, y: float, yaw: float) -> Floats | None:
         """Return the margins the base can keep when it leaves a blocked pose, None if the pose is not blocked.
@@ -163,7 +214,11 @@ class BaseGrid:
         Returns:
             Margin from each of `standing`, shape (S,) [m]; -inf: none.
         """
-        return None if self.clear(x, y, yaw, reaching=True) else self.base.leaving(np.array([x, y]), yaw)
+        return (
+            None
+            if self.clear(x, y, yaw, reaching=True)
+            else self.base.leaving(np.array([x, y]), yaw)
+        )
 
     def forward(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether the move at `heading` from a cell is free all along; remembered."""
@@ -174,7 +229,9 @@ class BaseGrid:
             room = [rows[i][j] + rows[k][m] for rows in self._room]
             roomy = room[0] >= enough and (reaching or room[1] >= enough)
             ends = self.center(i, j), self.center(k, m)
-            self._note(key, roomy or self.driven(*ends, float(self.yaws[heading]), reaching=reaching))
+            self._note(
+                key, roomy or self.driven(*ends, float(self.yaws[heading]), reaching=reaching)
+            )
         return bool(self._known[key])
 
     def left(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
@@ -183,7 +240,13 @@ class BaseGrid:
         if self._known[key] < 0:
             end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
             roomy = self._roomy(i, j, reaching)
-            self._note(key, roomy or self.turned(self.center(i, j), float(self.yaws[heading]), end, reaching=reaching))
+            self._note(
+                key,
+                roomy
+                or self.turned(
+                    self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
+                ),
+            )
         return bool(self._known[key])
 
     def refused(self, reaching: Bools) -> tuple[Ints, Ints, Ints]:
@@ -198,7 +261,14 @@ class BaseGrid:
         found = []
         for parts in self._refused:
             rows = [np.array(part, int).reshape(-1, 3) for part in parts]
-            found.append(np.concatenate([part[reaching[part[:, 0], part[:, 1]] == alone] for alone, part in enumerate(rows)]))
+            found.append(
+                np.concatenate(
+                    [
+                        part[reaching[part[:, 0], part[:, 1]] == alone]
+                        for alone, part in enumerate(rows)
+                    ]
+                )
+            )
         return found[_FREE], found[_FORWARD], found[_LEFT]
 
     def _note(self, key: tuple[int, int, int, int, int], free: bool) -> None:
@@ -233,9 +303,9 @@ class BaseGrid:
     def distances_from(self, starts: Floats, *, threads: int = 1) -> Floats:
         """Return how far the base drives at least from places, shape (W, 2) [m], to every cell, shape (W, cells, cells) [m].
 
-        Infinite: there is no path. Turns are free, and only what surely blocks the base counts. Each start takes about a
-        millisecond on 100 x 100 cells; for many of them, a grid of fewer cells will do. It makes no difference how many threads
-        look for them.
+        Infinite: there is no path. Turns are free, and only what surely blocks the base counts.
+        Each start takes about a millisecond on 100 x 100 cells; for many of them, a grid of fewer
+        cells will do. It makes no difference how many threads look for them.
         """
         blocked = np.asarray(self.stuck.all(axis=2))
         entries: list[tuple[Ints, Floats]] = []
@@ -245,7 +315,12 @@ class BaseGrid:
                 cells = cells[~blocked[cells[:, 0], cells[:, 1]]]
                 if len(cells):
                     break
-            entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(*(self.origin + cells * self.step - (x, y)).T)))
+            entries.append(
+                (
+                    self.cells * cells[:, 0] + cells[:, 1],
+                    np.hypot(*(self.origin + cells * self.step - (x, y)).T),
+                )
+            )
         firsts = np.cumsum([0, *(len(cells) for cells, _ in entries)])
         begins, costs = (np.concatenate(part) for part in zip(*entries, strict=True))
         return np.asarray(self._floor.distances(firsts, begins, costs, threads))

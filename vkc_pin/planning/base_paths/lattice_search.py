@@ -1,11 +1,13 @@
 """The cheapest path of the mobile base over cells and headings, where it takes long to find out whether a move is free.
 
-The cheapest path is found as if everything were free that is not known to be blocked. Then its moves are looked at, from the goal
-on, since dead ends are mostly around goals. What is not free is taken out, and so on, until a path is free throughout (LazySP,
-Dellin and Srinivasa 2016). From one path to the next, compiled code (`_driving.cpp`) finds only anew what is different (LPA*, A*
-that is repaired; its heuristic is what is left if turns are free).
+The cheapest path is found as if everything were free that is not known to be blocked. Then its
+moves are looked at, from the goal on, since dead ends are mostly around goals. What is not free is
+taken out, and so on, until a path is free throughout (LazySP, Dellin and Srinivasa 2016). From one
+path to the next, compiled code (`_driving.cpp`) finds only anew what is different (LPA*, A* that is
+repaired; its heuristic is what is left if turns are free).
 
-What searches in the same grid have found out is used, and makes no difference: of equal paths, what moves cost decides.
+What searches in the same grid have found out is used, and makes no difference: of equal paths, what
+moves cost decides.
 """
 
 from __future__ import annotations
@@ -73,12 +75,17 @@ class _Search:
         self.near = self.ground.near.reshape(-1)
         lengths = np.rint(grid.lengths / UNIT)
         left = np.rint(grid.turning * wrapped(np.roll(grid.yaws, -1) - grid.yaws) / UNIT)
-        costs = np.column_stack([lengths, np.rint(BACKWARDS * grid.lengths / UNIT), left, np.roll(left, 1)])
+        costs = np.column_stack(
+            [lengths, np.rint(BACKWARDS * grid.lengths / UNIT), left, np.roll(left, 1)]
+        )
         self.paths = compiled_module("vkc_pin.planning.base_paths._driving").Paths(
             self._flags(),
             grid.moves.astype(np.int64),
             np.maximum(costs, 1.0).astype(np.int64),
-            *(np.column_stack([part.cell * HEADINGS + part.heading, part.cost]).astype(np.int64) for part in (starts, ends)),
+            *(
+                np.column_stack([part.cell * HEADINGS + part.heading, part.cost]).astype(np.int64)
+                for part in (starts, ends)
+            ),
         )
 
     def _flags(self) -> NDArray[np.uint8]:
@@ -125,7 +132,9 @@ class _Search:
             return grid.left(i, j, heading, reaching=near >= 0)
         if near == self.near[other]:
             return grid.forward(i, j, heading, reaching=near >= 0)
-        return self.ground.driven(Drive(self.ground.center(cell), self.ground.center(other), float(grid.yaws[heading])))
+        return self.ground.driven(
+            Drive(self.ground.center(cell), self.ground.center(other), float(grid.yaws[heading]))
+        )
 
     def _learn(self, node: int, after: int) -> None:
         """Take out a move that is not free, and what is blocked around it."""
@@ -134,7 +143,14 @@ class _Search:
         i, j = divmod(cell, self.grid.cells)
         if self._blocked(i, j, heading):  # then its neighbours may well be, too
             di, dj = self.grid.moves[heading].tolist()
-            for k, m in ((i + di, j + dj), (i - di, j - dj), (i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+            for k, m in (
+                (i + di, j + dj),
+                (i - di, j - dj),
+                (i + 1, j),
+                (i - 1, j),
+                (i, j + 1),
+                (i, j - 1),
+            ):
                 self._blocked(k, m, heading)
             for turned in (heading + 1, heading - 1):
                 self._blocked(i, j, turned % HEADINGS)
@@ -152,7 +168,12 @@ class _Search:
 
     def drives(self, path: list[int], begin: int, end: int) -> tuple[int, list[Drive], float]:
         """Return the goal of a path, the drives up to it, and the yaw there; arguments as of `free`."""
-        query, ground, yaws, goal = self.query, self.ground, self.grid.yaws, int(self.query.goal[end])
+        query, ground, yaws, goal = (
+            self.query,
+            self.ground,
+            self.grid.yaws,
+            int(self.query.goal[end]),
+        )
         drive, yaw = ground.begin(query.starts, begin)
         drives, before = [drive], -1
         for node, after in pairwise(path):

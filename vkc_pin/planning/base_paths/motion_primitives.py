@@ -1,6 +1,7 @@
 """How the mobile base moves between two places: it turns, drives straight, turns; what that costs, and where it is free.
 
-It drives ahead or backwards. Only next to the start and the goals, where furniture may leave no room to turn, it may slide.
+It drives ahead or backwards. Only next to the start and the goals, where furniture may leave no
+room to turn, it may slide.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ SIDEWAYS = 5.0
 UNIT = 1e-6
 """Costs on the grid are whole numbers of this [m], so that equal paths cost exactly the same."""
 
-_ENTRY = 0.6  # [m] from the start, and from the goals, to the cells where the path over the grid begins and ends
+# [m] from the start, and from the goals, to the cells where the path over the grid begins and ends
+_ENTRY = 0.6
 _CELL = 0.1  # [m]: where cells are smaller, so is the distance to them
 _LEAVE = 1.0  # [m]: so far a blocked start may be left in one go, if it overlaps something
 _AWAY = 10.0  # what a metre costs on which the base leaves what it overlaps
@@ -78,8 +80,10 @@ class Ground:
     """Where the base may move in one search: near its start and its goals, only the base counts, elsewhere what it carries, too.
 
     Attributes:
-        near: For each cell, a place (0: start, then the goals) that it is near, shape (cells, cells); -1: none.
-        stuck: Where the base, or what counts of what it carries, is known to be blocked, shape (cells, cells, HEADINGS).
+        near: For each cell, a place (0: start, then the goals) that it is near, shape (cells,
+            cells); -1: none.
+        stuck: Where the base, or what counts of what it carries, is known to be blocked, shape
+            (cells, cells, HEADINGS).
         leaving: Margins kept when leaving the start, if that is blocked; see `BaseGrid.leaving`.
         haste: What a metre costs when leaving the start.
     """
@@ -109,7 +113,9 @@ class Ground:
             self.grid.carried.driven(a, b, drive.yaw) for a, b in self._outside(drive)
         )
 
-    def swept(self, before: float, drive: Drive, after: float, margins: Floats | None = None) -> bool:
+    def swept(
+        self, before: float, drive: Drive, after: float, margins: Floats | None = None
+    ) -> bool:
         """Return whether the base can turn to a drive from one yaw, drive, and turn to another; `margins` up to there."""
         return (
             self.turned(drive.a, before, drive.yaw, margins)
@@ -122,7 +128,9 @@ class Ground:
         grid = self.grid
         count = int(np.hypot(*((drive.b - drive.a) / grid.step))) + 2
         cells = (
-            np.rint((np.linspace(drive.a, drive.b, count)[1:-1] - grid.origin) / grid.step).astype(int).clip(0, grid.cells - 1)
+            np.rint((np.linspace(drive.a, drive.b, count)[1:-1] - grid.origin) / grid.step)
+            .astype(int)
+            .clip(0, grid.cells - 1)
         )
         heading = int(np.abs(wrapped(grid.yaws - drive.yaw)).argmin())
         return not self.stuck[cells[:, 0], cells[:, 1], heading].any()
@@ -142,7 +150,13 @@ class Ground:
             return
         meets = mixed**2 > square * rest
         root = np.sqrt(mixed[meets] ** 2 - square * rest[meets])
-        inside = sorted(zip(((-mixed[meets] - root) / square).tolist(), ((-mixed[meets] + root) / square).tolist(), strict=True))
+        inside = sorted(
+            zip(
+                ((-mixed[meets] - root) / square).tolist(),
+                ((-mixed[meets] + root) / square).tolist(),
+                strict=True,
+            )
+        )
         done = 0.0
         for begin, end in [*inside, (1.0, np.inf)]:
             if done < min(begin, 1.0):
@@ -151,7 +165,9 @@ class Ground:
 
     def starts(self) -> Connections:
         """Return the connections from the start to the cells around it."""
-        found = self._connections(self.start, 1.0, _LEAVE if self.haste > 1.0 else _ENTRY, self.haste)
+        found = self._connections(
+            self.start, 1.0, _LEAVE if self.haste > 1.0 else _ENTRY, self.haste
+        )
         # A search from the goals would find out last, after it has looked everywhere else.
         return found.select(self.turnable(self.start, found, self.leaving))
 
@@ -163,22 +179,38 @@ class Ground:
         """Return those from a pose (`sign` 1), or to it (-1), within a radius [m], where a metre costs `haste`."""
         grid = self.grid
         step = float(grid.step.max())
-        cells = grid.around(float(pose[0]), float(pose[1]), max(radius * min(1.0, step / _CELL), 1.5 * step))
+        cells = grid.around(
+            float(pose[0]), float(pose[1]), max(radius * min(1.0, step / _CELL), 1.5 * step)
+        )
         offset = sign * (grid.origin + cells * grid.step - pose[:2])
         length = np.hypot(*offset.T)
         ahead = np.where(length > _SAME, np.arctan2(offset[:, 1], offset[:, 0]), pose[2])
         yaw = np.concatenate([ahead, ahead + np.pi, np.full(len(cells), pose[2])])
         heading = np.abs(wrapped(yaw[:, None] - grid.yaws)).argmin(axis=1)
         turned = np.abs(wrapped(yaw - pose[2])) + np.abs(wrapped(yaw - grid.yaws[heading]))
-        cost = haste * np.concatenate([length, BACKWARDS * length, SIDEWAYS * length]) + grid.turning * turned
-        found = Connections(np.tile(cells @ [grid.cells, 1], 3), heading, yaw, np.rint(cost / UNIT).astype(int))
+        cost = (
+            haste * np.concatenate([length, BACKWARDS * length, SIDEWAYS * length])
+            + grid.turning * turned
+        )
+        found = Connections(
+            np.tile(cells @ [grid.cells, 1], 3), heading, yaw, np.rint(cost / UNIT).astype(int)
+        )
         return found.select(~self.stuck.reshape(-1, len(grid.yaws))[found.cell, heading])
 
-    def turnable(self, pose: Floats, connections: Connections, margins: Floats | None = None) -> Bools:
+    def turnable(
+        self, pose: Floats, connections: Connections, margins: Floats | None = None
+    ) -> Bools:
         """Return for which connections the base can turn at the pose between its yaw and theirs, up to a few degrees more."""
-        key = pose.tobytes(), self._reaching(pose[:2]), None if margins is None else margins.tobytes()
+        key = (
+            pose.tobytes(),
+            self._reaching(pose[:2]),
+            None if margins is None else margins.tobytes(),
+        )
         if key not in self.grid.turns:  # one start, or goal, has paths to many
-            self.grid.turns[key] = self._turns(pose, 1.0, margins) + _TRY, self._turns(pose, -1.0, margins) + _TRY
+            self.grid.turns[key] = (
+                self._turns(pose, 1.0, margins) + _TRY,
+                self._turns(pose, -1.0, margins) + _TRY,
+            )
         left, right = self.grid.turns[key]
         turn = wrapped(connections.yaw - pose[2])
         return (turn < left) & (turn > -right)
@@ -186,7 +218,9 @@ class Ground:
     def _turns(self, pose: Floats, side: float, margins: Floats | None) -> float:
         """Return how far the base can turn at a pose to the left (`side` 1) or right (-1), up to half a turn [rad]."""
         turned = 0.0
-        while turned < np.pi and self.turned(pose[:2], pose[2] + side * turned, pose[2] + side * (turned + _TRY), margins):
+        while turned < np.pi and self.turned(
+            pose[:2], pose[2] + side * turned, pose[2] + side * (turned + _TRY), margins
+        ):
             turned += _TRY
         return turned
 
@@ -194,12 +228,20 @@ class Ground:
         """Return the drive of a connection from the start, and the yaw in its cell."""
         yaw = float(self.start[2] + wrapped(connections.yaw[number] - self.start[2]))
         drive = Drive(self.start[:2], self.center(connections.cell[number]), yaw)
-        return drive, float(drive.yaw + wrapped(self.grid.yaws[connections.heading[number]] - drive.yaw))
+        return drive, float(
+            drive.yaw + wrapped(self.grid.yaws[connections.heading[number]] - drive.yaw)
+        )
 
-    def end(self, connections: Connections, number: int, goal: int, yaw: float) -> tuple[Drive, float]:
+    def end(
+        self, connections: Connections, number: int, goal: int, yaw: float
+    ) -> tuple[Drive, float]:
         """Return the drive of a connection to a goal from its cell, where the base has a yaw, and the yaw at the goal."""
         pose = self.goals[goal]
-        drive = Drive(self.center(connections.cell[number]), pose[:2], float(yaw + wrapped(connections.yaw[number] - yaw)))
+        drive = Drive(
+            self.center(connections.cell[number]),
+            pose[:2],
+            float(yaw + wrapped(connections.yaw[number] - yaw)),
+        )
         return drive, float(drive.yaw + wrapped(pose[2] - drive.yaw))
 
     def direct(self, goal: int, how: int) -> tuple[Drive, float] | None:

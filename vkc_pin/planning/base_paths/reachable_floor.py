@@ -1,7 +1,8 @@
 """Where the base cannot get to at any heading: a disc inside it does not pass, so that nothing around the disc passes either.
 
-Whatever the heading, the base covers a disc around a point of it. Obstacles grown by its radius are where the point cannot be. A
-cell counts as taken only if all of it is: what a flood over the other cells, corners included, does not touch, no motion gets to.
+Whatever the heading, the base covers a disc around a point of it. Obstacles grown by its radius are
+where the point cannot be. A cell counts as taken only if all of it is: what a flood over the other
+cells, corners included, does not touch, no motion gets to.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ class Wall(NamedTuple):
     """Part of an obstacle at some height, and how near the base's origin it keeps away.
 
     Attributes:
-        outline: Corners of a convex polygon that is inside the obstacle, counter-clockwise, shape (n, 2) [m].
+        outline: Corners of a convex polygon that is inside the obstacle, counter-clockwise, shape
+            (n, 2) [m].
         radius: Of a disc that is inside the base at the same height [m].
         number: Of the obstacle.
     """
@@ -57,7 +59,9 @@ class Cells(NamedTuple):
 
     def at(self, place: Floats) -> tuple[int, int]:
         """Return the cell that a place is in, shape (2,) [m], or the nearest one."""
-        i, j = np.clip(np.rint((place - self.origin) / self.step), 0, np.array(self.shape) - 1).astype(int)
+        i, j = np.clip(
+            np.rint((place - self.origin) / self.step), 0, np.array(self.shape) - 1
+        ).astype(int)
         return int(i), int(j)
 
 
@@ -83,7 +87,11 @@ class Discs:
     def radius(self, height: float) -> float:
         """Return the radius of a disc around the base's origin that is inside the base at a height [m]; not positive: none."""
         if height not in self._radii:
-            part = [_outline(solid, height) for solid in self._solids if solid.bottom < height < solid.top]
+            part = [
+                _outline(solid, height)
+                for solid in self._solids
+                if solid.bottom < height < solid.top
+            ]
             self._radii[height] = _disc(part) - _SLACK
         return self._radii[height]
 
@@ -98,10 +106,16 @@ class Discs:
         for number, shape in enumerate(standing):
             for solid in solids_of([shape]):
                 low, high = max(solid.bottom, self._bottom), min(solid.top, self._top)
-                heights = [z for z in levels if low < z < high] or [(low + high) / 2.0] * (low < high)
+                heights = [z for z in levels if low < z < high] or [(low + high) / 2.0] * (
+                    low < high
+                )
                 if solid.prism and heights:
                     heights = [max(heights, key=self.radius)]
-                found += [Wall(self._slice(solid, z), self.radius(z), number) for z in heights if self.radius(z) > 0.0]
+                found += [
+                    Wall(self._slice(solid, z), self.radius(z), number)
+                    for z in heights
+                    if self.radius(z) > 0.0
+                ]
         return [wall for wall in found if len(wall.outline)]
 
     def _slice(self, solid: Solid, height: float) -> Floats:
@@ -173,20 +187,26 @@ def taken(cells: Cells, wall: Wall, grown: float) -> tuple[tuple[slice, slice], 
     Args:
         cells: The floor.
         wall: What keeps the base's origin away.
-        grown: A cell is taken if its centre is nearer to the wall than the wall's radius and so much [m]. With half a cell's
-            diagonal, negative, all of it is out of bounds; positive, no part of what is not taken is.
+        grown: A cell is taken if its centre is nearer to the wall than the wall's radius and so
+            much [m]. With half a cell's diagonal, negative, all of it is out of bounds; positive,
+            no part of what is not taken is.
     """
     outline, reach = wall.outline, wall.radius + grown
     low = np.ceil((outline.min(axis=0) - max(reach, 0.0) - cells.origin) / cells.step)
     high = np.floor((outline.max(axis=0) + max(reach, 0.0) - cells.origin) / cells.step) + 1
-    rows, columns = (slice(*np.clip([low[k], high[k]], 0, cells.shape[k]).astype(int).tolist()) for k in (0, 1))
+    rows, columns = (
+        slice(*np.clip([low[k], high[k]], 0, cells.shape[k]).astype(int).tolist()) for k in (0, 1)
+    )
     x, y = cells.centers()
     return (rows, columns), _signed(outline, x[rows], y[:, columns]) < reach
 
 
 def _signed(outline: Floats, x: Floats, y: Floats) -> Floats:
     """Return how far places are from a convex polygon, negative inside, shape (X, Y) [m]; x of shape (X, 1), y (1, Y)."""
-    square, inside = np.full((len(x), y.shape[1]), np.inf), np.full((len(x), y.shape[1]), len(outline) > 2)
+    square, inside = (
+        np.full((len(x), y.shape[1]), np.inf),
+        np.full((len(x), y.shape[1]), len(outline) > 2),
+    )
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         ex, ey, ox, oy = bx - ax, by - ay, x - ax, y - ay
         share = np.clip((ox * ex + oy * ey) / max(ex * ex + ey * ey, _THIN), 0.0, 1.0)

@@ -1,10 +1,11 @@
 """The shortest paths of a car that drives ahead and back, in closed form.
 
-J. A. Reeds and L. A. Shepp, Optimal paths for a car that goes both forwards and backwards, Pacific Journal of Mathematics 145
-(2), 1990: they are among 48 words of at most five pieces, arcs of the least radius and straight lines. A formula each gives the
-pieces of some (8.1 to 8.4 and 8.7 to 8.11 there); going backwards in time, mirroring and reversing give the rest. The formulas
-are compiled (`reeds_shepp.hpp`): a search for seeds asks for thousands of lengths. Here poses are those of the goal as the start
-sees it, in units of the radius.
+J. A. Reeds and L. A. Shepp, Optimal paths for a car that goes both forwards and backwards, Pacific
+Journal of Mathematics 145 (2), 1990: they are among 48 words of at most five pieces, arcs of the
+least radius and straight lines. A formula each gives the pieces of some (8.1 to 8.4 and 8.7 to 8.11
+there); going backwards in time, mirroring and reversing give the rest. The formulas are compiled
+(`reeds_shepp.hpp`): a search for seeds asks for thousands of lengths. Here poses are those of the
+goal as the start sees it, in units of the radius.
 """
 
 from __future__ import annotations
@@ -39,9 +40,17 @@ def shortest_words(goal: Floats, radius: float) -> list[tuple[float, float]]:
     Raises:
         BuildError: The compiled module is missing.
     """
-    return [(radius * length, turn) for length, turn in _words(goal[None])[0].tolist() if abs(length) > _SAME]
+    return [
+        (radius * length, turn)
+        for length, turn in _words(goal[None])[0].tolist()
+        if abs(length) > _SAME
+    ]
 
 
 def _words(goals: Floats) -> Floats:
     """Return what the pieces of paths to goals lead, in radii, and turn, shape (B, 5, 2); pieces that are not needed are 0."""
-    return np.asarray(compiled_module("vkc_pin.planning.base_paths._driving").shortest_words(np.ascontiguousarray(goals, float)))
+    return np.asarray(
+        compiled_module("vkc_pin.planning.base_paths._driving").shortest_words(
+            np.ascontiguousarray(goals, float)
+        )
+    )

@@ -19,7 +19,13 @@ from vkc_pin.utils.budget import spend
 from vkc_pin.world.collision.margins import Place
 from vkc_pin.world.models.shapes import bounding_box, link_name, own_name
 from vkc_pin.world.scene.clearance_exemptions import allowances, shape_keys
-from vkc_pin.world.scene.contact_rules import CONTACT, grasped, hand_clearance, moves_as_one, touching
+from vkc_pin.world.scene.contact_rules import (
+    CONTACT,
+    grasped,
+    hand_clearance,
+    moves_as_one,
+    touching,
+)
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
@@ -29,7 +35,9 @@ from vkc_pin.world.task.phases import Phase, Task
 __all__ = ["phase_geometries"]
 
 
-def phase_geometries(scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> list[PhaseGeometry]:
+def phase_geometries(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
+) -> list[PhaseGeometry]:
     """Return the geometry of every phase of a task, and the pairs that can collide in it.
 
     Args:
@@ -46,14 +54,23 @@ def phase_geometries(scene: Scene, chain: VirtualKinematicChain, task: Task, opt
 
 
 class _Pairing:
-    def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> None:
+    def __init__(
+        self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
+    ) -> None:
         self.scene, self.chain, self.task, self.options = scene, chain, task, options
-        self.first_waypoint = np.concatenate([[0], np.cumsum([phase.segments for phase in task.phases])])
-        self._labels = [scene.robot.link_of(i) for i in range(len(scene.robot.collision.geometryObjects))]
+        self.first_waypoint = np.concatenate(
+            [[0], np.cumsum([phase.segments for phase in task.phases])]
+        )
+        self._labels = [
+            scene.robot.link_of(i) for i in range(len(scene.robot.collision.geometryObjects))
+        ]
         held = [(hold.object, indices) for hold, indices in chain.held_geometries.items()]
         riding = [(ride.object, indices) for ride, indices in chain.ride_geometries.items()]
         for name, indices in (*held, *riding):
-            self._labels += [f"{name}.{link_name(own_name(chain.collision.geometryObjects[i].name))}" for i in indices]
+            self._labels += [
+                f"{name}.{link_name(own_name(chain.collision.geometryObjects[i].name))}"
+                for i in indices
+            ]
         self._allowances = allowances(scene, options.dist_safe)
         self._obstacles = scene.obstacles
         self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
@@ -63,29 +80,55 @@ class _Pairing:
         holds = {hold.object: hold for hold in phase.held}
         shapes, labels = list(chain.opened(phase.opening).geometryObjects), list(self._labels)
         of_chain = self._boxes[0] if phase.opening is None else _boxes(shapes)
-        robots, own, margin = range(len(scene.robot.collision.geometryObjects)), len(shapes), self.options.dist_safe
-        pairs = [(*pair, own_margin) for pair, own_margin in scene.robot.own_margins(self.options.self_distance).items()]
+        robots, own, margin = (
+            range(len(scene.robot.collision.geometryObjects)),
+            len(shapes),
+            self.options.dist_safe,
+        )
+        pairs = [
+            (*pair, own_margin)
+            for pair, own_margin in scene.robot.own_margins(self.options.self_distance).items()
+        ]
         moving, mine = list(robots), dict[str, tuple[int, ...]]()
         for hold in phase.held:
             mine[hold.object] = chain.held_geometries[hold]
-            pairs += [(i, j, self._held_margin(hold, labels[i], labels[j])) for i in moving for j in mine[hold.object]]
             pairs += [
-                (i, j, margin) for i, j in combinations(mine[hold.object], 2) if self._own_pair(hold.object, labels[i], labels[j])
+                (i, j, self._held_margin(hold, labels[i], labels[j]))
+                for i in moving
+                for j in mine[hold.object]
+            ]
+            pairs += [
+                (i, j, margin)
+                for i, j in combinations(mine[hold.object], 2)
+                if self._own_pair(hold.object, labels[i], labels[j])
             ]
             moving += mine[hold.object]
         for ride in phase.rides:
             mine[ride.object] = chain.ride_geometries[ride]
-            together = {shapes[j].parentJoint for j in mine[ride.object]}  # with what is on the same joint it moves as one
-            pairs += [(i, j, margin) for i in moving if shapes[i].parentJoint not in together for j in mine[ride.object]]
+            together = {
+                shapes[j].parentJoint for j in mine[ride.object]
+            }  # with what is on the same joint it moves as one
+            pairs += [
+                (i, j, margin)
+                for i in moving
+                if shapes[i].parentJoint not in together
+                for j in mine[ride.object]
+            ]
             moving += mine[ride.object]
         pairs = [pair for pair in pairs if np.isfinite(pair[2])]
         left: dict[str, tuple[int, ...]] = {}
         for name, placed in scene.objects.items():
-            state = {c.removeprefix(f"{name}."): v for c, v in phase.before.items() if c.startswith(f"{name}.")}
+            state = {
+                c.removeprefix(f"{name}."): v
+                for c, v in phase.before.items()
+                if c.startswith(f"{name}.")
+            }
             if placed.object.free:
                 if name in mine:
                     continue
-                placed = dataclasses.replace(placed, placement=phase.standing.get(name, placed.placement))
+                placed = dataclasses.replace(
+                    placed, placement=phase.standing.get(name, placed.placement)
+                )
             standing = standing_geometry(placed.with_state(state))
             if name in mine:  # its frame stands on, the rest is in the hand
                 held_shapes = {own_name(shapes[i].name) for i in mine[name]}
@@ -94,22 +137,35 @@ class _Pairing:
                 left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
             for shape in standing:
                 label = f"{name}.{link_name(shape.name)}"
-                others = [i for i in moving if i not in mine.get(name, ()) or self._own_pair(name, labels[i], label)]
+                others = [
+                    i
+                    for i in moving
+                    if i not in mine.get(name, ()) or self._own_pair(name, labels[i], label)
+                ]
                 held = holds.get(name)  # and it moves only some of its joints
-                pairs += [(i, len(shapes), self._held_margin(held, labels[i], label) if held else margin) for i in others]
+                pairs += [
+                    (i, len(shapes), self._held_margin(held, labels[i], label) if held else margin)
+                    for i in others
+                ]
                 shape.name = f"{name}.{shape.name}"
                 shapes.append(shape)
                 labels.append(label)
         spend()
-        attached = {i for name, indices in mine.items() if scene.objects[name].object.free for i in indices}
+        attached = {
+            i for name, indices in mine.items() if scene.objects[name].object.free for i in indices
+        }
         above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
-        table = np.concatenate([np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)])
+        table = np.concatenate(
+            [np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)]
+        )
         labels += scene.obstacle_labels
         names = [shape.name for shape in shapes] + [shape.name for shape in self._obstacles]
         table, near = self._allowed(phase, table, labels, shape_keys(labels, names))
         if not len(table):
             expected = "collision geometry in robot or scene"
-            raise InputError("no pair of geometries can collide", field=phase.name, expected=expected)
+            raise InputError(
+                "no pair of geometries can collide", field=phase.name, expected=expected
+            )
         boxes = zip(of_chain, _boxes(shapes[own:]), self._boxes[1], strict=True)
         center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
         shapes += self._obstacles
@@ -126,12 +182,15 @@ class _Pairing:
             neighbours=near,
             left=left,
         )
-        return dataclasses.replace(part, eased=eased_pairs(self.scene, self.chain, self.task, number, part, self.options))
+        return dataclasses.replace(
+            part, eased=eased_pairs(self.scene, self.chain, self.task, number, part, self.options)
+        )
 
     def _held_margin(self, hold: Hold, one: str, link: str) -> float:
         """Return the clearance [m] of what has the label `one` from a link, by its label, of what is held.
 
-        The hand and what it grasps move together, so that there is nothing to plan, unless the grasp leaves a freedom.
+        The hand and what it grasps move together, so that there is nothing to plan, unless the
+        grasp leaves a freedom.
         """
         if one not in touching(self.scene, hold):
             return self.options.dist_safe
@@ -173,7 +232,9 @@ class _Pairing:
                 near.append(Place(near_pairs, margin, *within))
         return table[kept], near
 
-    def _within(self, phase: Phase, ranges: Mapping[str, tuple[float, float]]) -> tuple[Ints, Floats, Floats] | None:
+    def _within(
+        self, phase: Phase, ranges: Mapping[str, tuple[float, float]]
+    ) -> tuple[Ints, Floats, Floats] | None:
         """Return coordinates of the chain and limits, shape (m,) each; None if one that stands still is outside its own."""
         columns, limits = list[int](), list[tuple[float, float]]()
         for name, (lower, upper) in ranges.items():
@@ -183,7 +244,9 @@ class _Pairing:
                 continue
             owner, _, joint = name.partition(".")
             placed = self.scene.objects[owner]
-            value = phase.before.get(name, float(placed.state[placed.object.coordinates.index(joint)]))
+            value = phase.before.get(
+                name, float(placed.state[placed.object.coordinates.index(joint)])
+            )
             if not lower <= value <= upper:
                 return None
         low, high = np.array(limits).reshape(-1, 2).T
@@ -191,19 +254,24 @@ class _Pairing:
 
     def _own_pair(self, name: str, first: str, second: str) -> bool:
         """Return whether two links of an object, by their labels, can meet."""
-        return frozenset(label.partition(".")[2] for label in (first, second)) in self.scene.objects[name].object.own_pairs
+        return (
+            frozenset(label.partition(".")[2] for label in (first, second))
+            in self.scene.objects[name].object.own_pairs
+        )
 
     def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> Floats:
         """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.
 
-        Of `moving`, only those that are `above` the floor can hit it: wheels stand on it, and doors hang above it as their
-        makers hung them.
+        Of `moving`, only those that are `above` the floor can hit it: wheels stand on it, and doors
+        hang above it as their makers hung them.
         """
         ones, others = np.array(moving, int), np.arange(len(self._obstacles))
         floor = np.array([label == FLOOR for label in self.scene.obstacle_labels], bool)
         pairs = np.column_stack([np.tile(ones, len(others)), np.repeat(others, len(ones))])
         pairs = pairs[~floor[pairs[:, 1]] | np.isin(pairs[:, 0], above)]
-        return np.column_stack([pairs[:, 0], first + pairs[:, 1], np.full(len(pairs), self.options.dist_safe)])
+        return np.column_stack(
+            [pairs[:, 0], first + pairs[:, 1], np.full(len(pairs), self.options.dist_safe)]
+        )
 
 
 def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:

@@ -27,14 +27,20 @@ Eased = dict[int, list[tuple[int, int, float]]]
 
 
 def eased_pairs(
-    scene: Scene, chain: VirtualKinematicChain, task: Task, number: int, part: PhaseGeometry, options: Options
+    scene: Scene,
+    chain: VirtualKinematicChain,
+    task: Task,
+    number: int,
+    part: PhaseGeometry,
+    options: Options,
 ) -> Eased:
     """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while; see `world.scene.contact_rules`.
 
-    A hand keeps the attachment's clearance from the object that it takes or lets go of. A free object rests on something where it
-    is lifted from and where it is put down, and may still do so in the hand at the start, with what rides on it; a frame that
-    touches a target may come close to what the target is on: there the margin is half the distance at the contact. What a free
-    object stands in at the start it may stand in then.
+    A hand keeps the attachment's clearance from the object that it takes or lets go of. A free
+    object rests on something where it is lifted from and where it is put down, and may still do so
+    in the hand at the start, with what rides on it; a frame that touches a target may come close to
+    what the target is on: there the margin is half the distance at the contact. What a free object
+    stands in at the start it may stand in then.
 
     Args:
         scene: Where it happens.
@@ -49,7 +55,15 @@ def eased_pairs(
     last, steps = first + phase.segments, options.steps(EASED_TIME)
     shapes, eased = part.shapes, Eased()
 
-    def ease(moving: int, shape: coal.CollisionGeometry, where: pin.SE3, begin: int, end: int, *, inside: bool = False) -> None:
+    def ease(
+        moving: int,
+        shape: coal.CollisionGeometry,
+        where: pin.SE3,
+        begin: int,
+        end: int,
+        *,
+        inside: bool = False,
+    ) -> None:
         """Ease the pairs of a geometry that moves with what stands next to a shape, or in it."""
         beside = part.within(float(part.margins.max()), *world_box(shape, where))
         for k in part.pairs_of(moving, beside).tolist():
@@ -57,9 +71,14 @@ def eased_pairs(
             distance = shape_distance(shape, where, other.geometry, other.placement)
             share = EASED_SHARE * max(distance, 0.0)
             if distance < part.margins[k]:
-                eased.setdefault(k, []).append((begin, end, distance if inside and distance < -CONTACT else share))
+                eased.setdefault(k, []).append(
+                    (begin, end, distance if inside and distance < -CONTACT else share)
+                )
 
-    for holds, begin, end in ((phase.leaves, first, first + steps), (phase.grasps, last - steps, last)):
+    for holds, begin, end in (
+        (phase.leaves, first, first + steps),
+        (phase.grasps, last - steps, last),
+    ):
         for hold in holds:
             hand = np.isin(part.labels, list(touching(scene, hold)))
             its = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
@@ -70,7 +89,9 @@ def eased_pairs(
         stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
         for i in geometries:
             begin, end = (first, first + steps) if begins else (last - steps, last)
-            new = begins and placed.name not in {hold.object for earlier in task.phases[:number] for hold in earlier.held}
+            new = begins and placed.name not in {
+                hold.object for earlier in task.phases[:number] for hold in earlier.held
+            }
             ease(i, shapes[i].geometry, stands[own_name(shapes[i].name)], begin, end, inside=new)
     touches = [(goal, last - steps, last) for goal in phase.frames]
     touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
@@ -93,7 +114,11 @@ def _moments(
     What is in the hand at the start begins there.
     """
     phase = task.phases[number]
-    at_start = {hold: scene.objects[hold.object].placement for hold in phase.held if number == 0 and hold in scene.holds}
+    at_start = {
+        hold: scene.objects[hold.object].placement
+        for hold in phase.held
+        if number == 0 and hold in scene.holds
+    }
     for moments, begins in ((at_start, True), (phase.lifted, True), (phase.lowered, False)):
         for hold, placement in moments.items():
             if not scene.objects[hold.object].object.free:
@@ -106,16 +131,27 @@ def _moments(
     for ride in phase.rides:
         carrier = scene.objects[ride.hold.object]
         if not carrier.object.free:
-            goals = {name: float(np.clip(value, *phase.ranges[name])) for name, value in phase.values.items()}
+            goals = {
+                name: float(np.clip(value, *phase.ranges[name]))
+                for name, value in phase.values.items()
+            }
             for state, begins in ((phase.before, True), ({**phase.before, **goals}, False)):
-                yield chain.ride_geometries[ride], _ridden(scene, ride, _with(carrier, state)), begins
+                yield (
+                    chain.ride_geometries[ride],
+                    _ridden(scene, ride, _with(carrier, state)),
+                    begins,
+                )
 
 
 def _ridden(scene: Scene, ride: Ride, carrier: PlacedObject) -> PlacedObject:
     """Return what rides, where it stands on a carrier."""
-    return dataclasses.replace(scene.objects[ride.object], placement=carrier.link_placement(ride.link) * ride.local)
+    return dataclasses.replace(
+        scene.objects[ride.object], placement=carrier.link_placement(ride.link) * ride.local
+    )
 
 
 def _with(placed: PlacedObject, state: Mapping[str, float]) -> PlacedObject:
     """Return an object with those of some values, by coordinate "<object>.<joint>", that are its own."""
-    return placed.with_state({c.partition(".")[2]: v for c, v in state.items() if c.partition(".")[0] == placed.name})
+    return placed.with_state(
+        {c.partition(".")[2]: v for c, v in state.items() if c.partition(".")[0] == placed.name}
+    )

@@ -34,7 +34,9 @@ class PoseSolver:
         self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))
         self._function = BatchFunction(ca.Function("pose", [z, target], [residual, jacobian]))
-        lower, upper, weights = (ca.SX.sym(name, self.size) for name in ("lower", "upper", "weights"))
+        lower, upper, weights = (
+            ca.SX.sym(name, self.size) for name in ("lower", "upper", "weights")
+        )
         step = _step(z, residual, jacobian, weights, (lower, upper))
         moved = [ca.mmax(ca.fabs(residual)), ca.fmin(ca.fmax(z + step, lower), upper)]
         self._moved = BatchFunction(ca.Function("moved", [z, target, lower, upper, weights], moved))
@@ -66,7 +68,8 @@ class PoseSolver:
             z: Seeds, shape (B, n).
             target: Placement of the frame in the world.
             lower: Lower limits, shape (n,) or (B, n).
-            upper: Upper limits, shape (n,) or (B, n); a coordinate whose limits are equal stays there.
+            upper: Upper limits, shape (n,) or (B, n); a coordinate whose limits are equal stays
+                there.
             weights: What moving a coordinate costs, shape (n,).
             iterations: At most so many steps.
             tolerance: Largest residual of a solution, [m] and [rad].
@@ -91,7 +94,9 @@ class PoseSolver:
         return z, errors < tolerance
 
 
-def _step(z: ca.SX, residual: ca.SX, jacobian: ca.SX, weights: ca.SX, limits: tuple[ca.SX, ca.SX]) -> ca.SX:
+def _step(
+    z: ca.SX, residual: ca.SX, jacobian: ca.SX, weights: ca.SX, limits: tuple[ca.SX, ca.SX]
+) -> ca.SX:
     """Return the damped Gauss-Newton step, shape (n,); a coordinate that it pushes beyond its limit is taken out, once."""
     lower, upper = limits
     free = upper - lower > 1e-9

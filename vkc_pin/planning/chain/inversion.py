@@ -24,8 +24,8 @@ class InvertedTree:
     """An object re-rooted at one of its links: `model`'s universe frame is that link's frame.
 
     Attributes:
-        model: The joints on the path from the link to the base link, each with its name, coordinate and limits; a body
-            frame for every link of the object, by its name.
+        model: The joints on the path from the link to the base link, each with its name, coordinate
+            and limits; a body frame for every link of the object, by its name.
         collision, visual: The object's geometry, with its names, on the bodies of `model`.
         coordinates: The minimal coordinates of `model`.
         link: The link that is now the root.
@@ -43,16 +43,17 @@ class InvertedTree:
 def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
     """Re-root `obj` at `link`.
 
-    With placement P and motion J(q) of a joint, parent → child is P·J(q), so child → parent is J(q)⁻¹·P⁻¹. For revolute
-    and prismatic joints J(q)⁻¹ is the same joint with the axis negated. The axis is then turned into z by a constant
-    rotation R, J(q)⁻¹ = R·J_z(q)·R⁻¹, which goes into the placements around it: every joint of the result is one of
-    Pinocchio's z-aligned joints, whose symbolic expressions are the shortest.
+    With placement P and motion J(q) of a joint, parent → child is P·J(q), so child → parent is
+    J(q)⁻¹·P⁻¹. For revolute and prismatic joints J(q)⁻¹ is the same joint with the axis negated.
+    The axis is then turned into z by a constant rotation R, J(q)⁻¹ = R·J_z(q)·R⁻¹, which goes into
+    the placements around it: every joint of the result is one of Pinocchio's z-aligned joints,
+    whose symbolic expressions are the shortest.
 
     Args:
         obj: The object.
         link: The link that becomes the root.
-        state: Joint values, shape (n,), [rad] or [m]. Joints beside the path from `link` to the base link are locked at
-            these; the values of those on the path do not matter.
+        state: Joint values, shape (n,), [rad] or [m]. Joints beside the path from `link` to the
+            base link are locked at these; the values of those on the path do not matter.
 
     Raises:
         UnknownNameError: The object has no such link.
@@ -68,7 +69,8 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
 
     model = pin.Model()
     model.name = obj.name
-    # For every joint of the path: the joint of the new model that carries its body, and the body's placement there.
+    # For every joint of the path: the joint of the new model that carries its body, and the body's
+    # placement there.
     carrier: dict[int, tuple[int, pin.SE3]] = {path[0]: (0, root.placement.inverse())}
     for child, parent in pairwise(path):
         new_parent, body = carrier[child]
@@ -93,7 +95,9 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
     for index, frame in enumerate(source.frames):
         if frame.type == pin.FrameType.BODY:
             new, placement = place(frame.parentJoint, frame.placement)
-            frames[index] = model.addFrame(pin.Frame(frame.name, new, 0, placement, pin.FrameType.BODY), False)
+            frames[index] = model.addFrame(
+                pin.Frame(frame.name, new, 0, placement, pin.FrameType.BODY), False
+            )
 
     def carry(geometry: pin.GeometryModel) -> pin.GeometryModel:
         carried = pin.GeometryModel()
@@ -125,7 +129,9 @@ def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointM
     if kind in ("PX", "PY", "PZ", "PrismaticUnaligned"):
         return pin.JointModelPZ(), subspace[:3]
     expected = "a revolute, continuous or prismatic joint"
-    raise InputError("this joint cannot be inverted", field=model.names[index], expected=expected, got=kind)
+    raise InputError(
+        "this joint cannot be inverted", field=model.names[index], expected=expected, got=kind
+    )
 
 
 def _z_to(axis: Floats) -> Floats:

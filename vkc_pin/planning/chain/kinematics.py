@@ -30,7 +30,9 @@ class Kinematics:
     def batch(self) -> BatchFunction:
         """Z → (12·(J − 1),): by columns R and t of every joint's placement in the world, for many rows at once."""
         z = ca.SX.sym("z", self._coordinates.size)
-        return BatchFunction(ca.Function("placements", [z], [ca.densify(self.symbolic(z))], {"cse": True}))
+        return BatchFunction(
+            ca.Function("placements", [z], [ca.densify(self.symbolic(z))], {"cse": True})
+        )
 
     @property
     def nbytes(self) -> int:

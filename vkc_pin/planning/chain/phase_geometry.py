@@ -26,10 +26,14 @@ class PhaseGeometry:
         pairs: Shape (P, 2); of every pair at least the first moves.
         margins: Clearance each pair must keep, shape (P,) [m].
         joint: Parent joint per geometry, shape (G,).
-        center, half: Bounding box per geometry, in the geometry's own frame: centre and half extents, shape (G, 3) [m].
-        rotation, translation: Placement of each geometry in its joint's frame, shapes (G, 3, 3) and (G, 3).
-        eased: Pair → (first waypoint, last waypoint, margin) [m]: between these it may come closer than `margins` says, so close.
-        neighbours: Where pairs may come closer than `margins` says; see `world.scene.clearance_exemptions`.
+        center, half: Bounding box per geometry, in the geometry's own frame: centre and half
+            extents, shape (G, 3) [m].
+        rotation, translation: Placement of each geometry in its joint's frame, shapes (G, 3, 3) and
+            (G, 3).
+        eased: Pair → (first waypoint, last waypoint, margin) [m]: between these it may come closer
+            than `margins` says, so close.
+        neighbours: Where pairs may come closer than `margins` says; see
+            `world.scene.clearance_exemptions`.
         left: Object → its geometries, for what the motion leaves behind at a place that it chooses.
     """
 
@@ -46,7 +50,9 @@ class PhaseGeometry:
     neighbours: Sequence[Place] = ()
     left: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
-    def margins_at(self, pairs: Ints, waypoints: Ints, z: Floats | None = None, rows: Ints | None = None) -> Floats:
+    def margins_at(
+        self, pairs: Ints, waypoints: Ints, z: Floats | None = None, rows: Ints | None = None
+    ) -> Floats:
         """Return the clearances that pairs must keep at waypoints, shape (n,) [m]; -inf: none.
 
         Args:
@@ -57,11 +63,17 @@ class PhaseGeometry:
         """
         if z is None:
             return self._usual.at(pairs, waypoints, np.empty((1, 0)), np.zeros(len(pairs), int))
-        return self.margin_table.at(pairs, waypoints, z, np.arange(len(z)) if rows is None else rows)
+        return self.margin_table.at(
+            pairs, waypoints, z, np.arange(len(z)) if rows is None else rows
+        )
 
     def placed(self, where: Mapping[int, pin.SE3]) -> PhaseGeometry:
         """Return the same with geometries that stand placed elsewhere in the world."""
-        shapes, rotation, translation = list(self.shapes), self.rotation.copy(), self.translation.copy()
+        shapes, rotation, translation = (
+            list(self.shapes),
+            self.rotation.copy(),
+            self.translation.copy(),
+        )
         for geometry, placement in where.items():
             shapes[geometry] = pin.GeometryObject(shapes[geometry])
             shapes[geometry].placement = placement

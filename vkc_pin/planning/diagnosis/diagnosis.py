@@ -40,9 +40,16 @@ class Blocked(NamedTuple):
 def impossible(problem: TrajectoryProblem) -> list[Violation]:
     """Return what is wrong before anything moves: a start in collision, a hand off what it holds, goals beyond limits."""
     found = []
-    contacts, deepest = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0), dict[str, float]()
-    for (first, second), distance, margin in zip(contacts.pair, contacts.distance, contacts.margin, strict=True):
-        if distance >= (margin if margin > CONTACT else margin - CONTACT):  # as the scene allows, or in contact where that may be
+    contacts, deepest = (
+        problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0),
+        dict[str, float](),
+    )
+    for (first, second), distance, margin in zip(
+        contacts.pair, contacts.distance, contacts.margin, strict=True
+    ):
+        if distance >= (
+            margin if margin > CONTACT else margin - CONTACT
+        ):  # as the scene allows, or in contact where that may be
             continue
         labels = problem.contacts.phases[0].labels
         subject = f"{labels[first]} – {labels[second]}"
@@ -55,20 +62,34 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
             error = float(np.abs(solver.evaluate(problem.start[None], goal.target)[0]).max())
             if error > problem.options.closure_position:
                 detail = f"it is held at the start, but the hand is {error:.4f} m or rad from its attachment"
-                found.append(Violation("closure", goal.about, amount=error, unit="m", detail=detail))
+                found.append(
+                    Violation("closure", goal.about, amount=error, unit="m", detail=detail)
+                )
     dt = problem.timing_for(problem.still).dt
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         waypoint, time = int(end), float(dt[:end].sum())
         goals = dict(phase.values)
         if phase.base is not None:
-            goals |= {n: v for n, v in zip(problem.chain.names[:2], phase.base[:2], strict=True) if v is not None}
+            goals |= {
+                n: v
+                for n, v in zip(problem.chain.names[:2], phase.base[:2], strict=True)
+                if v is not None
+            }
         for name, value in goals.items():
             lower, upper = problem.limits(name)
             beyond = max(lower - value, value - upper)
             if beyond > 1e-9:
                 detail = f"{value:g} is beyond the limits {lower:g} to {upper:g} by {beyond:.4g}"
                 found.append(
-                    Violation("goal", name, waypoint=waypoint, time=time, amount=beyond, unit=problem.unit(name), detail=detail)
+                    Violation(
+                        "goal",
+                        name,
+                        waypoint=waypoint,
+                        time=time,
+                        amount=beyond,
+                        unit=problem.unit(name),
+                        detail=detail,
+                    )
                 )
     return found
 
@@ -99,7 +120,9 @@ def blocked(problem: TrajectoryProblem, number: int, random_seed: int) -> Blocke
         )
         return Blocked(text, float(residual[nearest]))
     reached = z[residual < TOLERANCE]
-    contacts = problem.contacts.evaluate(reached, np.full(len(reached), end), reach=problem.options.largest_margin)
+    contacts = problem.contacts.evaluate(
+        reached, np.full(len(reached), end), reach=problem.options.largest_margin
+    )
     shortfall = contacts.shortfall(len(reached))
     if shortfall.min() <= CLOSE_ENOUGH:  # a motion that ended so may go on so
         return None
@@ -114,7 +137,9 @@ def blocked(problem: TrajectoryProblem, number: int, random_seed: int) -> Blocke
     return Blocked(text, float(shortfall[best]))
 
 
-def _try(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator) -> tuple[Floats, Floats] | None:
+def _try(
+    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
+) -> tuple[Floats, Floats] | None:
     """Return what `scatter` does, drawn again and again until something is free, up to `_DRAWS` times."""
     found: list[tuple[Floats, Floats]] = []
     for _ in range(_DRAWS):
@@ -125,8 +150,14 @@ def _try(problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator) ->
         z = tried[0][tried[1] < TOLERANCE]
         if len(z) and depth(problem, z, waypoint).min() <= CLOSE_ENOUGH:
             break
-    return np.concatenate([z for z, _ in found]), np.concatenate([residual for _, residual in found])
+    return np.concatenate([z for z, _ in found]), np.concatenate(
+        [residual for _, residual in found]
+    )
 
 
 def _gap(distance: float) -> str:
-    return f"overlap by {-1e3 * distance:.1f} mm" if distance < 0 else f"are only {1e3 * distance:.1f} mm apart"
+    return (
+        f"overlap by {-1e3 * distance:.1f} mm"
+        if distance < 0
+        else f"are only {1e3 * distance:.1f} mm apart"
+    )

@@ -34,11 +34,14 @@ class Ways(NamedTuple):
     cut_off: bool = False
 
 
-def ways(problem: TrajectoryProblem, z: Floats, report: Report, blocked: Sequence[str], random_seed: int) -> Ways:
+def ways(
+    problem: TrajectoryProblem, z: Floats, report: Report, blocked: Sequence[str], random_seed: int
+) -> Ways:
     """Return in which phases a motion that failed has no way, as far as searches say.
 
-    The base's ways are looked for from where the motion begins a phase to where it may end it: at any of the free configurations
-    that are found for the goal; if none is, or the goal is the base's place, where the motion ends it.
+    The base's ways are looked for from where the motion begins a phase to where it may end it: at
+    any of the free configurations that are found for the goal; if none is, or the goal is the
+    base's place, where the motion ends it.
 
     Args:
         problem: What could not be solved.
@@ -51,7 +54,9 @@ def ways(problem: TrajectoryProblem, z: Floats, report: Report, blocked: Sequenc
         return Ways(list(blocked))
     lines, routes, path, cut_off = [], Routes(problem), problem.waypoints(z), False
     begins = np.concatenate([[0], problem.ends[:-1]])
-    for number, (phase, begin, end) in enumerate(zip(problem.task.phases, begins, problem.ends, strict=True)):
+    for number, (phase, begin, end) in enumerate(
+        zip(problem.task.phases, begins, problem.ends, strict=True)
+    ):
         own = [line for line in blocked if line.startswith(f"{phase.name}: ")]
         hit = [v for v in report.violations if v.constraint in _HITS and begin <= v.waypoint <= end]
         if problem.closed(phase) or not (own or hit):
@@ -60,26 +65,35 @@ def ways(problem: TrajectoryProblem, z: Floats, report: Report, blocked: Sequenc
         goals, where = _goals(problem, phase, path[end], int(end), random_seed)
         start = path[begin, :3]
         home, folded = (
-            shortest_path(routes.grid(number, folded=how), start.tolist(), goals, smooth=False) for how in (False, True)
+            shortest_path(routes.grid(number, folded=how), start.tolist(), goals, smooth=False)
+            for how in (False, True)
         )
         leads = f"from {_place(start)} to {where if (way := home or folded) is None else _end(way)}"
         if way is None:
-            lines.append(f"{phase.name}: found no way for the base {leads}, and none with the arm folded")
+            lines.append(
+                f"{phase.name}: found no way for the base {leads}, and none with the arm folded"
+            )
             cut_off = cut_off or number == 0
         elif home is None:
             lines.append(
                 f"{phase.name}: found no way for the base {leads} but with the arm folded, and none for the arm to there"
             )
         elif hit:
-            lines.append(f"{phase.name}: found a way for the base {leads}, but none for the arm at the goal")
+            lines.append(
+                f"{phase.name}: found a way for the base {leads}, but none for the arm at the goal"
+            )
         else:
             lines += own
     return Ways(lines, cut_off)
 
 
-def _goals(problem: TrajectoryProblem, phase: Phase, last: Floats, end: int, random_seed: int) -> tuple[Floats, str]:
+def _goals(
+    problem: TrajectoryProblem, phase: Phase, last: Floats, end: int, random_seed: int
+) -> tuple[Floats, str]:
     """Return where the base may stand at a phase's end, shape (G, 3), and that in words; `last` is where a motion ends it."""
-    tried = scatter(problem, end, np.random.default_rng(random_seed)) if phase.base is None else None
+    tried = (
+        scatter(problem, end, np.random.default_rng(random_seed)) if phase.base is None else None
+    )
     if tried is not None:
         z = tried[0][tried[1] < TOLERANCE]
         free = z[depth(problem, z, end) <= 0.0] if len(z) else z

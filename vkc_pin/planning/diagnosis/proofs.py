@@ -21,9 +21,13 @@ __all__ = ["PROVEN", "proofs"]
 PROVEN = "proven: "
 """What comes before that part of a note which is certain."""
 
-_COARSE = 0.1  # [m] cells in which a way is looked for: where there is one, there is nothing to prove
+_COARSE = (
+    0.1  # [m] cells in which a way is looked for: where there is one, there is nothing to prove
+)
 _FINE, _MOST = 0.02, 400_000  # [m] and number of cells otherwise
-_LEEWAY = 0.02  # [m] that a base may be out of the arena, or a frame away from its goal: more than validation lets pass
+# [m] that a base may be out of the arena, or a frame away from its goal: more than validation lets
+# pass
+_LEEWAY = 0.02
 _NAMED = 6  # obstacles
 _SHUT = 0.05  # [rad] or [m] from where a joint is shut
 _BASE = 1  # the joint of the model that is the base
@@ -42,7 +46,10 @@ class _Goal:
 
     def allows(self, cells: Cells, grown: float) -> Bools:
         """Return which cells have their centre no further away than the radius and so much [m], shape (X, Y)."""
-        x, y = (np.nan_to_num(centers - at) for centers, at in zip(cells.centers(), self.at, strict=True))
+        x, y = (
+            np.nan_to_num(centers - at)
+            for centers, at in zip(cells.centers(), self.at, strict=True)
+        )
         return np.asarray(np.hypot(x, y) <= self.radius + grown)
 
 
@@ -59,7 +66,8 @@ class _Part:
 def proofs(problem: TrajectoryProblem) -> list[str]:
     """Return why a task is impossible for certain; no line at all proves nothing.
 
-    What a phase holds is no obstacle in it, nor is what the motion itself leaves at a place that it chooses.
+    What a phase holds is no obstacle in it, nor is what the motion itself leaves at a place that it
+    chooses.
     """
     if problem.chain.robot.base == "fixed":
         return []
@@ -69,18 +77,26 @@ def proofs(problem: TrajectoryProblem) -> list[str]:
         if beyond:
             return [f"{phase.name}: out of reach, {PROVEN}{text}" for text in beyond]
         goals.append(found)
-    low, high = (np.array(side) for side in zip(*(problem.limits(name) for name in problem.chain.names[:2]), strict=True))
+    low, high = (
+        np.array(side)
+        for side in zip(*(problem.limits(name) for name in problem.chain.names[:2]), strict=True)
+    )
     x, y, yaw = problem.start[:3].tolist()
     for point in _points(problem):
         away = float(np.hypot(*point))
-        start = np.array([x, y]) + np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ point
+        start = (
+            np.array([x, y])
+            + np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ point
+        )
         parts = []
         for number, phase in enumerate(problem.task.phases):
             own = [_Goal(goal.at, goal.radius + away) for goal in goals[number]]
             parts.append(_Part(phase, own, *_standing(problem, number, point)))
         begin, end = low - _LEEWAY - away, high + _LEEWAY + away
         step = max(_FINE, float(np.sqrt(np.prod(end - begin) / _MOST)))
-        if not any(part.goals for part in parts) or _passes(start, parts, Cells.over(begin, end, _COARSE)):
+        if not any(part.goals for part in parts) or _passes(
+            start, parts, Cells.over(begin, end, _COARSE)
+        ):
             continue
         missed = _missed(problem, start, parts, Cells.over(begin, end, step))
         if missed:
@@ -91,7 +107,9 @@ def proofs(problem: TrajectoryProblem) -> list[str]:
 def _points(problem: TrajectoryProblem) -> list[Floats]:
     """Return points fixed in the base, shape (2,) [m], whose ways are looked for: its origin, and where it is highest."""
     robot = problem.chain.robot.collision.geometryObjects
-    solids = solids_of([(shape.geometry, shape.placement) for shape in robot if shape.parentJoint == _BASE])
+    solids = solids_of(
+        [(shape.geometry, shape.placement) for shape in robot if shape.parentJoint == _BASE]
+    )
     if not solids:
         return []
     corners = max(solids, key=lambda solid: solid.top).points[:, :2]
@@ -116,7 +134,12 @@ def _goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Goal], list[s
                     f"it turns about a joint at z = {shoulder[2]:.2f} m, and the whole arm with it is {length:.2f} m long"
                 )
             elif np.isfinite(length):
-                goals.append(_Goal(at[:2].copy(), float(np.hypot(*shoulder[:2]) + np.sqrt(length**2 - height**2))))
+                goals.append(
+                    _Goal(
+                        at[:2].copy(),
+                        float(np.hypot(*shoulder[:2]) + np.sqrt(length**2 - height**2)),
+                    )
+                )
     return goals, beyond
 
 
@@ -130,11 +153,21 @@ def _arm(problem: TrajectoryProblem, joint: int, local: Floats) -> tuple[Floats,
     length += sum(float(np.linalg.norm(model.jointPlacements[k].translation)) for k in along[1:])
     for column, owner, factor, offset, slides in chain.coordinates.moves:
         if owner in along and slides:
-            length += float(max(abs(factor * bound + offset) for bound in (chain.lower[column], chain.upper[column]))) + _LEEWAY
+            length += (
+                float(
+                    max(
+                        abs(factor * bound + offset)
+                        for bound in (chain.lower[column], chain.upper[column])
+                    )
+                )
+                + _LEEWAY
+            )
     return np.asarray(model.jointPlacements[along[0]].translation), length
 
 
-def _standing(problem: TrajectoryProblem, number: int, point: Floats) -> tuple[list[Wall], list[str]]:
+def _standing(
+    problem: TrajectoryProblem, number: int, point: Floats
+) -> tuple[list[Wall], list[str]]:
     """Return what surely keeps a point of the base away in a phase, and the names of what stands there."""
     part = problem.contacts.phases[number]
     robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
@@ -145,10 +178,18 @@ def _standing(problem: TrajectoryProblem, number: int, point: Floats) -> tuple[l
     solid = [
         i
         for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True))
-        if shape.parentJoint == 0 and label != FLOOR and hits[i] == len(base) and i not in left | eased
+        if shape.parentJoint == 0
+        and label != FLOOR
+        and hits[i] == len(base)
+        and i not in left | eased
     ]
-    below, shapes = ([(part.shapes[i].geometry, part.shapes[i].placement) for i in which] for which in (base, solid))
-    below = [(shape, pin.SE3(np.eye(3), -np.array([*point, 0.0])) * where) for shape, where in below]
+    below, shapes = (
+        [(part.shapes[i].geometry, part.shapes[i].placement) for i in which]
+        for which in (base, solid)
+    )
+    below = [
+        (shape, pin.SE3(np.eye(3), -np.array([*point, 0.0])) * where) for shape, where in below
+    ]
     key = ("discs", *(solid.key for solid in solids_of(below)))
     discs = problem.cache.get(key, lambda: Discs(below))
     return discs.walls(shapes), [part.labels[i] for i in solid]
@@ -176,7 +217,9 @@ def _passes(start: Floats, parts: Sequence[_Part], cells: Cells) -> bool:
     return True
 
 
-def _missed(problem: TrajectoryProblem, start: Floats, parts: Sequence[_Part], cells: Cells) -> list[str]:
+def _missed(
+    problem: TrajectoryProblem, start: Floats, parts: Sequence[_Part], cells: Cells
+) -> list[str]:
     """Return a line about the first phase whose goals the base surely cannot get to, if any."""
     half = cells.step * float(np.sqrt(0.5))
     here = np.zeros(cells.shape, bool)
@@ -194,7 +237,9 @@ def _missed(problem: TrajectoryProblem, start: Floats, parts: Sequence[_Part], c
         here = cut.reached & goal
         if not here.any():
             if not goal.any():
-                return [f"{part.phase.name}: no place for the base, {PROVEN}the goal is in reach from outside the arena alone"]
+                return [
+                    f"{part.phase.name}: no place for the base, {PROVEN}the goal is in reach from outside the arena alone"
+                ]
             names = [part.names[number] for number in cut.obstacles()]
             return [f"{part.phase.name}: {cut.what}{_listed(problem, part.phase, names)}"]
     return []
@@ -225,13 +270,25 @@ class _Cut:
         """Return few obstacles that cut it off: each of them is needed for that."""
         from scipy import ndimage
 
-        beside = ndimage.binary_dilation(self.reached, structure=np.ones((3, 3), bool)) & ~self.reached
-        seen = {k for k, windows in self.taking.items() if any((own & beside[window]).any() for window, own in windows)}
+        beside = (
+            ndimage.binary_dilation(self.reached, structure=np.ones((3, 3), bool)) & ~self.reached
+        )
+        seen = {
+            k
+            for k, windows in self.taking.items()
+            if any((own & beside[window]).any() for window, own in windows)
+        }
         count, kept = self.count.copy(), set(self.taking)
-        for some in (kept - seen, *({number} for number in sorted(seen)), *({number} for number in sorted(kept - seen))):
+        for some in (
+            kept - seen,
+            *({number} for number in sorted(seen)),
+            *({number} for number in sorted(kept - seen)),
+        ):
             some = some & kept
             less = count.copy()
-            for window, own in itertools.chain.from_iterable(self.taking[number] for number in some):
+            for window, own in itertools.chain.from_iterable(
+                self.taking[number] for number in some
+            ):
                 less[window] -= own
             if some and not (flooded(less == 0, self.here, corners=True) & self.goal).any():
                 count, kept = less, kept - some
@@ -248,7 +305,12 @@ def _listed(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) -> s
         if placed is None or placed.object.free or not len(placed.state):
             continue
         joints = placed.object.coordinates.names
-        state = [phase.before.get(f"{name}.{joint}", float(value)) for joint, value in zip(joints, placed.state, strict=True)]
-        ajar = ", ".join(f"at {joint} = {value:.2f}" for joint, value in zip(joints, state, strict=True))
+        state = [
+            phase.before.get(f"{name}.{joint}", float(value))
+            for joint, value in zip(joints, placed.state, strict=True)
+        ]
+        ajar = ", ".join(
+            f"at {joint} = {value:.2f}" for joint, value in zip(joints, state, strict=True)
+        )
         text += f"; {name} stands {'shut' if max(map(abs, state)) < _SHUT else ajar} meanwhile"
     return text

@@ -21,7 +21,8 @@ _VALUES = 200  # of a joint between begin and goal
 def swept(problem: TrajectoryProblem) -> list[str]:
     """Return why joints of objects cannot get to where a task wants them, for certain; no line at all proves nothing.
 
-    A link that one joint alone moves is, on any motion, in all places between begin and goal, and so in what stands there.
+    A link that one joint alone moves is, on any motion, in all places between begin and goal, and
+    so in what stands there.
     """
     for phase in problem.task.phases:
         for coordinate in phase.values:
@@ -37,13 +38,27 @@ def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
     placed = scene.objects[name]
     if placed.object.free:
         return ""
-    begin, end = phase.before[coordinate], float(np.clip(phase.values[coordinate], *problem.limits(coordinate)))
+    begin, end = (
+        phase.before[coordinate],
+        float(np.clip(phase.values[coordinate], *problem.limits(coordinate))),
+    )
     values = np.linspace(begin, end, _VALUES)
     fixed = {owner: one for owner, one in scene.objects.items() if not one.object.free}
     standing, known = Standing(scene, fixed), allowances(scene, problem.options.dist_safe)
-    links = [label for label in (f"{name}.{link}" for link in placed.object.links) if standing.joints(label) == [joint]]
-    others = {f"{owner}.{link}" for owner, one in fixed.items() if owner != name for link in one.object.links}
-    others = {label for label in others if not standing.joints(label)} | set(scene.obstacle_labels) - {FLOOR}
+    links = [
+        label
+        for label in (f"{name}.{link}" for link in placed.object.links)
+        if standing.joints(label) == [joint]
+    ]
+    others = {
+        f"{owner}.{link}"
+        for owner, one in fixed.items()
+        if owner != name
+        for link in one.object.links
+    }
+    others = {label for label in others if not standing.joints(label)} | set(
+        scene.obstacle_labels
+    ) - {FLOOR}
     deepest, text = -_SURE, ""
     index = placed.object.coordinates.index(joint)
     for label in links:
@@ -53,7 +68,10 @@ def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
             for one in known:
                 if not one.between(label, other):
                     continue
-                holds, pairs = one.holds([coordinate], values[:, None]), set(one.shape_pairs(standing.labels, standing.keys))
+                holds, pairs = (
+                    one.holds([coordinate], values[:, None]),
+                    set(one.shape_pairs(standing.labels, standing.keys)),
+                )
                 for k, j in itertools.product(range(len(own)), range(len(hit))):
                     if (min(own[k], hit[j]), max(own[k], hit[j])) in pairs:
                         distances[holds, k, j] += max(0.0, -one.margin)

@@ -23,17 +23,23 @@ _UP = np.array([0.0, 0.0, 1.0])
 class Approach:
     """Finds configurations on straight paths to and from the ends of a problem's phases.
 
-    A path is the tool's, `Options.approach` long: back along its approach for what it grasps or lets go of, up for what is lifted
-    or put down, back along the frame's z axis for what a frame touches. It is one configuration, or none where none is found.
+    A path is the tool's, `Options.approach` long: back along its approach for what it grasps or
+    lets go of, up for what is lifted or put down, back along the frame's z axis for what a frame
+    touches. It is one configuration, or none where none is found.
 
     Args:
         knots: Of the problem.
-        stands: Whether the base stands still meanwhile, as long as the arm alone can do it: in narrow places it has no room. One
-            on wheels always does.
+        stands: Whether the base stands still meanwhile, as long as the arm alone can do it: in
+            narrow places it has no room. One on wheels always does.
     """
 
     def __init__(self, knots: Knots, *, stands: bool = False) -> None:
-        self.knots, self.problem, self.chain, self.stands = knots, knots.problem, knots.chain, stands or knots.curves is not None
+        self.knots, self.problem, self.chain, self.stands = (
+            knots,
+            knots.problem,
+            knots.chain,
+            stands or knots.curves is not None,
+        )
         joint, local = self.chain.frame(self.chain.robot.tool_frame)
         self.joint, self.local = joint, local
         model, cache = self.chain.model, self.problem.cache
@@ -48,7 +54,9 @@ class Approach:
         """Return where the path from `z`, shape (n,), a phase's start, leads: shape (K, n), K is 1 or 0."""
         return self._leaving(z, phase.leaves, phase.lifted, before.frames if before else ())
 
-    def _leaving(self, z: Floats, holds: Sequence[Hold], lifted: Sized, frames: Sequence[FrameGoal]) -> Floats:
+    def _leaving(
+        self, z: Floats, holds: Sequence[Hold], lifted: Sized, frames: Sequence[FrameGoal]
+    ) -> Floats:
         """Return where the path away from a grasp, from where something stands, or from what a frame touches, leads."""
         if holds:
             return self._retreat(z, -self._ahead(z, self.chain.holder(holds[0])))
@@ -62,10 +70,13 @@ class Approach:
     def away(self, z: Floats, phase: Phase) -> Floats:
         """Return the configuration to which the path leads from `z`, shape (n,), the base where it is: shape (K, n), K is 1 or 0.
 
-        The hand goes back from what a phase lets go of at its start, or up with what is carried in it.
+        The hand goes back from what a phase lets go of at its start, or up with what is carried in
+        it.
         """
         if phase.leaves:
-            return self._retreat(z, -self._ahead(z, self.chain.holder(phase.leaves[0])), drives=False)
+            return self._retreat(
+                z, -self._ahead(z, self.chain.holder(phase.leaves[0])), drives=False
+            )
         return self._retreat(z, _UP, drives=False) if phase.held else np.empty((0, len(z)))
 
     def _ahead(self, z: Floats, frame: tuple[int, pin.SE3]) -> Floats:
@@ -79,14 +90,23 @@ class Approach:
         rotations, translations = self.chain.joint_placements(z[None])
         carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
         tool = carrier * self.local
-        target = pin.SE3(tool.rotation, tool.translation + self.problem.options.approach * direction)
+        target = pin.SE3(
+            tool.rotation, tool.translation + self.problem.options.approach * direction
+        )
         lower, upper = z.copy(), z.copy()  # only the robot moves
         for column, name in enumerate(self.chain.names[: self.knots.robot]):
             if drives or column > 2:
                 lower[column], upper[column] = self.problem.limits(name)
         standing = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
         for low, high in (standing, (lower, upper)) if self.stands else ((lower, upper),):
-            near, ok = self.solver.solve(z[None], target, lower=low, upper=high, weights=self.knots.weights, tolerance=TOLERANCE)
+            near, ok = self.solver.solve(
+                z[None],
+                target,
+                lower=low,
+                upper=high,
+                weights=self.knots.weights,
+                tolerance=TOLERANCE,
+            )
             if ok[0]:
                 return near
         return np.empty((0, len(z)))

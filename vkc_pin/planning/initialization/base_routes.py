@@ -22,15 +22,18 @@ from vkc_pin.world.scene.obstacles import FLOOR
 __all__ = ["Routes", "folded_arms", "grid_shapes"]
 
 _ARM_BASE = 2  # the joint of the model that is the arm's first: joint 1 is the base
-_REACHING_RADIUS = 0.4  # [m] from the ends of a path within which the arm reaches in and out, and only the base counts
-_POSTURES = 1000  # random postures: with 192 the arm may stay wider than the base, with 4000 it gets no narrower
+# [m] from the ends of a path within which the arm reaches in and out, and only the base counts
+_REACHING_RADIUS = 0.4
+# random postures: with 192 the arm may stay wider than the base, with 4000 it gets no narrower
+_POSTURES = 1000
 
 
 class Routes:
     """The base's paths in each phase of a problem, looked for when they are asked for.
 
-    With the arm folded, the grid is one for narrow passages: cells are so small that one of them is in the middle of any
-    passage in which there is room for the margins, and there nothing but contact counts.
+    With the arm folded, the grid is one for narrow passages: cells are so small that one of them is
+    in the middle of any passage in which there is room for the margins, and there nothing but
+    contact counts.
     """
 
     def __init__(self, problem: TrajectoryProblem) -> None:
@@ -50,15 +53,24 @@ class Routes:
         """
         key = (phase, folded)
         if key not in self._grids:
-            z, arena, margin = self._resting(), self.problem.scene.arena, self.problem.options.dist_safe
+            z, arena, margin = (
+                self._resting(),
+                self.problem.scene.arena,
+                self.problem.options.dist_safe,
+            )
             cache, turning = self.problem.cache, self.problem.chain.robot.lever
             if folded:
                 z[self.arm] = self.folded_arm(phase)
             moving, standing = grid_shapes(self.problem, phase, z)
-            # Where the arm stands on the base it is always: a low base does not go under a table that the arm does not.
+            # Where the arm stands on the base it is always: a low base does not go under a table
+            # that the arm does not.
             base = [shape for joint, shape in moving if joint <= _ARM_BASE]
             carried = [shape for joint, shape in moving if joint > _ARM_BASE]
-            how: dict[str, Any] = {"margin": 0.0, "cells": fine_cells(arena, margin)} if folded else {"margin": margin}
+            how: dict[str, Any] = (
+                {"margin": 0.0, "cells": fine_cells(arena, margin)}
+                if folded
+                else {"margin": margin}
+            )
             how |= {"near": _REACHING_RADIUS, "turning": turning, "cache": cache}
             self._grids[key] = BaseGrid(base, carried, standing, arena, **how)
         return self._grids[key]
@@ -91,16 +103,24 @@ class Routes:
             z[column] = np.clip(0.0, chain.lower[column], chain.upper[column])
         return z
 
-    def distances(self, phase: int, starts: Floats, goals: Floats, *, folded: bool = False) -> Floats:
+    def distances(
+        self, phase: int, starts: Floats, goals: Floats, *, folded: bool = False
+    ) -> Floats:
         """Return how far it is at least from starts to goals, both (B, 3), one by one, shape (B,) [m]; infinite: no path.
 
         Starts that are `ALIKE` share the distances of the first that was asked about.
         """
         grid = self.grid(phase, folded=folded)
-        end = np.clip(np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int), 0, grid.cells - 1).tolist()
+        end = np.clip(
+            np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int), 0, grid.cells - 1
+        ).tolist()
         begin = np.floor(starts[:, :2] / ALIKE).astype(int).tolist()
         keys = [(phase, folded, *cell) for cell in begin]
-        new = {key: start[:2] for key, start in zip(keys, starts, strict=True) if key not in self._distances}
+        new = {
+            key: start[:2]
+            for key, start in zip(keys, starts, strict=True)
+            if key not in self._distances
+        }
         if new:
             found = grid.distances_from(np.array(list(new.values())), threads=available_threads())
             self._distances |= dict(zip(new, found, strict=True))
@@ -109,16 +129,25 @@ class Routes:
     def path(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Return `steps` poses of the base from start to goal, both (3,), the last at the goal's place: shape (steps, 3).
 
-        The heading is continuous from the start's, and ends at one equal to the goal's. None if there is no path.
+        The heading is continuous from the start's, and ends at one equal to the goal's. None if
+        there is no path.
         """
         path = self._shortest(phase, start, goal)
-        return None if path is None else self._poses(self.grid(phase), path, steps, self.problem.chain.robot.lever)
+        return (
+            None
+            if path is None
+            else self._poses(self.grid(phase), path, steps, self.problem.chain.robot.lever)
+        )
 
-    def _shortest(self, phase: int, start: Floats, goal: Floats, *, folded: bool = False) -> BasePath | None:
+    def _shortest(
+        self, phase: int, start: Floats, goal: Floats, *, folded: bool = False
+    ) -> BasePath | None:
         """Return the shortest path of the base from start to goal, both (3,), if there is one; looked for once."""
         key = (phase, folded, start.tobytes(), goal.tobytes())
         if key not in self._paths:
-            self._paths[key] = shortest_path(self.grid(phase, folded=folded), start.tolist(), goal[None])
+            self._paths[key] = shortest_path(
+                self.grid(phase, folded=folded), start.tolist(), goal[None]
+            )
         return self._paths[key]
 
     def _poses(self, grid: BaseGrid, path: BasePath, steps: int, turning: float) -> Floats:
@@ -128,16 +157,21 @@ class Routes:
             return poses_along(path, steps, turning=turning)
         corners = path.poses
         if rolling.radius > 0.0:
-            corners = Curves(rolling.radius, turning).through(corners, lambda pose: grid.clear(*pose, reaching=True))
+            corners = Curves(rolling.radius, turning).through(
+                corners, lambda pose: grid.clear(*pose, reaching=True)
+            )
         return spread_along(corners, steps, turning=turning)
 
     def guide(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Return poses from a start to a goal, both (3,), on which the base fits, shape (steps, 3).
 
-        With the arm at home or, if there is no such path, with the arm folded. None if there is none either.
+        With the arm at home or, if there is no such path, with the arm folded. None if there is
+        none either.
         """
         for folded in (False, True):
-            path = self._shortest(phase, start, goal, folded=folded)  # the fine grid only where it is needed
+            path = self._shortest(
+                phase, start, goal, folded=folded
+            )  # the fine grid only where it is needed
             if path is not None:
                 grid = self.grid(phase, folded=folded)
                 return self._poses(grid, path, steps, grid.turning)
@@ -147,14 +181,16 @@ class Routes:
 def folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) -> Floats:
     """Return arms, shape (F, m - 3) [m] and [rad], with which the robot is compact: of random postures, the same every time.
 
-    The first is the best of all: what counts is how far the arm, and what is carried, reach from the base's origin along its
-    three axes, in sum. The others reach no further over the floor than that one, or than the base itself, along either axis. The
-    robot is free of collisions with itself and with what it carries.
+    The first is the best of all: what counts is how far the arm, and what is carried, reach from
+    the base's origin along its three axes, in sum. The others reach no further over the floor than
+    that one, or than the base itself, along either axis. The robot is free of collisions with
+    itself and with what it carries.
 
     Args:
         problem: Whose robot it is.
         phase: In which it carries what it carries.
-        resting: Where robot and load rest, shape (n,): what is not the arm stays so; where the base is does not matter.
+        resting: Where robot and load rest, shape (n,): what is not the arm stays so; where the base
+            is does not matter.
     """
     chain, rng = problem.chain, np.random.default_rng(0)
     arm, home = slice(3, chain.robot.coordinates.size), chain.robot.home
@@ -186,10 +222,16 @@ def _reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[Floats, F
     rotations, translations = chain.joint_placements(z)
     reach, base = np.zeros((len(z), 3)), np.zeros(3)
     carried = problem.contacts.carried(phase)
-    for shape in (shapes[i] for i in [*range(len(chain.robot.collision.geometryObjects)), *carried]):
+    for shape in (
+        shapes[i] for i in [*range(len(chain.robot.collision.geometryObjects)), *carried]
+    ):
         joint = shape.parentJoint
         corners, radius = hull_points(shape.geometry, shape.placement, outer=True)
-        at = rotations[:, joint] @ corners.T + translations[:, joint, :, None] - translations[:, 1, :, None]
+        at = (
+            rotations[:, joint] @ corners.T
+            + translations[:, joint, :, None]
+            - translations[:, 1, :, None]
+        )
         own = np.abs(rotations[:, 1].transpose(0, 2, 1) @ at).max(axis=2) + radius
         if joint > 1:
             np.maximum(reach, own, out=reach)
@@ -198,7 +240,9 @@ def _reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[Floats, F
     return reach, base
 
 
-def grid_shapes(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[list[tuple[int, Shape]], list[Shape]]:
+def grid_shapes(
+    problem: TrajectoryProblem, phase: int, z: Floats
+) -> tuple[list[tuple[int, Shape]], list[Shape]]:
     """Return what a grid of the base is made of: what rides on the base in a phase, and what stands in the world but the floor.
 
     Args:
@@ -207,8 +251,8 @@ def grid_shapes(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[list
         z: Its configuration with the base at the origin, shape (n,).
 
     Returns:
-        Shapes in the base's frame, those of the robot first, each after the joint that carries it; shapes in the world that the
-        base may not touch.
+        Shapes in the base's frame, those of the robot first, each after the joint that carries it;
+        shapes in the world that the base may not touch.
     """
     chain, part = problem.chain, problem.contacts.phases[phase]
     rotations, translations = chain.joint_placements(z[None])

@@ -29,9 +29,10 @@ def clear_out(
 ) -> Floats:
     """Return configurations that are further from collision than `z`, as far as a few damped Gauss-Newton steps get them.
 
-    Each step asks for the residuals of the pose to vanish and for the contacts that fall short of their margins to keep them,
-    linearised: with the witness points fixed in their bodies the gradient of a distance d = n·(b − a) is n·(∂b − ∂a). It aims at
-    `Options.dist_safe` more than the margins, looks at `Options.contact_slots` contacts, the nearest, and is no longer than
+    Each step asks for the residuals of the pose to vanish and for the contacts that fall short of
+    their margins to keep them, linearised: with the witness points fixed in their bodies the
+    gradient of a distance d = n·(b − a) is n·(∂b − ∂a). It aims at `Options.dist_safe` more than
+    the margins, looks at `Options.contact_slots` contacts, the nearest, and is no longer than
     `LONGEST_STEP`.
 
     Args:
@@ -60,12 +61,19 @@ def clear_out(
         # Gradients of the nearest distances, and by how much they should grow [m].
         rows, growth = np.zeros((len(at), slots, z.shape[1])), np.zeros((len(at), slots))
         rows[contacts.waypoint, contacts.place] = problem.contacts.gradients(z[at], contacts)
-        growth[contacts.waypoint, contacts.place] = np.maximum(contacts.margin + extra - contacts.distance, 0.0)
-        jacobian, wanted = np.concatenate([pose_rows, rows], axis=1), np.concatenate([-residual, growth], axis=1)
+        growth[contacts.waypoint, contacts.place] = np.maximum(
+            contacts.margin + extra - contacts.distance, 0.0
+        )
+        jacobian, wanted = (
+            np.concatenate([pose_rows, rows], axis=1),
+            np.concatenate([-residual, growth], axis=1),
+        )
         scaled = jacobian * free[at][:, None, :]
         system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
         step = np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, wanted[..., None])[..., 0])
-        step *= np.minimum(1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
+        step *= np.minimum(
+            1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12)
+        )
         step[done[at]] = 0.0
         z[at] = np.clip(z[at] + step, lower[at], upper[at])
     return z

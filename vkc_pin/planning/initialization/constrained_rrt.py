@@ -1,8 +1,9 @@
 """The robot's path while something fixed is held, by random trees on the manifold on which the hand stays where it holds.
 
-Two trees whose steps are projected to the manifold (Berenson, Srinivasa, Ferguson and Kuffner, *Manipulation planning on
-constraint manifolds*, ICRA 2009) grow towards random configurations that are on it. How far the objects' joints are on the way
-that the task has for them is one more coordinate: a door may wait until the arm is out of its frame.
+Two trees whose steps are projected to the manifold (Berenson, Srinivasa, Ferguson and Kuffner,
+*Manipulation planning on constraint manifolds*, ICRA 2009) grow towards random configurations that
+are on it. How far the objects' joints are on the way that the task has for them is one more
+coordinate: a door may wait until the arm is out of its frame.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ __all__ = ["held_path", "obstructed"]
 def obstructed(knots: Knots, phase: int, through: Floats, straight: Floats) -> bool:
     """Return whether something is in the straight way through a phase, and trees may lead around it.
 
-    Not where the base drives on wheels, whose arcs trees do not know, or where the robot overlaps things as the phase begins.
+    Not where the base drives on wheels, whose arcs trees do not know, or where the robot overlaps
+    things as the phase begins.
 
     Args:
         knots: Of the problem.
@@ -48,7 +50,8 @@ def held_path(knots: Knots, phase: int, through: Floats, steps: int, tries: int)
         tries: How often trees may grow until they meet.
 
     Returns:
-        The waypoints, shape (steps, n), which overlap nothing but may end elsewhere; None if none are found.
+        The waypoints, shape (steps, n), which overlap nothing but may end elsewhere; None if none
+        are found.
 
     Raises:
         SpentError: The effort of planning is spent.
@@ -112,7 +115,14 @@ class _Search:
         z[:, driven] = np.column_stack([np.interp(at, whole, column) for column in self.moved.T])
         lower, upper = self.knots.limits(z, self.waypoint)
         lower[:, driven] = upper[:, driven] = z[:, driven]
-        return self.solver.solve(z, self.target, lower=lower, upper=upper, weights=self.knots.weights, tolerance=TOLERANCE)
+        return self.solver.solve(
+            z,
+            self.target,
+            lower=lower,
+            upper=upper,
+            weights=self.knots.weights,
+            tolerance=TOLERANCE,
+        )
 
     def free(self, z: Floats) -> Bools:
         """Return which configurations overlap nothing, shape (B,): the solver pushes apart what is too close."""
@@ -135,7 +145,10 @@ class _Search:
         """Return a path from the first of some configurations to the end of the phase; None if trees do not meet."""
         ends = np.vstack([through[-1:], self.drawn(through, self.end)])
         ends = ends[self.free(ends)]
-        one, other = _Tree(through[:1], np.array([float(self.begin)])), _Tree(ends, np.full(len(ends), float(self.end)))
+        one, other = (
+            _Tree(through[:1], np.array([float(self.begin)])),
+            _Tree(ends, np.full(len(ends), float(self.end))),
+        )
         forwards, grown, tips = True, 0, np.zeros(1, int)
         while len(ends) and grown < tries:
             path = self.meet(one, other, tips)
@@ -191,7 +204,9 @@ class _Search:
             between, closed = self.close(path.z[first] + share * (path.z[last] - path.z[first]), at)
             way = np.vstack([path.z[first], between, path.z[last]])
             gaps, before = self.apart(way[1:], way[:-1]), path.z[first : last + 1]
-            shorter = gaps.max() <= 2.0 * STEP and gaps.sum() < self.apart(before[1:], before[:-1]).sum()
+            shorter = (
+                gaps.max() <= 2.0 * STEP and gaps.sum() < self.apart(before[1:], before[:-1]).sum()
+            )
             if closed.all() and shorter and self.free(between).all():
                 z = np.vstack([path.z[: first + 1], between, path.z[last:]])
                 path = _Path(z, np.concatenate([path.at[: first + 1], at, path.at[last:]]))

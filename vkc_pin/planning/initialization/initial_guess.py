@@ -14,7 +14,8 @@ from vkc_pin.world.trajectory.splicing import filled
 
 __all__ = ["PhaseWaypoints", "Seed", "perturbed", "seed_of"]
 
-_WARM_RADIUS = 0.2  # [m] and [rad] trust region at first: what is nearly free already is improved in smaller steps
+# [m] and [rad] trust region at first: what is nearly free already is improved in smaller steps
+_WARM_RADIUS = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,8 @@ class Seed:
     Attributes:
         name: The method, and the number of the try if it is not the first.
         z: z_1..z_N, shape (N, n).
-        overlap: The most that a waypoint lacks of its clearance beyond `Options.dist_safe` [m]; NaN if nobody looked.
+        overlap: The most that a waypoint lacks of its clearance beyond `Options.dist_safe` [m]; NaN
+            if nobody looked.
         radius: How far the solver believes planes at first, shape (N,); None: as usual.
     """
 
@@ -41,7 +43,8 @@ class PhaseWaypoints:
     Attributes:
         phases: What happens in the phases.
         names: Of the n coordinates.
-        waypoints: Their waypoints, for each phase, from its first, which is the last of the phase before, to its last.
+        waypoints: Their waypoints, for each phase, from its first, which is the last of the phase
+            before, to its last.
         seed: The name of the seed that led to them.
     """
 
@@ -60,12 +63,18 @@ def seed_of(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> Seed
         count = len(part.phases)
         phases = problem.task.phases[number : number + count]
         if part.phases != tuple(phase.key for phase in phases):
-            continue  # only to let go of something the robot stands still for a while; here that has no phase of its own
+            # only to let go of something the robot stands still for a while; here that has no phase
+            # of its own
+            continue
         number += count
-        known = [k for k, name in enumerate(part.names) if name in chain.names]  # the rest belongs to what is held no more
+        known = [
+            k for k, name in enumerate(part.names) if name in chain.names
+        ]  # the rest belongs to what is held no more
         columns = [chain.index(part.names[k]) for k in known]
         for phase, waypoints in zip(phases, part.waypoints, strict=True):
-            z[begin : begin + phase.segments, columns] = _resampled(waypoints[:, known], phase.segments)
+            z[begin : begin + phase.segments, columns] = _resampled(
+                waypoints[:, known], phase.segments
+            )
             begin += phase.segments
     z = filled(z)
     z = np.where(np.isnan(z), problem.start, z)  # no part moves it
@@ -78,14 +87,20 @@ def _resampled(waypoints: Floats, segments: int) -> Floats:
     if len(waypoints) == segments + 1:
         return waypoints[1:]
     at = np.linspace(0.0, len(waypoints) - 1, segments + 1)[1:]
-    return np.stack([np.interp(at, np.arange(len(waypoints)), column) for column in waypoints.T], axis=1)
+    return np.stack(
+        [np.interp(at, np.arange(len(waypoints)), column) for column in waypoints.T], axis=1
+    )
 
 
-def perturbed(problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator) -> Floats:
+def perturbed(
+    problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator
+) -> Floats:
     """Return a seed with smooth noise on the robot's coordinates: half waves in time, of amplitudes as their lengths squared."""
     robot, waves = problem.chain.robot.coordinates.size, np.arange(1, len(z) + 1)
     shape = np.sin(np.pi * np.outer(waves / (len(z) + 1), waves)) / waves**2
-    noise = shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**4))
+    noise = (
+        shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**4))
+    )
     z = z.copy()
     z[:, :robot] += noise
     return problem.clip(z)

@@ -27,11 +27,13 @@ class DrivenPaths:
     def __init__(self, routes: Routes) -> None:
         self.routes = routes
 
-    def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
+    def path(
+        self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
+    ) -> Floats | None:
         """Return `steps` rows from `first` to `last`, both (n,), of the robot's first coordinates, shape (steps, c).
 
-        The last row is as `last`, but with `turns` the heading may end whole turns further, and without `reaches` the arm may end
-        elsewhere. None if there is no path.
+        The last row is as `last`, but with `turns` the heading may end whole turns further, and
+        without `reaches` the arm may end elsewhere. None if there is no path.
         """
         path = self.routes.path(phase, first[:3], last[:3], steps)
         if path is not None and not turns:
@@ -47,7 +49,9 @@ class CurvePaths:
     def __init__(self, curves: Curves) -> None:
         self.curves = curves
 
-    def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats:
+    def path(
+        self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
+    ) -> Floats:
         """See `DrivenPaths.path`."""
         corners = self.curves.corners(first[:3], last[:3])
         if not turns:
@@ -64,7 +68,9 @@ class RrtPaths:
         self.knots, self.problem, self.routes = knots, knots.problem, routes
         self.failed: Counter[int] = Counter()  # how often in a row in each phase
 
-    def path(self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool) -> Floats | None:
+    def path(
+        self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
+    ) -> Floats | None:
         """See `DrivenPaths.path`."""
         problem, size = self.problem, self.knots.robot
         poses, last = first[None, :3], last.copy()
@@ -78,15 +84,22 @@ class RrtPaths:
             else:
                 guide[:, 2] -= turned  # the trees find where there is room to turn
             poses = guide
-        folded = self.routes.folded_arm(phase), self.routes.nearest_folded_arm(phase, first[3:size], last[3:size])
+        folded = (
+            self.routes.folded_arm(phase),
+            self.routes.nearest_folded_arm(phase, first[3:size], last[3:size]),
+        )
         arms = [first[3:size], last[3:size], problem.chain.robot.home, *folded]
         ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
         if not reaches:
             ends[:, 3:] = arms
         rng, tries = self.knots.rng, self._tries(phase)
-        path = connect(problem, phase, first, ends, poses=poses, arms=np.array(arms), rng=rng, tries=tries)
+        path = connect(
+            problem, phase, first, ends, poses=poses, arms=np.array(arms), rng=rng, tries=tries
+        )
         self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
-        return None if path is None else spread(path, steps, self.knots.chain.metric[: path.shape[1]])
+        return (
+            None if path is None else spread(path, steps, self.knots.chain.metric[: path.shape[1]])
+        )
 
     def held(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
         """Return waypoints of a phase in which something fixed is held, if trees lead around what is in the straight way."""
@@ -131,13 +144,23 @@ class Joiner:
         None if there is no path somewhere.
         """
         problem, size = self.problem, self.problem.chain.size
-        z, knots, objects = np.empty((problem.segments, size)), through.copy(), self.knots.objects.copy()
+        z, knots, objects = (
+            np.empty((problem.segments, size)),
+            through.copy(),
+            self.knots.objects.copy(),
+        )
         begin, previous = 0, None
-        for number, (phase, end) in enumerate(zip(problem.task.phases, problem.ends.tolist(), strict=True)):
+        for number, (phase, end) in enumerate(
+            zip(problem.task.phases, problem.ends.tolist(), strict=True)
+        ):
             inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
             if problem.closed(phase):
                 self._straight(z[begin:end], knots[inside], [at[k] - begin for k in inside])
-                held = self.paths.held(number, knots[inside], z[begin:end]) if isinstance(self.paths, RrtPaths) else None
+                held = (
+                    self.paths.held(number, knots[inside], z[begin:end])
+                    if isinstance(self.paths, RrtPaths)
+                    else None
+                )
                 if held is not None:
                     z[begin:end] = objects[begin:end] = held
                     knots[inside[-1]] = held[-1]
@@ -157,7 +180,9 @@ class Joiner:
             leg = np.minimum(at.astype(int), len(when) - 2)
             z[:, :3] = between(through[leg, :3], through[leg + 1, :3], at - leg)
 
-    def _open(self, z: Floats, knots: Floats, inside: list[int], number: int, previous: Phase | None) -> bool:
+    def _open(
+        self, z: Floats, knots: Floats, inside: list[int], number: int, previous: Phase | None
+    ) -> bool:
         """Fill the rows of a phase in which nothing fixed is held; turn the knots that follow as that ends. False: no path."""
         problem, phase = self.problem, self.problem.task.phases[number]
         end = int(problem.ends[number])
@@ -166,8 +191,12 @@ class Joiner:
         if self.paths is not None:
             steps = when[arrive] - when[leave]
             reaches = self.knots.pose_at(end) is not None
-            turns = problem.lower[end - 1, 2] < problem.upper[end - 1, 2]  # unless the goal says how far to turn
-            path = self.paths.path(number, through[leave], through[arrive], steps, turns=turns, reaches=reaches)
+            turns = (
+                problem.lower[end - 1, 2] < problem.upper[end - 1, 2]
+            )  # unless the goal says how far to turn
+            path = self.paths.path(
+                number, through[leave], through[arrive], steps, turns=turns, reaches=reaches
+            )
             if path is None:
                 blocked = f"{phase.name}: found no way for the base"
                 (x, y), (u, v) = through[[leave, arrive], :2]
@@ -183,7 +212,9 @@ class Joiner:
             knots[inside[-1], : path.shape[1]] = z[-1, : path.shape[1]]
         return True
 
-    def _via(self, ends: Floats, number: int, previous: Phase | None, segments: int) -> tuple[Floats, list[int], int, int]:
+    def _via(
+        self, ends: Floats, number: int, previous: Phase | None, segments: int
+    ) -> tuple[Floats, list[int], int, int]:
         """Return configurations to go through from start to end of a phase, `ends`, shape (2, n), and when, counted from 0.
 
         The last two numbers say between which of them it is neither a straight path out nor one in.
@@ -193,7 +224,9 @@ class Joiner:
         last = self.approach.before(ends[1], phase)
         if self.paths is not None and self.paths.careful:
             waypoint = self.problem.contacts.inside(number)
-            first, last = (part[: len(part) if self._free(part, waypoint) else 0] for part in (first, last))
+            first, last = (
+                part[: len(part) if self._free(part, waypoint) else 0] for part in (first, last)
+            )
         steps = self.problem.options.steps(self.problem.options.approach_time)
         spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))
         when = [0, *(spacing * (1 + k) for k in range(len(first)))]
@@ -201,7 +234,9 @@ class Joiner:
         return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
 
     def _free(self, z: Floats, waypoint: int) -> bool:
-        return not len(z) or bool(np.all(self.knots.depth(z, waypoint) < self.problem.options.dist_safe / 2))
+        return not len(z) or bool(
+            np.all(self.knots.depth(z, waypoint) < self.problem.options.dist_safe / 2)
+        )
 
     def _close(self, z: Floats, objects: Floats) -> None:
         """Move the objects' joints in z, shape (N, n), as they are driven in `objects`, and the robot with what it holds."""
@@ -215,4 +250,11 @@ class Joiner:
                 if self.knots.curves is not None:
                     lower[:, :3] = upper[:, :3] = z[rows, :3]
                 solver, target = self.knots.solver(pose)
-                z[rows], _ = solver.solve(z[rows], target, lower=lower, upper=upper, weights=self.knots.weights, iterations=6)
+                z[rows], _ = solver.solve(
+                    z[rows],
+                    target,
+                    lower=lower,
+                    upper=upper,
+                    weights=self.knots.weights,
+                    iterations=6,
+                )

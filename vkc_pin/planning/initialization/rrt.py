@@ -1,7 +1,8 @@
 """A path of base and arm together from one configuration to another, by two random trees that grow towards each other.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is drawn near a path that it could drive, the
-arm near postures it is likely to need there, so that narrow passages are found soon.
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is drawn near a
+path that it could drive, the arm near postures it is likely to need there, so that narrow passages
+are found soon.
 """
 
 from __future__ import annotations
@@ -26,10 +27,19 @@ TRIES = 1500
 STEP = 0.15
 """Between configurations that are looked at, in the metric of searches: [rad] of a joint."""
 
-_STEPS = (STEP, 0.04)  # of one search after the other: the latter where the former overlooked something
-_STRAIGHTENINGS = 11  # times that the arm and each of its joints are tried to be straightened between random places
-_WORTH = 1e-3  # share of a path's length that is to be saved by it, or by all of that once more where the arm goes far round
-_DETOUR = 1 / 3  # share of a path that the arm goes beyond its straight way, up to which no other one is looked for
+_STEPS = (
+    STEP,
+    0.04,
+)  # of one search after the other: the latter where the former overlooked something
+# times that the arm and each of its joints are tried to be straightened between random places
+_STRAIGHTENINGS = 11
+# share of a path's length that is to be saved by it, or by all of that once more where the arm goes
+# far round
+_WORTH = 1e-3
+_DETOUR = (
+    1 / 3
+    # share of a path that the arm goes beyond its straight way, up to which no other one is looked for
+)
 _BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
 _AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
 
@@ -66,7 +76,10 @@ def connect(
 
 def far_round(problem: TrajectoryProblem, z: Floats) -> bool:
     """Return whether the arm goes far round in a phase of a motion, z_1..z_N of shape (N, n), in which nothing fixed is held."""
-    rows, metric = problem.waypoints(z)[:, : problem.chain.robot.coordinates.size], problem.chain.metric
+    rows, metric = (
+        problem.waypoints(z)[:, : problem.chain.robot.coordinates.size],
+        problem.chain.metric,
+    )
     spans = zip(problem.task.phases, itertools.pairwise([0, *problem.ends.tolist()]), strict=True)
     ways = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.closed(phase)]
     return any(_detour(way, metric[: way.shape[1]]) > _DETOUR for way in ways)
@@ -75,7 +88,10 @@ def far_round(problem: TrajectoryProblem, z: Floats) -> bool:
 def _detour(path: Floats, metric: Floats) -> float:
     """Return which share of a path of the robot, shape (K, m), the arm goes beyond its straight way, in a metric, shape (m,)."""
     base, arm = np.split(path * metric, [3], axis=1)
-    way, driven = np.abs(np.diff(arm, axis=0)).sum(), np.linalg.norm(np.diff(base, axis=0), axis=1).sum()
+    way, driven = (
+        np.abs(np.diff(arm, axis=0)).sum(),
+        np.linalg.norm(np.diff(base, axis=0), axis=1).sum(),
+    )
     return float((way - np.abs(arm[-1] - arm[0]).sum()) / max(way + driven, 1e-12))
 
 
@@ -100,10 +116,19 @@ class _Search:
         rng: np.random.Generator,
         step: float,
     ) -> None:
-        self.problem, self.first, self.poses, self.arms, self.rng, self.step = problem, first, poses, arms, rng, step
+        self.problem, self.first, self.poses, self.arms, self.rng, self.step = (
+            problem,
+            first,
+            poses,
+            arms,
+            rng,
+            step,
+        )
         self.size = problem.chain.robot.coordinates.size
         self.waypoint = problem.contacts.inside(phase)
-        self.allowed = problem.options.dist_safe  # all of a margin may be missing: the solver pushes that apart
+        self.allowed = (
+            problem.options.dist_safe
+        )  # all of a margin may be missing: the solver pushes that apart
         self.weights = problem.chain.metric[: self.size]
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = np.ascontiguousarray(limits.T)
@@ -121,14 +146,20 @@ class _Search:
         """The parts of the base's path that are free with each of the arms, each shape (R, m)."""
         runs = []
         for arm in self.arms:
-            rows = np.clip(np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))]), self.lower, self.upper)
+            rows = np.clip(
+                np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))]),
+                self.lower,
+                self.upper,
+            )
             between = (rows[1:] + rows[:-1]) / 2
             free = self._depth(np.concatenate([rows, between])) <= self.allowed
             begin = None
             for k in range(len(rows)):
                 if begin is None and free[k]:
                     begin = k
-                if begin is not None and (k + 1 == len(rows) or not (free[len(rows) + k] and free[k + 1])):
+                if begin is not None and (
+                    k + 1 == len(rows) or not (free[len(rows) + k] and free[k + 1])
+                ):
                     runs.append(rows[begin : k + 1])
                     begin = None
         return runs
@@ -137,14 +168,24 @@ class _Search:
     def _lines(self) -> Any:
         """Looks at straight lines."""
         contacts, weights = self.problem.contacts, self.weights
-        return contacts.lines(self.first, self.waypoint, weights=weights, step=self.step, reach=0.0, allowed=self.allowed)
+        return contacts.lines(
+            self.first,
+            self.waypoint,
+            weights=weights,
+            step=self.step,
+            reach=0.0,
+            allowed=self.allowed,
+        )
 
     @cached_property
     def _trees(self) -> Any:
         """Grows trees, and straightens what they find."""
         runs = np.concatenate(self.runs) if self.runs else np.empty((0, self.size))
         rows = map(_array, (self.weights, self.lower, self.upper, self.poses, self.arms, runs))
-        lengths, seed = np.array([len(run) for run in self.runs], np.int64), int(self.rng.integers(2**63))
+        lengths, seed = (
+            np.array([len(run) for run in self.runs], np.int64),
+            int(self.rng.integers(2**63)),
+        )
         module = compiled_module("vkc_pin.planning.initialization._trees")
         return module.Trees(self._lines, *rows, lengths, _BESIDE_PATH, _AROUND, seed)
 
@@ -176,10 +217,11 @@ class _Search:
     def straightened(self, path: Floats) -> Floats:
         """Return a path on which the arm, and each of its joints alone, moves evenly between two places where nothing hinders it.
 
-        What leads through a passage with another posture takes all joints along; straight lines of all coordinates seldom undo
-        that, and the solver cannot, since things are between. So coordinates are taken apart (partial shortcuts: Geraerts and
-        Overmars, IJRR 2007), at first all along the path, then between random places on it; where the arm goes far round, as
-        long as that is worth it.
+        What leads through a passage with another posture takes all joints along; straight lines of
+        all coordinates seldom undo that, and the solver cannot, since things are between. So
+        coordinates are taken apart (partial shortcuts: Geraerts and Overmars, IJRR 2007), at first
+        all along the path, then between random places on it; where the arm goes far round, as long
+        as that is worth it.
         """
         length, path = np.inf, self._evened(path, 0)
         while self.length(path) < (1.0 - _WORTH) * length:

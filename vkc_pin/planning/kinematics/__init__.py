@@ -1,11 +1,12 @@
 """Pinocchio's algorithms as CasADi functions: their arguments are a model's q, v, a.
 
-Every function here takes a numeric `pinocchio.Model` and returns a `casadi.Function` built from SX expressions, with
-exact derivatives of any order. q is Pinocchio's configuration (a planar joint is x, y, cos θ, sin θ), v and a are in
-its tangent space. Entries that vanish at every configuration are structural zeros of the result.
+Every function here takes a numeric `pinocchio.Model` and returns a `casadi.Function` built from SX
+expressions, with exact derivatives of any order. q is Pinocchio's configuration (a planar joint is
+x, y, cos θ, sin θ), v and a are in its tangent space. Entries that vanish at every configuration
+are structural zeros of the result.
 
-Where upstream's `pinocchio.casadi` can be imported (conda-forge), it does the work; otherwise the small module that is
-compiled when this package is installed.
+Where upstream's `pinocchio.casadi` can be imported (conda-forge), it does the work; otherwise the
+small module that is compiled when this package is installed.
 """
 
 from __future__ import annotations
@@ -22,7 +23,14 @@ if TYPE_CHECKING:
     import casadi
     import pinocchio as pin
 
-__all__ = ["backend_name", "center_of_mass", "frame_jacobian", "frame_placements", "joint_placements", "rnea"]
+__all__ = [
+    "backend_name",
+    "center_of_mass",
+    "frame_jacobian",
+    "frame_placements",
+    "joint_placements",
+    "rnea",
+]
 
 # The numbers are those of pinocchio.ReferenceFrame.
 _REFERENCES = {"world": 0, "local": 1, "local_world_aligned": 2}
@@ -52,8 +60,9 @@ def joint_placements(model: pin.Model) -> casadi.Function:
         model: The model; nq configuration entries, njoints joints counting the universe.
 
     Returns:
-        q, shape (nq, 1) → M, shape (12, njoints - 1). Column i belongs to joint i + 1 (the universe is left out) and
-        stacks the columns of its rotation matrix and its translation [m]: [R[:, 0]; R[:, 1]; R[:, 2]; t].
+        q, shape (nq, 1) → M, shape (12, njoints - 1). Column i belongs to joint i + 1 (the universe
+        is left out) and stacks the columns of its rotation matrix and its translation [m]: [R[:,
+        0]; R[:, 1]; R[:, 2]; t].
 
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
@@ -76,24 +85,30 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
         InputError: Several different frames of the model share the name.
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    listed: tuple[Any, ...] = items([frames] if isinstance(frames, str) else frames, "frames", "a list of frames")
+    listed: tuple[Any, ...] = items(
+        [frames] if isinstance(frames, str) else frames, "frames", "a list of frames"
+    )
     indices = [_frame_index(model, frame, f"frames[{i}]") for i, frame in enumerate(listed)]
     return _backend()("frame_placements", _exact(model), indices)
 
 
 def frame_jacobian(
-    model: pin.Model, frame: str | int, reference: Literal["local_world_aligned", "local", "world"] = "local_world_aligned"
+    model: pin.Model,
+    frame: str | int,
+    reference: Literal["local_world_aligned", "local", "world"] = "local_world_aligned",
 ) -> casadi.Function:
     """Return the function q → J of the Jacobian of a frame: its spatial velocity is J·v.
 
     Args:
         model: The model.
         frame: Name or index of the frame.
-        reference: Where the velocity is expressed: at the frame's origin in world axes ("local_world_aligned"), at
-            the frame's origin in its own axes ("local"), or at the world's origin in world axes ("world").
+        reference: Where the velocity is expressed: at the frame's origin in world axes
+            ("local_world_aligned"), at the frame's origin in its own axes ("local"), or at the
+            world's origin in world axes ("world").
 
     Returns:
-        q, shape (nq, 1) → J, shape (6, nv); rows 0-2 linear [m/s], rows 3-5 angular [rad/s] per unit of v.
+        q, shape (nq, 1) → J, shape (6, nv); rows 0-2 linear [m/s], rows 3-5 angular [rad/s] per
+        unit of v.
 
     Raises:
         UnknownNameError: The model has no such frame, or there is no such reference.
@@ -112,7 +127,8 @@ def rnea(model: pin.Model) -> casadi.Function:
         model: The model, with inertias.
 
     Returns:
-        q, shape (nq, 1), v [rad/s, m/s] and a [rad/s², m/s²], shape (nv, 1) → tau [N·m, N], shape (nv, 1).
+        q, shape (nq, 1), v [rad/s, m/s] and a [rad/s², m/s²], shape (nv, 1) → tau [N·m, N], shape
+        (nv, 1).
 
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
@@ -147,18 +163,22 @@ def _frame_index(model: pin.Model, frame: str | int, field: str) -> int:
     if not found:
         raise UnknownNameError("frame", frame, names, field=field)
     first = model.frames[found[0]]
-    # A URDF gives a joint and its link frames of one name now and then; as long as they coincide, either will do.
+    # A URDF gives a joint and its link frames of one name now and then; as long as they coincide,
+    # either will do.
     for other in (model.frames[index] for index in found[1:]):
         if other.parentJoint != first.parentJoint or other.placement != first.placement:
-            raise InputError(f"several frames are named '{frame}'", field=field, expected="an index", got=found)
+            raise InputError(
+                f"several frames are named '{frame}'", field=field, expected="an index", got=found
+            )
     return found[0]
 
 
 def _exact(model: pin.Model) -> pin.Model:
     """Return a copy of `model` whose quarter turns are exact.
 
-    They come as cos(π/2) = 6e-17, and a number that is neither 0 nor ±1 stays in every expression it enters: without
-    this a UR5e on a planar base takes a tenth more. The change is below the rounding of the numeric algorithms.
+    They come as cos(π/2) = 6e-17, and a number that is neither 0 nor ±1 stays in every expression
+    it enters: without this a UR5e on a planar base takes a tenth more. The change is below the
+    rounding of the numeric algorithms.
     """
     import numpy as np
     import pinocchio as pin

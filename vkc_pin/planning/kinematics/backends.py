@@ -6,8 +6,8 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-# CasADi and Pinocchio come first: the compiled module then uses the libraries these packages have loaded, wherever
-# they are installed.
+# CasADi and Pinocchio come first: the compiled module then uses the libraries these packages have
+# loaded, wherever they are installed.
 import casadi
 import pinocchio as pin
 
@@ -19,7 +19,9 @@ __all__ = ["check_versions", "compiled", "upstream"]
 
 def compiled(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
     """Return the function of `vkc_pin.planning.kinematics` that is called so; frames and references among its arguments are numbers."""
-    return casadi.Function.deserialize(getattr(_extension(), name)(model.saveToString(), *arguments))
+    return casadi.Function.deserialize(
+        getattr(_extension(), name)(model.saveToString(), *arguments)
+    )
 
 
 def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
@@ -34,9 +36,15 @@ def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
     """
     wrong = [name for name in built if _release(built[name]) != _release(installed[name])]
     if wrong:
-        what = " and ".join(f"{name} {built[name]}, but {installed[name]} is installed" for name in wrong)
-        wanted = " ".join(f"'{name}=={'.'.join(map(str, _release(built[name])))}.*'" for name in wrong)
-        raise BuildError(f"vkc_pin.planning.kinematics was compiled against {what}. Either pip install {wanted}, or {REBUILD}")
+        what = " and ".join(
+            f"{name} {built[name]}, but {installed[name]} is installed" for name in wrong
+        )
+        wanted = " ".join(
+            f"'{name}=={'.'.join(map(str, _release(built[name])))}.*'" for name in wrong
+        )
+        raise BuildError(
+            f"vkc_pin.planning.kinematics was compiled against {what}. Either pip install {wanted}, or {REBUILD}"
+        )
 
 
 def _release(version: str) -> tuple[int, int]:
@@ -45,7 +53,9 @@ def _release(version: str) -> tuple[int, int]:
     try:
         return int(parts[0]), int(parts[1])
     except (IndexError, ValueError):
-        raise BuildError(f"cannot read the version '{version}' of a library that vkc_pin.planning.kinematics needs; {REBUILD}") from None
+        raise BuildError(
+            f"cannot read the version '{version}' of a library that vkc_pin.planning.kinematics needs; {REBUILD}"
+        ) from None
 
 
 @cache
@@ -73,13 +83,23 @@ def upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
         frame, reference = arguments
         cpin.computeJointJacobians(symbolic, data, q)
         cpin.updateFramePlacements(symbolic, data)
-        output, result = cpin.getFrameJacobian(symbolic, data, frame, pin.ReferenceFrame.values[reference]), "J"
+        output, result = (
+            cpin.getFrameJacobian(symbolic, data, frame, pin.ReferenceFrame.values[reference]),
+            "J",
+        )
     else:
         cpin.forwardKinematics(symbolic, data, q)
         cpin.updateFramePlacements(symbolic, data)
         joints = name == "joint_placements"
-        placements = [data.oMi[i] for i in range(1, model.njoints)] if joints else [data.oMf[i] for i in arguments[0]]
-        columns = [casadi.vertcat(casadi.vec(casadi.SX(m.rotation)), casadi.SX(m.translation)) for m in placements]
+        placements = (
+            [data.oMi[i] for i in range(1, model.njoints)]
+            if joints
+            else [data.oMf[i] for i in arguments[0]]
+        )
+        columns = [
+            casadi.vertcat(casadi.vec(casadi.SX(m.rotation)), casadi.SX(m.translation))
+            for m in placements
+        ]
         output, result = casadi.horzcat(casadi.SX(12, 0), *columns), "M"
     lean = casadi.cse(casadi.sparsify(casadi.SX(output)))
     return casadi.Function(name, list(inputs.values()), [lean], list(inputs), [result])

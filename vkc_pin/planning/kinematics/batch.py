@@ -15,8 +15,11 @@ __all__ = ["BatchFunction", "size_of"]
 
 _KEPT = 16  # batch sizes whose buffers are kept
 _ROUND = 16  # they are multiples of this
-_WORTH = 2_000_000  # instructions, 20 ms, after which a function is used enough to be asked for as machine code
-_INSTRUCTION = 70  # [bytes] that each instruction of a function takes, measured on those of waypoints
+# instructions, 20 ms, after which a function is used enough to be asked for as machine code
+_WORTH = 2_000_000
+_INSTRUCTION = (
+    70  # [bytes] that each instruction of a function takes, measured on those of waypoints
+)
 
 
 class BatchFunction:
@@ -29,13 +32,18 @@ class BatchFunction:
     def __init__(self, function: ca.Function) -> None:
         self.function = function
         self._buffers: OrderedDict[int, tuple[Any, Any, list[Floats], list[Floats]]] = OrderedDict()
-        self._code, self._instructions, self._worked = MachineCode(function), function.n_instructions(), 0
+        self._code, self._instructions, self._worked = (
+            MachineCode(function),
+            function.n_instructions(),
+            0,
+        )
 
     def __call__(self, *inputs: Floats) -> list[Floats]:
         """Return one array per output, shape (B, numel), entries column by column.
 
         Args:
-            inputs: One array per input: the first of shape (B, numel), others too, or (numel,) for the same in every row.
+            inputs: One array per input: the first of shape (B, numel), others too, or (numel,) for
+                the same in every row.
         """
         rows = len(inputs[0])
         self._worked += rows * self._instructions
@@ -56,8 +64,12 @@ class BatchFunction:
     def _allocate(self, batch: int) -> None:
         mapped = self._code.functions[0].map(batch)
         buffer, trigger = mapped.buffer()
-        arguments = [np.zeros((batch, self.function.nnz_in(i))) for i in range(self.function.n_in())]
-        results = [np.zeros((batch, self.function.nnz_out(i))) for i in range(self.function.n_out())]
+        arguments = [
+            np.zeros((batch, self.function.nnz_in(i))) for i in range(self.function.n_in())
+        ]
+        results = [
+            np.zeros((batch, self.function.nnz_out(i))) for i in range(self.function.n_out())
+        ]
         for index, argument in enumerate(arguments):
             buffer.set_arg(index, argument.data)
         for index, result in enumerate(results):
@@ -69,7 +81,11 @@ class BatchFunction:
     @property
     def nbytes(self) -> int:
         """Its size in memory, estimated [bytes]."""
-        buffers = (array.nbytes for *_, inputs, outputs in self._buffers.values() for array in (*inputs, *outputs))
+        buffers = (
+            array.nbytes
+            for *_, inputs, outputs in self._buffers.values()
+            for array in (*inputs, *outputs)
+        )
         return size_of(self.function) + sum(buffers)
 
 

@@ -18,21 +18,28 @@ __all__ = ["BUILD", "VARIABLE", "Libraries"]
 BUILD = ".build-"
 """Start of the names of folders in which libraries are compiled."""
 
-_FILES, _BYTES = 256, 512 * 2**20  # libraries that are kept at most, and records; a waypoint's functions take 0.1 MB
+_FILES, _BYTES = (
+    256,
+    512 * 2**20,
+)  # libraries that are kept at most, and records; a waypoint's functions take 0.1 MB
 _JOBS = 64  # that wait at most
-_RETRY = 86400.0  # [s] after which what could not be compiled is tried again, and what a dead process left is removed
+# [s] after which what could not be compiled is tried again, and what a dead process left is removed
+_RETRY = 86400.0
 # Names of the files and folders that the package creates here. No others are removed or run.
 _RANDOM = "[a-z0-9_]{8}"  # end of a name of `tempfile`
 _FILE = re.compile(rf"[0-9a-f]{{40}}\.(?:so|json|job|failed)|{re.escape(TEMPORARY)}{_RANDOM}")
 _BUILD = re.compile(re.escape(BUILD) + _RANDOM)
-_DIGEST = hashlib.sha256().digest_size  # bytes after the end of a library: loaders do not look at them
+_DIGEST = (
+    hashlib.sha256().digest_size
+)  # bytes after the end of a library: loaders do not look at them
 
 
 class Libraries:
     """A folder with libraries `KEY.so`, wishes for more `KEY.job`, and marks `KEY.failed` of what could not be compiled.
 
-    A library ends in a digest of all before it, so that one that was cut off is never loaded: that could kill the process. Files
-    appear whole or not at all. Any number of processes may use the folder at once. What cannot be done raises OSError.
+    A library ends in a digest of all before it, so that one that was cut off is never loaded: that
+    could kill the process. Files appear whole or not at all. Any number of processes may use the
+    folder at once. What cannot be done raises OSError.
 
     Attributes:
         path: The folder.
@@ -55,7 +62,9 @@ class Libraries:
         """Return a library that may be loaded; one that is damaged is removed."""
         path = self.path / f"{key}.so"
         try:
-            with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as stream:
+            with os.fdopen(
+                os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb"
+            ) as stream:
                 status = os.fstat(stream.fileno())
                 if not stat.S_ISREG(status.st_mode) or not only_mine(status):
                     return None
@@ -140,7 +149,9 @@ class Libraries:
 
         A process that inherits the handle has the lock as well, as long as one of them has it open.
         """
-        handle = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        handle = os.open(
+            self.path / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600
+        )
         try:
             if self.take(handle):
                 return handle

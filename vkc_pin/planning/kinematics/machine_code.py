@@ -1,7 +1,7 @@
 """CasADi functions as machine code: compiled in the background, kept on disk, and equal to the interpreted ones bit for bit.
 
-Nothing waits for a compiler, and nothing fails for want of one: as long as there is no library, the functions are those that were
-given.
+Nothing waits for a compiler, and nothing fails for want of one: as long as there is no library, the
+functions are those that were given.
 """
 
 from __future__ import annotations
@@ -28,11 +28,22 @@ from vkc_pin.planning.kinematics.libraries import BUILD, Libraries
 
 __all__ = ["MachineCode", "wait", "work"]
 
-# No contraction to fused multiplications and additions, the interpreter's own calls of sine and cosine, and nothing that another
-# machine with the same home may lack: results are equal to the last bit. -O2 took 1.4 times as long to compile, for no gain.
-_FLAGS = ("-O1", "-ffp-contract=off", "-fno-builtin-sin", "-fno-builtin-cos", "-w", "-fPIC", "-shared")
+# No contraction to fused multiplications and additions, the interpreter's own calls of sine and
+# cosine, and nothing that another machine with the same home may lack: results are equal to the
+# last bit. -O2 took 1.4 times as long to compile, for no gain.
+_FLAGS = (
+    "-O1",
+    "-ffp-contract=off",
+    "-fno-builtin-sin",
+    "-fno-builtin-cos",
+    "-w",
+    "-fPIC",
+    "-shared",
+)
 _LONGEST = 600.0  # [s] that a compiler may take; one that has a processor to itself takes 1 to 2
-_SAMPLES = 20  # at which a library is compared with the interpreter before it is kept; each time it is loaded, at one: 1 ms
+# at which a library is compared with the interpreter before it is kept; each time it is loaded, at
+# one: 1 ms
+_SAMPLES = 20
 _WORKER = """
 import os, sys
 os.nice(19)
@@ -67,17 +78,23 @@ class MachineCode:
         """
         if self._over:
             return self.compiled
-        with contextlib.suppress(OSError, RuntimeError, ValueError):  # RuntimeError: CasADi's, and no more threads
+        with contextlib.suppress(
+            OSError, RuntimeError, ValueError
+        ):  # RuntimeError: CasADi's, and no more threads
             if (folder := Libraries.here()) is None or (compiler := _compiler()) is None:
                 return False
             if not self._key:
                 texts = [function.serialize() for function in self._given]
                 self._key = _key(compiler, texts)
-                if not folder.exists(self._key) and folder.ask(self._key, json.dumps([compiler, texts]).encode()):
+                if not folder.exists(self._key) and folder.ask(
+                    self._key, json.dumps([compiler, texts]).encode()
+                ):
                     _start_if_idle(folder)
             if folder.exists(self._key):
                 self._over = True  # tried once: nothing changes after that
-                if (path := folder.find(self._key)) is not None and (loaded := _load(path, self._given)):
+                if (path := folder.find(self._key)) is not None and (
+                    loaded := _load(path, self._given)
+                ):
                     self._loaded = loaded
         return self.compiled
 
@@ -85,7 +102,8 @@ class MachineCode:
 def wait(timeout: float = 600.0) -> bool:
     """Compile what was asked for so far, in this process or others, and wait until that is done.
 
-    Plan once, then call this: the next plans of that kind begin with machine code. For installations, benchmarks and tests.
+    Plan once, then call this: the next plans of that kind begin with machine code. For
+    installations, benchmarks and tests.
 
     Args:
         timeout: How long to wait at most [s].
@@ -100,8 +118,14 @@ def wait(timeout: float = 600.0) -> bool:
         while jobs := folder.jobs():
             left = deadline - time.monotonic()
             process = _start_if_idle(folder)
-            if process is not None and process.wait(max(left, 0.0)) and not any(map(folder.failed, jobs)):
-                return False  # it does not even start; where it dies of a library, the next one goes on with the others
+            if (
+                process is not None
+                and process.wait(max(left, 0.0))
+                and not any(map(folder.failed, jobs))
+            ):
+                # it does not even start; where it dies of a library, the next one goes on with the
+                # others
+                return False
             if left < 0.0 or not _python():
                 return False
             time.sleep(0.02)  # somebody else may be at it
@@ -128,7 +152,9 @@ def work(path: str, lock: int) -> None:
                 folder.remove(f"{key}.job")
         done |= keys
         folder.tidy()
-        folder.unlock(lock)  # whoever asks from now on sees to it, and whoever asked before relies on this process
+        folder.unlock(
+            lock
+        )  # whoever asks from now on sees to it, and whoever asked before relies on this process
         if not done.issuperset(folder.jobs()) and not folder.take(lock):
             return
 
@@ -159,19 +185,27 @@ def _load(path: Path, given: tuple[ca.Function, ...], samples: int = 1) -> tuple
     try:
         with _LOADING:
             loaded = tuple(ca.external(function.name(), str(path)) for function in given)
-        return loaded if all(_same(*pair, samples) for pair in zip(given, loaded, strict=True)) else ()
+        return (
+            loaded if all(_same(*pair, samples) for pair in zip(given, loaded, strict=True)) else ()
+        )
     except RuntimeError:  # no library for this machine, or other functions
         return ()
 
 
 def _same(one: ca.Function, other: ca.Function, samples: int) -> bool:
     """Whether two functions have the same inputs and outputs, and the same bits come out where they are looked at."""
-    shapes = [[f.sparsity_in(i) for i in range(f.n_in())] + [f.sparsity_out(i) for i in range(f.n_out())] for f in (one, other)]
+    shapes = [
+        [f.sparsity_in(i) for i in range(f.n_in())] + [f.sparsity_out(i) for i in range(f.n_out())]
+        for f in (one, other)
+    ]
     if one.n_in() != other.n_in() or shapes[0] != shapes[1]:
         return False
     random = np.random.default_rng(0)
     for _ in range(samples):
-        inputs = [ca.DM(one.sparsity_in(i), random.uniform(-2.0, 2.0, one.nnz_in(i))) for i in range(one.n_in())]
+        inputs = [
+            ca.DM(one.sparsity_in(i), random.uniform(-2.0, 2.0, one.nnz_in(i)))
+            for i in range(one.n_in())
+        ]
         for a, b in zip(one.call(inputs), other.call(inputs), strict=True):
             a, b = np.array(a.nonzeros()), np.array(b.nonzeros())
             if (a.view(np.int64) != b.view(np.int64))[~(np.isnan(a) & np.isnan(b))].any():
@@ -195,7 +229,13 @@ def _key(compiler: tuple[str, ...], texts: list[str]) -> str:
     with contextlib.suppress(OSError, ValueError):  # not GNU
         libc = os.confstr("CS_GNU_LIBC_VERSION")
     machine = (platform.system(), platform.machine(), libc)
-    made_by = (*compiler, str(Path(compiler[0]).resolve()), status.st_size, status.st_mtime_ns, *_FLAGS)
+    made_by = (
+        *compiler,
+        str(Path(compiler[0]).resolve()),
+        status.st_size,
+        status.st_mtime_ns,
+        *_FLAGS,
+    )
     digest = hashlib.sha256(json.dumps([made_by, ca.CasadiMeta.version(), machine]).encode())
     for text in texts:
         digest.update(hashlib.sha256(text.encode()).digest())
@@ -208,7 +248,16 @@ def _start_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
         return None
     try:  # the lock goes on to the process
         nice = _NICE if shutil.which(_NICE[0]) else ()
-        command = [*nice, sys.executable, "-P", "-c", _WORKER, str(folder.path), str(lock), *map(os.path.abspath, sys.path)]
+        command = [
+            *nice,
+            sys.executable,
+            "-P",
+            "-c",
+            _WORKER,
+            str(folder.path),
+            str(lock),
+            *map(os.path.abspath, sys.path),
+        ]
         process = _run(command, folder.path, lock)
     finally:
         os.close(lock)
@@ -224,7 +273,10 @@ def _python() -> bool:
 def _run(command: list[str], folder: Path, *handles: int) -> subprocess.Popen[bytes]:
     """Start a process that hears and says nothing, in a group of its own: Ctrl-C is not for it.
 
-    Not in a session of its own: Linux shares processors out by session first, and lower priority would mean nothing in another.
+    Not in a session of its own: Linux shares processors out by session first, and lower priority
+    would mean nothing in another.
     """
     no = subprocess.DEVNULL
-    return subprocess.Popen(command, cwd=folder, process_group=0, stdin=no, stdout=no, stderr=no, pass_fds=handles)
+    return subprocess.Popen(
+        command, cwd=folder, process_group=0, stdin=no, stdout=no, stderr=no, pass_fds=handles
+    )

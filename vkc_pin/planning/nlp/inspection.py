@@ -38,7 +38,8 @@ class Plane:
         pair: Their geometries, shape (2,).
         distance: Of the pair, from coal [m].
         margin: The clearance that is asked for [m].
-        coefficients, offset: C, shape (12·joints,), and R: C·vec(M(z)) − R ≥ 0 says that the pair keeps its margin.
+        coefficients, offset: C, shape (12·joints,), and R: C·vec(M(z)) − R ≥ 0 says that the pair
+            keeps its margin.
         gradient: Of the plane's value, as the solver has it, shape (n,), [m/m] or [m/rad].
     """
 
@@ -56,8 +57,12 @@ class Plane:
     def values(self, z: Floats) -> Floats:
         """Return the distance that the plane takes the pair to have, shape (W,) [m], at z, shape (W, n)."""
         rotations, translations = self.problem.chain.joint_placements(z)
-        columns = np.concatenate([rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]], axis=2)
-        return np.asarray(self.margin + columns.reshape(len(z), -1) @ self.coefficients - self.offset)
+        columns = np.concatenate(
+            [rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]], axis=2
+        )
+        return np.asarray(
+            self.margin + columns.reshape(len(z), -1) @ self.coefficients - self.offset
+        )
 
     def distances(self, z: Floats) -> Floats:
         """Return the pair's distance from coal, shape (W,) [m], at z, shape (W, n); NaN where it is far from this one."""
@@ -76,7 +81,10 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
         z: z_1..z_N, shape (N, n).
         waypoint: Counted from 1.
     """
-    t, labels = problem.transcription, problem.contacts.phases[problem.contacts.phase_of(waypoint)].labels
+    t, labels = (
+        problem.transcription,
+        problem.contacts.phases[problem.contacts.phase_of(waypoint)].labels,
+    )
     model = problem.contacts.settled(z)
     waypoints = np.arange(1, problem.segments + 1)
     contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
@@ -84,8 +92,12 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     x = t.pack(z)
     dt, targets = problem.timing_for(z).dt, problem.target_matrix()
     weights, penalty = problem.effort.weights(*problem.rates(z)), problem.options.penalty
-    parameters = t.parameter_vector(problem.start, coefficients, offsets, targets, weights=weights, penalty=penalty, dt=dt)
-    jacobian = ca.Function("slopes", [t.x, t.parameters], [t.jacobian])(x, parameters).sparse().tocsr()
+    parameters = t.parameter_vector(
+        problem.start, coefficients, offsets, targets, weights=weights, penalty=penalty, dt=dt
+    )
+    jacobian = (
+        ca.Function("slopes", [t.x, t.parameters], [t.jacobian])(x, parameters).sparse().tocsr()
+    )
     columns = (waypoint - 1) * t.width + np.arange(t.n)
     return [
         Plane(
@@ -107,7 +119,8 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
 def sizes(problem: TrajectoryProblem) -> dict[str, int]:
     """Return how many variables and rows of each kind there are.
 
-    The rows of velocity and acceleration are not among those of the program unless it turns out to need them.
+    The rows of velocity and acceleration are not among those of the program unless it turns out to
+    need them.
     """
     t, (first, second) = problem.transcription, problem.rates(problem.still)
     fixed = int((problem.lower == problem.upper).sum())
@@ -138,7 +151,12 @@ def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
 
 
 def build(
-    scene: Scene, steps: Sequence[Step], *, options: Options | None = None, terms: Sequence[Term] = (), cache: Cache | None = None
+    scene: Scene,
+    steps: Sequence[Step],
+    *,
+    options: Options | None = None,
+    terms: Sequence[Term] = (),
+    cache: Cache | None = None,
 ) -> TrajectoryProblem:
     """Return the nonlinear program of `steps` in `scene`, to look at before solving.
 
@@ -147,10 +165,12 @@ def build(
         steps: What should change in the world.
         options: How to plan.
         terms: Own constraints and costs.
-        cache: Where the symbolic program is kept, for problems of the same structure in the same thread; None: one of its own.
+        cache: Where the symbolic program is kept, for problems of the same structure in the same
+            thread; None: one of its own.
 
     Raises:
-        InputError: The steps or terms name something that is not there, or ask for what cannot be done.
+        InputError: The steps or terms name something that is not there, or ask for what cannot be
+            done.
     """
     options = Options() if options is None else instance(options, Options, "options")
     cache = None if cache is None else instance(cache, Cache, "cache")

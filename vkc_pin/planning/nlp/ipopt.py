@@ -13,7 +13,9 @@ from vkc_pin.utils.budget import SpentError, spend
 __all__ = ["ENTRY", "Ipopt", "Monitor", "ipopt"]
 
 _MEMORY = 1  # CasADi keeps memory 0 of a function to itself, and the buffer has the next one
-ENTRY = 600  # [bytes] that an entry of Jacobian or Hessian takes, in a program and in a solver, measured at the door
+# [bytes] that an entry of Jacobian or Hessian takes, in a program and in a solver, measured at the
+# door
+ENTRY = 600
 
 
 class Monitor(ca.Callback):
@@ -29,7 +31,14 @@ class Monitor(ca.Callback):
     def __init__(self, variables: int, rows: int, parameters: int, waypoints: int) -> None:
         ca.Callback.__init__(self)
         self._waypoints = waypoints
-        self._sizes = {"x": variables, "f": 1, "g": rows, "lam_x": variables, "lam_g": rows, "lam_p": parameters}
+        self._sizes = {
+            "x": variables,
+            "f": 1,
+            "g": rows,
+            "lam_x": variables,
+            "lam_g": rows,
+            "lam_p": parameters,
+        }
         self.construct("monitor", {})
 
     def get_n_in(self) -> int:
@@ -52,8 +61,8 @@ class Monitor(ca.Callback):
 class Ipopt:
     """A solver, with the arrays that it reads and writes.
 
-    What CasADi is handed, and hands out, it converts number by number, which takes 0.1 ms for a thousand of them; so arrays are
-    shared with it once.
+    What CasADi is handed, and hands out, it converts number by number, which takes 0.1 ms for a
+    thousand of them; so arrays are shared with it once.
 
     Args:
         function: The solver.
@@ -70,8 +79,12 @@ class Ipopt:
         self._buffer, self._run = function.buffer()
         self.stats: dict[str, Any] = {}
         self.evaluating = self._total = 0.0
-        self._given = {function.name_in(i): np.zeros(function.nnz_in(i)) for i in range(function.n_in())}
-        self._found = {function.name_out(i): np.zeros(function.nnz_out(i)) for i in range(function.n_out())}
+        self._given = {
+            function.name_in(i): np.zeros(function.nnz_in(i)) for i in range(function.n_in())
+        }
+        self._found = {
+            function.name_out(i): np.zeros(function.nnz_out(i)) for i in range(function.n_out())
+        }
         for i, values in enumerate(self._given.values()):
             self._buffer.set_arg(i, values.data)
         for i, values in enumerate(self._found.values()):
@@ -105,7 +118,8 @@ def ipopt(
         parameters: The parameters.
         objective: f and its gradient.
         rows: g and its Jacobian.
-        lagrangian: Symbols of the weight σ of f and of the multipliers λ, and the upper triangle of the Hessian of σ·f + λᵀ·g.
+        lagrangian: Symbols of the weight σ of f and of the multipliers λ, and the upper triangle of
+            the Hessian of σ·f + λᵀ·g.
         options: For CasADi's nlpsol.
         waypoints: Units of effort of an iteration.
     """
@@ -115,7 +129,11 @@ def ipopt(
         "grad_f": ca.Function("nlp_grad_f", given, list(objective), ["x", "p"], ["f", "grad_f_x"]),
         "jac_g": ca.Function("nlp_jac_g", given, list(rows), ["x", "p"], ["g", "jac_g_x"]),
         "hess_lag": ca.Function(
-            "nlp_hess_l", [*given, weight, multipliers], [hessian], ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
+            "nlp_hess_l",
+            [*given, weight, multipliers],
+            [hessian],
+            ["x", "p", "lam_f", "lam_g"],
+            ["triu_hess_gamma_x_x"],
         ),
     }
     quiet = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
@@ -123,5 +141,7 @@ def ipopt(
     callback = {"iteration_callback": monitor}
     spend()
     program = {"x": x, "p": parameters, "f": f, "g": g}
-    solver = ca.nlpsol("trajectory", "ipopt", program, {**quiet, **functions, **callback, **options})
+    solver = ca.nlpsol(
+        "trajectory", "ipopt", program, {**quiet, **functions, **callback, **options}
+    )
     return Ipopt(solver, monitor, ENTRY * (rows[1].nnz() + hessian.nnz()))

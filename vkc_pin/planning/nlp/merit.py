@@ -15,7 +15,9 @@ from vkc_pin.utils.arrays import Floats
 
 __all__ = ["GROWTH", "TOLERANCE", "Infeasibility", "Merit", "infeasibility", "shortfalls"]
 
-TOLERANCE = 1e-4  # [m], [rad] and, of rates, relative to their limits: besides clearance, what is missing of what holds
+# [m], [rad] and, of rates, relative to their limits: besides clearance, what is missing of what
+# holds
+TOLERANCE = 1e-4
 GROWTH = 4.0  # ratio of a weight to the one before, where it proved too small
 
 
@@ -24,9 +26,10 @@ class Infeasibility:
     """What does not hold along a motion.
 
     Attributes:
-        amounts: For every kind of constraint, the sum of what is missing at every waypoint, shape (N,): "clearance" [m], "poses"
-            (closure, goals and grasps: distance and angle) [m] and [rad], "rolling" [m], "clamped" [m] and [rad], "terms" (1e-3
-            is their tolerance), "rates" [m] and [rad].
+        amounts: For every kind of constraint, the sum of what is missing at every waypoint, shape
+            (N,): "clearance" [m], "poses" (closure, goals and grasps: distance and angle) [m] and
+            [rad], "rolling" [m], "clamped" [m] and [rad], "terms" (1e-3 is their tolerance),
+            "rates" [m] and [rad].
         away: See `Transcription.parameter_vector`, shape (N, poses, 7).
         excess: Of rolling, clamping and own constraints, in the order of their rows.
         rate_excess: Of velocities and accelerations; empty if they are not rows of the program.
@@ -45,7 +48,9 @@ class Infeasibility:
     @property
     def others(self) -> float:
         """The most that is missing of one kind at a waypoint, clearance aside."""
-        return float(np.max([amount for kind, amount in self.amounts.items() if kind != "clearance"]))
+        return float(
+            np.max([amount for kind, amount in self.amounts.items() if kind != "clearance"])
+        )
 
 
 def shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
@@ -53,11 +58,15 @@ def shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
     plane = contacts.place
     kept = plane < slots
     found = np.zeros((segments, slots))
-    found[contacts.waypoint[kept], plane[kept]] = np.maximum(contacts.margin[kept] - contacts.distance[kept], 0.0)
+    found[contacts.waypoint[kept], plane[kept]] = np.maximum(
+        contacts.margin[kept] - contacts.distance[kept], 0.0
+    )
     return found
 
 
-def infeasibility(problem: TrajectoryProblem, z: Floats, timing: Timing, contacts: Contacts, *, rates: bool) -> Infeasibility:
+def infeasibility(
+    problem: TrajectoryProblem, z: Floats, timing: Timing, contacts: Contacts, *, rates: bool
+) -> Infeasibility:
     """Return what does not hold at z_1..z_N, shape (N, n).
 
     Args:
@@ -75,8 +84,12 @@ def infeasibility(problem: TrajectoryProblem, z: Floats, timing: Timing, contact
     for k, goal in enumerate(problem.pose_goals):
         if goal.row.waypoints:
             at = np.array(goal.row.waypoints) - 1
-            away[at, k] = away_from(goal.row.kind, *goal.row.placed(rotations[at], translations[at]), goal.target)
-    amounts["poses"] = np.linalg.norm(away[:, :, :3], axis=2).sum(axis=1) + away[:, :, 6].sum(axis=1)
+            away[at, k] = away_from(
+                goal.row.kind, *goal.row.placed(rotations[at], translations[at]), goal.target
+            )
+    amounts["poses"] = np.linalg.norm(away[:, :, :3], axis=2).sum(axis=1) + away[:, :, 6].sum(
+        axis=1
+    )
     excess = problem.excess(z, timing, rates=rates)
     for kind, scale in problem.row_kinds.items():
         np.add.at(amounts[kind], t.owners, scale * np.abs(excess))
@@ -92,8 +105,8 @@ def infeasibility(problem: TrajectoryProblem, z: Floats, timing: Timing, contact
 class Merit:
     """φ(z) = f(z) + Σ_k ν_k Σ_t v_kt(z): f of eq. 1, and for kinds k of constraints their weights and `Infeasibility.amounts`.
 
-    It is exact: where the weights exceed the multipliers, its minima are those of the program (Nocedal and Wright, Numerical
-    Optimization, theorem 17.3).
+    It is exact: where the weights exceed the multipliers, its minima are those of the program
+    (Nocedal and Wright, Numerical Optimization, theorem 17.3).
 
     Attributes:
         weights: ν_k of every kind, [1/m] and [1/rad].

@@ -11,7 +11,9 @@ from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["Effort", "changed_at"]
 
-STILL = 0.03  # [m] and [rad] ways of a coordinate in a phase that are shorter count as squares: a length has a slope at 0 then
+# [m] and [rad] ways of a coordinate in a phase that are shorter count as squares: a length has a
+# slope at 0 then
+STILL = 0.03
 
 
 def changed_at(stops: Sequence[int], segments: int) -> list[int]:
@@ -32,9 +34,10 @@ class Effort:
 
         f = Σ_p Σ_g [ √(ε_g² + m_p·E_pg) − ε_g ],
 
-    where E_pg are the same two sums over phase p, of m_p steps, and the coordinates g alone: x and y of the base are one g, every
-    other coordinate is one of its own. At even speed √(m_p·E_pg) is how long the way of g is, so that slow motion is not cheap,
-    and a phase not the dearer the fewer steps it has. It is a sum of norms, but for ε, and convex.
+    where E_pg are the same two sums over phase p, of m_p steps, and the coordinates g alone: x and
+    y of the base are one g, every other coordinate is one of its own. At even speed √(m_p·E_pg) is
+    how long the way of g is, so that slow motion is not cheap, and a phase not the dearer the fewer
+    steps it has. It is a sum of norms, but for ε, and convex.
 
     Args:
         metric: The diagonal of W, shape (n,), [1/m²] and [1/rad²].
@@ -44,11 +47,16 @@ class Effort:
         length: Whether it is a length; otherwise it is a sum of squares.
     """
 
-    def __init__(self, metric: Floats, smoothing: float, ends: Ints, stops: Sequence[int], *, length: bool) -> None:
+    def __init__(
+        self, metric: Floats, smoothing: float, ends: Ints, stops: Sequence[int], *, length: bool
+    ) -> None:
         self.metric, self.smoothing, self.length = metric, smoothing, length
         self._counts = np.diff(ends, prepend=0)
         phase = np.repeat(np.arange(len(self._counts)), self._counts)
-        self._phases = phase, phase[changed_at(stops, len(phase))]  # of the steps, and of their changes
+        self._phases = (
+            phase,
+            phase[changed_at(stops, len(phase))],
+        )  # of the steps, and of their changes
 
     def value(self, steps: Floats, changes: Floats) -> float:
         """Return f.
@@ -61,13 +69,16 @@ class Effort:
         if not self.length:
             return float(energies.sum())
         still = self._still
-        return float((np.sqrt(still**2 + self._counts[:, None] * energies) - still)[:, self._own].sum())
+        return float(
+            (np.sqrt(still**2 + self._counts[:, None] * energies) - still)[:, self._own].sum()
+        )
 
     def weights(self, steps: Floats, changes: Floats) -> tuple[Floats, Floats]:
         """Return the weights of squared steps, shape (N, n), and of squared changes, in a quadratic function that stands for f.
 
-        It has the value and slope of f at the steps given, up to a constant, and nowhere lies below f: √q ≤ (q/√q̄ + √q̄)/2
-        (reweighted least squares; Hunter and Lange, A tutorial on MM algorithms, 2004).
+        It has the value and slope of f at the steps given, up to a constant, and nowhere lies below
+        f: √q ≤ (q/√q̄ + √q̄)/2 (reweighted least squares; Hunter and Lange, A tutorial on MM
+        algorithms, 2004).
 
         Args:
             steps: Shape (N, n).
@@ -76,7 +87,9 @@ class Effort:
         share = np.ones((len(self._counts), len(self.metric)))
         if self.length:
             counts = self._counts[:, None]
-            share = counts / (2.0 * np.sqrt(self._still**2 + counts * self._energies(steps, changes)))
+            share = counts / (
+                2.0 * np.sqrt(self._still**2 + counts * self._energies(steps, changes))
+            )
         of_steps, of_changes = (share[phase] * self.metric for phase in self._phases)
         return of_steps, self.smoothing * of_changes
 

@@ -24,8 +24,9 @@ class PoseGoal:
     Attributes:
         row: The frame, and the waypoints at which it must be there.
         target: Where, in the world.
-        kind: "closure" of what stands fixed and is held; "grasp" of a free object; "approach": where the straight path to a grasp
-            begins; "level": what something rides on; "goal" of a step.
+        kind: "closure" of what stands fixed and is held; "grasp" of a free object; "approach":
+            where the straight path to a grasp begins; "level": what something rides on; "goal" of a
+            step.
         about: What it is about, for people: an object, a hold or a frame.
         object: The object that is held or grasped; None for the goal of a step.
     """
@@ -42,7 +43,9 @@ class PoseGoal:
         return f"{self.kind} {self.about}"
 
 
-def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options) -> tuple[PoseGoal, ...]:
+def pose_goals(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
+) -> tuple[PoseGoal, ...]:
     """Return the frames that must be somewhere: grasps and closures, then the approaches to grasps and the steps' own goals.
 
     Args:
@@ -59,7 +62,9 @@ def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: 
         for phase, first, last in zip(task.phases, starts, ends, strict=True):
             if hold in phase.grasps and scene.objects[hold.object].object.free:
                 row = PoseRow(closure.joint, closure.local, (int(last),))
-                goals.append(PoseGoal(row, phase.standing[hold.object], "grasp", str(hold), hold.object))
+                goals.append(
+                    PoseGoal(row, phase.standing[hold.object], "grasp", str(hold), hold.object)
+                )
             elif hold in phase.grasps:
                 waypoints.append(last)
             elif hold in phase.held:
@@ -69,7 +74,10 @@ def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: 
             goals.append(PoseGoal(row, closure.target, "closure", hold.object, hold.object))
     for phase, first, last in zip(task.phases, starts, ends, strict=True):
         for hold in phase.grasps:  # short of the grasp, straight back along the hand's approach
-            closure, target = chain.closures[hold], phase.standing.get(hold.object, chain.closures[hold].target)
+            closure, target = (
+                chain.closures[hold],
+                phase.standing.get(hold.object, chain.closures[hold].target),
+            )
             joint, frame = chain.holder(hold)
             x, y, z = (options.approach * frame.rotation[:, 2]).tolist()
             at = approach_at(int(first), int(last), options)
@@ -80,10 +88,16 @@ def pose_goals(scene: Scene, chain: VirtualKinematicChain, task: Task, options: 
         for hold, ride in {ride.hold: ride for ride in phase.rides}.items():
             thing = scene.objects[hold.object].object
             if thing.free:
-                row = PoseRow(*chain.frame(thing.base_link, hold), tuple(range(int(first) + 1, int(last) + 1)), "level")
+                row = PoseRow(
+                    *chain.frame(thing.base_link, hold),
+                    tuple(range(int(first) + 1, int(last) + 1)),
+                    "level",
+                )
                 goals.append(PoseGoal(row, ride.carrier, "level", hold.object, hold.object))
         for goal in phase.frames:
-            row = PoseRow(*chain.frame(goal.frame, goal.hold, opening=phase.opening), (int(last),), goal.kind)
+            row = PoseRow(
+                *chain.frame(goal.frame, goal.hold, opening=phase.opening), (int(last),), goal.kind
+            )
             goals.append(PoseGoal(row, goal.placement, "goal", str(goal)))
     return tuple(goals)
 
@@ -97,10 +111,16 @@ def pushed_steps(chain: VirtualKinematicChain, task: Task) -> tuple[tuple[int, i
     """Return column, first and last waypoint, and way (1 or -1), for every coordinate that a phase pushes."""
     ends = np.cumsum([phase.segments for phase in task.phases]).tolist()
     phases = zip(task.phases, [0, *ends[:-1]], ends, strict=True)
-    return tuple((chain.index(name), first, last, way) for phase, first, last in phases for name, way in phase.pushed.items())
+    return tuple(
+        (chain.index(name), first, last, way)
+        for phase, first, last in phases
+        for name, way in phase.pushed.items()
+    )
 
 
-def chosen_freedoms(scene: Scene, chain: VirtualKinematicChain, task: Task) -> tuple[tuple[int, int, int], ...]:
+def chosen_freedoms(
+    scene: Scene, chain: VirtualKinematicChain, task: Task
+) -> tuple[tuple[int, int, int], ...]:
     """Return column, waypoint of the grasp and last waypoint of the hold, for every freedom that is chosen when a hand clamps.
 
     Args:

@@ -30,7 +30,9 @@ from vkc_pin.world.trajectory.wheels import rolling_of
 
 __all__ = ["TrajectoryProblem"]
 
-_CHOICE_WEIGHT = 1e-4  # ratio, of coordinates that are chosen when grasping and do not move: only keeps the problem regular
+# ratio, of coordinates that are chosen when grasping and do not move: only keeps the problem
+# regular
+_CHOICE_WEIGHT = 1e-4
 
 
 class TrajectoryProblem:
@@ -44,20 +46,32 @@ class TrajectoryProblem:
         transcription: The symbolic program, shared between problems of one structure.
         effort: What the way costs.
         start: z_0, shape (n,).
-        lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still, joint goals.
-        pose_goals: Which frames must be where (eqs. 2 and 3), one per `transcription.structure.poses`.
+        lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), what stands still,
+            joint goals.
+        pose_goals: Which frames must be where (eqs. 2 and 3), one per
+            `transcription.structure.poses`.
         targets: Their placements.
-        choices: What is chosen when a hand clamps: column, waypoint of the grasp and last waypoint of the hold.
-        terms: The user's own constraints and costs that count here, one per `transcription.structure.terms`.
+        choices: What is chosen when a hand clamps: column, waypoint of the grasp and last waypoint
+            of the hold.
+        terms: The user's own constraints and costs that count here, one per
+            `transcription.structure.terms`.
         term_numbers: Their values along a motion.
         cache: Where the symbolic program came from, and searches keep what they build.
     """
 
     def __init__(
-        self, scene: Scene, task: Task, options: Options, terms: Sequence[Term] = (), *, cache: Cache | None = None
+        self,
+        scene: Scene,
+        task: Task,
+        options: Options,
+        terms: Sequence[Term] = (),
+        *,
+        cache: Cache | None = None,
     ) -> None:
         self.scene, self.task, self.options, self.cache = scene, task, options, cache or Cache()
-        self.chain: VirtualKinematicChain = consolidate(scene, task.holds, rides=task.rides, cache=self.cache)
+        self.chain: VirtualKinematicChain = consolidate(
+            scene, task.holds, rides=task.rides, cache=self.cache
+        )
         self.rolling = rolling_of(self.chain.robot)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
@@ -95,10 +109,14 @@ class TrajectoryProblem:
     def _structure(self, terms: tuple[TermRow, ...]) -> Structure:
         """Return what the symbolic program depends on: the frames of eqs. 2 and 3, stops and firm holds."""
         o = self.options
-        # From the straight approach to the grasp on: there the hand must already be where it will close.
+        # From the straight approach to the grasp on: there the hand must already be where it will
+        # close.
         starts = np.concatenate([[0], self.ends[:-1]])
         begin = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
-        clamped = tuple((column, approach_at(begin[grasp], grasp, o), last) for column, grasp, last in self.choices)
+        clamped = tuple(
+            (column, approach_at(begin[grasp], grasp, o), last)
+            for column, grasp, last in self.choices
+        )
         # The robot stands still while its gripper closes or opens.
         phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
         stops = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
@@ -123,7 +141,9 @@ class TrajectoryProblem:
         metric = metric * of.turns**2 + o.velocity_weight_base * of.lengths**2
         metric[[column for column, _, _ in self.choices]] *= _CHOICE_WEIGHT
         stops = self.transcription.structure.stops
-        return Effort(metric, o.acceleration_weight / o.dt**2, self.ends, stops, length=o.effort == "length")
+        return Effort(
+            metric, o.acceleration_weight / o.dt**2, self.ends, stops, length=o.effort == "length"
+        )
 
     def _start(self) -> Floats:
         start = np.zeros(self.chain.size)
@@ -142,13 +162,18 @@ class TrajectoryProblem:
 
     def _bounds(self) -> tuple[Floats, Floats]:
         """Return the joint limits (eq. 4) at every waypoint, narrowed to what the phases and firm holds ask for."""
-        lower, upper = np.tile(self.chain.lower, (self.segments, 1)), np.tile(self.chain.upper, (self.segments, 1))
+        lower, upper = (
+            np.tile(self.chain.lower, (self.segments, 1)),
+            np.tile(self.chain.upper, (self.segments, 1)),
+        )
         for column, name in enumerate(self.chain.names[:3]):
             lower[:, column], upper[:, column] = self.limits(name)
         begin = 0
         for phase, end in zip(self.task.phases, self.ends, strict=True):
             inside = slice(begin, end)  # row t belongs to waypoint t + 1
-            if phase.kind == "stand" and not self.closed(phase):  # what is let go of then stands where it is
+            if phase.kind == "stand" and not self.closed(
+                phase
+            ):  # what is let go of then stands where it is
                 own = slice(0, self.chain.robot.coordinates.size)
                 lower[inside, own] = upper[inside, own] = self.start[own]
             for name, value in phase.before.items():
@@ -163,19 +188,30 @@ class TrajectoryProblem:
                 for column, goal in enumerate(phase.base):
                     if goal is not None:
                         turn = wrapped(goal - self.start[2])  # to the nearest of the equal headings
-                        lower[end - 1, column] = upper[end - 1, column] = self.start[2] + turn if column == 2 else goal
+                        lower[end - 1, column] = upper[end - 1, column] = (
+                            self.start[2] + turn if column == 2 else goal
+                        )
             begin = end
-        for hold in self._held_at_start():  # until it is let go of, what is clamped stays where it is
+        for (
+            hold
+        ) in self._held_at_start():  # until it is let go of, what is clamped stays where it is
             if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
                 held = [hold in phase.held for phase in self.task.phases]
-                until = int(self.ends[(held.index(False) if False in held else len(held)) - 1]) if held[0] else 0
+                until = (
+                    int(self.ends[(held.index(False) if False in held else len(held)) - 1])
+                    if held[0]
+                    else 0
+                )
                 for column in map(self.chain.index, self.chain.virtual[hold]):
                     lower[:until, column] = upper[:until, column] = self.start[column]
         return lower, upper
 
     def timing_for(self, z: Floats) -> Timing:
         """Return how long steps take where z_1..z_N, shape (N, n), is the seed; see `time_for`. Terms may ask for more time."""
-        structure, limits = self.transcription.structure, (self.chain.velocity, self.chain.acceleration)
+        structure, limits = (
+            self.transcription.structure,
+            (self.chain.velocity, self.chain.acceleration),
+        )
         runs = runs_between(structure.stops, self.segments)
         path = self.waypoints(z)
         dt = time_for(path, self.options.dt, runs, limits, self.rolling.times(path))
@@ -194,7 +230,10 @@ class TrajectoryProblem:
             return float(self.start[column]), float(self.start[column])
         lower, upper = float(self.chain.lower[column]), float(self.chain.upper[column])
         if column < 2:
-            lower, upper = max(lower, self.scene.arena[2 * column]), min(upper, self.scene.arena[2 * column + 1])
+            lower, upper = (
+                max(lower, self.scene.arena[2 * column]),
+                min(upper, self.scene.arena[2 * column + 1]),
+            )
         return lower, upper
 
     def unit(self, name: str) -> str:
@@ -211,7 +250,9 @@ class TrajectoryProblem:
 
     def evaluate_contacts(self, z: Floats, *, reach: float, nearest: int | None = None) -> Contacts:
         """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n); at most `nearest` a waypoint."""
-        return self.contacts.settled(z).evaluate(z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest)
+        return self.contacts.settled(z).evaluate(
+            z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest
+        )
 
     def rates(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the steps δz, shape (N, n), and their differences δδz, shape (N + 1 + stops, n); see `Transcription`."""
@@ -245,8 +286,12 @@ class TrajectoryProblem:
         t = self.transcription
         if t.rows == t.firm_rows:
             return np.zeros(0)
-        values = np.asarray(t.other_values(t.pack(z), self.start, timing.dt, self.rolling.gears(self.waypoints(z)))).ravel()
-        lower, upper = (bound[t.firm_rows : t.rows] for bound in self.row_bounds(timing if rates else None))
+        values = np.asarray(
+            t.other_values(t.pack(z), self.start, timing.dt, self.rolling.gears(self.waypoints(z)))
+        ).ravel()
+        lower, upper = (
+            bound[t.firm_rows : t.rows] for bound in self.row_bounds(timing if rates else None)
+        )
         return np.asarray(values - np.clip(values, lower, upper))
 
     @cached_property
@@ -257,7 +302,10 @@ class TrajectoryProblem:
         rolling[t.base_rows] = 1.0
         terms[self.term_numbers.rows] = self.term_numbers.scale
         clamped = np.where((rolling == 0.0) & (terms == 0.0), 1.0, 0.0)
-        return {kind: own[t.firm_rows :] for kind, own in (("rolling", rolling), ("clamped", clamped), ("terms", terms))}
+        return {
+            kind: own[t.firm_rows :]
+            for kind, own in (("rolling", rolling), ("clamped", clamped), ("terms", terms))
+        }
 
     def drift(self, z: Floats) -> float:
         """Return how far grasps drift half-way between waypoints at most, relative to what `Options` allow."""
@@ -282,7 +330,9 @@ class TrajectoryProblem:
                 lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
         lower[terms.rows], upper[terms.rows] = terms.lower, terms.upper
         if not self.rolling.aside:
-            lower[t.base_rows], upper[t.base_rows] = t.steps.bounds(None if timing is None else timing.dt)
+            lower[t.base_rows], upper[t.base_rows] = t.steps.bounds(
+                None if timing is None else timing.dt
+            )
         if timing is not None:
             rates = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])

@@ -16,7 +16,9 @@ __all__ = ["assemble", "curvature", "differences", "sparse"]
 def sparse(matrix: Floats) -> ca.DM:
     """Return a matrix without its zeros."""
     column, row = np.nonzero(matrix.T)
-    return ca.DM(ca.Sparsity.triplet(*matrix.shape, row.tolist(), column.tolist()), matrix[row, column])
+    return ca.DM(
+        ca.Sparsity.triplet(*matrix.shape, row.tolist(), column.tolist()), matrix[row, column]
+    )
 
 
 def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.MX:
@@ -38,7 +40,14 @@ def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.
         target = np.empty(len(order), int)
         target[order] = np.cumsum(place) - 1
         values = (
-            ca.DM.triplet(target.tolist(), list(range(len(order))), ca.DM.ones(len(order)), int(place.sum()), len(order)) @ values
+            ca.DM.triplet(
+                target.tolist(),
+                list(range(len(order))),
+                ca.DM.ones(len(order)),
+                int(place.sum()),
+                len(order),
+            )
+            @ values
         )
     row, column = where[0][order][place], where[1][order][place]
     pointers = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns))])
@@ -59,7 +68,12 @@ def differences(segments: int, stops: Sequence[int]) -> tuple[Floats, Floats, Fl
     start = np.zeros(segments)
     start[0] = -1.0
     ends = itertools.pairwise([0, *stops, segments])
-    changes = np.vstack([np.diff(np.eye(segments)[begin:end], axis=0, prepend=0.0, append=0.0) for begin, end in ends])
+    changes = np.vstack(
+        [
+            np.diff(np.eye(segments)[begin:end], axis=0, prepend=0.0, append=0.0)
+            for begin, end in ends
+        ]
+    )
     return first, changes @ first, start, changes @ start
 
 

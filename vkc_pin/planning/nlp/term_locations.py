@@ -20,7 +20,10 @@ from vkc_pin.world.task.terms import Cost, Term
 
 __all__ = ["TermNumbers", "term_goals"]
 
-_SLOWER, _SLOWEST = 1.2, 8.0  # factor by which steps are made longer at a time, and in all, until a seed is slow enough
+_SLOWER, _SLOWEST = (
+    1.2,
+    8.0,
+)  # factor by which steps are made longer at a time, and in all, until a seed is slow enough
 _SMALL = 1e-3  # what an excess as large as the tolerance counts as, among residuals of poses
 
 
@@ -44,12 +47,20 @@ def term_goals(
             if not term.active(name, held):
                 continue
             for waypoint in range(whereabouts.starts[number] + 1, whereabouts.ends[number] + 1):
-                earlier = number if waypoint - 1 > whereabouts.starts[number] else max(number - 1, 0)
-                now = tuple(whereabouts.frame_at(frame, number, waypoint) for frame in formula.frames)
-                before = tuple(whereabouts.frame_at(frame, earlier, waypoint - 1) for frame in formula.frames)
+                earlier = (
+                    number if waypoint - 1 > whereabouts.starts[number] else max(number - 1, 0)
+                )
+                now = tuple(
+                    whereabouts.frame_at(frame, number, waypoint) for frame in formula.frames
+                )
+                before = tuple(
+                    whereabouts.frame_at(frame, earlier, waypoint - 1) for frame in formula.frames
+                )
                 at.append(TermAt(waypoint, now, before))
         row = TermRow(formula, term.weight if isinstance(term, Cost) else None, values, tuple(at))
-        at = [item for item in at if any(waypoint > 0 for waypoint in row.kind(item)[0])]  # others nothing can change
+        at = [
+            item for item in at if any(waypoint > 0 for waypoint in row.kind(item)[0])
+        ]  # others nothing can change
         if at:
             rows.append(TermRow(formula, row.weight, values, tuple(at)))
             kept.append(term)
@@ -80,15 +91,21 @@ class _Whereabouts:
         """Return where a frame is at a waypoint of phase `number`."""
         owner, dot, link = frame.partition(".")
         if not dot or owner not in self.scene.objects:
-            return self._on_chain(self.chain.frame(frame, opening=self.phases[number].opening), waypoint)
+            return self._on_chain(
+                self.chain.frame(frame, opening=self.phases[number].opening), waypoint
+            )
         placed, phase = self.scene.objects[owner], self.phases[number]
         item = placed.object
-        if not item.free:  # the same whether it is held or not; where it is held, the chain is closed
+        if (
+            not item.free
+        ):  # the same whether it is held or not; where it is held, the chain is closed
             found = item.model.frames[item.model.getFrameId(link, pin.FrameType.BODY)]
             values = tuple(self.value(f"{owner}.{name}") for name in item.coordinates.names)
             tree = Tree(item.model.saveToString(), _numbers(placed.placement), values)
             moves = found.parentJoint > 0 and any(value.column is not None for value in values)
-            return FrameAt(_numbers(found.placement), found.parentJoint, waypoint if moves else -1, tree)
+            return FrameAt(
+                _numbers(found.placement), found.parentJoint, waypoint if moves else -1, tree
+            )
         hold = next((hold for hold in phase.held if hold.object == owner), None)
         if hold is not None:
             return self._on_chain(self.chain.frame(link, hold), waypoint)
@@ -177,7 +194,10 @@ class TermNumbers:
         if not self.terms:
             return
         values, jacobian, cost, gradient = self._evaluated(z, dt)
-        row, entries = np.array(jacobian.sparsity().get_triplet()[0], int), np.array(jacobian.nonzeros(), float)
+        row, entries = (
+            np.array(jacobian.sparsity().get_triplet()[0], int),
+            np.array(jacobian.nonzeros(), float),
+        )
         wrong = ~np.isfinite(values)
         wrong[row[~np.isfinite(entries)]] = True
         names = {name for name, bad in zip(self._names, wrong, strict=True) if bad}
@@ -186,7 +206,11 @@ class TermNumbers:
         if names:
             name = min(names)
             expected = "a smooth expression, e.g. cos(a) >= 0.98 instead of a <= 0.2, or squares instead of roots"
-            raise InputError("it has no value or no slope at the start", field=f"terms[{name!r}].expression", expected=expected)
+            raise InputError(
+                "it has no value or no slope at the start",
+                field=f"terms[{name!r}].expression",
+                expected=expected,
+            )
 
     def _excess(self, z: Floats, dt: Floats) -> Floats:
         if not len(self.rows):

@@ -50,7 +50,8 @@ class FrameAt:
 
     Attributes:
         local: Its placement in the joint's frame: R by columns and p, 12 numbers.
-        joint: Joint of the chain, or of `tree`, that carries it; 0 is the world, or what the tree stands on.
+        joint: Joint of the chain, or of `tree`, that carries it; 0 is the world, or what the tree
+            stands on.
         waypoint: Of which the coordinates count; -1 if none do.
         tree: The object's own tree that the joint is one of.
     """
@@ -89,7 +90,8 @@ class TermRow:
     def kind(self, at: TermAt) -> tuple[tuple[int, ...], tuple[TermAt, int]]:
         """Return the waypoints of which it depends, increasing, and what is equal where one function serves.
 
-        That is `at` with waypoints as positions among these, and the position of the waypoint before, if that counts.
+        That is `at` with waypoints as positions among these, and the position of the waypoint
+        before, if that counts.
         """
         places = (*at.now, *(at.before if self.formula.moving else ()))
         involved = {place.waypoint for place in places if place.waypoint >= 0}
@@ -101,7 +103,11 @@ class TermRow:
             return waypoints.index(waypoint) if waypoint in waypoints else -1
 
         now = tuple(replace(place, waypoint=position(place.waypoint)) for place in at.now)
-        before = tuple(replace(place, waypoint=position(place.waypoint)) for place in at.before) if self.formula.moving else now
+        before = (
+            tuple(replace(place, waypoint=position(place.waypoint)) for place in at.before)
+            if self.formula.moving
+            else now
+        )
         last = position(at.waypoint - 1) if self.formula.moving else position(at.waypoint)
         return waypoints, (TermAt(position(at.waypoint), now, before), last)
 
@@ -110,13 +116,20 @@ class TermFunctions:
     """The SX functions of one kind of row: of z of all waypoints involved, in one column, and the time of the step.
 
     Attributes:
-        value, jacobian, hessian: The formula, nonzeros of its Jacobian, and of the Hessian of λ·formula, upper triangle.
+        value, jacobian, hessian: The formula, nonzeros of its Jacobian, and of the Hessian of
+            λ·formula, upper triangle.
         jacobian_pattern, hessian_pattern: Rows and columns of these.
     """
 
-    def __init__(self, model: pin.Model, row: TermRow, at: TermAt, before: int, waypoints: int, cache: Cache) -> None:
+    def __init__(
+        self, model: pin.Model, row: TermRow, at: TermAt, before: int, waypoints: int, cache: Cache
+    ) -> None:
         coordinates, formula = Coordinates(model), row.formula
-        z, dt, multipliers = ca.SX.sym("z", coordinates.size * waypoints), ca.SX.sym("dt"), ca.SX.sym("lam", formula.rows)
+        z, dt, multipliers = (
+            ca.SX.sym("z", coordinates.size * waypoints),
+            ca.SX.sym("dt"),
+            ca.SX.sym("lam", formula.rows),
+        )
         points = ca.vertsplit(z, coordinates.size) if waypoints else []
         chain: dict[int, Any] = {}
 
@@ -133,13 +146,23 @@ class TermFunctions:
         inputs = []
         for places, position in ((at.now, at.waypoint), (at.before, before)):
             inputs += [column(place) for place in places]
-            inputs += [points[position][v.column] if v.column is not None else ca.SX(v.number) for v in row.values]
+            inputs += [
+                points[position][v.column] if v.column is not None else ca.SX(v.number)
+                for v in row.values
+            ]
         value = formula.function(ca.vertcat(*inputs, dt))
-        jacobian, hessian = ca.jacobian(value, z), ca.triu(ca.hessian(ca.dot(multipliers, value), z)[0])
+        jacobian, hessian = (
+            ca.jacobian(value, z),
+            ca.triu(ca.hessian(ca.dot(multipliers, value), z)[0]),
+        )
         options = {"cse": True}
         self.value = ca.Function("term", [z, dt], [value], options)
-        self.jacobian = ca.Function("term_jacobian", [z, dt], [ca.vertcat(*jacobian.nonzeros())], options)
-        self.hessian = ca.Function("term_hessian", [z, dt, multipliers], [ca.vertcat(*hessian.nonzeros())], options)
+        self.jacobian = ca.Function(
+            "term_jacobian", [z, dt], [ca.vertcat(*jacobian.nonzeros())], options
+        )
+        self.hessian = ca.Function(
+            "term_hessian", [z, dt, multipliers], [ca.vertcat(*hessian.nonzeros())], options
+        )
         self.jacobian_pattern = [np.array(part, int) for part in jacobian.sparsity().get_triplet()]
         self.hessian_pattern = [np.array(part, int) for part in hessian.sparsity().get_triplet()]
         self.nbytes = size_of(self.value, self.jacobian, self.hessian)
@@ -154,14 +177,19 @@ def _in_tree(place: FrameAt, points: list[Any], cache: Cache) -> Any:
         return base
     model = pin.Model()
     model.loadFromString(tree.model)
-    values = [points[place.waypoint][v.column] if v.column is not None else ca.SX(v.number) for v in tree.values]
+    values = [
+        points[place.waypoint][v.column] if v.column is not None else ca.SX(v.number)
+        for v in tree.values
+    ]
     placements = kinematics_of(model, cache).symbolic(ca.vertcat(*values))
     return base @ _matrix(placements[:, place.joint - 1])
 
 
 def _matrix(column: Any) -> Any:
     """Return R by columns and p as a homogeneous matrix."""
-    return ca.vertcat(ca.horzcat(ca.reshape(column[:9], 3, 3), column[9:]), ca.DM([[0.0, 0.0, 0.0, 1.0]]))
+    return ca.vertcat(
+        ca.horzcat(ca.reshape(column[:9], 3, 3), column[9:]), ca.DM([[0.0, 0.0, 0.0, 1.0]])
+    )
 
 
 def _column(matrix: Any) -> Any:
@@ -181,7 +209,14 @@ class TermProgram:
     """
 
     def __init__(
-        self, model: pin.Model, terms: tuple[TermRow, ...], z: Any, dt: Any, cache: Cache, *, width: int | None = None
+        self,
+        model: pin.Model,
+        terms: tuple[TermRow, ...],
+        z: Any,
+        dt: Any,
+        cache: Cache,
+        *,
+        width: int | None = None,
     ) -> None:
         """Put the terms together.
 
@@ -213,7 +248,10 @@ class TermProgram:
                 functions = cache.get(key, functools.partial(TermFunctions, model, *how, cache))
                 involved = np.array([waypoints for _, waypoints in found])
                 steps = [waypoint - 1 for waypoint, _ in found]
-                inputs = [ca.vertcat(*(z[:, columns.tolist()] for columns in involved.T)), dt[steps].T]
+                inputs = [
+                    ca.vertcat(*(z[:, columns.tolist()] for columns in involved.T)),
+                    dt[steps].T,
+                ]
                 height, count = term.formula.rows, len(found)
                 first = self.rows + height * np.arange(count)
                 value = ca.vec(functions.value.map(count)(*inputs))
@@ -228,24 +266,38 @@ class TermProgram:
                     slopes_at.append(where)
                     rows = first[:, None] + np.arange(height)
                     rows_at.update(zip((waypoint for waypoint, _ in found), rows, strict=True))
-                    self._hessians.append((functions.hessian, inputs, involved, rows, functions.hessian_pattern))
+                    self._hessians.append(
+                        (functions.hessian, inputs, involved, rows, functions.hessian_pattern)
+                    )
                     self.rows += height * count
                 else:
                     self.cost += term.weight * ca.sum1(value)
                     gradients.append(term.weight * slope)
                     gradients_at.append(np.stack([where[1], np.zeros_like(where[1])]))
                     weights, pattern = ca.DM.ones(1, count) * term.weight, functions.hessian_pattern
-                    curvature, place = self._curvature(functions.hessian, inputs, involved, pattern, weights)
+                    curvature, place = self._curvature(
+                        functions.hessian, inputs, involved, pattern, weights
+                    )
                     curvatures.append(curvature)
                     curvatures_at.append(place)
         self.owners = np.zeros(self.rows, int)
-        for waypoint, rows in ((waypoint, rows) for rows_at in self.at for waypoint, rows in rows_at.items()):
+        for waypoint, rows in (
+            (waypoint, rows) for rows_at in self.at for waypoint, rows in rows_at.items()
+        ):
             self.owners[rows] = waypoint - 1
         self.values = ca.vertcat(*values) if values else ca.MX(0, 1)
-        self.jacobian = assemble(slopes, slopes_at, self.rows, self._size) if slopes else ca.MX(self.rows, self._size)
-        self.gradient = assemble(gradients, gradients_at, self._size, 1) if gradients else ca.MX(self._size, 1)
+        self.jacobian = (
+            assemble(slopes, slopes_at, self.rows, self._size)
+            if slopes
+            else ca.MX(self.rows, self._size)
+        )
+        self.gradient = (
+            assemble(gradients, gradients_at, self._size, 1) if gradients else ca.MX(self._size, 1)
+        )
         empty = ca.MX(self._size, self._size)
-        self.cost_hessian = assemble(curvatures, curvatures_at, self._size, self._size) if curvatures else empty
+        self.cost_hessian = (
+            assemble(curvatures, curvatures_at, self._size, self._size) if curvatures else empty
+        )
 
     def hessian(self, multipliers: Any) -> Any:
         """Return the upper triangle of the Hessian of multipliers·values."""
@@ -255,9 +307,18 @@ class TermProgram:
             part, place = self._curvature(function, inputs, involved, pattern, given)
             parts.append(part)
             at.append(place)
-        return assemble(parts, at, self._size, self._size) if parts else ca.MX(self._size, self._size)
+        return (
+            assemble(parts, at, self._size, self._size) if parts else ca.MX(self._size, self._size)
+        )
 
-    def _curvature(self, function: ca.Function, inputs: list[Any], involved: Ints, pattern: Any, multipliers: Any) -> Any:
+    def _curvature(
+        self,
+        function: ca.Function,
+        inputs: list[Any],
+        involved: Ints,
+        pattern: Any,
+        multipliers: Any,
+    ) -> Any:
         """Return nonzeros of the Hessian of all waypoints of a kind, and where they are; what is about the start is left out."""
         part = ca.vec(function.map(len(involved))(*inputs, multipliers))
         row, column = (self._place(involved, index) for index in pattern)

@@ -13,7 +13,8 @@ from vkc_pin.utils.arrays import Floats
 
 __all__ = ["Timing", "runs_between", "time_for"]
 
-_PATIENCE = 1.5  # how much more time a motion may take before limits on its rates become rows of the program
+# how much more time a motion may take before limits on its rates become rows of the program
+_PATIENCE = 1.5
 _SLACK = 1.15  # how much longer a motion may take than the profile 3s² − 2s³ along its seed
 
 Runs = Sequence[tuple[int, int]]
@@ -43,7 +44,9 @@ class Timing:
     @cached_property
     def acceleration(self) -> Floats:
         """Bounds of the differences δδz, shape (N + 1 + stops, n): limits times dt²."""
-        of_rows = np.concatenate([np.full(last - first + 1, self.dt[first]) for first, last in self.runs])
+        of_rows = np.concatenate(
+            [np.full(last - first + 1, self.dt[first]) for first, last in self.runs]
+        )
         return np.asarray(self.limits[1] * of_rows[:, None] ** 2)
 
     def violation(self, first: Floats, second: Floats, needed: Floats | float = 0.0) -> float:
@@ -54,7 +57,10 @@ class Timing:
             second: Their differences, shape (N + 1 + stops, n).
             needed: How long each step takes at least for other reasons, shape (N,) [s].
         """
-        fast, strong = np.max(np.abs(first) / self.velocity), np.max(np.abs(second) / self.acceleration)
+        fast, strong = (
+            np.max(np.abs(first) / self.velocity),
+            np.max(np.abs(second) / self.acceleration),
+        )
         return float(max(fast, strong, np.max(needed / self.dt)) - 1.0)
 
     def stretched(self, first: Floats, second: Floats, needed: Floats | float = 0.0) -> Timing:
@@ -63,8 +69,13 @@ class Timing:
         strong = np.max(np.abs(second) / self.acceleration, axis=1)
         dt = self.dt.copy()
         for number, (begin, end) in enumerate(self.runs):
-            excess = max(float(fast[begin:end].max()), float(np.sqrt(strong[begin + number : end + number + 1].max())))
-            dt[begin:end] = np.clip(dt[begin:end] * excess * 1.001, dt[begin:end], _PATIENCE * self.least[begin:end])
+            excess = max(
+                float(fast[begin:end].max()),
+                float(np.sqrt(strong[begin + number : end + number + 1].max())),
+            )
+            dt[begin:end] = np.clip(
+                dt[begin:end] * excess * 1.001, dt[begin:end], _PATIENCE * self.least[begin:end]
+            )
         return replace(self, dt=dt)
 
 
@@ -73,11 +84,14 @@ def runs_between(stops: Sequence[int], segments: int) -> Runs:
     return tuple(itertools.pairwise([0, *stops, segments]))
 
 
-def time_for(path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats], least: Floats | None = None) -> Floats:
+def time_for(
+    path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats], least: Floats | None = None
+) -> Floats:
     """Return the time of every step, shape (N,) [s]: `dt`, or more in runs where z_0..z_N, shape (N + 1, n), is too long for it.
 
-    The measure is the profile 3s² − 2s³ over the distance that each coordinate moves between two stops: its speed is at most 1.5
-    times the mean, its acceleration 6 times the distance over the square of the duration.
+    The measure is the profile 3s² − 2s³ over the distance that each coordinate moves between two
+    stops: its speed is at most 1.5 times the mean, its acceleration 6 times the distance over the
+    square of the duration.
 
     Args:
         path: The waypoints, the start first.
@@ -91,7 +105,10 @@ def time_for(path: Floats, dt: float, runs: Runs, limits: tuple[Floats, Floats],
     times, least = np.full(len(steps), dt), np.zeros(len(steps)) if least is None else least
     for first, last in runs:
         distance = steps[first:last].sum(axis=0)
-        fastest, strongest = np.max(1.5 * distance / velocity), np.sqrt(np.max(6.0 * distance / acceleration))
+        fastest, strongest = (
+            np.max(1.5 * distance / velocity),
+            np.sqrt(np.max(6.0 * distance / acceleration)),
+        )
         needed = max(fastest, strongest, 1.5 * least[first:last].sum())
         times[first:last] = np.maximum(times[first:last], _SLACK * needed / (last - first))
     return times

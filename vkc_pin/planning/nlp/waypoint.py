@@ -27,7 +27,9 @@ from vkc_pin.world.trajectory.wheels import ANYWHERE, Rolling
 
 __all__ = ["StepRows", "Structure", "WaypointFunctions", "waypoint_functions"]
 
-_WORTH = 4  # waypoints of one kind from which on it is compiled: most kinds have one, at a grasp, or some thirty
+# waypoints of one kind from which on it is compiled: most kinds have one, at a grasp, or some
+# thirty
+_WORTH = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,9 +43,10 @@ class Structure:
         slots: K, witness planes per waypoint.
         stops: Waypoints inside the motion at which it comes to rest, as it does at start and end.
         rolling: How the base may move.
-        clamped: (column, first, last): coordinates that keep their value from waypoint `first` to `last`, as a hand does
-            that clamps.
-        pushed: (column, first, last, way): coordinates that only go up (way 1) or down (-1) from waypoint `first` to `last`.
+        clamped: (column, first, last): coordinates that keep their value from waypoint `first` to
+            `last`, as a hand does that clamps.
+        pushed: (column, first, last, way): coordinates that only go up (way 1) or down (-1) from
+            waypoint `first` to `last`.
         terms: The user's own constraints and costs.
     """
 
@@ -75,7 +78,9 @@ def _key(pose: PoseRow) -> tuple[Any, ...]:
     return pose.joint, (pose.local.homogeneous + 0.0).tobytes(), pose.kind, pose.shift
 
 
-def waypoint_functions(model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache) -> WaypointFunctions:
+def waypoint_functions(
+    model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
+) -> WaypointFunctions:
     """Return the functions of one kind of waypoint, built if they are not in the cache."""
     key = ("waypoint", model.saveToString(), slots, *(_key(pose) for pose in poses))
     return cache.get(key, lambda: WaypointFunctions(model, slots, poses, cache))
@@ -84,15 +89,23 @@ def waypoint_functions(model: pin.Model, slots: int, poses: tuple[PoseRow, ...],
 class WaypointFunctions:
     """The SX functions of one kind of waypoint: a model, so many witness planes, and which poses it must satisfy."""
 
-    def __init__(self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache) -> None:
+    def __init__(
+        self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
+    ) -> None:
         n, joints = Coordinates(model).size, model.njoints - 1
         z, s, share = ca.SX.sym("z", n), ca.SX.sym("s", slots), ca.SX.sym("e")
         planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
-        targets, away = ca.SX.sym("W", 12, max(len(poses), 1)), ca.SX.sym("D", AWAY, max(len(poses), 1))
-        sweep = cache.get(("sweep", model.saveToString(), slots), lambda: _Sweep(model, slots, cache))
+        targets, away = (
+            ca.SX.sym("W", 12, max(len(poses), 1)),
+            ca.SX.sym("D", AWAY, max(len(poses), 1)),
+        )
+        sweep = cache.get(
+            ("sweep", model.saveToString(), slots), lambda: _Sweep(model, slots, cache)
+        )
         placements, slopes_of_planes = sweep.function(z, planes)
         stacked = ca.vec(placements)
-        # Every row is linear in the placements: rows = L·vec(M) + const, so one sweep of the kinematics serves them all.
+        # Every row is linear in the placements: rows = L·vec(M) + const, so one sweep of the
+        # kinematics serves them all.
         parts = []
         for k, pose in enumerate(poses):
             target = receded(targets[:, k], away[:, k], share)
@@ -102,7 +115,9 @@ class WaypointFunctions:
         self.rows = slots + sum(self.pose_rows)
         rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
         multipliers = ca.SX.sym("lam", self.rows)
-        of_planes, of_poses = ca.vertsplit(multipliers, [0, slots, self.rows])  # a slice of a scalar would be a row
+        of_planes, of_poses = ca.vertsplit(
+            multipliers, [0, slots, self.rows]
+        )  # a slice of a scalar would be a row
         own = ca.vertcat(z, s, share)
         slopes = ca.horzcat(slopes_of_planes, ca.SX.eye(slots), ca.SX(slots, 1))
         jacobian = ca.vertcat(slopes, ca.jacobian(pose_values, own))
@@ -117,7 +132,9 @@ class WaypointFunctions:
         self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())])
         spend()
         self.jacobian_pattern = jacobian.sparsity().get_triplet()
-        self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())])
+        self.hessian = ca.Function(
+            "lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())]
+        )
         self.hessian_pattern = hessian.sparsity().get_triplet()
         self.code = MachineCode(self.value, self.jacobian, self.hessian)
         self.nbytes = size_of(self.value, self.jacobian, self.hessian)
@@ -134,8 +151,9 @@ class WaypointFunctions:
 class StepRows:
     """The rows of all steps of a base on wheels, from one pose (x, y, yaw) to the next, in gears, 1 ahead or -1 back.
 
-    Those of a step, all in metres, with c along, s aside and δθ turned (see `Rolling.steps`), are s, which must be 0; of bases
-    that are steered gear·c ∓ radius·δθ, which must not be negative; and c ∓ track/2·δθ, what wheels go, if they have a limit.
+    Those of a step, all in metres, with c along, s aside and δθ turned (see `Rolling.steps`), are
+    s, which must be 0; of bases that are steered gear·c ∓ radius·δθ, which must not be negative;
+    and c ∓ track/2·δθ, what wheels go, if they have a limit.
 
     Args:
         rolling: The limits of the base.
@@ -149,7 +167,11 @@ class StepRows:
     """
 
     def __init__(self, rolling: Rolling, path: ca.MX, gears: ca.MX, *, width: int) -> None:
-        self.rolling, self.segments, self.size = rolling, path.shape[1] - 1, width * (path.shape[1] - 1)
+        self.rolling, self.segments, self.size = (
+            rolling,
+            path.shape[1] - 1,
+            width * (path.shape[1] - 1),
+        )
         value, jacobian, self._hessian = _step_functions(rolling)
         self.rows, every = value.size1_out(0), np.arange(self.segments)
         self._inputs = [ca.vertcat(path[:3, :-1], path[:3, 1:]), gears.T]
@@ -159,19 +181,25 @@ class StepRows:
         self.values = ca.vec(value.map(self.segments)(*self._inputs))
         row, column = (np.array(part) for part in jacobian.sparsity_out(0).get_triplet())
         slopes = jacobian.map(self.segments)(*self._inputs)
-        self.jacobian = self._placed(slopes, every[:, None] * self.rows + row, self._columns[:, column], len(self.owners))
+        self.jacobian = self._placed(
+            slopes, every[:, None] * self.rows + row, self._columns[:, column], len(self.owners)
+        )
 
     def hessian(self, multipliers: ca.MX) -> ca.MX:
         """Return the upper half of the Hessian of the rows, times their multipliers."""
         row, column = (np.array(part) for part in self._hessian.sparsity_out(0).get_triplet())
-        bends = self._hessian.map(self.segments)(*self._inputs, ca.reshape(multipliers, self.rows, self.segments))
+        bends = self._hessian.map(self.segments)(
+            *self._inputs, ca.reshape(multipliers, self.rows, self.segments)
+        )
         return self._placed(bends, self._columns[:, row], self._columns[:, column], self.size)
 
     def _placed(self, parts: ca.MX, row: Ints, column: Ints, height: int) -> ca.MX:
         """Return the matrix of the nonzeros of every step, without those of the start."""
         at = np.stack([row.ravel(), column.ravel()])
         kept = (at >= 0).all(axis=0)
-        nonzeros = ca.vertcat(*(part.nz[:] for part in ca.horzsplit(parts, parts.shape[1] // self.segments)))
+        nonzeros = ca.vertcat(
+            *(part.nz[:] for part in ca.horzsplit(parts, parts.shape[1] // self.segments))
+        )
         return assemble([nonzeros[np.flatnonzero(kept).tolist()]], [at[:, kept]], height, self.size)
 
     def bounds(self, dt: Floats | None) -> tuple[Floats, Floats]:
@@ -189,8 +217,13 @@ def _step_functions(rolling: Rolling) -> tuple[ca.Function, ca.Function, ca.Func
     poses, gear = ca.SX.sym("b", 6), ca.SX.sym("g")
     dx, dy, turn = ca.vertsplit(poses[3:] - poses[:3])
     heading = (poses[2] + poses[5]) / 2
-    along, aside = ca.cos(heading) * dx + ca.sin(heading) * dy, ca.cos(heading) * dy - ca.sin(heading) * dx
-    steered = [gear * along + side * rolling.radius * turn for side in (-1, 1)] if rolling.radius else []
+    along, aside = (
+        ca.cos(heading) * dx + ca.sin(heading) * dy,
+        ca.cos(heading) * dy - ca.sin(heading) * dx,
+    )
+    steered = (
+        [gear * along + side * rolling.radius * turn for side in (-1, 1)] if rolling.radius else []
+    )
     wheels = [along + side * rolling.track / 2 * turn for side in (-1, 1)] if rolling.timed else []
     rows = ca.vertcat(aside, *steered, *wheels)
     multipliers = ca.SX.sym("lam", rows.numel())
@@ -207,19 +240,27 @@ class _Sweep:
 
     def __init__(self, model: pin.Model, slots: int, cache: Cache) -> None:
         coordinates = Coordinates(model)
-        z, planes = ca.SX.sym("z", coordinates.size), ca.SX.sym("C", slots, 12 * (model.njoints - 1))
+        z, planes = (
+            ca.SX.sym("z", coordinates.size),
+            ca.SX.sym("C", slots, 12 * (model.njoints - 1)),
+        )
         placements = kinematics_of(model, cache).symbolic(z)
-        self.function = ca.Function("sweep", [z, planes], [placements, _slopes(model, coordinates, z, placements, planes)])
+        self.function = ca.Function(
+            "sweep", [z, planes], [placements, _slopes(model, coordinates, z, placements, planes)]
+        )
         self.nbytes = size_of(self.function)
 
 
-def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any) -> Any:
+def _slopes(
+    model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any
+) -> Any:
     """Return the derivatives of planes·vec(M(z)), shape (K, n), with respect to z.
 
-    A coordinate of a joint turns and shifts all that this joint carries by one twist (ω, v): dR = ω × R, dt = ω × t + v. So a
-    plane's derivative is m·ω + f·v, where m = Σ (Σ_c R_c × C_c + t × C_t) and f = Σ C_t add up over what the joint carries: a
-    fraction of the work of multiplying with the derivatives of all placements. Where it moves several joints, each adds its own
-    twist to that of those before it, and these add up.
+    A coordinate of a joint turns and shifts all that this joint carries by one twist (ω, v): dR = ω
+    × R, dt = ω × t + v. So a plane's derivative is m·ω + f·v, where m = Σ (Σ_c R_c × C_c + t × C_t)
+    and f = Σ C_t add up over what the joint carries: a fraction of the work of multiplying with the
+    derivatives of all placements. Where it moves several joints, each adds its own twist to that of
+    those before it, and these add up.
     """
     forces: list[Any] = []
     moments: list[Any] = []
@@ -237,16 +278,26 @@ def _slopes(model: pin.Model, coordinates: Coordinates, z: Any, placements: Any,
     for column, joint, *_ in coordinates.moves:
         placement = placements[:, joint - 1]
         change = ca.jacobian(placement, z[column])
-        turns = [ca.cross(placement[3 * c : 3 * c + 3], change[3 * c : 3 * c + 3]) for c in range(3)]
+        turns = [
+            ca.cross(placement[3 * c : 3 * c + 3], change[3 * c : 3 * c + 3]) for c in range(3)
+        ]
         omega = sum(turns, ca.SX(3, 1)) / 2
-        twist = twists[column, joint] = ca.vertcat(omega, change[9:] - ca.cross(omega, placement[9:]))
+        twist = twists[column, joint] = ca.vertcat(
+            omega, change[9:] - ca.cross(omega, placement[9:])
+        )
         above = [k for k in model.supports[joint] if (column, k) in twists and k != joint]
         own = twist - twists[column, above[-1]] if above else twist
-        slopes[column] = slopes[column] + (moments[joint - 1] @ own[:3] + forces[joint - 1] @ own[3:])
+        slopes[column] = slopes[column] + (
+            moments[joint - 1] @ own[:3] + forces[joint - 1] @ own[3:]
+        )
     return ca.horzcat(*slopes)
 
 
 def _cross_rows(point: Any, rows: Any) -> Any:
     """Return point × row of each of the K `rows`, shape (K, 3)."""
     x, y, z = point[0], point[1], point[2]
-    return ca.horzcat(y * rows[:, 2] - z * rows[:, 1], z * rows[:, 0] - x * rows[:, 2], x * rows[:, 1] - y * rows[:, 0])
+    return ca.horzcat(
+        y * rows[:, 2] - z * rows[:, 1],
+        z * rows[:, 0] - x * rows[:, 2],
+        x * rows[:, 1] - y * rows[:, 0],
+    )

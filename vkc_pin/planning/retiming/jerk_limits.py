@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 __all__ = ["eased"]
 
-_SPANS = np.geomspace(0.25, 4.0, 9)  # of the average, as multiples of the time in which an acceleration may grow
+_SPANS = np.geomspace(
+    0.25, 4.0, 9
+)  # of the average, as multiples of the time in which an acceleration may grow
 _LEAST = 4  # cubics in a step, at least
 _SHARE = 0.5  # of the average that a cubic may last
 _LOOKS = 8  # places on a cubic, between which the time of a waypoint is sought
@@ -25,11 +27,13 @@ _ROUNDS = 6  # of Newton's method
 def eased(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits) -> Curve:
     """Return a curve along a path whose jerk is within limits, with accelerations that do not jump, from none to none.
 
-    How far it has come, s(t), is replaced by its average over some time before: where s is twice differentiable but for jumps,
-    its average is but for kinks, and goes neither back nor faster. Through places along the path at the times of that, closely,
-    lead cubics that are twice differentiable, whose jerk is the same all along each; the second and the last but one are where
-    that has them, so that there is no acceleration at both ends. They are slowed down until all limits are kept. Of several
-    spans of the average, that one is taken with which they take least time.
+    How far it has come, s(t), is replaced by its average over some time before: where s is twice
+    differentiable but for jumps, its average is but for kinks, and goes neither back nor faster.
+    Through places along the path at the times of that, closely, lead cubics that are twice
+    differentiable, whose jerk is the same all along each; the second and the last but one are where
+    that has them, so that there is no acceleration at both ends. They are slowed down until all
+    limits are kept. Of several spans of the average, that one is taken with which they take least
+    time.
 
     Args:
         path: The path; knots at the ends of each step, and as many in every step.
@@ -51,7 +55,10 @@ def _averaged(path: CubicHermiteSpline, pace: Curve, steps: int, span: float) ->
     area, last, length = way.antiderivative(), float(pace.times[-1]), float(pace.positions[-1, 0])
 
     def gone(times: Floats) -> Floats:
-        now, before = (area(np.clip(t, 0.0, last)) + length * np.maximum(t - last, 0.0) for t in (times, times - span))
+        now, before = (
+            area(np.clip(t, 0.0, last)) + length * np.maximum(t - last, 0.0)
+            for t in (times, times - span)
+        )
         return np.asarray((now - before) / span)
 
     def speed(times: Floats) -> Floats:
@@ -62,7 +69,9 @@ def _averaged(path: CubicHermiteSpline, pace: Curve, steps: int, span: float) ->
     coarse = np.linspace(0.0, last + span, _LOOKS * len(pace.times))
     stops = np.interp(places, gone(coarse), coarse)
     for _ in range(_ROUNDS):
-        stops[1:-1] -= np.clip((gone(stops) - places) / np.maximum(speed(stops), 1e-12), -span, span)[1:-1]
+        stops[1:-1] -= np.clip(
+            (gone(stops) - places) / np.maximum(speed(stops), 1e-12), -span, span
+        )[1:-1]
     stops[0], stops[-1] = 0.0, last + span
     parts = max(_LEAST, int(np.ceil(np.diff(stops).max() / (_SHARE * span))))
     times = moments_at(stops, np.arange(parts) / parts, last=True)

@@ -36,12 +36,27 @@ class Limits(NamedTuple):
             jerk_time: See `Options.jerk_time`.
         """
         robot, known = scene.robot, dict[str, tuple[float, ...]]()
-        sources = [("", robot.coordinates.names, (robot.lower, robot.upper, robot.velocity, robot.acceleration))]
+        sources = [
+            (
+                "",
+                robot.coordinates.names,
+                (robot.lower, robot.upper, robot.velocity, robot.acceleration),
+            )
+        ]
         for owner, placed in scene.objects.items():
             item = placed.object
-            sources.append((f"{owner}.", item.coordinates.names, (item.lower, item.upper, item.velocity, item.acceleration)))
+            sources.append(
+                (
+                    f"{owner}.",
+                    item.coordinates.names,
+                    (item.lower, item.upper, item.velocity, item.acceleration),
+                )
+            )
         for prefix, own, values in sources:
-            known |= {prefix + name: tuple(row) for name, row in zip(own, np.transpose(values).tolist(), strict=True)}
+            known |= {
+                prefix + name: tuple(row)
+                for name, row in zip(own, np.transpose(values).tolist(), strict=True)
+            }
         rows = np.array([known.get(name, (-np.inf, np.inf, np.inf, np.inf)) for name in names])
         lower, upper, velocity, acceleration = rows.T
         jerk = acceleration / jerk_time if jerk_time > 0.0 else np.full(len(names), np.inf)
@@ -54,7 +69,9 @@ class Limits(NamedTuple):
         """
         strongest = self.acceleration[:2].sum() + rolling.track / 2 * self.acceleration[2]
         wheel = (-np.inf, np.inf, rolling.rim, strongest, np.inf)
-        return Limits(*(np.append(side, [value, value]) for side, value in zip(self, wheel, strict=True)))
+        return Limits(
+            *(np.append(side, [value, value]) for side, value in zip(self, wheel, strict=True))
+        )
 
     @property
     def jerky(self) -> bool:
@@ -64,7 +81,11 @@ class Limits(NamedTuple):
     def factor(self, curve: Curve) -> float:
         """Return how many times as long, at least 1, a curve must take to keep the limits of its rates of change."""
         fastest, strongest = curve.speeds()
-        needed = [1.0, float((fastest / self.velocity).max()), float(np.sqrt((strongest / self.acceleration).max()))]
+        needed = [
+            1.0,
+            float((fastest / self.velocity).max()),
+            float(np.sqrt((strongest / self.acceleration).max())),
+        ]
         if not self.jerky:
             needed.append(float(np.cbrt((curve.jerks()[0] / self.jerk).max())))
         return max(needed) * (1.0 + _ROUNDING)

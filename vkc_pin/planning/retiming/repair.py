@@ -13,7 +13,8 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["accepted"]
 
-_REPAIRS = 3  # how often a curve is drawn closer to the straight lines; each time it leaves them a quarter as far
+# how often a curve is drawn closer to the straight lines; each time it leaves them a quarter as far
+_REPAIRS = 3
 
 
 class _Found(Protocol):
@@ -40,11 +41,17 @@ R = TypeVar("R", bound=_Report)
 
 
 def accepted(
-    scene: Scene, waypoints: Trajectory, check: Callable[[Trajectory], R], *, repairs: int = _REPAIRS, jerk_time: float = 0.0
+    scene: Scene,
+    waypoints: Trajectory,
+    check: Callable[[Trajectory], R],
+    *,
+    repairs: int = _REPAIRS,
+    jerk_time: float = 0.0,
 ) -> tuple[Trajectory, R]:
     """Return a motion through waypoints, see `retimed`, and what a check says of it; a last one, if none is accepted.
 
-    Where something is wrong, the path passes the middles of the straight lines as well, which the program has looked along.
+    Where something is wrong, the path passes the middles of the straight lines as well, which the
+    program has looked along.
 
     Args:
         scene: Robot and objects.
@@ -57,7 +64,12 @@ def accepted(
     trajectory = retimed(scene, waypoints, jerk_time=jerk_time)
     report = check(trajectory)
     for _ in range(repairs):
-        near = {found.waypoint + k for found in report.violations for k in (-1, 0, 1) if found.constraint != "torque"}
+        near = {
+            found.waypoint + k
+            for found in report.violations
+            for k in (-1, 0, 1)
+            if found.constraint != "torque"
+        }
         if not near:  # all is well, or too heavy on whatever curve
             break
         parts[[k for k in near if 0 <= k < len(parts)]] *= 2

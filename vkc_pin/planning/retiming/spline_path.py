@@ -15,12 +15,15 @@ if TYPE_CHECKING:
 __all__ = ["path_through"]
 
 
-def path_through(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> CubicHermiteSpline:
+def path_through(
+    points: Floats, scale: Floats, limits: tuple[Floats, Floats]
+) -> CubicHermiteSpline:
     """Return cubics through waypoints, over the length of the way between them.
 
-    They are the spline that is twice differentiable. It is linear in the waypoints, so that what these all satisfy, such as a
-    closed chain, it satisfies but for the curvature of that. A coordinate that would leave its limits nowhere leaves the range
-    between two waypoints instead (Hyman, Accurate monotonicity preserving cubic interpolation, 1983).
+    They are the spline that is twice differentiable. It is linear in the waypoints, so that what
+    these all satisfy, such as a closed chain, it satisfies but for the curvature of that. A
+    coordinate that would leave its limits nowhere leaves the range between two waypoints instead
+    (Hyman, Accurate monotonicity preserving cubic interpolation, 1983).
 
     Args:
         points: Shape (m, n), m ≥ 2, no two consecutive ones the same.
@@ -33,7 +36,11 @@ def path_through(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -
     at = np.concatenate([[0.0], np.cumsum(lengths)])
     steps = np.diff(points, axis=0)
     chords = steps / lengths[:, None]
-    slopes = CubicSpline(at, points, bc_type="natural")(at, 1) if len(points) > 2 else np.repeat(chords, 2, axis=0)
+    slopes = (
+        CubicSpline(at, points, bc_type="natural")(at, 1)
+        if len(points) > 2
+        else np.repeat(chords, 2, axis=0)
+    )
     leaves = _leaves(points, slopes, lengths, limits)
     before, after = np.vstack([chords[:1], chords]), np.vstack([chords, chords[-1:]])
     ways, steepest = np.sign(after), 3.0 * np.minimum(np.abs(before), np.abs(after))
@@ -41,8 +48,12 @@ def path_through(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -
     return CubicHermiteSpline(at, points, np.where(leaves, within, slopes))
 
 
-def _leaves(points: Floats, slopes: Floats, lengths: Floats, limits: tuple[Floats, Floats]) -> Bools:
+def _leaves(
+    points: Floats, slopes: Floats, lengths: Floats, limits: tuple[Floats, Floats]
+) -> Bools:
     """Return which coordinates of cubics lie outside limits between two points that do not, shape (n,)."""
     low, high = Curve(np.concatenate([[0.0], np.cumsum(lengths)]), points, slopes).extremes()
     lower, upper = np.minimum(points[:-1], points[1:]), np.maximum(points[:-1], points[1:])
-    return np.asarray(((low < np.minimum(limits[0], lower)) | (high > np.maximum(limits[1], upper))).any(axis=0))
+    return np.asarray(
+        ((low < np.minimum(limits[0], lower)) | (high > np.maximum(limits[1], upper))).any(axis=0)
+    )

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 __all__ = ["speeds_along"]
 
-_ASIDE = (1e-3, 1e-2)  # share of a segment beside its ends at which accelerations are limited: at the end they jump
+_ASIDE = (
+    1e-3,
+    1e-2,
+)  # share of a segment beside its ends at which accelerations are limited: at the end they jump
 
 
 def speeds_along(
@@ -27,19 +30,25 @@ def speeds_along(
 ) -> Floats | None:
     """Return how fast a path can be gone along at some places, from rest to rest, shape (K,) [1/s]; None: it is not known.
 
-    Between two places the speed changes evenly in time. It is TOPP-RA's (Pham and Pham, A new approach to time-optimal path
-    parameterization based on reachability analysis, 2018), as the library `toppra` computes it.
+    Between two places the speed changes evenly in time. It is TOPP-RA's (Pham and Pham, A new
+    approach to time-optimal path parameterization based on reachability analysis, 2018), as the
+    library `toppra` computes it.
 
     Args:
         path: The path, of n coordinates.
-        places: Along it, increasing, from its begin to its end, all knots of the path among them, shape (K,).
+        places: Along it, increasing, from its begin to its end, all knots of the path among them,
+            shape (K,).
         velocity: Limits, shape (n,) [m/s], [rad/s]; inf: none.
         acceleration: Limits, shape (n,) [m/s²], [rad/s²]; inf: none.
-        linear: Returns a, b, c at places, shape (K, m) each, with |a u + b w² + c| ≤ 1 for the path's velocity w and acceleration
-            u; None: nothing but limits bounds it.
+        linear: Returns a, b, c at places, shape (K, m) each, with |a u + b w² + c| ≤ 1 for the
+            path's velocity w and acceleration u; None: nothing but limits bounds it.
     """
     from toppra.algorithm import TOPPRA
-    from toppra.constraint import DiscretizationType, JointAccelerationConstraint, JointVelocityConstraint
+    from toppra.constraint import (
+        DiscretizationType,
+        JointAccelerationConstraint,
+        JointVelocityConstraint,
+    )
 
     both = np.flatnonzero(np.isfinite(velocity) & np.isfinite(acceleration))
     if not len(both):
@@ -47,10 +56,14 @@ def speeds_along(
     _silence()
     rates = JointVelocityConstraint(np.column_stack([-velocity[both], velocity[both]]))
     limits = np.column_stack([-acceleration[both], acceleration[both]])
-    changes = JointAccelerationConstraint(limits, discretization_scheme=DiscretizationType.Interpolation)
+    changes = JointAccelerationConstraint(
+        limits, discretization_scheme=DiscretizationType.Interpolation
+    )
     for aside in _ASIDE:
         grid = _beside(path.x, places, aside)
-        bounds = [rates, changes] if linear is None else [rates, changes, _linear(linear, len(both))]
+        bounds = (
+            [rates, changes] if linear is None else [rates, changes, _linear(linear, len(both))]
+        )
         found = TOPPRA(bounds, _geometric(path, both), gridpoints=grid, solver_wrapper="seidel")
         _, speeds, _ = found.compute_parameterization(0.0, 0.0)
         if speeds is not None and np.isfinite(speeds).all() and (speeds[1:-1] > 0.0).all():
@@ -91,10 +104,14 @@ def _linear(linear: Callable[[Floats], tuple[Floats, Floats, Floats]], size: int
             super().__init__()
             self.identical = True
 
-        def compute_constraint_params(self, path: Any, gridpoints: Floats, *_: Any, **__: Any) -> Any:
+        def compute_constraint_params(
+            self, path: Any, gridpoints: Floats, *_: Any, **__: Any
+        ) -> Any:
             a, b, c = linear(gridpoints)
             both = np.vstack([np.eye(a.shape[1]), -np.eye(a.shape[1])])
-            return canlinear_colloc_to_interpolate(a, b, c, both, np.ones(len(both)), None, None, gridpoints, identical=True)
+            return canlinear_colloc_to_interpolate(
+                a, b, c, both, np.ones(len(both)), None, None, gridpoints, identical=True
+            )
 
     return Bound()
 

@@ -34,7 +34,8 @@ class Rows(NamedTuple):
     def linear(self, speeds: Floats) -> tuple[Floats, Floats, Floats]:
         """Return factors of u, of w² and of 1 for the same, with w replaced by its tangent in w² at some speeds, shape (K,).
 
-        Joints that are at their limit already, whatever the speed, have as much more as it takes to stay there.
+        Joints that are at their limit already, whatever the speed, have as much more as it takes to
+        stay there.
         """
         around = np.maximum(speeds, 1e-3 * max(float(speeds.max()), 1e-9))[:, None]
         still = self.still + 0.5 * self.drag * around
@@ -47,8 +48,8 @@ class Load:
 
     Args:
         torques: Of the whole motion.
-        phases: For each step of the run the phase that it is part of, shape (m − 1,). Its paths and curves have the same number
-            of cubics in each step.
+        phases: For each step of the run the phase that it is part of, shape (m − 1,). Its paths and
+            curves have the same number of cubics in each step.
     """
 
     def __init__(self, torques: Torques, phases: Ints) -> None:
@@ -60,12 +61,18 @@ class Load:
         """Return those of some of its steps."""
         return Load(self._torques, self._phases[first : first + count])
 
-    def _shares(self, pieces: Ints, of: int, positions: Floats, velocities: Floats, accelerations: Floats) -> Floats:
+    def _shares(
+        self, pieces: Ints, of: int, positions: Floats, velocities: Floats, accelerations: Floats
+    ) -> Floats:
         """Return shares of limits, shape (K, m), of the pieces, shape (K,), of a path or curve that has so many of them."""
-        found = self._torques.at(self._phases[pieces // (of // len(self._phases))], positions, velocities, accelerations)
+        found = self._torques.at(
+            self._phases[pieces // (of // len(self._phases))], positions, velocities, accelerations
+        )
         return found[:, self._limited] / self._torques.efforts.limits[self._limited]
 
-    def linear(self, path: CubicHermiteSpline, known: Floats, speeds: Floats, places: Floats) -> tuple[Floats, Floats, Floats]:
+    def linear(
+        self, path: CubicHermiteSpline, known: Floats, speeds: Floats, places: Floats
+    ) -> tuple[Floats, Floats, Floats]:
         """Return the torques at some places on the path as `Rows.linear` does.
 
         Args:
@@ -84,7 +91,10 @@ class Load:
         pieces = np.clip(np.searchsorted(path.x, places, side="right") - 1, 0, of - 1)
         points, tangents, bends = (path(places, order)[:, :size] for order in range(3))
         at = [self._shares(pieces, of, points, w * tangents, w**2 * bends) for w in (1.0, 2.0, 3.0)]
-        still, drag = 3.0 * at[0] - 3.0 * at[1] + at[2], 0.5 * (8.0 * at[1] - 5.0 * at[0] - 3.0 * at[2])
+        still, drag = (
+            3.0 * at[0] - 3.0 * at[1] + at[2],
+            0.5 * (8.0 * at[1] - 5.0 * at[0] - 3.0 * at[2]),
+        )
         push = self._shares(pieces, of, points, tangents, bends + tangents) - at[0]
         return Rows(still, drag, 0.5 * (at[2] - 2.0 * at[1] + at[0]), push)
 
@@ -96,7 +106,9 @@ class Load:
 
     def split(self, curve: Curve) -> tuple[Floats, Floats, Floats]:
         """Return still, drag and square with torques still + drag / k + square / k² if a curve took k times as long."""
-        at = np.array([self.of(Curve(curve.times * k, curve.positions, curve.rates / k)) for k in _FACTORS])
+        at = np.array(
+            [self.of(Curve(curve.times * k, curve.positions, curve.rates / k)) for k in _FACTORS]
+        )
         matrix = np.array([[1.0, 1.0 / k, 1.0 / k**2] for k in _FACTORS])
         still, drag, square = np.tensordot(np.linalg.inv(matrix), at, axes=1)
         return still, drag, square

@@ -20,7 +20,9 @@ __all__ = ["rolling_paths", "slip"]
 _PARTS = 3  # pieces of a step, at least
 _TURN = 0.05  # [rad] of a piece, at most
 _ROUNDS = 12  # of Newton's method
-_STIFF = 1e-3  # error of a place that is as bad as a bump of the way, so that none comes of rounding where the base stands
+# error of a place that is as bad as a bump of the way, so that none comes of rounding where the
+# base stands
+_STIFF = 1e-3
 _LEVER = 0.5  # [m/rad]: bump of the way that is as bad as one of the heading
 _LOOKS = 8  # moments on each cubic of a curve
 _NOWHERE = 1e-9  # [m] that is no way
@@ -34,34 +36,42 @@ def rolling_paths(
 ) -> list[tuple[CubicHermiteSpline, Floats]]:
     """Return paths through waypoints, one from each stop to the next, on which a base rolls, each with its waypoints.
 
-    How far it has driven, ℓ, and where it heads, θ, are cubics between waypoints, as all other coordinates are, and its place is
-    the integral of (cos θ, sin θ) dℓ. For that to lead to the next waypoint, the length of the step and bumps of ℓ and θ inside
-    it, in 16s²(1 − s)², are found by Newton's method, as small as can be: the arc from the one waypoint to the next is near.
-    Knots are so close to each other that cubics through them roll, too.
+    How far it has driven, ℓ, and where it heads, θ, are cubics between waypoints, as all other
+    coordinates are, and its place is the integral of (cos θ, sin θ) dℓ. For that to lead to the
+    next waypoint, the length of the step and bumps of ℓ and θ inside it, in 16s²(1 − s)², are found
+    by Newton's method, as small as can be: the arc from the one waypoint to the next is near. Knots
+    are so close to each other that cubics through them roll, too.
 
-    A base that is steered stops, and turns its wheels, where it cannot go from arc to arc without turning too tightly.
-    From stop to stop there may be one step only, which is the arc itself.
+    A base that is steered stops, and turns its wheels, where it cannot go from arc to arc without
+    turning too tightly. From stop to stop there may be one step only, which is the arc itself.
 
     Args:
-        points: (x, y, yaw) of the base, and other coordinates, shape (m, n), m ≥ 2; the arcs between them are what it can drive.
+        points: (x, y, yaw) of the base, and other coordinates, shape (m, n), m ≥ 2; the arcs
+            between them are what it can drive.
         scale: What a unit of each coordinate counts for the length, shape (n,).
         limits: Lower and upper, shape (n,) each.
         rolling: The limits of the base.
         finer: How many times as many knots there are as usual.
 
     Returns:
-        Paths, see `path_through`, with as many knots in every step, of the n coordinates, and of how far left and right
-        wheels have gone [m], which are none of the motion's, but have a limit of their own.
+        Paths, see `path_through`, with as many knots in every step, of the n coordinates, and of
+        how far left and right wheels have gone [m], which are none of the motion's, but have a
+        limit of their own.
     """
     if rolling.radius > 0.0 and (backs := _backs(points, rolling)):
-        pieces = [points[first : last + 1] for first, last in itertools.pairwise([0, *backs, len(points) - 1])]
+        pieces = [
+            points[first : last + 1]
+            for first, last in itertools.pairwise([0, *backs, len(points) - 1])
+        ]
     else:
         path, wrong = _rolled(points, scale, limits, rolling, finer)
         if len(points) == 2 or not wrong.any():
             return [(path, points)]
         corner = _corner(points, wrong, rolling)
         pieces = [points[: corner + 1], points[corner:]]
-    return [found for piece in pieces for found in rolling_paths(piece, scale, limits, rolling, finer)]
+    return [
+        found for piece in pieces for found in rolling_paths(piece, scale, limits, rolling, finer)
+    ]
 
 
 def slip(curve: Curve) -> float:
@@ -95,14 +105,18 @@ def _rolled(
 
     along, _, turn = rolling.steps(points)
     driven = np.concatenate([[0.0], np.cumsum(along / np.sinc(turn / (2 * np.pi)))])
-    bounds = np.append(limits[0], np.inf), np.append(limits[1], -np.inf)  # it goes back nowhere but where it turns round
+    bounds = (
+        np.append(limits[0], np.inf),
+        np.append(limits[1], -np.inf),
+    )  # it goes back nowhere but where it turns round
     path = path_through(np.column_stack([points, driven]), np.append(scale, 0.0), bounds)
     parts = finer * max(_PARTS, int(np.ceil(np.abs(turn).max() / _TURN)))
     slopes = path(path.x, 1)[:, [2, -1]]
     if rolling.radius > 0.0:
         slopes[:, 0] = _bends(turn, np.diff(driven), rolling.radius) * slopes[:, 1]
     steps = _Steps(points[:, :3], slopes, np.diff(path.x), np.diff(driven), parts)
-    # An arc is where it should be but for rounding, of which bumps would make tight turns where a step is short.
+    # An arc is where it should be but for rounding, of which bumps would make tight turns where a
+    # step is short.
     left = steps.missing() if len(points) == 2 else steps.fit()
     if rolling.radius > 0.0 and (bent := steps.tight(rolling.radius)).any():
         left = steps.plain(bent)
@@ -110,15 +124,20 @@ def _rolled(
     base, slopes, wheels = steps.at_knots(left)
     half = rolling.track / 2 * np.array([-1.0, 1.0])
     values = np.column_stack([base, path(at)[:, 3:-1], wheels[0][:, None] + half * base[:, 2:]])
-    rates = np.column_stack([slopes, path(at, 1)[:, 3:-1], wheels[1][:, None] + half * slopes[:, 2:]])
-    return CubicHermiteSpline(at, values, rates), (np.abs(left) > _OFF) | steps.tight(rolling.radius)
+    rates = np.column_stack(
+        [slopes, path(at, 1)[:, 3:-1], wheels[1][:, None] + half * slopes[:, 2:]]
+    )
+    return CubicHermiteSpline(at, values, rates), (np.abs(left) > _OFF) | steps.tight(
+        rolling.radius
+    )
 
 
 def _bends(turns: Floats, ways: Floats, radius: float) -> Floats:
     """Return how much a path bends at waypoints, shape (m,) [rad/m], so that no step between turns tighter than need be.
 
-    A step that bends by κ in the middle of what it goes, and by a and b at its ends, bends by 3/2·κ − (a + b)/4 half-way: no more
-    than 1/r if both are at least 3κ − 2/r. Where steps before and after ask for no less than that, it is the mean of both.
+    A step that bends by κ in the middle of what it goes, and by a and b at its ends, bends by 3/2·κ
+    − (a + b)/4 half-way: no more than 1/r if both are at least 3κ − 2/r. Where steps before and
+    after ask for no less than that, it is the mean of both.
 
     Args:
         turns: Of the steps, shape (m − 1,) [rad].
@@ -144,9 +163,13 @@ class _Steps:
         parts: Pieces of a step, between whose ends the knots will be.
     """
 
-    def __init__(self, poses: Floats, slopes: Floats, spans: Floats, ways: Floats, parts: int) -> None:
+    def __init__(
+        self, poses: Floats, slopes: Floats, spans: Floats, ways: Floats, parts: int
+    ) -> None:
         self.poses, self.spans, self.parts = poses, spans[:, None], parts
-        self.yaw, self.way = ([column[:-1, None] * self.spans, column[1:, None] * self.spans] for column in slopes.T)
+        self.yaw, self.way = (
+            [column[:-1, None] * self.spans, column[1:, None] * self.spans] for column in slopes.T
+        )
         self.ways = self._driven = ways[:, None]
         self.hops, self.bumps = np.zeros((len(ways), 1)), np.zeros((len(ways), 1))
         nodes, weights = np.polynomial.legendre.leggauss(5)
@@ -176,9 +199,15 @@ class _Steps:
             slopes = np.stack([effects.real, effects.imag], axis=1)
             found = np.stack([0.0 * self.ways, self.hops, self.bumps], axis=1)[..., 0]
             across = np.swapaxes(slopes, 1, 2)
-            wanted = (across @ np.stack([missing.real, missing.imag], axis=1)[..., None])[..., 0] - cost * found
+            wanted = (across @ np.stack([missing.real, missing.imag], axis=1)[..., None])[
+                ..., 0
+            ] - cost * found
             change = np.linalg.solve(across @ slopes + np.diag(cost), wanted[..., None])
-            self.ways, self.hops, self.bumps = self.ways + change[:, 0], self.hops + change[:, 1], self.bumps + change[:, 2]
+            self.ways, self.hops, self.bumps = (
+                self.ways + change[:, 0],
+                self.hops + change[:, 1],
+                self.bumps + change[:, 2],
+            )
             if np.abs(change).max() < 1e-12:
                 break
         return self.missing()
@@ -192,7 +221,9 @@ class _Steps:
         self.ways, self.hops, self.bumps = self._driven, 0.0 * self.hops, 0.0 * self.bumps
         back = (which & (np.abs(self.missing()) < _ROUNDING))[:, None]
         plain = self.ways, self.hops, self.bumps
-        self.ways, self.hops, self.bumps = (np.where(back, new, old) for new, old in zip(plain, fitted, strict=True))
+        self.ways, self.hops, self.bumps = (
+            np.where(back, new, old) for new, old in zip(plain, fitted, strict=True)
+        )
         return self.missing()
 
     def missing(self) -> Floats:
@@ -206,9 +237,15 @@ class _Steps:
     def at_knots(self, left: Floats) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
         """Return poses at the knots and their slopes, shape (K, 3), and how far it has driven there, with slopes, shape (K,)."""
         s = np.arange(self.parts + 1) / self.parts
-        pieces = (self._moving() * self._weights).reshape(len(self.spans), self.parts, -1).sum(axis=2)
+        pieces = (
+            (self._moving() * self._weights).reshape(len(self.spans), self.parts, -1).sum(axis=2)
+        )
         gone = np.concatenate([np.zeros((len(pieces), 1)), np.cumsum(pieces, axis=1)], axis=1)
-        place = (self.poses[:-1, :1] + 1j * self.poses[:-1, 1:2]) + gone + left[:, None] * (3.0 - 2.0 * s) * s**2
+        place = (
+            (self.poses[:-1, :1] + 1j * self.poses[:-1, 1:2])
+            + gone
+            + left[:, None] * (3.0 - 2.0 * s) * s**2
+        )
         (yaw, turning), (way, speed) = self.heading(s), self.driven(s)
         begun = np.concatenate([[[0.0]], np.cumsum(self.ways, axis=0)[:-1]])
         moving = speed * np.exp(1j * yaw)
@@ -220,13 +257,19 @@ class _Steps:
         """Return which steps turn tighter than on a radius [m], shape (N,)."""
         s = np.linspace(0.0, 1.0, 8 * self.parts + 1)
         (_, turning), (_, speed) = self.heading(s), self.driven(s)
-        return np.asarray((radius * np.abs(turning) > (1.0 + _TIGHT) * np.abs(speed) + 1e-9).any(axis=1))
+        return np.asarray(
+            (radius * np.abs(turning) > (1.0 + _TIGHT) * np.abs(speed) + 1e-9).any(axis=1)
+        )
 
 
 def _hermite(s: Floats, change: Floats, before: Floats, after: Floats) -> tuple[Floats, Floats]:
     """Return what cubics from 0 to `change` with these slopes at their ends, (N, 1) each, have at s, and their slopes, (N, K)."""
     value = change * (3.0 - 2.0 * s) * s**2 + before * s * (1.0 - s) ** 2 - after * s**2 * (1.0 - s)
-    slope = change * 6.0 * (s - s**2) + before * (1.0 - 4.0 * s + 3.0 * s**2) + after * (3.0 * s**2 - 2.0 * s)
+    slope = (
+        change * 6.0 * (s - s**2)
+        + before * (1.0 - 4.0 * s + 3.0 * s**2)
+        + after * (3.0 * s**2 - 2.0 * s)
+    )
     return value, slope
 
 

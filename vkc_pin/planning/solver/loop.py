@@ -13,17 +13,29 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.segment_planes import collisions_between, merge
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.subproblem import Subproblem
-from vkc_pin.planning.solver.trust_region import BLOCK_TIME, CLOSE_ENOUGH, INSIDE, Trial, TrustRegion, judge
+from vkc_pin.planning.solver.trust_region import (
+    BLOCK_TIME,
+    CLOSE_ENOUGH,
+    INSIDE,
+    Trial,
+    TrustRegion,
+    judge,
+)
 from vkc_pin.planning.solver.tunnelling import Passage, new
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import ENDINGS, SpentError, spend
 
 __all__ = ["solve"]
 
-NEARLY = 0.01  # [m], [rad] of clearance, or of closures, goals and grasps, that is missing of a motion that nearly holds
-PROGRESS_ROUNDS = 5  # rounds in which what is missing must fall; accepted ones, where hardly any clearance is missing
+# [m], [rad] of clearance, or of closures, goals and grasps, that is missing of a motion that nearly
+# holds
+NEARLY = 0.01
+# rounds in which what is missing must fall; accepted ones, where hardly any clearance is missing
+PROGRESS_ROUNDS = 5
 PROGRESS = 0.7  # share of what was missing to which it must fall, or the motion is given up
-WORTHWHILE = 0.05  # relative decrease of the objective for which a feasible motion is improved further
+WORTHWHILE = (
+    0.05  # relative decrease of the objective for which a feasible motion is improved further
+)
 
 
 class _Loop:
@@ -37,7 +49,9 @@ class _Loop:
         self.merit = Merit(weight)
         self.solution = Solution(self.z, self.timing.dt)
         self.subproblem = Subproblem(problem, self.solution)
-        self.feasible: tuple[Floats, Floats] | None = None  # the last motion at which everything held
+        self.feasible: tuple[Floats, Floats] | None = (
+            None  # the last motion at which everything held
+        )
 
     def begin(self) -> None:
         """Find what is close and what does not hold at the seed."""
@@ -57,7 +71,9 @@ class _Loop:
     def contacts(self, z: Floats) -> tuple[Contacts, bool, list[Passage]]:
         """Return what is close at the waypoints and between them, whether all is far enough, and what goes through each other."""
         begin = time.perf_counter()
-        found = self.problem.evaluate_contacts(z, reach=self.options.contact_reach, nearest=self.options.contact_slots)
+        found = self.problem.evaluate_contacts(
+            z, reach=self.options.contact_reach, nearest=self.options.contact_slots
+        )
         between = collisions_between(self.problem, z)
         self.solution.timings["coal"] += time.perf_counter() - begin
         clear = between.free and found.violation() < CLOSE_ENOUGH
@@ -69,7 +85,10 @@ class _Loop:
             self.z, self.at, self.found, self.merit, self.timing, radius, rates=self.rates
         )
         contacts, clear, passed = self.contacts(z)
-        promise = self.merit.weights["clearance"] * slack + self.merit.price(self.found, clearance=False) * shares
+        promise = (
+            self.merit.weights["clearance"] * slack
+            + self.merit.price(self.found, clearance=False) * shares
+        )
         return Trial(
             z=z,
             promise=promise,
@@ -87,9 +106,12 @@ class _Loop:
     def prices(self, trial: Trial) -> tuple[Floats, Floats]:
         """Return what all that is missing costs at every waypoint, before a round and where it led, shape (N,) each.
 
-        It is infinite where a pair goes through each other that did not before. Of what is no motion yet that says nothing.
+        It is infinite where a pair goes through each other that did not before. Of what is no
+        motion yet that says nothing.
         """
-        before, after = (self.merit.price(found, clearance=True) for found in (self.found, trial.found))
+        before, after = (
+            self.merit.price(found, clearance=True) for found in (self.found, trial.found)
+        )
         if self.found.amounts["poses"].max() < NEARLY:
             for passage in new(trial.passages, self.passages):
                 after[max(passage.first - 1, 0) : passage.last + 1] = np.inf
@@ -98,12 +120,21 @@ class _Loop:
     def judge(self, trial: Trial, before: Floats, after: Floats) -> bool:
         """Return whether enough of the promised decrease came true to accept a step; `before` and `after`: see `prices`."""
         missing, gain = float(before.sum()), self.objective - trial.objective
-        return judge(gain + missing - float(trial.promise.sum()), gain + missing - float(after.sum()), self.objective + missing)
+        return judge(
+            gain + missing - float(trial.promise.sum()),
+            gain + missing - float(after.sum()),
+            self.objective + missing,
+        )
 
     def accept(self, trial: Trial) -> None:
         """Go on from `trial`."""
         far = self.found.others > TOLERANCE
-        self.z, self.at, self.found, self.passages = trial.z, trial.contacts, trial.found, trial.passages
+        self.z, self.at, self.found, self.passages = (
+            trial.z,
+            trial.contacts,
+            trial.found,
+            trial.passages,
+        )
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
         if far and not self.rates:  # what was no motion yet says little about how long one takes
@@ -150,7 +181,8 @@ def solve(
         seed: z_1..z_N, shape (N, n).
         callback: Called after every round.
         rounds: At most so many rounds; None: `Options.max_outer`.
-        radius: How far planes are believed at first, shape (N,): `Solution.radius` where another solution goes on.
+        radius: How far planes are believed at first, shape (N,): `Solution.radius` where another
+            solution goes on.
     """
     loop = _Loop(problem, seed, problem.options.penalty)
     solution = loop.solution
@@ -160,16 +192,22 @@ def solve(
         _iterate(loop, region, callback, loop.options.max_outer if rounds is None else rounds)
     except SpentError as end:
         solution.status = "converged" if solution.converged else str(end)
-    if loop.feasible is not None:  # rounds after the first feasible one only made it shorter, or failed to
+    if (
+        loop.feasible is not None
+    ):  # rounds after the first feasible one only made it shorter, or failed to
         solution.z, solution.dt = loop.feasible
     elif solution.status not in ENDINGS:
-        short = problem.evaluate_contacts(solution.z, reach=problem.options.largest_margin, nearest=1).violation()
+        short = problem.evaluate_contacts(
+            solution.z, reach=problem.options.largest_margin, nearest=1
+        ).violation()
         solution.astray = short if short > NEARLY else 0.0
     solution.radius = region.radius
     return solution
 
 
-def _iterate(loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], None] | None, rounds: int) -> None:
+def _iterate(
+    loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], None] | None, rounds: int
+) -> None:
     """Run rounds until everything holds or nothing helps any more."""
     solution, started = loop.solution, time.perf_counter()
     missing, since = loop.found.total, 0  # what was missing when rounds were last counted
@@ -203,14 +241,24 @@ def _iterate(loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], N
             loop.accept(trial)
             if done := loop.done(trial):
                 good = trial.objective
-                if loop.problem.drift(trial.z) <= 1.0:  # that waypoints are too far apart along an arc no round can help
-                    solution.converged, solution.status, loop.feasible = True, "converged", (trial.z, solution.dt)
+                if (
+                    loop.problem.drift(trial.z) <= 1.0
+                ):  # that waypoints are too far apart along an arc no round can help
+                    solution.converged, solution.status, loop.feasible = (
+                        True,
+                        "converged",
+                        (trial.z, solution.dt),
+                    )
                 improved = good < (1.0 - WORTHWHILE) * last
                 if not improved or (trial.step < INSIDE * used).all():
                     break
         region.adapt(before, after, trial, accepted)
-        since += accepted or short.max() >= NEARLY  # refused steps narrow the region, which has an end
-        if not PROGRESS * missing < loop.found.total <= missing:  # more is missing where the objective fell instead
+        since += (
+            accepted or short.max() >= NEARLY
+        )  # refused steps narrow the region, which has an end
+        if (
+            not PROGRESS * missing < loop.found.total <= missing
+        ):  # more is missing where the objective fell instead
             missing, since = loop.found.total, 0
         if since >= PROGRESS_ROUNDS:
             break

@@ -24,8 +24,8 @@ class Between(NamedTuple):
     """What is close between waypoints.
 
     Attributes:
-        contacts: At z_1..z_N. Their margin exceeds their distance by what is missing in between, or falls below it by what is to
-            spare: they guard against what is close already.
+        contacts: At z_1..z_N. Their margin exceeds their distance by what is missing in between, or
+            falls below it by what is to spare: they guard against what is close already.
         free: Whether no sub-state is closer than `CLOSE_ENOUGH`.
         passages: What goes through each other.
     """
@@ -38,9 +38,10 @@ class Between(NamedTuple):
 def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
     """Return contacts at waypoints that stand for closeness inside the segments around them.
 
-    At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP (or than the pair's margin, where that is less), the witness
-    points, fixed in their bodies, are carried to both waypoints. There n·(b − a) has some value v; asking for v + KEEP − d at
-    both lifts the sub-state by KEEP − d, to first order. Of each segment and pair only the deepest sub-state counts.
+    At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP (or than the pair's margin, where
+    that is less), the witness points, fixed in their bodies, are carried to both waypoints. There
+    n·(b − a) has some value v; asking for v + KEEP − d at both lifts the sub-state by KEEP − d, to
+    first order. Of each segment and pair only the deepest sub-state counts.
 
     Args:
         problem: The problem.
@@ -55,7 +56,11 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
     near = contacts.evaluate(middles, waypoints, reach=KEEP + CLOSE)
     passed = passages(contacts, middles, segment, near)
     rows = np.unique(near.waypoint)
-    segment, begin, length = segment[rows], piece[rows] / counts[segment[rows]], 1 / counts[segment[rows]]
+    segment, begin, length = (
+        segment[rows],
+        piece[rows] / counts[segment[rows]],
+        1 / counts[segment[rows]],
+    )
     if not len(rows):
         return Between(no_contacts(), True, [])
     segment = np.repeat(segment, FINER)
@@ -74,13 +79,27 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
         points = []
         for column, witness in ((0, found.first), (1, found.second)):
             j, contact = joints[:, column], np.arange(len(joints))
-            local = np.einsum("cji,cj->ci", rotations[contact, j], witness - translations[contact, j])
-            points.append(np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j])
+            local = np.einsum(
+                "cji,cj->ci", rotations[contact, j], witness - translations[contact, j]
+            )
+            points.append(
+                np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j]
+            )
         value = np.einsum("ci,ci->c", found.normal, points[1] - points[0])
         inside = waypoint > 0  # the start cannot be moved
-        part = Contacts(waypoint - 1, found.pair, value, value + keep - found.distance, found.normal, points[0], points[1])
+        part = Contacts(
+            waypoint - 1,
+            found.pair,
+            value,
+            value + keep - found.distance,
+            found.normal,
+            points[0],
+            points[1],
+        )
         parts.append(part.select(np.flatnonzero(inside)))
-    return Between(merge(*parts), bool(np.all(found.distance >= np.minimum(CLOSE_ENOUGH, keep))), passed)
+    return Between(
+        merge(*parts), bool(np.all(found.distance >= np.minimum(CLOSE_ENOUGH, keep))), passed
+    )
 
 
 def _states(path: Floats, segment: Ints, s: Floats) -> tuple[Floats, Ints]:
@@ -99,5 +118,7 @@ def _deepest(found: Contacts, segment: Ints) -> Contacts:
 
 def merge(*parts: Contacts) -> Contacts:
     """Return all contacts of `parts`, per waypoint those first that fall shortest of their margins."""
-    joined = Contacts(*(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True)))
+    joined = Contacts(
+        *(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True))
+    )
     return joined.select(np.lexsort((joined.distance - joined.margin, joined.waypoint)))

@@ -19,7 +19,8 @@ class Iteration:
         objective: f of eq. 1.
         clearance: Smallest distance at waypoints [m]; infinite if nothing is within reach.
         shortfall: What is missing to the clearance that is asked for [m].
-        pose_error: Largest residual of closure and goals, [m] or [rad], and of own constraints, 1e-3 being their tolerance.
+        pose_error: Largest residual of closure and goals, [m] or [rad], and of own constraints,
+            1e-3 being their tolerance.
         step: Largest change of a coordinate in this round.
         radius: Trust region of this round.
         penalty: Weight of the clearance slack.
@@ -49,11 +50,12 @@ class Solution:
         dt: Time of every step of it [s], shape (N,).
         converged: Whether the loop ended by its own criteria.
         status: "converged", "not converged", or one of `budget.ENDINGS`.
-        astray: Of one that did not converge, by how much the worst pair at a waypoint falls short of its margin [m], if that is
-            so much that `validation` cannot accept it; otherwise 0.
+        astray: Of one that did not converge, by how much the worst pair at a waypoint falls short
+            of its margin [m], if that is so much that `validation` cannot accept it; otherwise 0.
         radius: How far planes were believed in the end, shape (N,).
         rounds, iterations: Of the outer loop and of Ipopt.
-        timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of it).
+        timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of
+            it).
         history: One `Iteration` per round.
     """
 
@@ -65,5 +67,7 @@ class Solution:
     radius: Floats | None = None
     rounds: int = 0
     iterations: int = 0
-    timings: dict[str, float] = field(default_factory=lambda: {"coal": 0.0, "casadi": 0.0, "ipopt": 0.0})
+    timings: dict[str, float] = field(
+        default_factory=lambda: {"coal": 0.0, "casadi": 0.0, "ipopt": 0.0}
+    )
     history: list[Iteration] = field(default_factory=list)

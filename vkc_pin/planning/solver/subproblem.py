@@ -93,7 +93,15 @@ class Subproblem:
         self._multipliers = {}
 
     def solve(
-        self, z: Floats, at: Contacts, found: Infeasibility, merit: Merit, timing: Timing, radius: Floats, *, rates: bool
+        self,
+        z: Floats,
+        at: Contacts,
+        found: Infeasibility,
+        merit: Merit,
+        timing: Timing,
+        radius: Floats,
+        *,
+        rates: bool,
     ) -> Step:
         """Return the minimum of the merit's model in the trust region.
 
@@ -110,13 +118,23 @@ class Subproblem:
         begin = time.perf_counter()
         planes, offsets = problem.contacts.planes(z, at, slots=t.slots)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        lower, upper = np.maximum(problem.lower, z - radius[:, None]), np.minimum(problem.upper, z + radius[:, None])
+        lower, upper = (
+            np.maximum(problem.lower, z - radius[:, None]),
+            np.minimum(problem.upper, z + radius[:, None]),
+        )
         bounds = problem.row_bounds(timing if rates else None)
         relaxed = found.others > TOLERANCE
-        if relaxed:  # on the way: the rows of the round before were others, and its end need not be exact
+        if (
+            relaxed
+        ):  # on the way: the rows of the round before were others, and its end need not be exact
             self.forget()
         how = _ROUGH if relaxed else _WARM if self._multipliers else {}
-        options = {"ipopt.max_iter": problem.options.max_iterations, **linear_solver(), **_IPOPT, **how}
+        options = {
+            "ipopt.max_iter": problem.options.max_iterations,
+            **linear_solver(),
+            **_IPOPT,
+            **how,
+        }
         solver = t.solver(rates=rates, options=options)
         prices = merit.price(found, clearance=False)
         shares = np.where(relaxed & (prices > 0.0), 1.0, 0.0)

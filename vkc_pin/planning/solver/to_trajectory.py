@@ -39,7 +39,9 @@ def as_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajecto
     if set(problem.task.after) < {*last.held, *last.grasps}:
         rows.append(rows[-1])
         times.append(times[-1] + wait)
-        phases.append(PhaseSpan("let go", len(rows) - 2, len(rows) - 1, problem.task.after, last.opening))
+        phases.append(
+            PhaseSpan("let go", len(rows) - 2, len(rows) - 1, problem.task.after, last.opening)
+        )
     robot = problem.chain.robot.coordinates.size
     return Trajectory(problem.chain.names, np.array(times), waypoints[rows], tuple(phases), robot)
 

@@ -15,11 +15,15 @@ __all__ = ["Trial", "TrustRegion", "judge"]
 
 BLOCK_TIME = 2.5  # [s] of motion that share a radius, at `Options.dt` a waypoint
 FIRST_RADIUS = 0.5  # [m] and [rad] of the trust region at first, and after weights have grown
-INSIDE = 0.9  # share of the radius: steps that end within it were not held back (Ipopt ends a little inside its bounds)
+# share of the radius: steps that end within it were not held back (Ipopt ends a little inside its
+# bounds)
+INSIDE = 0.9
 SETTLE_RADIUS = 0.05  # [m] and [rad] in which planes are as good as distances
 SHRINK = 0.4  # of the radius, or of the step if that was shorter, where a promise did not come true
 NO_MATTER = 0.4  # of the merit, in a block: 8 mm of shortfall at the weight that it has at first
-CLOSE_ENOUGH = 5e-4  # [m] shortfall at a waypoint, clearance between waypoints, and steps ([rad], too), that do not matter
+# [m] shortfall at a waypoint, clearance between waypoints, and steps ([rad], too), that do not
+# matter
+CLOSE_ENOUGH = 5e-4
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,8 @@ class Trial:
 
     Attributes:
         z: z_1..z_N, shape (N, n).
-        promise: What all that is missing would cost at every waypoint, were the planes the distances, shape (N,).
+        promise: What all that is missing would cost at every waypoint, were the planes the
+            distances, shape (N,).
         objective: f of eq. 1.
         pose_error: Largest residual, see `TrajectoryProblem.row_error`.
         found: What does not hold there.

@@ -21,7 +21,9 @@ class Passage(NamedTuple):
     last: int
 
 
-def passages(contacts: ContactModel, states: Floats, segments: Ints, found: Contacts) -> list[Passage]:
+def passages(
+    contacts: ContactModel, states: Floats, segments: Ints, found: Contacts
+) -> list[Passage]:
     """Return where pairs overlap that part on another side than they met: their normals before and after are opposite.
 
     What dips into something and comes out again where it went in is none.
@@ -43,11 +45,20 @@ def passages(contacts: ContactModel, states: Floats, segments: Ints, found: Cont
     before, after, pairs = rows[begins] - 1, rows[ends] + 1, pairs[begins]
     phases = contacts.phases_of(segments + 1)
     inside = np.flatnonzero((before >= 0) & (after < len(states)))
-    inside = inside[phases[before[inside]] == phases[after[inside]]]  # shapes are others in another phase
+    inside = inside[
+        phases[before[inside]] == phases[after[inside]]
+    ]  # shapes are others in another phase
     before, after, pairs = before[inside], after[inside], pairs[inside]
-    here, there = (contacts.normals(states[rows], segments[rows] + 1, pairs) for rows in (before, after))
+    here, there = (
+        contacts.normals(states[rows], segments[rows] + 1, pairs) for rows in (before, after)
+    )
     through = np.einsum("ci,ci->c", here, there) < 0.0
-    parts = zip(pairs[through].tolist(), segments[before[through]].tolist(), segments[after[through]].tolist(), strict=True)
+    parts = zip(
+        pairs[through].tolist(),
+        segments[before[through]].tolist(),
+        segments[after[through]].tolist(),
+        strict=True,
+    )
     return [Passage((first, second), begin, end) for (first, second), begin, end in parts]
 
 

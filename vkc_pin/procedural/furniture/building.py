@@ -31,7 +31,11 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 _DENSITY = 500.0  # [kg/m³] of wood; what is hollow is built of its walls
 _UPRIGHT = (0.0, 0.0, 0.0)
-_TURNED = {"x": (0.0, math.pi / 2.0, 0.0), "y": (math.pi / 2.0, 0.0, 0.0), "z": _UPRIGHT}  # roll, pitch, yaw of a cylinder
+_TURNED = {
+    "x": (0.0, math.pi / 2.0, 0.0),
+    "y": (math.pi / 2.0, 0.0, 0.0),
+    "z": _UPRIGHT,
+}  # roll, pitch, yaw of a cylinder
 _VELOCITY = {"revolute": 1.0, "prismatic": 0.5}  # [rad/s], [m/s]
 _EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
 
@@ -51,7 +55,9 @@ class _Shape:
         if self.kind == "box":
             size = f'size="{_numbers(self.size)}"'
         else:
-            size = f'radius="{_numbers(self.size[:1])}"' + (f' length="{_numbers(self.size[1:])}"' if self.size[1:] else "")
+            size = f'radius="{_numbers(self.size[:1])}"' + (
+                f' length="{_numbers(self.size[1:])}"' if self.size[1:] else ""
+            )
         turned = f' rpy="{_numbers(self.rpy, 6)}"' if any(self.rpy) else ""
         material = f"<material name={quoteattr(self.colour)}/>" if element == "visual" else ""
         geometry = f"<geometry><{self.kind} {size}/></geometry>"
@@ -63,7 +69,11 @@ class _Shape:
         if self.kind == "box":
             return _DENSITY * math.prod(self.size)
         radius = self.size[0]
-        volume = math.pi * radius**2 * self.size[1] if self.kind == "cylinder" else 4.0 / 3.0 * math.pi * radius**3
+        volume = (
+            math.pi * radius**2 * self.size[1]
+            if self.kind == "cylinder"
+            else 4.0 / 3.0 * math.pi * radius**3
+        )
         return _DENSITY * volume
 
     @property
@@ -75,7 +85,10 @@ class _Shape:
             squares = np.square(self.size)
             return np.diag(self.mass * (squares.sum() - squares) / 12.0)
         radius, length = self.size
-        along, across = 0.5 * self.mass * radius**2, self.mass * (3.0 * radius**2 + length**2) / 12.0
+        along, across = (
+            0.5 * self.mass * radius**2,
+            self.mass * (3.0 * radius**2 + length**2) / 12.0,
+        )
         turned = pin.rpy.rpyToMatrix(*self.rpy)
         return np.asarray(turned @ np.diag([across, across, along]) @ turned.T)
 
@@ -90,18 +103,30 @@ class Link:
     def box(self, low: Point, high: Point, colour: str) -> None:
         """Add a box between two corners."""
         size = tuple(b - a for a, b in zip(low, high, strict=True))
-        self.shapes.append(_Shape("box", size, tuple((a + b) / 2.0 for a, b in zip(low, high, strict=True)), _UPRIGHT, colour))
+        self.shapes.append(
+            _Shape(
+                "box",
+                size,
+                tuple((a + b) / 2.0 for a, b in zip(low, high, strict=True)),
+                _UPRIGHT,
+                colour,
+            )
+        )
 
     def cylinder(self, centre: Point, radius: float, length: float, axis: str, colour: str) -> None:
         """Add a cylinder along an axis of the link: "x", "y" or "z"."""
-        self.shapes.append(_Shape("cylinder", (radius, length), tuple(centre), _TURNED[axis], colour))
+        self.shapes.append(
+            _Shape("cylinder", (radius, length), tuple(centre), _TURNED[axis], colour)
+        )
 
     def rod(self, one: Point, other: Point, radius: float, colour: str) -> None:
         """Add a cylinder between two points."""
         way = np.subtract(other, one)
         length = float(np.linalg.norm(way))
         turned = (0.0, float(np.arccos(way[2] / length)), float(np.arctan2(way[1], way[0])))
-        self.shapes.append(_Shape("cylinder", (radius, length), tuple(np.add(one, other) / 2.0), turned, colour))
+        self.shapes.append(
+            _Shape("cylinder", (radius, length), tuple(np.add(one, other) / 2.0), turned, colour)
+        )
 
     def ball(self, centre: Point, radius: float, colour: str) -> None:
         """Add a ball."""
@@ -123,11 +148,25 @@ class Link:
         middle = masses @ centres / masses.sum()
         inertia = np.zeros((3, 3))
         for shape, mass, offset in zip(self.shapes, masses, centres - middle, strict=True):
-            inertia += shape.inertia + mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
-        entries = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{_numbers([inertia[i, j]], 6)}"' for i in range(3) for j in range(i, 3))
-        mass, origin = f'<mass value="{_numbers([masses.sum()])}"/>', f'<origin xyz="{_numbers(middle)}"/>'
-        lines = [f"  <link name={quoteattr(self.name)}>", f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>"]
-        lines += [shape.xml(element) for element in ("visual", "collision") for shape in self.shapes]
+            inertia += shape.inertia + mass * (
+                offset @ offset * np.eye(3) - np.outer(offset, offset)
+            )
+        entries = " ".join(
+            f'i{"xyz"[i]}{"xyz"[j]}="{_numbers([inertia[i, j]], 6)}"'
+            for i in range(3)
+            for j in range(i, 3)
+        )
+        mass, origin = (
+            f'<mass value="{_numbers([masses.sum()])}"/>',
+            f'<origin xyz="{_numbers(middle)}"/>',
+        )
+        lines = [
+            f"  <link name={quoteattr(self.name)}>",
+            f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>",
+        ]
+        lines += [
+            shape.xml(element) for element in ("visual", "collision") for shape in self.shapes
+        ]
         return "\n".join([*lines, "  </link>"])
 
 
@@ -135,8 +174,9 @@ class Link:
 class Article:
     """An object that is being built.
 
-    Its base link's frame lies on the floor (or on what it stands on) in the middle below its face: x points into it, away from
-    whoever stands before it, z up. `description` is what `vkc_pin.load_object` takes.
+    Its base link's frame lies on the floor (or on what it stands on) in the middle below its face:
+    x points into it, away from whoever stands before it, z up. `description` is what
+    `vkc_pin.load_object` takes.
 
     Attributes:
         name: Its name.
@@ -191,9 +231,21 @@ class Article:
         self.accelerations[name] = acceleration
         return moved
 
-    def attach(self, name: str, link: Link, position: Point, approach: Point, closing: Point, **freedom: Any) -> None:
+    def attach(
+        self,
+        name: str,
+        link: Link,
+        position: Point,
+        approach: Point,
+        closing: Point,
+        **freedom: Any,
+    ) -> None:
         """Add an attachment: where and how a hand takes hold of a link, in the link's frame; see `Attachment`."""
-        where = {"position": _rounded(position), "approach": _rounded(approach), "closing": _rounded(closing)}
+        where = {
+            "position": _rounded(position),
+            "approach": _rounded(approach),
+            "closing": _rounded(closing),
+        }
         self.attachments.append({"name": name, "link": link.name, **where, **freedom})
 
     @property
@@ -201,7 +253,10 @@ class Article:
         """The object as a URDF."""
         links = [self.base, *(link for link, _ in self.links)]
         used = sorted({shape.colour for link in links for shape in link.shapes})
-        materials = [f'  <material name="{name}"><color rgba="{_numbers(COLOURS[name])} 1"/></material>' for name in used]
+        materials = [
+            f'  <material name="{name}"><color rgba="{_numbers(COLOURS[name])} 1"/></material>'
+            for name in used
+        ]
         parts = [part for link, joint in self.links for part in (joint, link.xml())]
         head = ['<?xml version="1.0"?>', f"<robot name={quoteattr(self.name)}>", *materials]
         return "\n".join([*head, self.base.xml(), *parts, "</robot>"]) + "\n"
@@ -210,9 +265,14 @@ class Article:
     def description(self) -> dict[str, Any]:
         """The object's description as plain data, the URDF inside it."""
         plain: dict[str, Any] = {"urdf": self.urdf}
-        plain["joints"] = {name: {"acceleration": value} for name, value in self.accelerations.items()}
+        plain["joints"] = {
+            name: {"acceleration": value} for name, value in self.accelerations.items()
+        }
         plain["attachments"] = [_plain(item) for item in self.attachments]
-        return {**plain, **({"latches": [_plain(item) for item in self.latches]} if self.latches else {})}
+        return {
+            **plain,
+            **({"latches": [_plain(item) for item in self.latches]} if self.latches else {}),
+        }
 
 
 def _numbers(values: Sequence[float] | Floats, digits: int = 4) -> str:

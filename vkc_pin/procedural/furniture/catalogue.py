@@ -30,7 +30,8 @@ class Kind:
 
     Attributes:
         make: Makes one of random sizes.
-        place: "wall" for what stands in an opening of a wall, "floor", or "counter" for what stands on something.
+        place: "wall" for what stands in an opening of a wall, "floor", or "counter" for what stands
+            on something.
         beside: How far to either side of it the floor before it is needed, by robot and leaves [m].
     """
 
@@ -59,13 +60,14 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
 def random_object(kind: str, seed: int = 0) -> dict[str, Any]:
     """Return a piece of furniture or an appliance of random, sensible sizes that can be opened or turned.
 
-    Its joints, handles and attachments are in the description, its URDF too. It is what `load_object` takes, and `type` of an
-    object in a scene, and it is the same in every run. Its base link stands on the floor, or on a counter, and looks along -x; a
-    door's is on the hinge line, in the middle of a wall.
+    Its joints, handles and attachments are in the description, its URDF too. It is what
+    `load_object` takes, and `type` of an object in a scene, and it is the same in every run. Its
+    base link stands on the floor, or on a counter, and looks along -x; a door's is on the hinge
+    line, in the middle of a wall.
 
     Args:
-        kind: `cabinet`, `chest` (with a lid), `dishwasher`, `door`, `drawers`, `faucet`, `microwave`, `oven`, `refrigerator` or
-            `valve`.
+        kind: `cabinet`, `chest` (with a lid), `dishwasher`, `door`, `drawers`, `faucet`,
+            `microwave`, `oven`, `refrigerator` or `valve`.
         seed: Which one, from 0.
 
     Raises:
@@ -92,7 +94,12 @@ def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
     """
     plain, file = mapping(description, "description"), file_path(path, "path")
     if file.suffix not in (".yaml", ".yml"):
-        raise InputError("not a file of an object", field="path", expected="a path that ends with .yaml", got=file.name)
+        raise InputError(
+            "not a file of an object",
+            field="path",
+            expected="a path that ends with .yaml",
+            got=file.name,
+        )
     load_object(plain, folder=file.parent)  # says what is wrong with it
     urdf = plain["urdf"]
     if urdf.lstrip().startswith("<"):

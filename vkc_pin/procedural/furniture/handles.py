@@ -1,6 +1,7 @@
 """Handles of furniture, and the attachments that a hand takes them by.
 
-A finger reaches some 0.02 beyond the tool's origin: what stands 0.05 and more before its face is taken with air behind it.
+A finger reaches some 0.02 beyond the tool's origin: what stands 0.05 and more before its face is
+taken with air behind it.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ _POST = 0.02  # [m] from a bar's ends to the posts that carry it
 _THUMB = 0.03  # [m] from a post to the middle of the hand
 _TILT = 0.6  # [rad] to which a hand may tilt about a bar
 _SWING = 0.8  # [rad] to which it may swing about an upright bar, or in any direction about a knob
-_LEVEL = 0.55  # [m] height from which on a hand comes level; to lower handles it comes obliquely from above
+# [m] height from which on a hand comes level; to lower handles it comes obliquely from above
+_LEVEL = 0.55
 _STEEPEST = 0.65  # [rad] to which it does so
 
 
-def upright_bar(article: Article, link: Link, at: Point, length: float, out: float, name: str = "handle") -> None:
+def upright_bar(
+    article: Article, link: Link, at: Point, length: float, out: float, name: str = "handle"
+) -> None:
     """Add an upright bar before a face that looks along -x, and its attachments `name` and `<name>_free`.
 
     Args:
@@ -37,7 +41,9 @@ def upright_bar(article: Article, link: Link, at: Point, length: float, out: flo
     where: tuple[Link, Point, Point, Point] = (link, middle, (1, 0, 0), (0, 1, 0))
     article.attach(name, *where)
     limits, turn = _interval(reach), _interval(_SWING)
-    article.attach(f"{name}_free", *where, joint="cylindrical", axis=[0, 1, 0], limits=limits, turn=turn)
+    article.attach(
+        f"{name}_free", *where, joint="cylindrical", axis=[0, 1, 0], limits=limits, turn=turn
+    )
 
 
 def level_bar(
@@ -65,11 +71,21 @@ def level_bar(
     """
     middle, reach = _bar(link, at, length, out, "y")
     down = _STEEPEST * float(np.clip((_LEVEL - height) / 0.25, 0.0, 1.0))
-    approach, closing = (math.cos(down), 0.0, -math.sin(down)), (math.sin(down), 0.0, math.cos(down))
+    approach, closing = (
+        (math.cos(down), 0.0, -math.sin(down)),
+        (math.sin(down), 0.0, math.cos(down)),
+    )
     where: tuple[Link, Point, Point, Point] = (link, middle, approach, closing)
     article.attach(name, *where)
     limits = list(turn) if turn is not None else _interval(_TILT)
-    article.attach(f"{name}_free", *where, joint="cylindrical", axis=[0, 1, 0], limits=_interval(reach), turn=limits)
+    article.attach(
+        f"{name}_free",
+        *where,
+        joint="cylindrical",
+        axis=[0, 1, 0],
+        limits=_interval(reach),
+        turn=limits,
+    )
 
 
 def knob(article: Article, link: Link, at: Point, out: float, name: str = "handle") -> None:

@@ -19,8 +19,8 @@ _FRONTS = ("white", "shade", "sage", "sand", "slate", "oak", "walnut")
 def door(draws: Draws) -> Article:
     """Return a door in its frame, which is pushed or pulled open: with levers and a latch, or with a bar on either side.
 
-    The base link's frame is on the hinge line, in the middle of a wall about 0.1 thick. Measures are those of DIN 18101, with
-    leaves from 0.735 to 0.985.
+    The base link's frame is on the hinge line, in the middle of a wall about 0.1 thick. Measures
+    are those of DIN 18101, with leaves from 0.735 to 0.985.
     """
     width, height, thick = draws.size(0.735, 0.985), draws.size(1.95, 2.05), 0.04
     to = draws.one_of((-1.0, 1.0))  # from the hinge to the lock, along y
@@ -35,7 +35,11 @@ def door(draws: Draws) -> Article:
     axis = (0, 0, -to * away)
     panel = frame.joint("hinge", "revolute", (0, 0, 0), axis, draws.size(1.4, 1.55), link="panel")
     ends = sorted((0.0, to * width))
-    panel.box((-thick / 2, ends[0], 0.01), (thick / 2, ends[1], 0.01 + height), draws.one_of(("oak", "white", "walnut", "sand")))
+    panel.box(
+        (-thick / 2, ends[0], 0.01),
+        (thick / 2, ends[1], 0.01 + height),
+        draws.one_of(("oak", "white", "walnut", "sand")),
+    )
     grip = draws.size(0.95, 1.08)
     if draws.chance(0.3):
         length = draws.size(0.25, 0.5)
@@ -43,15 +47,38 @@ def door(draws: Draws) -> Article:
         return frame
     turn = draws.size(0.35, 0.55)
     spindle = (0.0, to * (width - 0.08), grip)
-    lever = frame.joint("knob", "revolute", spindle, (to, 0, 0), 0.8, link="lever", parent="panel", acceleration=4.0)
+    lever = frame.joint(
+        "knob", "revolute", spindle, (to, 0, 0), 0.8, link="lever", parent="panel", acceleration=4.0
+    )
     out, length = thick / 2 + 0.085, draws.size(0.125, 0.145)
     lever.cylinder((0, 0, 0), 0.011, 2 * out, "x", "steel")
     for side in (-1, 1):
         lever.cylinder((side * out, -to * (length / 2 - 0.01), 0), 0.012, length, "y", "steel")
-    held = (-out, -to * 0.085, 0.0)  # so far from the spindle the wrist passes the post with room to spare
+    held = (
+        -out,
+        -to * 0.085,
+        0.0,
+    )  # so far from the spindle the wrist passes the post with room to spare
     frame.attach("handle", lever, held, (1, 0, 0), (0, 0, 1))
-    frame.attach("handle_free", lever, held, (1, 0, 0), (0, 0, 1), joint="revolute", axis=[0, 1, 0], limits=[-0.6, 0.6])
-    frame.latches.append({"joint": "hinge", "held_at": 0.0, "released_by": "knob", "threshold": turn, "engaged_within": 0.05})
+    frame.attach(
+        "handle_free",
+        lever,
+        held,
+        (1, 0, 0),
+        (0, 0, 1),
+        joint="revolute",
+        axis=[0, 1, 0],
+        limits=[-0.6, 0.6],
+    )
+    frame.latches.append(
+        {
+            "joint": "hinge",
+            "held_at": 0.0,
+            "released_by": "knob",
+            "threshold": turn,
+            "engaged_within": 0.05,
+        }
+    )
     return frame
 
 
@@ -61,18 +88,44 @@ def cabinet(draws: Draws) -> Article:
     width = draws.size(0.7, 1.1) if two else draws.size(0.4, 0.65)
     height, depth, foot = draws.size(0.8, 1.9), draws.size(0.35, 0.6), draws.size(0.06, 0.12)
     made = Article("cabinet", Link("case"))
-    made.base.case((0, -width / 2, foot), (depth, width / 2, height), 0.02, draws.one_of(_FRONTS), "shade")
+    made.base.case(
+        (0, -width / 2, foot), (depth, width / 2, height), 0.02, draws.one_of(_FRONTS), "shade"
+    )
     made.base.box((0.04, -width / 2 + 0.02, 0), (depth - 0.02, width / 2 - 0.02, foot), "dark")
     for z in np.linspace(foot, height, 2 + int((height - foot) / 0.4))[1:-1]:
-        made.base.box((0.03, -width / 2 + 0.02, z - 0.01), (depth - 0.02, width / 2 - 0.02, z + 0.01), "oak")
-    front, bars, length, out = draws.one_of(_FRONTS), draws.chance(0.7), draws.size(0.14, 0.34), draws.size(0.055, 0.075)
+        made.base.box(
+            (0.03, -width / 2 + 0.02, z - 0.01), (depth - 0.02, width / 2 - 0.02, z + 0.01), "oak"
+        )
+    front, bars, length, out = (
+        draws.one_of(_FRONTS),
+        draws.chance(0.7),
+        draws.size(0.14, 0.34),
+        draws.size(0.055, 0.075),
+    )
     grip = draws.size(0.85, 1.1)
     names = ("left", "right") if two else (draws.one_of(("left", "right")),)
     upper = draws.size(1.7, 1.9)
     for name in names:
-        y = (0.002, width / 2) if two and name == "left" else (-width / 2, -0.002) if two else (-width / 2, width / 2)
-        leaf = _leaf(made, (y[0], y[1], foot, height), 0.02, name, f"_{name}" if two else "", front, upper)
-        _handle(made, leaf, (y[1] - y[0], foot, height), 0.02, name, grip, (length if bars else 0.0, out), two)
+        y = (
+            (0.002, width / 2)
+            if two and name == "left"
+            else (-width / 2, -0.002)
+            if two
+            else (-width / 2, width / 2)
+        )
+        leaf = _leaf(
+            made, (y[0], y[1], foot, height), 0.02, name, f"_{name}" if two else "", front, upper
+        )
+        _handle(
+            made,
+            leaf,
+            (y[1] - y[0], foot, height),
+            0.02,
+            name,
+            grip,
+            (length if bars else 0.0, out),
+            two,
+        )
     return made
 
 
@@ -85,13 +138,26 @@ def refrigerator(draws: Draws) -> Article:
     colour = draws.one_of(("white", "steel", "slate", "sand"))
     made.base.case((0, -width / 2, 0.05), (depth, width / 2, height), 0.04, colour, "white")
     made.base.box((0.04, -width / 2 + 0.03, 0), (depth - 0.04, width / 2 - 0.03, 0.05), "dark")
-    length, out, grip, upper = draws.size(0.3, 0.55), draws.size(0.06, 0.075), draws.size(0.95, 1.1), draws.size(1.7, 2.0)
+    length, out, grip, upper = (
+        draws.size(0.3, 0.55),
+        draws.size(0.06, 0.075),
+        draws.size(0.95, 1.1),
+        draws.size(1.7, 2.0),
+    )
     side = draws.one_of(("left", "right"))
     split = draws.size(0.62, 0.8) if draws.chance(0.5) else draws.size(1.1, 1.2)
     if kind == "stacked":
-        made.base.box((0, -width / 2 + 0.04, split - 0.02), (depth - 0.04, width / 2 - 0.04, split + 0.02), "white")
+        made.base.box(
+            (0, -width / 2 + 0.04, split - 0.02),
+            (depth - 0.04, width / 2 - 0.04, split + 0.02),
+            "white",
+        )
     for z in np.arange(split + 0.3, height - 0.2, 0.3):
-        made.base.box((0.12, -width / 2 + 0.04, z - 0.006), (depth - 0.04, width / 2 - 0.04, z + 0.006), "glass")
+        made.base.box(
+            (0.12, -width / 2 + 0.04, z - 0.006),
+            (depth - 0.04, width / 2 - 0.04, z + 0.006),
+            "glass",
+        )
     low, high = 0.06, height
     parts = {
         "single": [("", side, (-width / 2, width / 2, low, high))],
@@ -99,12 +165,25 @@ def refrigerator(draws: Draws) -> Article:
             ("_upper", side, (-width / 2, width / 2, split + 0.004, high)),
             ("_lower", side, (-width / 2, width / 2, low, split - 0.004)),
         ],
-        "side_by_side": [("_left", "left", (0.003, width / 2, low, high)), ("_right", "right", (-width / 2, -0.003, low, high))],
+        "side_by_side": [
+            ("_left", "left", (0.003, width / 2, low, high)),
+            ("_right", "right", (-width / 2, -0.003, low, high)),
+        ],
     }[kind]
     for suffix, hinge, (y0, y1, z0, z1) in parts:
         leaf = _leaf(made, (y0, y1, z0, z1), 0.05, hinge, suffix, colour, upper)
         own = min(length, round(0.5 * (z1 - z0), 3))
-        _handle(made, leaf, (y1 - y0, z0, z1), 0.05, hinge, grip, (own, out), bool(suffix), suffix.strip("_"))
+        _handle(
+            made,
+            leaf,
+            (y1 - y0, z0, z1),
+            0.05,
+            hinge,
+            grip,
+            (own, out),
+            bool(suffix),
+            suffix.strip("_"),
+        )
     return made
 
 
@@ -119,14 +198,37 @@ def microwave(draws: Draws) -> Article:
     made.base.box((-0.03, -width / 2, 0.02), (depth, edge, height), colour)
     for y in (-width / 2 + 0.04, width / 2 - 0.04):
         made.base.box((0.03, y - 0.02, 0), (depth - 0.03, y + 0.02, 0.02), "dark")  # feet
-    leaf = _leaf(made, (edge + 0.003, width / 2, 0.03, height - 0.005), 0.03, "left", "", "glass", draws.size(1.6, 1.9))
+    leaf = _leaf(
+        made,
+        (edge + 0.003, width / 2, 0.03, height - 0.005),
+        0.03,
+        "left",
+        "",
+        "glass",
+        draws.size(1.6, 1.9),
+    )
     length = round(min(draws.size(0.14, 0.2), height - 0.12), 3)
-    _handle(made, leaf, (width / 2 - edge, 0.03, height), 0.03, "left", height / 2, (length, draws.size(0.055, 0.065)), False)
+    _handle(
+        made,
+        leaf,
+        (width / 2 - edge, 0.03, height),
+        0.03,
+        "left",
+        height / 2,
+        (length, draws.size(0.055, 0.065)),
+        False,
+    )
     return made
 
 
 def _leaf(
-    article: Article, extent: tuple[float, float, float, float], thick: float, side: str, suffix: str, colour: str, upper: float
+    article: Article,
+    extent: tuple[float, float, float, float],
+    thick: float,
+    side: str,
+    suffix: str,
+    colour: str,
+    upper: float,
 ) -> Link:
     """Add a leaf before a case's face, y and z from lowest to highest; its hinge is on the left or right of who looks at it.
 
@@ -134,7 +236,10 @@ def _leaf(
     """
     y0, y1, z0, z1 = extent
     right = side == "right"
-    origin, axis = (-_GAP - thick / 2, y0 if right else y1, (z0 + z1) / 2), (0, 0, 1 if right else -1)
+    origin, axis = (
+        (-_GAP - thick / 2, y0 if right else y1, (z0 + z1) / 2),
+        (0, 0, 1 if right else -1),
+    )
     link = article.joint(f"hinge{suffix}", "revolute", origin, axis, upper, link=f"door{suffix}")
     ends = sorted((0.0, (y1 - y0) * (1 if right else -1)))
     half = (z1 - z0) / 2

@@ -19,14 +19,26 @@ def faucet(draws: Draws) -> Article:
     made.base.cylinder((0, 0, height / 2), 0.022, height, "z", "steel")
     names = (("_left", 0.14), ("_right", -0.14)) if two else (("", 0.0),)
     low = draws.size(0.12, 0.16) if two else round(height + 0.03, 3)
-    made.base.cylinder((-reach / 2, 0, height - 0.015 if two else height - 0.06), 0.012, reach, "x", "steel")
-    length = draws.size(0.11, 0.16) + (0.0 if two else max(reach - 0.1, 0.0))  # the hand stays before the spout
+    made.base.cylinder(
+        (-reach / 2, 0, height - 0.015 if two else height - 0.06), 0.012, reach, "x", "steel"
+    )
+    length = draws.size(0.11, 0.16) + (
+        0.0 if two else max(reach - 0.1, 0.0)
+    )  # the hand stays before the spout
     for suffix, y in names:
         if two:
             made.base.cylinder((0, y, low / 2 - 0.01), 0.018, low - 0.02, "z", "steel")
         lower, upper = (0.0, 1.2) if two else (-0.8, 0.8)
         axis = (0, 0, -1 if y > 0.0 else 1)  # of two, each away from the spout
-        lever = made.joint(f"turn{suffix}", "revolute", (0, y, low), axis, upper, lower=lower, link=f"lever{suffix}")
+        lever = made.joint(
+            f"turn{suffix}",
+            "revolute",
+            (0, y, low),
+            axis,
+            upper,
+            lower=lower,
+            link=f"lever{suffix}",
+        )
         lever.cylinder((0, 0, -0.0125), 0.02, 0.015, "z", "steel")
         lever.cylinder((-length / 2, 0, 0), 0.008, length, "x", "steel")
         held = (-length + 0.015, 0.0, 0.0)
@@ -44,7 +56,9 @@ def valve(draws: Draws) -> Article:
     made.base.cylinder((back, 0, (height + 0.3) / 2), thick, height + 0.3, "z", "slate")
     spindle = back - thick - 0.017  # to the hub, which is 0.03 long
     made.base.cylinder((back - spindle / 2, 0, height), 0.018, spindle, "x", "steel")
-    turned = made.joint("turn", "revolute", (thick, 0, height), (1, 0, 0), 1.5, lower=-0.2, link="wheel")
+    turned = made.joint(
+        "turn", "revolute", (thick, 0, height), (1, 0, 0), 1.5, lower=-0.2, link="wheel"
+    )
     turned.cylinder((0, 0, 0), 0.025, 0.03, "x", "dark")
     if draws.chance(0.5):
         length = draws.size(0.16, 0.24)
@@ -60,7 +74,10 @@ def valve(draws: Draws) -> Article:
             turned.rod(one, other, 0.011, "sage")
         turned.box((-0.006, -0.01, -radius), (0.006, 0.01, radius), "slate")
         turned.box((-0.006, -radius, -0.01), (0.006, radius, 0.01), "slate")
-        held, closing = (0.0, radius * math.sin(math.pi / 4), radius * math.cos(math.pi / 4)), (0, 1, 1)
+        held, closing = (
+            (0.0, radius * math.sin(math.pi / 4), radius * math.cos(math.pi / 4)),
+            (0, 1, 1),
+        )
         bend = {"joint": "revolute", "axis": [0, 1, 0], "limits": [-0.5, 0.5]}
     made.attach("handle", turned, held, (1, 0, 0), closing)
     made.attach("handle_free", turned, held, (1, 0, 0), closing, **bend)

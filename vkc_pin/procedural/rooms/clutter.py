@@ -27,7 +27,18 @@ _TOPS = (0.2, 1.6)  # heights of what things are put on [m]
 _LEAST = 0.12  # shorter side of it [m]
 _WALL = (0.2, 1.5)  # a wall is at most so thick and at least so high [m]
 _SUNK = 0.005  # [m] by which a picture is let into its wall
-_COLOURS = ("blue", "brown", "cream", "green", "orange", "red", "teal", "terracotta", "white", "yellow")
+_COLOURS = (
+    "blue",
+    "brown",
+    "cream",
+    "green",
+    "orange",
+    "red",
+    "teal",
+    "terracotta",
+    "white",
+    "yellow",
+)
 
 
 @dataclass(frozen=True)
@@ -38,10 +49,13 @@ class _Face:
     half: Floats
 
 
-def cluttered(scene: Scene, things: int, *, seed: int = 0, clear: Sequence[tuple[Sequence[float], float]] = ()) -> Scene:
+def cluttered(
+    scene: Scene, things: int, *, seed: int = 0, clear: Sequence[tuple[Sequence[float], float]] = ()
+) -> Scene:
     """Return a scene with small things on its tables, shelves and cupboards, and pictures on its walls, as homes have them.
 
-    Each is one convex shape: an obstacle `clutter_<number>`. Around objects that can be carried, 0.15 m stay free.
+    Each is one convex shape: an obstacle `clutter_<number>`. Around objects that can be carried,
+    0.15 m stay free.
 
     Args:
         scene: The scene; nothing of it is changed.
@@ -65,10 +79,15 @@ class _Faces:
 
     def __init__(self, scene: Scene, clear: Sequence[tuple[Sequence[float], float]]) -> None:
         objects = scene.objects.values()
-        shapes = [*scene.obstacles, *(shape for placed in objects for shape in standing_geometry(placed))]
+        shapes = [
+            *scene.obstacles,
+            *(shape for placed in objects for shape in standing_geometry(placed)),
+        ]
         self.boxes = [world_box(shape.geometry, shape.placement) for shape in shapes]
         self.clear = [(np.array(place, float), float(radius)) for place, radius in clear]
-        self.clear += [(placed.placement.translation, _REACH) for placed in objects if placed.object.free]
+        self.clear += [
+            (placed.placement.translation, _REACH) for placed in objects if placed.object.free
+        ]
         flat = [shape for shape in scene.obstacles if isinstance(shape.geometry, coal.Box)]
         self.tops = [face for shape in flat for face in _tops(shape)]
         self.walls = [face for shape in flat for face in _sides(shape, scene.arena)]
@@ -94,14 +113,23 @@ class _Faces:
                 self.boxes.append(box)
                 rpy = [round(float(angle), 6) for angle in pin.rpy.matrixToRpy(where.rotation)]
                 at = [round(float(value), 4) for value in where.translation]
-                return {"name": name, **shape, "position": at, "rpy": rpy, "colour": str(rng.choice(_COLOURS))}
+                return {
+                    "name": name,
+                    **shape,
+                    "position": at,
+                    "rpy": rpy,
+                    "colour": str(rng.choice(_COLOURS)),
+                }
         expected = "fewer things, or more tables and shelves"
         raise InputError("there is no place for so many things", field="things", expected=expected)
 
     def _free(self, box: tuple[Floats, Floats], face: _Face, sunk: float) -> bool:
         """Return whether nothing is in a box but what it stands or hangs on."""
         inside = (box[0] + box[1]) / 2.0
-        if any(np.linalg.norm(np.maximum(np.abs(inside - at) - (box[1] - box[0]) / 2.0, 0.0)) < far for at, far in self.clear):
+        if any(
+            np.linalg.norm(np.maximum(np.abs(inside - at) - (box[1] - box[0]) / 2.0, 0.0)) < far
+            for at, far in self.clear
+        ):
             return False
         out = face.frame.rotation[:, 2]
         lift = (sunk + _GAP + 1e-6) * out  # off what it stands on
@@ -126,7 +154,11 @@ def _sides(shape: pin.GeometryObject, arena: Sequence[float]) -> Iterator[_Face]
     """Yield the two large faces of a wall, those within the arena."""
     half, where = np.asarray(shape.geometry.halfSide, float), shape.placement
     thin = int(np.argmin(half[:2]))
-    if 2.0 * half[thin] > _WALL[0] or 2.0 * half[2] < _WALL[1] or abs(where.rotation[2, 2]) < 1.0 - 1e-9:
+    if (
+        2.0 * half[thin] > _WALL[0]
+        or 2.0 * half[2] < _WALL[1]
+        or abs(where.rotation[2, 2]) < 1.0 - 1e-9
+    ):
         return
     for side in (-1.0, 1.0):
         out = side * where.rotation[:, thin]
@@ -134,7 +166,10 @@ def _sides(shape: pin.GeometryObject, arena: Sequence[float]) -> Iterator[_Face]
         middle = where.translation + half[thin] * out
         before = middle + 0.1 * out
         if arena[0] <= before[0] <= arena[1] and arena[2] <= before[1] <= arena[3]:
-            yield _Face(pin.SE3(np.column_stack([np.cross(up, out), up, out]), middle), np.array([half[1 - thin], half[2]]))
+            yield _Face(
+                pin.SE3(np.column_stack([np.cross(up, out), up, out]), middle),
+                np.array([half[1 - thin], half[2]]),
+            )
 
 
 def _thing(rng: np.random.Generator) -> tuple[dict[str, Any], Floats, float]:
@@ -145,9 +180,16 @@ def _thing(rng: np.random.Generator) -> tuple[dict[str, Any], Floats, float]:
     elif kind == 1:  # a plate or a bowl
         radius, length = round(0.06 + 0.07 * u[0], 3), round(0.02 + 0.06 * u[1], 3)
     else:  # a book or a box
-        size = [round(low + more * value, 3) for low, more, value in zip((0.03, 0.1, 0.08), (0.15, 0.12, 0.2), u, strict=True)]
+        size = [
+            round(low + more * value, 3)
+            for low, more, value in zip((0.03, 0.1, 0.08), (0.15, 0.12, 0.2), u, strict=True)
+        ]
         return {"type": "box", "size": size}, np.array(size), 0.0
-    return {"type": "cylinder", "radius": radius, "length": length}, np.array([2 * radius, 2 * radius, length]), 0.0
+    return (
+        {"type": "cylinder", "radius": radius, "length": length},
+        np.array([2 * radius, 2 * radius, length]),
+        0.0,
+    )
 
 
 def _picture(rng: np.random.Generator) -> tuple[dict[str, Any], Floats, float]:

@@ -60,13 +60,15 @@ class Fixture:
 
     Attributes:
         type: Of the object in a scene: a name, a path, or a description.
-        low, high: Corners of its base link and of what is shut, in its own frame, shape (3,) each [m]. Of a door in a wall it is
-            the frame alone, as handles stick out of the wall, and as high as the panel needs it.
+        low, high: Corners of its base link and of what is shut, in its own frame, shape (3,) each
+            [m]. Of a door in a wall it is the frame alone, as handles stick out of the wall, and as
+            high as the panel needs it.
         in_wall: Whether it stands in an opening of a wall.
         beside: How far to either side of it the floor before it stays free [m].
         lift: How high its frame is above what it stands on [m].
         counter: What it stands on, if not on the floor.
-        face: Where it ends towards the room without what moves and sticks out, in its own frame, along x [m].
+        face: Where it ends towards the room without what moves and sticks out, in its own frame,
+            along x [m].
     """
 
     type: str | dict[str, Any]
@@ -130,11 +132,22 @@ def _named(kind: str) -> Fixture:
 def _other(kind: str | dict[str, Any], own: ArticulatedObject) -> Fixture:
     """Return an object that only its description tells of: it stands on the floor, with its back to a wall."""
     if own.free:
-        raise InputError("this is carried, not opened", field="objects", expected="an object that is not free", got=own.name)
+        raise InputError(
+            "this is carried, not opened",
+            field="objects",
+            expected="an object that is not free",
+            got=own.name,
+        )
     low, high = _extent(own, in_wall=False)
-    fixed = [world_box(shape.geometry, shape.placement)[0] for shape in own.collision.geometryObjects if shape.parentJoint == 0]
+    fixed = [
+        world_box(shape.geometry, shape.placement)[0]
+        for shape in own.collision.geometryObjects
+        if shape.parentJoint == 0
+    ]
     face = min((float(lowest[0]) for lowest in fixed), default=float(low[0]))
-    return Fixture(kind, low, high, False, _BESIDE, lift=round(float(-low[2]), 4), face=round(face, 4))
+    return Fixture(
+        kind, low, high, False, _BESIDE, lift=round(float(-low[2]), 4), face=round(face, 4)
+    )
 
 
 def _random(kind: str, seed: int) -> Fixture:
@@ -144,13 +157,20 @@ def _random(kind: str, seed: int) -> Fixture:
     if about.place == "counter":
         rng = np.random.default_rng([5, seed])
         before, extra, width, height = (
-            float(rng.uniform(*interval)) for interval in ((0.01, 0.06), (0.0, 0.1), (0.2, 0.8), (0.72, 0.9))
+            float(rng.uniform(*interval))
+            for interval in ((0.01, 0.06), (0.0, 0.1), (0.2, 0.8), (0.72, 0.9))
         )
-        setback = float(-low[0]) + before  # so that nothing of it, levers and handles too, is beyond the counter's edge
+        setback = (
+            float(-low[0]) + before
+        )  # so that nothing of it, levers and handles too, is beyond the counter's edge
         depth = max(0.5, setback + float(high[0]) + 0.02) + extra
-        sizes = [math.ceil(100.0 * size) / 100.0 for size in (depth, high[1] - low[1] + width, height)]
+        sizes = [
+            math.ceil(100.0 * size) / 100.0 for size in (depth, high[1] - low[1] + width, height)
+        ]
         counter = Counter((sizes[0], sizes[1], sizes[2]), round(setback, 3))
-    return Fixture(own, low, high, about.place == "wall", about.beside, _ON if counter else 0.0, counter)
+    return Fixture(
+        own, low, high, about.place == "wall", about.beside, _ON if counter else 0.0, counter
+    )
 
 
 def _is_path(kind: str) -> bool:
@@ -160,7 +180,9 @@ def _is_path(kind: str) -> bool:
 def _extent(own: ArticulatedObject, *, in_wall: bool) -> tuple[Floats, Floats]:
     """Return lowest and highest corner, shape (3,) each [m]; see `Fixture`."""
     placed = PlacedObject("it", own, pin.SE3.Identity(), np.clip(0.0, own.lower, own.upper))
-    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(placed)])
+    boxes = np.array(
+        [world_box(shape.geometry, shape.placement) for shape in standing_geometry(placed)]
+    )
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     if in_wall:
         fixed = [shape.parentJoint == 0 for shape in own.collision.geometryObjects]

@@ -43,7 +43,9 @@ class Rectangle:
     def corners(self) -> Floats:
         """Its corners in the world frame, shape (4, 2) [m]."""
         signs = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-        return np.array([self.x, self.y]) + signs * (self.length / 2.0, self.width / 2.0) @ self.axes
+        return (
+            np.array([self.x, self.y]) + signs * (self.length / 2.0, self.width / 2.0) @ self.axes
+        )
 
     def gap(self, other: Rectangle) -> float:
         """Return how far two rectangles are apart along the axis that separates them most [m]; negative: they overlap."""
@@ -56,7 +58,9 @@ class Rectangle:
     def distance(self, points: ArrayLike) -> Floats:
         """Return the distances [m] of points, shape (n, 2), to the rectangle, shape (n,); 0 inside."""
         local = np.abs((np.asarray(points, float) - (self.x, self.y)) @ self.axes.T)
-        return np.linalg.norm(np.maximum(local - (self.length / 2.0, self.width / 2.0), 0.0), axis=-1)
+        return np.linalg.norm(
+            np.maximum(local - (self.length / 2.0, self.width / 2.0), 0.0), axis=-1
+        )
 
 
 @dataclass(frozen=True)
@@ -107,17 +111,25 @@ class Floor:
 
     def holds(self, rectangle: Rectangle) -> bool:
         """Return whether all of a rectangle lies between the walls."""
-        return bool((np.abs(rectangle.corners) <= np.array([self.width, self.depth]) / 2.0 + 1e-6).all())
+        return bool(
+            (np.abs(rectangle.corners) <= np.array([self.width, self.depth]) / 2.0 + 1e-6).all()
+        )
 
-    def free(self, standing: Sequence[Rectangle], radius: float, points: ArrayLike) -> NDArray[np.bool_]:
+    def free(
+        self, standing: Sequence[Rectangle], radius: float, points: ArrayLike
+    ) -> NDArray[np.bool_]:
         """Return at which points, shape (n, 2) [m], a disc of a radius [m] touches neither walls nor what stands there."""
         points = np.asarray(points, float)
-        free = np.asarray((np.array([self.width, self.depth]) / 2.0 - np.abs(points)).min(axis=1) >= radius)
+        free = np.asarray(
+            (np.array([self.width, self.depth]) / 2.0 - np.abs(points)).min(axis=1) >= radius
+        )
         for rectangle in standing:
             free &= rectangle.distance(points) >= radius
         return free
 
-    def connected(self, standing: Sequence[Rectangle], radius: float, places: Sequence[tuple[float, float]]) -> bool:
+    def connected(
+        self, standing: Sequence[Rectangle], radius: float, places: Sequence[tuple[float, float]]
+    ) -> bool:
         """Return whether a disc can get from each of some places to all others without touching anything.
 
         Args:
@@ -127,12 +139,17 @@ class Floor:
         """
         from scipy.ndimage import label
 
-        ticks = [np.arange(-size / 2.0, size / 2.0 + _CELL, _CELL) for size in (self.width, self.depth)]
+        ticks = [
+            np.arange(-size / 2.0, size / 2.0 + _CELL, _CELL) for size in (self.width, self.depth)
+        ]
         cells = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
         free = self.free(standing, radius, cells.reshape(-1, 2)).reshape(cells.shape[:2])
         regions, _ = label(free)
         found = set()
         for place in places:
-            i, j = (int(np.argmin(np.abs(axis - value))) for axis, value in zip(ticks, place, strict=True))
+            i, j = (
+                int(np.argmin(np.abs(axis - value)))
+                for axis, value in zip(ticks, place, strict=True)
+            )
             found.add(int(regions[i, j]))
         return 0 not in found and len(found) <= 1

@@ -53,7 +53,9 @@ class Part:
 def box(name: str, frame: Frame, size: Sequence[float], colour: str) -> Part:
     """Return a box on the floor, its middle at the frame's origin; edges along the frame's x, y, z [m]."""
     footprint = Rectangle(frame.x, frame.y, size[0], size[1], frame.yaw)
-    return Part(name, frame, footprint, (_box(name, frame, (0.0, 0.0), (0.0, size[2]), size[:2], colour),))
+    return Part(
+        name, frame, footprint, (_box(name, frame, (0.0, 0.0), (0.0, size[2]), size[:2], colour),)
+    )
 
 
 def table(name: str, frame: Frame, size: tuple[float, float, float]) -> Part:
@@ -65,10 +67,14 @@ def table(name: str, frame: Frame, size: tuple[float, float, float]) -> Part:
         size: Depth along x, width along y, height [m].
     """
     depth, width, height = size
-    items = [_box(f"{name}_top", frame, (0.0, 0.0), (height - PLATE, height), (depth, width), "oak")]
+    items = [
+        _box(f"{name}_top", frame, (0.0, 0.0), (height - PLATE, height), (depth, width), "oak")
+    ]
     for k, (x, y) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1)), start=1):
         at = (x * (depth - LEG) / 2.0, y * (width - LEG) / 2.0)
-        items.append(_box(f"{name}_leg_{k}", frame, at, (0.0, height - PLATE), (LEG, LEG), "walnut"))
+        items.append(
+            _box(f"{name}_leg_{k}", frame, at, (0.0, height - PLATE), (LEG, LEG), "walnut")
+        )
     half, side = depth / 2.0, max(width / 2.0, _LEAST)
     before = frame.rectangle((-half - BEFORE_TABLE, -half), (-side, side))
     spot = frame.point(-half - BEFORE_TABLE / 2.0, 0.0)
@@ -87,14 +93,27 @@ def shelf(name: str, frame: Frame, size: tuple[float, float, float], boards: int
     """
     depth, width, height = size
     middle = -AIR - depth / 2.0
-    back = _box(f"{name}_back", frame, (-AIR - BOARD / 2.0, 0.0), (0.0, height), (BOARD, width), "walnut")
+    back = _box(
+        f"{name}_back", frame, (-AIR - BOARD / 2.0, 0.0), (0.0, height), (BOARD, width), "walnut"
+    )
     items = [back]
     for k, y in enumerate((-1, 1), start=1):
         at = (middle - BOARD / 2.0, y * (width - BOARD) / 2.0)
-        items.append(_box(f"{name}_side_{k}", frame, at, (0.0, height), (depth - BOARD, BOARD), "walnut"))
+        items.append(
+            _box(f"{name}_side_{k}", frame, at, (0.0, height), (depth - BOARD, BOARD), "walnut")
+        )
     for k, low in enumerate(np.linspace(0.06, height - BOARD, boards).tolist(), start=1):
         inside = (depth - BOARD, width - 2.0 * BOARD)
-        items.append(_box(f"{name}_board_{k}", frame, (middle - BOARD / 2.0, 0.0), (low, low + BOARD), inside, "oak"))
+        items.append(
+            _box(
+                f"{name}_board_{k}",
+                frame,
+                (middle - BOARD / 2.0, 0.0),
+                (low, low + BOARD),
+                inside,
+                "oak",
+            )
+        )
     footprint = frame.rectangle((-AIR - depth, -AIR), (-width / 2.0, width / 2.0))
     return Part(name, frame, footprint, tuple(items), size=size)
 
@@ -120,7 +139,11 @@ def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front
     footprint, items, up = frame.rectangle((low[0], high[0]), sides), [], own.lift
     if counter:
         depth, width, height = counter.size
-        sides, face, up = (middle - width / 2.0, middle + width / 2.0), -counter.setback, height + own.lift
+        sides, face, up = (
+            (middle - width / 2.0, middle + width / 2.0),
+            -counter.setback,
+            height + own.lift,
+        )
         footprint = frame.rectangle((face, face + depth), sides)
         centre = (face + depth / 2.0, middle)
         items = [
@@ -129,10 +152,25 @@ def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front
         ]
     beside = (low[1] - own.beside, high[1] + own.beside)
     before = frame.rectangle((face - front, face), beside)
-    entry = {"name": name, "type": own.type, "position": [frame.x, frame.y, round(up, 4)], "yaw": frame.yaw}
+    entry = {
+        "name": name,
+        "type": own.type,
+        "position": [frame.x, frame.y, round(up, 4)],
+        "yaw": frame.yaw,
+    }
     spot = frame.point(face - front / 2.0, middle)
     size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
-    return Part(name, frame, footprint, tuple(items), (entry,), before, spot, size, side if own.in_wall else None)
+    return Part(
+        name,
+        frame,
+        footprint,
+        tuple(items),
+        (entry,),
+        before,
+        spot,
+        size,
+        side if own.in_wall else None,
+    )
 
 
 def carried(name: str, kind: str, on: Part, x: float, y: float) -> Part:
@@ -146,7 +184,11 @@ def carried(name: str, kind: str, on: Part, x: float, y: float) -> Part:
         y: Where across it [m].
     """
     place = on.frame.point(x, y)
-    entry = {"name": name, "type": kind, "position": [*place, round(on.size[2] + CARRIED[kind] + _ON, 3)]}
+    entry = {
+        "name": name,
+        "type": kind,
+        "position": [*place, round(on.size[2] + CARRIED[kind] + _ON, 3)],
+    }
     return Part(name, Frame(*place, 0.0), on.footprint, (), (entry,))
 
 
@@ -155,10 +197,14 @@ def walls(floor: Floor, height: float, parts: Sequence[Part]) -> list[dict[str, 
     items = []
     for side, name in enumerate(("east", "north", "west", "south")):
         half, frame = floor.half_length(side), floor.at_wall(side, 0.0)
-        end = half + WALL if side % 2 else half  # walls in the north and south reach round the corners
+        end = (
+            half + WALL if side % 2 else half
+        )  # walls in the north and south reach round the corners
         begin, own = -end, f"wall_{name}"
         centres = {part.name: _along(frame, part.footprint) for part in parts if part.side == side}
-        doors = sorted((part for part in parts if part.side == side), key=lambda part: centres[part.name])
+        doors = sorted(
+            (part for part in parts if part.side == side), key=lambda part: centres[part.name]
+        )
         for k, door in enumerate(doors, start=1):
             middle, width = centres[door.name], door.size[1]
             low, high, top = middle - width / 2.0, middle + width / 2.0, door.size[2]
@@ -166,23 +212,41 @@ def walls(floor: Floor, height: float, parts: Sequence[Part]) -> list[dict[str, 
             if top < height:
                 items.append(_wall(f"{own}_above_{door.name}", frame, (low, high), (top, height)))
             begin = high
-        items.append(_wall(f"{own}_{len(doors) + 1}" if doors else own, frame, (begin, end), (0.0, height)))
+        items.append(
+            _wall(f"{own}_{len(doors) + 1}" if doors else own, frame, (begin, end), (0.0, height))
+        )
     return items
 
 
-def _wall(name: str, frame: Frame, along: tuple[float, float], z: tuple[float, float]) -> dict[str, Any]:
+def _wall(
+    name: str, frame: Frame, along: tuple[float, float], z: tuple[float, float]
+) -> dict[str, Any]:
     return _box(name, frame, (WALL / 2.0, sum(along) / 2.0), z, (WALL, along[1] - along[0]), "wall")
 
 
 def _along(frame: Frame, rectangle: Rectangle) -> float:
     """Return where the middle of a rectangle is along a frame's y [m]."""
-    return float(-np.sin(frame.yaw) * (rectangle.x - frame.x) + np.cos(frame.yaw) * (rectangle.y - frame.y))
+    return float(
+        -np.sin(frame.yaw) * (rectangle.x - frame.x) + np.cos(frame.yaw) * (rectangle.y - frame.y)
+    )
 
 
 def _box(
-    name: str, frame: Frame, at: tuple[float, float], z: tuple[float, float], size: Sequence[float], colour: str
+    name: str,
+    frame: Frame,
+    at: tuple[float, float],
+    z: tuple[float, float],
+    size: Sequence[float],
+    colour: str,
 ) -> dict[str, Any]:
     """Return a box as an entry of a scene's description, its middle at a point of a frame, between two heights [m]."""
     edges = [round(float(edge), 3) for edge in (*size, z[1] - z[0])]
     position = [*frame.point(*at), round((z[0] + z[1]) / 2.0, 4)]
-    return {"name": name, "type": "box", "size": edges, "position": position, "yaw": frame.yaw, "colour": colour}
+    return {
+        "name": name,
+        "type": "box",
+        "size": edges,
+        "position": position,
+        "yaw": frame.yaw,
+        "colour": colour,
+    }

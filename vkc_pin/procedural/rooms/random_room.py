@@ -29,7 +29,9 @@ __all__ = ["Layout", "random_layout", "random_room"]
 _TRIES = 60  # places for one thing
 _ROOMS = 60  # rooms that are begun anew since something finds no place
 _STARTS = 1000  # places for the robot
-_TURNING = 0.07  # [m] of air round a robot that turns, more than the clearance that a plan keeps and half a grid cell
+# [m] of air round a robot that turns, more than the clearance that a plan keeps and half a grid
+# cell
+_TURNING = 0.07
 _DENSITY = 0.45  # pieces of furniture per square metre of floor at clutter 1
 _BEYOND = 2.0  # [m] of floor beyond a wall with a door
 _COLOURS = ("teal", "terracotta", "blue", "cream", "orange", "grey", "green")
@@ -86,9 +88,10 @@ class Layout:
 def random_room(number: int, settings: RoomSettings | None = None, **changes: Any) -> Scene:
     """Return a random room with a robot in it: the scene that a number stands for, the same in every run.
 
-    Tables, shelves and boxes stand about, doors are in the walls and drawers, cabinets and refrigerators against them. Nothing
-    overlaps. Before whatever can be opened, and on one side of every table, the floor is free, and the robot gets there
-    from its start without folding its arm. Nobody asks a planner whether anything can be done.
+    Tables, shelves and boxes stand about, doors are in the walls and drawers, cabinets and
+    refrigerators against them. Nothing overlaps. Before whatever can be opened, and on one side of
+    every table, the floor is free, and the robot gets there from its start without folding its arm.
+    Nobody asks a planner whether anything can be done.
 
     Args:
         number: Which room, from 0.
@@ -96,7 +99,8 @@ def random_room(number: int, settings: RoomSettings | None = None, **changes: An
         changes: Fields of `RoomSettings` that are to be otherwise, `clutter=0.8` for one.
 
     Raises:
-        InputError: A number or a field is out of range, or the things find no place in a room of this size.
+        InputError: A number or a field is out of range, or the things find no place in a room of
+            this size.
         UnknownNameError: There is no such field, or no such type of object.
     """
     return random_layout(number, settings, **changes).scene()
@@ -109,7 +113,10 @@ def random_layout(number: int, settings: RoomSettings | None = None, **changes: 
     for name in changes:
         if name not in known:
             raise UnknownNameError("field of RoomSettings", name, known, field=name)
-    chosen = dataclasses.replace(RoomSettings() if settings is None else instance(settings, RoomSettings, "settings"), **changes)
+    chosen = dataclasses.replace(
+        RoomSettings() if settings is None else instance(settings, RoomSettings, "settings"),
+        **changes,
+    )
     rng, radius = np.random.default_rng([1, number]), _turning_radius(load_robot(chosen.robot))
     named = None if chosen.objects is None else _named(chosen.objects, number)
     for _ in range(_ROOMS):
@@ -119,14 +126,25 @@ def random_layout(number: int, settings: RoomSettings | None = None, **changes: 
             return Layout(number, chosen, floor, standing, start, radius)
     expected = "less clutter, fewer objects or tables, wider rooms, or a robot whose arm is folded closer at home"
     got = f"{chosen.clutter:g}, and a robot that turns in a circle of {radius:.2f} m"
-    raise InputError(f"no room in {_ROOMS} had a place for everything", field="clutter", expected=expected, got=got)
+    raise InputError(
+        f"no room in {_ROOMS} had a place for everything",
+        field="clutter",
+        expected=expected,
+        got=got,
+    )
 
 
 def _named(kinds: Sequence[str | Mapping[str, Any]], number: int) -> list[tuple[str, Fixture]]:
     """Return the things to open, each with its name in the room of a number."""
     names = [own_name(kind) for kind in kinds]
-    names = [name if names.count(name) == 1 else f"{name}_{names[: k + 1].count(name)}" for k, name in enumerate(names)]
-    return [(name, fixture(kind, 100 * number + k)) for k, (name, kind) in enumerate(zip(names, kinds, strict=True))]
+    names = [
+        name if names.count(name) == 1 else f"{name}_{names[: k + 1].count(name)}"
+        for k, name in enumerate(names)
+    ]
+    return [
+        (name, fixture(kind, 100 * number + k))
+        for k, (name, kind) in enumerate(zip(names, kinds, strict=True))
+    ]
 
 
 class _Room:
@@ -149,7 +167,9 @@ class _Room:
         """
         if named is None:
             count = int(self.rng.integers(1, 3))
-            named = _named([str(kind) for kind in self.rng.choice(list(OPENED), count, replace=False)], 0)
+            named = _named(
+                [str(kind) for kind in self.rng.choice(list(OPENED), count, replace=False)], 0
+            )
         fixed = [self._opened(name, own) for name, own in named]
         fixed += [self._table(f"table_{k + 1}") for k in range(self.settings.tables)]
         if not all(self._put(draws) for draws in fixed):
@@ -158,13 +178,17 @@ class _Room:
         if start is None:
             return None
         self.start = start
-        free = self.floor.width * self.floor.depth - sum(part.footprint.length * part.footprint.width for part in self.parts)
+        free = self.floor.width * self.floor.depth - sum(
+            part.footprint.length * part.footprint.width for part in self.parts
+        )
         for k in range(round(self.settings.clutter * _DENSITY * free)):
             draws = (self._box, self._box, self._shelf, self._table)[int(self.rng.integers(4))]
             if not self._put(draws(f"{draws.__name__.strip('_')}_{k + 1 + self.settings.tables}")):
                 return None
         tables = [part for part in self.parts if part.name == "table_1"]
-        standing = [self._carried(kind, k, tables[0]) for k, kind in enumerate(self.settings.carried)]
+        standing = [
+            self._carried(kind, k, tables[0]) for k, kind in enumerate(self.settings.carried)
+        ]
         return self.floor, (*self.parts, *standing), start
 
     def _put(self, draws: Iterator[Part]) -> bool:
@@ -178,11 +202,15 @@ class _Room:
     def _fits(self, part: Part) -> bool:
         """Return whether a part stands in the room, away from the others, and leaves free what has to be."""
         own, gap = part.footprint, self.settings.gap
-        if (part.side is None and not self.floor.holds(own)) or (part.before and not self.floor.holds(part.before)):
+        if (part.side is None and not self.floor.holds(own)) or (
+            part.before and not self.floor.holds(part.before)
+        ):
             return False
         for other in self.parts:
             pairs = [(own, other.footprint), (own, other.before), (part.before, other.footprint)]
-            if any(one is not None and two is not None and one.gap(two) < gap for one, two in pairs):
+            if any(
+                one is not None and two is not None and one.gap(two) < gap for one, two in pairs
+            ):
                 return False
         places = [one.spot for one in (*self.parts, part) if one.spot is not None]
         if self.start is not None:
@@ -198,7 +226,10 @@ class _Room:
         places = [part.spot for part in self.parts if part.spot is not None]
         half = np.array([self.floor.width, self.floor.depth]) / 2.0
         for _ in range(_STARTS):
-            x, y, yaw = (round(float(value), 3) for value in self.rng.uniform([*-half, -math.pi], [*half, math.pi]))
+            x, y, yaw = (
+                round(float(value), 3)
+                for value in self.rng.uniform([*-half, -math.pi], [*half, math.pi])
+            )
             if self.floor.free(standing, self.radius, [[x, y]])[0] and self.floor.connected(
                 standing, self.radius, [*places, (x, y)]
             ):
@@ -238,12 +269,17 @@ class _Room:
         while True:
             depth, width, height = self._size((0.28, 0.4), (0.6, 1.2), (1.2, 2.0))
             boards = int(self.rng.integers(4, 6))
-            yield parts.shelf(name, self.floor.at_wall(*self._wall(width)), (depth, width, height), boards)
+            yield parts.shelf(
+                name, self.floor.at_wall(*self._wall(width)), (depth, width, height), boards
+            )
 
     def _box(self, name: str) -> Iterator[Part]:
         colour = _COLOURS[int(self.rng.integers(len(_COLOURS)))]
         while True:
-            size, yaw = self._size((0.25, 0.8), (0.25, 0.8), (0.3, 1.4)), round(float(self.rng.uniform(-math.pi, math.pi)), 3)
+            size, yaw = (
+                self._size((0.25, 0.8), (0.25, 0.8), (0.3, 1.4)),
+                round(float(self.rng.uniform(-math.pi, math.pi)), 3),
+            )
             yield parts.box(name, self._anywhere(yaw), size, colour)
 
     def _carried(self, kind: str, number: int, on: Part) -> Part:
@@ -262,7 +298,14 @@ def _turning_radius(robot: Robot) -> float:
     """Return the radius of a disc about the base in which a robot with its arm at home turns with some air [m]."""
     data, shapes = robot.model.createData(), robot.collision.createData()
     rest = np.concatenate([np.zeros(3), robot.home])
-    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(rest))
-    boxes = [world_box(shape.geometry, where) for shape, where in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)]
-    reach = max(float(np.hypot(*np.maximum(np.abs(low[:2]), np.abs(high[:2])))) for low, high in boxes)
+    pin.updateGeometryPlacements(
+        robot.model, data, robot.collision, shapes, robot.coordinates.q(rest)
+    )
+    boxes = [
+        world_box(shape.geometry, where)
+        for shape, where in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
+    ]
+    reach = max(
+        float(np.hypot(*np.maximum(np.abs(low[:2]), np.abs(high[:2])))) for low, high in boxes
+    )
     return reach + max(_TURNING, START_CLEARANCE)

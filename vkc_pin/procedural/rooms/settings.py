@@ -24,12 +24,14 @@ class RoomSettings:
 
     Attributes:
         clutter: How much furniture there is, from 0, nothing but `tables`, to 1.
-        objects: What can be opened; None: one or two, at random, of `door`, `narrow_door`, `wide_door`, `drawer`, `low_drawer`,
-            `refrigerator` and `cabinet`, which are always the same. `random_door`, `random_oven` and others have sizes of their
-            own in every room, see `random_object`. Objects can also be given by path, or as what `random_object` returns: they
-            stand on the floor with their face, -x, towards the room.
+        objects: What can be opened; None: one or two, at random, of `door`, `narrow_door`,
+            `wide_door`, `drawer`, `low_drawer`, `refrigerator` and `cabinet`, which are always the
+            same. `random_door`, `random_oven` and others have sizes of their own in every room, see
+            `random_object`. Objects can also be given by path, or as what `random_object` returns:
+            they stand on the floor with their face, -x, towards the room.
         tables: How many tables there are at least, each with a side at which a robot can stand.
-        carried: Types of free objects, up to four of `cup` and `ball`, which stand on the first table.
+        carried: Types of free objects, up to four of `cup` and `ball`, which stand on the first
+            table.
         width: Lowest and highest inner length of a wall [m].
         height: Of the walls [m].
         front: Depth of the floor that stays free before what can be opened [m].
@@ -53,23 +55,40 @@ class RoomSettings:
             _within(name, getattr(self, name), low, high)
         expected = "two lengths of 4 to 20 m, the lower one first"
         if not isinstance(self.width, tuple | list) or len(self.width) != 2:
-            raise InputError("not an interval", field="width", expected=expected, got=shown(self.width))
+            raise InputError(
+                "not an interval", field="width", expected=expected, got=shown(self.width)
+            )
         for value in self.width:
             _within("width", value, 4.0, 20.0)
         if self.width[0] > self.width[1]:
-            raise InputError("the interval is empty", field="width", expected=expected, got=shown(self.width))
+            raise InputError(
+                "the interval is empty", field="width", expected=expected, got=shown(self.width)
+            )
         object.__setattr__(self, "width", tuple(map(float, self.width)))
         object.__setattr__(self, "tables", whole(self.tables, "tables", low=0, high=10))
         if self.objects is not None:
-            object.__setattr__(self, "objects", tuple(map(_opened, items(self.objects, "objects", "a list of types"))))
+            object.__setattr__(
+                self,
+                "objects",
+                tuple(map(_opened, items(self.objects, "objects", "a list of types"))),
+            )
         kinds: tuple[Any, ...] = items(self.carried, "carried", "a list of types")
-        object.__setattr__(self, "carried", tuple(known(kind, CARRIED, "object that is carried", "carried") for kind in kinds))
+        object.__setattr__(
+            self,
+            "carried",
+            tuple(known(kind, CARRIED, "object that is carried", "carried") for kind in kinds),
+        )
         object.__setattr__(self, "robot", _robot(self.robot))
         if len(self.carried) > _CARRIED:
-            raise InputError("too many", field="carried", expected=f"at most {_CARRIED}", got=len(self.carried))
+            raise InputError(
+                "too many", field="carried", expected=f"at most {_CARRIED}", got=len(self.carried)
+            )
         if self.carried and not self.tables:
             raise InputError(
-                "there is nothing for it to stand on", field="carried", expected="tables of at least 1", got=self.tables
+                "there is nothing for it to stand on",
+                field="carried",
+                expected="tables of at least 1",
+                got=self.tables,
             )
 
 
@@ -77,17 +96,34 @@ def _opened(kind: Any) -> str | dict[str, Any]:
     """Return what a thing that opens is given by. Raises an error if nothing is called that."""
     if isinstance(kind, Mapping):
         return mapping(kind, "objects")
-    path = isinstance(kind, Path) or (isinstance(kind, str) and (kind.endswith((".yaml", ".yml")) or "/" in kind))
-    return str(file_path(kind, "objects")) if path else known(kind, known_objects(), "object that opens", "objects")
+    path = isinstance(kind, Path) or (
+        isinstance(kind, str) and (kind.endswith((".yaml", ".yml")) or "/" in kind)
+    )
+    return (
+        str(file_path(kind, "objects"))
+        if path
+        else known(kind, known_objects(), "object that opens", "objects")
+    )
 
 
 def _robot(robot: Any) -> str:
     """Return a robot's name, or the whole path of its file or folder: a room is written with no folder in mind."""
-    path = isinstance(robot, Path) or (isinstance(robot, str) and (robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot))
-    return str(file_path(robot, "robot").resolve()) if path else text(robot, "robot", "a robot's name, or the path of its file")
+    path = isinstance(robot, Path) or (
+        isinstance(robot, str) and (robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot)
+    )
+    return (
+        str(file_path(robot, "robot").resolve())
+        if path
+        else text(robot, "robot", "a robot's name, or the path of its file")
+    )
 
 
 def _within(name: str, value: Any, low: float, high: float) -> None:
     """Raise an error unless a setting is a number from the lowest to the highest."""
     if not is_number(value) or not low <= value <= high:
-        raise InputError("out of range", field=name, expected=f"a number from {low:g} to {high:g}", got=shown(value))
+        raise InputError(
+            "out of range",
+            field=name,
+            expected=f"a number from {low:g} to {high:g}",
+            got=shown(value),
+        )

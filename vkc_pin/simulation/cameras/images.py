@@ -30,10 +30,12 @@ class Images:
     """What cameras saw.
 
     Attributes:
-        pictures: By `<camera>_image`: colours, shape (N, height, width, 3), 8 bits; `<camera>_depth`: distance along the camera's
-            axis [mm], shape (N, height, width), 16 bits, 0 where there is nothing; `<camera>_segmentation`: place in `segments`
-            of what is seen, shape (N, height, width), 16 bits.
-        segments: What there is to see: "" for nothing, `ROBOT`, the floor, obstacles by name, links of objects as `door.panel`.
+        pictures: By `<camera>_image`: colours, shape (N, height, width, 3), 8 bits;
+            `<camera>_depth`: distance along the camera's axis [mm], shape (N, height, width), 16
+            bits, 0 where there is nothing; `<camera>_segmentation`: place in `segments` of what is
+            seen, shape (N, height, width), 16 bits.
+        segments: What there is to see: "" for nothing, `ROBOT`, the floor, obstacles by name, links
+            of objects as `door.panel`.
     """
 
     pictures: Mapping[str, NDArray[np.generic]]
@@ -52,7 +54,9 @@ class Images:
         """Return those that `to_bytes` made bytes of."""
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             names, segments = json.loads(str(archive["names"]))
-            return cls({name: archive[f"picture_{k}"] for k, name in enumerate(names)}, tuple(segments))
+            return cls(
+                {name: archive[f"picture_{k}"] for k, name in enumerate(names)}, tuple(segments)
+            )
 
 
 def taken(executed: Executed, cameras: Sequence[Camera], times: Floats) -> Images:
@@ -73,7 +77,9 @@ def taken(executed: Executed, cameras: Sequence[Camera], times: Floats) -> Image
         for camera in cameras:
             body, place = builder.frame(camera.on(robot))
             seat = place * camera.placement
-            body.add_camera(name=camera.name, pos=seat.translation, quat=quaternion(seat), fovy=camera.fov)
+            body.add_camera(
+                name=camera.name, pos=seat.translation, quat=quaternion(seat), fovy=camera.fov
+            )
 
     robot: Robot = executed.scene.robot
     size = (max(camera.width for camera in cameras), max(camera.height for camera in cameras))
@@ -82,7 +88,9 @@ def taken(executed: Executed, cameras: Sequence[Camera], times: Floats) -> Image
     found: dict[str, list[NDArray[np.generic]]] = {}
     for camera, picture in _drawn(stage, cameras, times, size):
         for kind, pixels in zip(("image", "depth", "segmentation"), picture, strict=True):
-            found.setdefault(f"{camera}_{kind}", []).append(numbers[pixels] if kind == "segmentation" else pixels)
+            found.setdefault(f"{camera}_{kind}", []).append(
+                numbers[pixels] if kind == "segmentation" else pixels
+            )
     return Images({name: np.array(values) for name, values in found.items()}, segments)
 
 
@@ -90,18 +98,28 @@ def _drawn(stage: Stage, cameras: Sequence[Camera], times: Floats, size: tuple[i
     """Yield a camera's name and its colours, distances [mm] and geoms, of every camera at every moment; geom 0 is none."""
     mj, model = stage.mj, stage.model
     data, option, eye = mj.MjData(model), mj.MjvOption(), mj.MjvCamera()
-    near, far = (float(limit * model.stat.extent) for limit in (model.vis.map.znear, model.vis.map.zfar))
+    near, far = (
+        float(limit * model.stat.extent) for limit in (model.vis.map.znear, model.vis.map.zfar)
+    )
     eye.type = mj.mjtCamera.mjCAMERA_FIXED
     with drawing_context(size):
-        scene, render = mj.MjvScene(model, maxgeom=20_000), mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100)
+        scene, render = (
+            mj.MjvScene(model, maxgeom=20_000),
+            mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100),
+        )
         mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN, render)
         for row in stage.rows(times):
             data.qpos[:] = stage.qpos(row)
             mj.mj_forward(model, data)
             for camera in cameras:
                 eye.fixedcamid = model.camera(camera.name).id
-                mj.mjv_updateScene(model, data, option, mj.MjvPerturb(), eye, mj.mjtCatBit.mjCAT_ALL, scene)
-                window, shape = mj.MjrRect(0, 0, camera.width, camera.height), (camera.height, camera.width)
+                mj.mjv_updateScene(
+                    model, data, option, mj.MjvPerturb(), eye, mj.mjtCatBit.mjCAT_ALL, scene
+                )
+                window, shape = (
+                    mj.MjrRect(0, 0, camera.width, camera.height),
+                    (camera.height, camera.width),
+                )
                 colours, codes = np.zeros((2, *shape, 3), np.uint8)
                 depth = np.zeros(shape, np.float32)
                 mj.mjr_render(window, scene, render)
@@ -111,7 +129,14 @@ def _drawn(stage: Stage, cameras: Sequence[Camera], times: Floats, size: tuple[i
                 mj.mjr_render(window, scene, render)
                 mj.mjr_readPixels(codes, None, window, render)
                 scene.flags[flags] = 0
-                yield camera.name, (colours[::-1], _millimetres(depth, near, far)[::-1], _geoms(scene, codes)[::-1])
+                yield (
+                    camera.name,
+                    (
+                        colours[::-1],
+                        _millimetres(depth, near, far)[::-1],
+                        _geoms(scene, codes)[::-1],
+                    ),
+                )
         render.free()
 
 

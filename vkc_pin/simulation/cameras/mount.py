@@ -49,7 +49,12 @@ class Camera:
         lengths = np.linalg.norm(ahead) * np.linalg.norm(up)
         if np.linalg.norm(np.cross(ahead, up)) <= _ASTRAY * lengths:
             expected = "a target that is not at the camera's position, nor straight above or below it along `up`"
-            raise InputError("this camera has no direction", field="target", expected=expected, got=list(self.target))
+            raise InputError(
+                "this camera has no direction",
+                field="target",
+                expected=expected,
+                got=list(self.target),
+            )
 
     @property
     def placement(self) -> pin.SE3:
@@ -58,7 +63,9 @@ class Camera:
         back /= np.linalg.norm(back)
         right = np.cross(self.up, back)
         right /= np.linalg.norm(right)
-        return pin.SE3(np.column_stack([right, np.cross(back, right), back]), np.array(self.position))
+        return pin.SE3(
+            np.column_stack([right, np.cross(back, right), back]), np.array(self.position)
+        )
 
     def on(self, robot: Robot) -> str:
         """Return the frame of a robot's model that it is mounted on.
@@ -83,6 +90,12 @@ def check_frame(robot: Robot, frame: str) -> None:
     Raises:
         UnknownNameError: It has none of this name.
     """
-    known = sorted({BASE, HAND, *(str(one.name) for one in robot.model.frames if one.type == pin.FrameType.BODY)})
+    known = sorted(
+        {
+            BASE,
+            HAND,
+            *(str(one.name) for one in robot.model.frames if one.type == pin.FrameType.BODY),
+        }
+    )
     if frame not in known:
         raise UnknownNameError(f"frame of {robot.name}", frame, known)

@@ -1,8 +1,8 @@
 """Fingers that close on what is to be held: those of a gripper that is described, or else the two sides of a hand.
 
-A hand whose robot.yaml says nothing of a `gripper` has fingers that do not move. For holding by friction its pads slide towards
-each other: the shapes of the touch links that the x axis of the tool frame meets, on either side. Fingers of one hand are
-coupled, as by one motor.
+A hand whose robot.yaml says nothing of a `gripper` has fingers that do not move. For holding by
+friction its pads slide towards each other: the shapes of the touch links that the x axis of the
+tool frame meets, on either side. Fingers of one hand are coupled, as by one motor.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class Fingers:
 
     Attributes:
         names: MuJoCo's joints, k of them.
-        closed: Where they are when nothing is between them and they are closed, shape (k,), [m] or [rad].
+        closed: Where they are when nothing is between them and they are closed, shape (k,), [m] or
+            [rad].
         open: The same when they are fully open.
         sides: What slides, if they are the sides of a hand; None: they are joints of the robot.
         servos: Of the sides.
@@ -70,13 +71,20 @@ class Fingers:
         if self.sides is None:
             return
         hand, kinds = builder.bodies[self.sides.joint], builder.mj.mjtJoint
-        for name, servo, sign, shapes in zip(self.names, self.servos, (1.0, -1.0), self.sides.shapes, strict=True):
+        for name, servo, sign, shapes in zip(
+            self.names, self.servos, (1.0, -1.0), self.sides.shapes, strict=True
+        ):
             tool = self.sides.tool
-            body = hand.add_body(name=name, pos=tool.translation, quat=quaternion(tool), gravcomp=1.0)
+            body = hand.add_body(
+                name=name, pos=tool.translation, quat=quaternion(tool), gravcomp=1.0
+            )
             body.mass, body.inertia, body.explicitinertial = _MASS, np.full(3, 1e-4), True
             joint = body.add_joint(name=name, type=kinds.mjJNT_SLIDE, axis=[-sign, 0.0, 0.0])
             servo.give_motor(joint, builder.mj)
-            joint.limited, joint.range = builder.mj.mjtLimited.mjLIMITED_TRUE, [0.0, self.sides.travel]
+            joint.limited, joint.range = (
+                builder.mj.mjtLimited.mjLIMITED_TRUE,
+                [0.0, self.sides.travel],
+            )
             for number in shapes:
                 builder.moved[number] = (body, tool.actInv(builder.world.shapes[number].placement))
 
@@ -87,7 +95,9 @@ class Fingers:
         kind, of = builder.mj.mjtEq.mjEQ_JOINT, builder.mj.mjtObj.mjOBJ_JOINT
         for k in range(1, len(self.names)):
             slope = (self.closed[k] - self.open[k]) / (self.closed[0] - self.open[0])
-            couple = builder.spec.add_equality(type=kind, objtype=of, name1=self.names[k], name2=self.names[0], active=True)
+            couple = builder.spec.add_equality(
+                type=kind, objtype=of, name1=self.names[k], name2=self.names[0], active=True
+            )
             couple.data[:2] = [self.open[k] - slope * self.open[0], slope]
             couple.solref = _COUPLING
 
@@ -114,11 +124,15 @@ def fingers_of(world: World, physics: Physics) -> Fingers:
     sides = _sides(world)
     names = ("side 0", "side 1")
     bandwidth, ratio = physics.arm_bandwidth, physics.damping_ratio
-    servos = tuple(position_servo(name, _MASS, physics.closing_force, "m", bandwidth, ratio) for name in names)
+    servos = tuple(
+        position_servo(name, _MASS, physics.closing_force, "m", bandwidth, ratio) for name in names
+    )
     return Fingers(names, np.full(2, sides.travel), np.zeros(2), sides, servos)
 
 
-def limited(servos: Sequence[Servo], fingers: Fingers, world: World, physics: Physics) -> tuple[Servo, ...]:
+def limited(
+    servos: Sequence[Servo], fingers: Fingers, world: World, physics: Physics
+) -> tuple[Servo, ...]:
     """Return servos of which those of fingers close no harder than a hand does.
 
     Raises:
@@ -134,9 +148,17 @@ def limited(servos: Sequence[Servo], fingers: Fingers, world: World, physics: Ph
             elif np.isfinite(servo.limit):
                 limit = servo.limit
             else:
-                problem = "a finger that turns, and the URDF states no effort: it cannot hold by friction"
-                raise InputError(problem, field="grasp", expected='an effort, or grasp="weld"', got=name)
-            moved, bandwidth, ratio = servo.inertia - servo.armature, physics.arm_bandwidth, physics.damping_ratio
+                problem = (
+                    "a finger that turns, and the URDF states no effort: it cannot hold by friction"
+                )
+                raise InputError(
+                    problem, field="grasp", expected='an effort, or grasp="weld"', got=name
+                )
+            moved, bandwidth, ratio = (
+                servo.inertia - servo.armature,
+                physics.arm_bandwidth,
+                physics.damping_ratio,
+            )
             servo = position_servo(name, moved, limit, units[name], bandwidth, ratio)
         found.append(servo)
     return tuple(found)
@@ -154,15 +176,26 @@ def _sides(world: World) -> Sides:
     for number, shape in hand:
         place = back * shape.placement
         x = _across(place, shape)
-        if (x.min() > 0.0 or x.max() < 0.0) and not bar_fits(2.0 * _FURTHEST, [(shape.geometry, place)]):
+        if (x.min() > 0.0 or x.max() < 0.0) and not bar_fits(
+            2.0 * _FURTHEST, [(shape.geometry, place)]
+        ):
             sides[0 if x.min() > 0.0 else 1].append(number)
-    travel = widest_bar([(shape.geometry, back * shape.placement) for _, shape in hand]) / 2.0 if all(sides) else 0.0
+    travel = (
+        widest_bar([(shape.geometry, back * shape.placement) for _, shape in hand]) / 2.0
+        if all(sides)
+        else 0.0
+    )
     if not (all(sides) and 0.0 < travel < _FURTHEST):
         expected = "a robot.yaml with a `gripper`, or touch_links on both sides of the tool frame, along its x axis"
         raise InputError(
-            f"the hand of '{robot.name}' has no fingers that close", field="grasp", expected=expected, got="friction"
+            f"the hand of '{robot.name}' has no fingers that close",
+            field="grasp",
+            expected=expected,
+            got="friction",
         )
-    return Sides((tuple(sides[0]), tuple(sides[1])), frame.placement, int(frame.parentJoint), travel)
+    return Sides(
+        (tuple(sides[0]), tuple(sides[1])), frame.placement, int(frame.parentJoint), travel
+    )
 
 
 def _across(place: pin.SE3, shape: pin.GeometryObject) -> Floats:

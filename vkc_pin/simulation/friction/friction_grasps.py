@@ -22,7 +22,9 @@ __all__ = ["Span", "Squeezes", "grip_changes", "split"]
 
 Span = tuple[Hold, float, float]
 """What is held, from when to when [s]."""
-_BITE = 0.15  # of their way that fingers are told to go on beyond where they are closed, so that thin things are pressed as well
+# of their way that fingers are told to go on beyond where they are closed, so that thin things are
+# pressed as well
+_BITE = 0.15
 _LOST = 0.1  # [s] without touching, after which what was held is lost
 _AVERAGED = 2  # looks over which forces are averaged
 
@@ -30,7 +32,11 @@ _AVERAGED = 2  # looks over which forces are averaged
 def grip_changes(trajectory: Trajectory, spans: Sequence[Span]) -> list[int]:
     """Return the waypoints at which the hand closes or opens."""
     moments = {time for _, begin, end in spans for time in (begin, end) if np.isfinite(time)}
-    return [phase.first for phase in trajectory.phases if float(trajectory.times[phase.first]) in moments]
+    return [
+        phase.first
+        for phase in trajectory.phases
+        if float(trajectory.times[phase.first]) in moments
+    ]
 
 
 @dataclass(eq=False)
@@ -43,7 +49,8 @@ class _Squeeze:
         pairs: The names of these, which may touch.
         grip: What is known of it.
         forces: The last ones, and torques, shape (6,) each.
-        place: The tool in the link's frame when the fingers had closed [m]; None: they have not yet.
+        place: The tool in the link's frame when the fingers had closed [m]; None: they have not
+            yet.
         missing: For how many looks nothing has touched.
     """
 
@@ -80,7 +87,12 @@ class Squeezes:
         physics: Physics,
         period: float,
     ) -> None:
-        self._physical, self._fingers, self._physics, self._period = physical, fingers, physics, period
+        self._physical, self._fingers, self._physics, self._period = (
+            physical,
+            fingers,
+            physics,
+            period,
+        )
         self._engine = engine()
         first, last = float(trajectory.times[0]), float(trajectory.times[-1])
         world, scene = physical.world, physical.world.scene
@@ -90,8 +102,13 @@ class Squeezes:
         for hold, begin, end in spans:
             hands, link = frozenset(touching(scene, hold)), grasped(scene, hold)
             pairs = frozenset((min(hand, link), max(hand, link)) for hand in hands)
-            own, grip = np.isin(labels, list(hands)), Grip(str(hold), max(begin, first), min(end, last))
-            self._squeezes.append(_Squeeze(hold, begin, end, own, np.asarray(labels == link), pairs, grip))
+            own, grip = (
+                np.isin(labels, list(hands)),
+                Grip(str(hold), max(begin, first), min(end, last)),
+            )
+            self._squeezes.append(
+                _Squeeze(hold, begin, end, own, np.asarray(labels == link), pairs, grip)
+            )
         tree = world.model
         self._tool = tree.frames[tree.getFrameId(scene.robot.tool_frame)]
 
@@ -105,7 +122,12 @@ class Squeezes:
         shares, time = np.zeros(len(times)), self._physics.grip_time
         for squeeze in self._squeezes:
             begin = max(squeeze.begin, float(times[0]))
-            corners = [begin, begin + time, max(squeeze.end, begin + time), max(squeeze.end, begin + time) + time]
+            corners = [
+                begin,
+                begin + time,
+                max(squeeze.end, begin + time),
+                max(squeeze.end, begin + time) + time,
+            ]
             shares = np.maximum(shares, np.interp(times, corners, [0.0, 1.0, 1.0, 0.0]))
         fingers = self._fingers
         closed = fingers.closed + _BITE * (fingers.closed - fingers.open)
@@ -114,7 +136,12 @@ class Squeezes:
     def may_touch(self, clock: float) -> set[tuple[str, str]]:
         """Return the names of what may touch at a time [s], because it is held, taken or let go."""
         time = self._physics.grip_time
-        return {pair for one in self._squeezes if one.begin <= clock <= one.end + time for pair in one.pairs}
+        return {
+            pair
+            for one in self._squeezes
+            if one.begin <= clock <= one.end + time
+            for pair in one.pairs
+        }
 
     def measure(self, data: Any, clock: float) -> None:
         """Note how hard hands pull, and how far they have slipped."""
@@ -129,7 +156,10 @@ class Squeezes:
             squeeze.forces.append(np.zeros(6) if pull is None else pull)
             mean = np.mean(squeeze.forces, axis=0)
             grip = squeeze.grip
-            force, torque = max(grip.force, float(np.linalg.norm(mean[:3]))), max(grip.torque, float(np.linalg.norm(mean[3:])))
+            force, torque = (
+                max(grip.force, float(np.linalg.norm(mean[:3]))),
+                max(grip.torque, float(np.linalg.norm(mean[3:]))),
+            )
             slip = max(grip.slip, float(np.linalg.norm(place - squeeze.place)))
             lost = clock if squeeze.missing * self._period >= _LOST else None
             squeeze.grip = replace(grip, force=force, torque=torque, slip=slip, broken=lost)
@@ -137,7 +167,10 @@ class Squeezes:
     def _places(self, data: Any, squeeze: _Squeeze) -> tuple[Floats, Floats]:
         """Return where the tool is in the world, and in the frame of the body that is held [m]."""
         tool = int(self._physical.bodies[self._tool.parentJoint])
-        where = data.xpos[tool] + np.asarray(data.xmat[tool]).reshape(3, 3) @ self._tool.placement.translation
+        where = (
+            data.xpos[tool]
+            + np.asarray(data.xmat[tool]).reshape(3, 3) @ self._tool.placement.translation
+        )
         body = int(self._physical.model.geom_bodyid[np.flatnonzero(squeeze.link)[0]])
         turn = np.asarray(data.xmat[body]).reshape(3, 3)
         return np.asarray(where), np.asarray(turn.T @ (where - data.xpos[body]))

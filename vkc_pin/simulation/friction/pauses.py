@@ -37,7 +37,12 @@ def paused(trajectory: Trajectory, waypoints: Iterable[int], seconds: float) -> 
         moving = np.abs(curve.rates[knots]).max(axis=1) > _REST
         if moving.any():
             got = f"moving at {trajectory.times[at[moving]][0]:.2f} s"
-            raise InputError("the hand closes or opens while the robot moves", field="trajectory", expected="a rest", got=got)
+            raise InputError(
+                "the hand closes or opens while the robot moves",
+                field="trajectory",
+                expected="a rest",
+                got=got,
+            )
         rates = np.insert(curve.rates, knots + 1, 0.0, axis=0)
         rates[knots + np.arange(len(knots))] = 0.0
         positions = np.insert(curve.positions, knots + 1, curve.positions[knots], axis=0)
@@ -50,7 +55,10 @@ def paused(trajectory: Trajectory, waypoints: Iterable[int], seconds: float) -> 
         trajectory,
         times=_later(trajectory.times, at, seconds),
         positions=np.insert(trajectory.positions, at + 1, trajectory.positions[at], axis=0),
-        phases=tuple(replace(phase, first=moved(phase.first), last=moved(phase.last)) for phase in trajectory.phases),
+        phases=tuple(
+            replace(phase, first=moved(phase.first), last=moved(phase.last))
+            for phase in trajectory.phases
+        ),
         curve=curve,
     )
 

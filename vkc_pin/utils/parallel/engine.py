@@ -1,6 +1,7 @@
 """Runs a function on many tasks, in this process, on others of this machine or on a cluster, and yields what comes of each.
 
-Whoever calls keeps what comes: processes that work know no files. A task that is lost with its process is run again.
+Whoever calls keeps what comes: processes that work know no files. A task that is lost with its
+process is run again.
 """
 
 from __future__ import annotations
@@ -59,7 +60,9 @@ def needs_dask(scheduler: str | None) -> None:
     """
     field = "jobs" if scheduler is None else "scheduler"
     if scheduler is not None and not (isinstance(scheduler, str) and _ADDRESS.fullmatch(scheduler)):
-        raise InputError("not an address", field=field, expected="such as tcp://HOST:8786", got=shown(scheduler))
+        raise InputError(
+            "not an address", field=field, expected="such as tcp://HOST:8786", got=shown(scheduler)
+        )
     optional_package("distributed", "cluster", what="running in other processes", field=field)
 
 
@@ -84,18 +87,21 @@ def results(
 ) -> Generator[tuple[str, Any]]:
     """Yield the key of every task and what the function returns for it, in the order in which they end.
 
-    Tasks are taken from their iterable when a process is about to be free, not before: what was yielded can decide about them.
-    With one job and no scheduler all run in this process. Otherwise the function and the tasks must be such that other processes
-    can read them. Processes leave Ctrl-C to this one.
+    Tasks are taken from their iterable when a process is about to be free, not before: what was
+    yielded can decide about them. With one job and no scheduler all run in this process. Otherwise
+    the function and the tasks must be such that other processes can read them. Processes leave
+    Ctrl-C to this one.
 
     Args:
         function: What runs a task.
         tasks: Key and task, each.
         jobs: Number of processes on this machine, each with one thread of BLAS.
-        scheduler: Address of a Dask scheduler ("tcp://host:8786") whose workers run the tasks; None: this machine.
-        dask: Whether processes on this machine are Dask's, which are started anew when they die, and whose tasks are run again.
-            Without it, a process that dies ends all.
-        limit: Time of a task by the clock [s], after which its process is ended, whatever it does. In this process there is none.
+        scheduler: Address of a Dask scheduler ("tcp://host:8786") whose workers run the tasks;
+            None: this machine.
+        dask: Whether processes on this machine are Dask's, which are started anew when they die,
+            and whose tasks are run again. Without it, a process that dies ends all.
+        limit: Time of a task by the clock [s], after which its process is ended, whatever it does.
+            In this process there is none.
         tell: Takes lines for people, such as where Dask's dashboard is.
 
     Yields:
@@ -123,14 +129,18 @@ def _on_processes(
     # Batches of one: a batch comes back as a whole, and a stop would lose all of it.
     with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
         parallel = Parallel(return_as="generator_unordered", batch_size=1, max_nbytes=None)
-        found = parallel(delayed(_elsewhere)(function, key, task, limit, os.getpid()) for key, task in tasks)
+        found = parallel(
+            delayed(_elsewhere)(function, key, task, limit, os.getpid()) for key, task in tasks
+        )
     try:
         yield from found
     except BrokenProcessPool as error:
         problem = "a process died, perhaps for want of memory; the trials that were done are kept, and the same call goes on"
         raise VkcError(f"{problem} ({str(error).splitlines()[0]})") from error
     finally:
-        with contextlib.suppress(KeyboardInterrupt):  # this ends the other processes' tasks if some are still running
+        with contextlib.suppress(
+            KeyboardInterrupt
+        ):  # this ends the other processes' tasks if some are still running
             found.close()
 
 
@@ -150,12 +160,17 @@ def _on_cluster(
         if tell is not None:
             tell(f"Dask's dashboard: {client.dashboard_link}")
         running: dict[str, tuple[str, Any, Future]] = {}
-        ended: queue.SimpleQueue[Future] = queue.SimpleQueue()  # waiting for all that run would cost more the more there are
-        suspects: list[tuple[str, Any]] = []  # tried again with nothing beside them: another one may have killed the process
+        ended: queue.SimpleQueue[Future] = (
+            queue.SimpleQueue()
+        )  # waiting for all that run would cost more the more there are
+        suspects: list[
+            tuple[str, Any]
+        ] = []  # tried again with nothing beside them: another one may have killed the process
         alone = False
 
         def submit(key: str, task: Any) -> None:
-            name = f"vkc-{key}-{secrets.token_hex(4)}"  # results of the same name would be shared among clients
+            # results of the same name would be shared among clients
+            name = f"vkc-{key}-{secrets.token_hex(4)}"
             future = client.submit(_watched, function, task, limit, key=name, pure=False)
             running[name] = key, task, future
             future.add_done_callback(ended.put)
@@ -179,7 +194,10 @@ def _on_cluster(
                     future = ended.get(timeout=_LOOKED)
                 except queue.Empty:
                     if cluster is not None:
-                        cluster.scale(jobs)  # a process that was killed while it started is not started anew otherwise
+                        cluster.scale(
+                            jobs
+                            # a process that was killed while it started is not started anew otherwise
+                        )
                     elif tell is not None and not client.nthreads():
                         tell(f"{scheduler} has no workers; waiting for some")
                         tell = None  # once
@@ -190,7 +208,9 @@ def _on_cluster(
                 except KilledWorker:
                     if alone:
                         late = "" if limit is None else f", or longer than {limit:g} s"
-                        result = Died(f"{DEATHS} processes died with it: out of memory, a crash{late}")
+                        result = Died(
+                            f"{DEATHS} processes died with it: out of memory, a crash{late}"
+                        )
                     else:
                         suspects.append((key, task))
                         feed()
@@ -214,15 +234,18 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
         "distributed.scheduler.allowed-failures": DEATHS // 2 - 1,  # and as many alone
         "distributed.logging.distributed": "error",
         "distributed.worker.multiprocessing-method": "spawn",
-        "distributed.worker.profile.enabled": False,  # it keeps every second of the last hour, 150 kB each of stacks like ours
-        # Tasks take seconds. At Dask's own intervals, of 20 to 500 ms, looking whether all is well took 4 % of a core.
+        # it keeps every second of the last hour, 150 kB each of stacks like ours
+        "distributed.worker.profile.enabled": False,
+        # Tasks take seconds. At Dask's own intervals, of 20 to 500 ms, looking whether all is well
+        # took 4 % of a core.
         "distributed.admin.tick.interval": "1s",
         "distributed.admin.tick.cycle": "10s",
         "distributed.admin.system-monitor.interval": "5s",
         "distributed.worker.memory.monitor-interval": "1s",
-        "distributed.scheduler.active-memory-manager.start": False,  # results leave the processes at once
-        # So there is nothing to move to the disk; and a process that is paused, for what it keeps of rooms and programs, never
-        # gets less, so that all would wait for it for ever.
+        # results leave the processes at once
+        "distributed.scheduler.active-memory-manager.start": False,
+        # So there is nothing to move to the disk; and a process that is paused, for what it keeps
+        # of rooms and programs, never gets less, so that all would wait for it for ever.
         **{f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")},
         "distributed.comm.timeouts.connect": f"{_CONNECTING:g}s",
     }
@@ -245,7 +268,10 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
             client = Client(scheduler, timeout=_CONNECTING, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(
-                "no scheduler answers there", field="scheduler", expected="tcp://HOST:PORT of a Dask scheduler", got=scheduler
+                "no scheduler answers there",
+                field="scheduler",
+                expected="tcp://HOST:PORT of a Dask scheduler",
+                got=scheduler,
             ) from error
         yield stack.enter_context(client), None
 
@@ -259,14 +285,18 @@ def _share(jobs: int) -> int:
 
 def _watched(function: Function, task: Any, limit: float | None) -> Any:
     """Run one task; end this process if it takes longer than a limit [s], be it in the middle of compiled code."""
-    signal.setitimer(signal.ITIMER_REAL, limit or 0.0)  # nobody handles its signal, which ends the process then
+    signal.setitimer(
+        signal.ITIMER_REAL, limit or 0.0
+    )  # nobody handles its signal, which ends the process then
     try:
         return function(task)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def _elsewhere(function: Function, key: str, task: Any, limit: float | None, parent: int) -> tuple[str, Any]:
+def _elsewhere(
+    function: Function, key: str, task: Any, limit: float | None, parent: int
+) -> tuple[str, Any]:
     """Run one task in a process of its own, which leaves Ctrl-C, that reaches all processes, to `parent` and ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with(parent)

@@ -56,10 +56,11 @@ class Kept:
 
     Attributes:
         lines: The records of every finished task.
-        sessions: For each session its jobs, the number of tasks, the time until the last of them [s] and, if tasks say it, the
-            processor time until then of the process that writes [s].
+        sessions: For each session its jobs, the number of tasks, the time until the last of them
+            [s] and, if tasks say it, the processor time until then of the process that writes [s].
         memory: The largest memory of a process [MB].
-        memories: Process → the memory it used after each of its tasks [MB], in their order; of tasks that say it.
+        memories: Process → the memory it used after each of its tasks [MB], in their order; of
+            tasks that say it.
         processes: Key → the process that ran the task; of tasks that say it.
     """
 
@@ -82,7 +83,9 @@ class Kept:
             with path.open("rb") as stream:
                 kept._parse(path, stream)
         except OSError as error:
-            raise InputError("cannot read this", file=path, expected="a journal", got=error.strerror) from error
+            raise InputError(
+                "cannot read this", file=path, expected="a journal", got=error.strerror
+            ) from error
         return kept
 
     @property
@@ -106,7 +109,9 @@ class Kept:
                 if isinstance(error, InputError):
                     raise
                 expected = "the lines that a run writes"
-                raise InputError("this line is damaged", file=path, line=number, expected=expected) from error
+                raise InputError(
+                    "this line is damaged", file=path, line=number, expected=expected
+                ) from error
             end += len(text)
         return end
 
@@ -146,12 +151,16 @@ class Journal(Kept):
         InputError: Another process has the file, it is not a journal, or its header is another one.
     """
 
-    def __init__(self, path: Path, stream: IO[bytes], header: Mapping[str, Any], what: str = "trials") -> None:
+    def __init__(
+        self, path: Path, stream: IO[bytes], header: Mapping[str, Any], what: str = "trials"
+    ) -> None:
         super().__init__(path)
         try:  # for this process alone
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError("another run is writing to this folder; wait for it, or use another", file=path) from None
+            raise InputError(
+                "another run is writing to this folder; wait for it, or use another", file=path
+            ) from None
         self._path, self._stream, self._what = path, stream, what
         self._header = json.loads(json.dumps(header))
         stream.seek(0)
@@ -190,8 +199,13 @@ class Journal(Kept):
         if differing:
             named = [name for name in differing if name != "specification"] or differing
             problem = f"the {self._what} in this folder were run otherwise; use another folder than {self._path.parent}"
-            was, now = (", ".join(f"{name.rpartition('.')[2]} {side.get(name)}" for name in named) for side in (old, new))
-            raise InputError(problem, file=self._path, field=", ".join(named), expected=was, got=now)
+            was, now = (
+                ", ".join(f"{name.rpartition('.')[2]} {side.get(name)}" for name in named)
+                for side in (old, new)
+            )
+            raise InputError(
+                problem, file=self._path, field=", ".join(named), expected=was, got=now
+            )
 
 
 def _line(data: Mapping[str, Any]) -> bytes:
@@ -204,5 +218,9 @@ def _flat(data: Mapping[str, Any]) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in data.items():
         prefix = "" if name == "settings" else f"{name}."
-        flat |= {f"{prefix}{key}": item for key, item in value.items()} if isinstance(value, Mapping) else {name: value}
+        flat |= (
+            {f"{prefix}{key}": item for key, item in value.items()}
+            if isinstance(value, Mapping)
+            else {name: value}
+        )
     return flat

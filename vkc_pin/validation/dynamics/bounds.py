@@ -17,7 +17,9 @@ _STILL = 1e-9  # of a limit
 _LEAST = 5e-3  # of the duration: less is not told of
 
 
-def bounds(samples: Samples, moments: Moments, torques: Floats, jerk_time: float) -> tuple[Bound, ...]:
+def bounds(
+    samples: Samples, moments: Moments, torques: Floats, jerk_time: float
+) -> tuple[Bound, ...]:
     """Return what bounds a motion and for how long, the longest first; nothing without a curve.
 
     Args:
@@ -42,9 +44,15 @@ def bounds(samples: Samples, moments: Moments, torques: Floats, jerk_time: float
     spans, found = np.diff(curve.times), list[Bound]()
     edges = np.concatenate([[0], np.flatnonzero(np.diff(nearest)) + 1, [len(nearest)]])
     for number in np.unique(nearest).tolist():
-        stretches = [(curve.times[a], curve.times[b]) for a, b in itertools.pairwise(edges) if nearest[a] == number]
+        stretches = [
+            (curve.times[a], curve.times[b])
+            for a, b in itertools.pairwise(edges)
+            if nearest[a] == number
+        ]
         begin, end = max(stretches, key=lambda stretch: float(stretch[1] - stretch[0]))
         name, kind = (*labels, ("", "rest"))[number]
         share = float(spans[nearest == number].sum() / spans.sum())
         found.append(Bound(name, kind, share=share, begin=float(begin), end=float(end)))
-    return tuple(sorted((bound for bound in found if bound.share >= _LEAST), key=lambda bound: -bound.share))
+    return tuple(
+        sorted((bound for bound in found if bound.share >= _LEAST), key=lambda bound: -bound.share)
+    )

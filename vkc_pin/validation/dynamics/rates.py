@@ -21,17 +21,26 @@ JUMP_TOLERANCE = 1e-3  # of an acceleration, relative to its limit
 def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
     """Yield what exceeds limits on velocities and accelerations (eq. 5), and on jerks if there are some, each where it does most.
 
-    A curve begins and ends at rest. Its accelerations are looked at at the ends of its cubics, where they are strongest, and its
-    jerks, which are the same all along each; where there are limits of jerk, accelerations do not jump from one to the next. Of a
-    motion without a curve, whose velocities jump, nothing is said of jerks.
+    A curve begins and ends at rest. Its accelerations are looked at at the ends of its cubics,
+    where they are strongest, and its jerks, which are the same all along each; where there are
+    limits of jerk, accelerations do not jump from one to the next. Of a motion without a curve,
+    whose velocities jump, nothing is said of jerks.
     """
     motion, curve = samples.trajectory, samples.trajectory.curve
     jerks: tuple[Floats, Floats] | None = None
     if curve is None:
-        moments, velocities, accelerations = motion.times, motion.velocities(), motion.accelerations()
+        moments, velocities, accelerations = (
+            motion.times,
+            motion.velocities(),
+            motion.accelerations(),
+        )
         rests = np.zeros((2, len(motion.names)))
     else:
-        moments, (velocities, accelerations), rests = curve.times, curve.speeds(), np.abs(curve.rates[[0, -1]])
+        moments, (velocities, accelerations), rests = (
+            curve.times,
+            curve.speeds(),
+            np.abs(curve.rates[[0, -1]]),
+        )
         jerks = curve.jerks() if options.jerk_time > 0.0 else None
     for i, name in enumerate(motion.names):
         _, _, fastest, strongest = samples.bounds(name)
@@ -42,7 +51,9 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
         ]
         if jerks is not None and np.isfinite(strongest):
             looks.append(("jerk", jerks[0][:, i], strongest / options.jerk_time, "s³", moments))
-            looks.append(("jerk", jerks[1][:, i], JUMP_TOLERANCE * strongest, "s² at once", moments))
+            looks.append(
+                ("jerk", jerks[1][:, i], JUMP_TOLERANCE * strongest, "s² at once", moments)
+            )
         unit = samples.unit(name)
         for kind, values, limit, per, when in looks:
             worst = int(np.argmax(np.abs(values)))
@@ -51,4 +62,12 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
                 at = max(int(np.searchsorted(motion.times, when[worst], side="right")) - 1, 0)
                 detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
                 time, amount = float(motion.times[at]), float(value - limit)
-                yield Violation(kind, name, waypoint=at, time=time, amount=amount, unit=f"{unit}/{per}", detail=detail)
+                yield Violation(
+                    kind,
+                    name,
+                    waypoint=at,
+                    time=time,
+                    amount=amount,
+                    unit=f"{unit}/{per}",
+                    detail=detail,
+                )

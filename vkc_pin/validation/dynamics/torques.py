@@ -15,7 +15,8 @@ from vkc_pin.world.trajectory.dynamics.torques import Moments, Torques, moments_
 
 __all__ = ["TORQUE_TOLERANCE", "Motors"]
 
-TORQUE_TOLERANCE = 5e-3  # excess over a limit, relative to it: torques are looked at at three moments of every cubic
+# excess over a limit, relative to it: torques are looked at at three moments of every cubic
+TORQUE_TOLERANCE = 5e-3
 
 
 class Motors:
@@ -34,13 +35,19 @@ class Motors:
         speeds = np.pad(trajectory.velocities(), ((1, 1), (0, 0)))
         pieces = np.minimum(np.arange(len(trajectory.times)), len(trajectory.times) - 2)
         return Moments(
-            trajectory.times, pieces, trajectory.positions, 0.5 * (speeds[1:] + speeds[:-1]), trajectory.accelerations()
+            trajectory.times,
+            pieces,
+            trajectory.positions,
+            0.5 * (speeds[1:] + speeds[:-1]),
+            trajectory.accelerations(),
         )
 
     @cached_property
     def waypoints(self) -> Ints:
         """After which waypoint each moment is."""
-        edges = self.trajectory.times if self.trajectory.curve is None else self.trajectory.curve.times
+        edges = (
+            self.trajectory.times if self.trajectory.curve is None else self.trajectory.curve.times
+        )
         before = np.searchsorted(self.trajectory.times, edges[:-1], side="right") - 1
         return np.asarray(before[self.moments.pieces])
 
@@ -58,17 +65,30 @@ class Motors:
 
     def _at(self, rows: Ints, speed: float = 1.0) -> Floats:
         now, phases = self.moments, self._torques.phases_of(self.waypoints[rows])
-        return self._torques.at(phases, now.positions[rows], speed * now.velocities[rows], speed**2 * now.accelerations[rows])
+        return self._torques.at(
+            phases,
+            now.positions[rows],
+            speed * now.velocities[rows],
+            speed**2 * now.accelerations[rows],
+        )
 
     def violations(self) -> list[Violation]:
         """Return what is too heavy or too fast, the worst of each joint."""
         found = list[Violation]()
         for k in np.flatnonzero(self.shares.max(axis=0) > 1.0 + TORQUE_TOLERANCE).tolist():
             row = int(np.argmax(self.shares[:, k]))
-            name, limit, torque = self.trajectory.names[k], float(self._torques.efforts.limits[k]), abs(self.torques[row, k])
+            name, limit, torque = (
+                self.trajectory.names[k],
+                float(self._torques.efforts.limits[k]),
+                abs(self.torques[row, k]),
+            )
             unit = "N" if self.samples.unit(name) == "m" else "N·m"
             rest = abs(float(self._at(np.array([row]), 1e-2)[0, k]))
-            why = f"{rest:.4g} {unit} however slow it is" if rest > limit else f"{rest:.4g} {unit} if it were slow"
+            why = (
+                f"{rest:.4g} {unit} however slow it is"
+                if rest > limit
+                else f"{rest:.4g} {unit} if it were slow"
+            )
             found.append(
                 Violation(
                     "torque",
@@ -86,6 +106,12 @@ class Motors:
         """Return what a report says of it; `jerk_time` is that of `Options`."""
         notes = [f"torques not checked: {note}" for note in self._torques.efforts.notes]
         if self._torques.weightless:
-            notes.append(f"carried as if it weighed nothing, as no mass is stated: {', '.join(self._torques.weightless)}")
+            notes.append(
+                f"carried as if it weighed nothing, as no mass is stated: {', '.join(self._torques.weightless)}"
+            )
         found = bounds(self.samples, self.moments, self.shares, jerk_time)
-        return {"torque": float(self.shares.max(initial=0.0)), "bounds": found, "remarks": tuple(notes)}
+        return {
+            "torque": float(self.shares.max(initial=0.0)),
+            "bounds": found,
+            "remarks": tuple(notes),
+        }

@@ -43,11 +43,13 @@ class ClearanceCurve:
         return float(self.distances[k]), float(self.times[k]), " – ".join(self.pairs[k])
 
 
-def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike) -> list[ClearanceCurve]:
+def clearance_curves(
+    scene: Scene, trajectory: Trajectory, times: ArrayLike
+) -> list[ClearanceCurve]:
     """Return how close shapes come along a motion, for each kind of pair that there is.
 
-    The kinds are the robot with itself, with articulated objects, with obstacles, objects with what stands around them,
-    and the gripper with what it grasps, which may touch.
+    The kinds are the robot with itself, with articulated objects, with obstacles, objects with what
+    stands around them, and the gripper with what it grasps, which may touch.
 
     Args:
         scene: Where it happens.
@@ -68,16 +70,28 @@ def clearance_curves(scene: Scene, trajectory: Trajectory, times: ArrayLike) -> 
     gripped = {(link, grasped(scene, hold)) for hold in holds for link in touching(scene, hold)}
     kinds = np.array([_kind(table, pair, gripped) for pair in table.pairs])
     asked = np.array([(min(pair), max(pair)) not in silent for pair in table.pairs.tolist()], bool)
-    groups = {kind: table.pairs[(kinds == kind) & asked] for kind in _KINDS if ((kinds == kind) & asked).any()}
+    groups = {
+        kind: table.pairs[(kinds == kind) & asked]
+        for kind in _KINDS
+        if ((kinds == kind) & asked).any()
+    }
     placed, curves = table.solids.at(world.coordinates.q(world.positions(trajectory, moments))), []
     for kind, pairs in groups.items():
         which, distances = placed.nearest(pairs)
-        names = tuple((world.collision_labels[i], world.collision_labels[j]) for i, j in pairs[which])
+        names = tuple(
+            (world.collision_labels[i], world.collision_labels[j]) for i, j in pairs[which]
+        )
         curves.append(ClearanceCurve(kind, moments, distances, names))
     return curves
 
 
-_KINDS = ("robot – itself", "robot – objects", "robot – obstacles", "objects – surroundings", "gripper – what it grasps")
+_KINDS = (
+    "robot – itself",
+    "robot – objects",
+    "robot – obstacles",
+    "objects – surroundings",
+    "gripper – what it grasps",
+)
 
 
 def _kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> str:

@@ -32,7 +32,8 @@ class Quantity:
     Attributes:
         name: In a word.
         units: Unit of a coordinate → that of the quantity.
-        values: Returns it at times [s], shape (K,) → (K, n), and when: shape (L,) and (L, n). Where it does not exist it is NaN.
+        values: Returns it at times [s], shape (K,) → (K, n), and when: shape (L,) and (L, n). Where
+            it does not exist it is NaN.
         limit: Returns how large it may be for a coordinate, by name; infinite if there is no limit.
         style: How its lines are drawn.
     """
@@ -61,7 +62,11 @@ def _limit(kind: str) -> Callable[[Judged, str], float]:
 
 def _accelerations(plan: Judged, times: Floats) -> tuple[Floats, Floats]:
     motion = plan.trajectory
-    return (times, motion.acceleration(times)) if motion.curve is not None else (motion.times, motion.accelerations())
+    return (
+        (times, motion.acceleration(times))
+        if motion.curve is not None
+        else (motion.times, motion.accelerations())
+    )
 
 
 QUANTITIES: tuple[Quantity, ...] = (
@@ -96,20 +101,32 @@ def _jerk() -> Quantity:
     def values(plan: Judged, times: Floats) -> tuple[Floats, Floats]:
         curve = plan.trajectory.curve
         assert curve is not None
-        edges = curve.acceleration(curve.times[:-1] + 0.5 * np.diff(curve.times)) - curve.acceleration(curve.times[:-1])
+        edges = curve.acceleration(
+            curve.times[:-1] + 0.5 * np.diff(curve.times)
+        ) - curve.acceleration(curve.times[:-1])
         jerks = 2.0 * edges / np.diff(curve.times)[:, None]
         return curve.times, np.concatenate([jerks, jerks[-1:]])
 
     def limit(plan: Judged, name: str) -> float:
         return _limit("acceleration")(plan, name) / plan.options.jerk_time
 
-    return Quantity("jerk", {"m": "m/s³", "rad": "rad/s³"}, values, limit, lambda motion: {"drawstyle": "steps-post"})
+    return Quantity(
+        "jerk",
+        {"m": "m/s³", "rad": "rad/s³"},
+        values,
+        limit,
+        lambda motion: {"drawstyle": "steps-post"},
+    )
 
 
 def groups_of(trajectory: Trajectory) -> dict[str, list[int]]:
     """Return the columns of a trajectory by what they belong to."""
     names, robot = trajectory.names, trajectory.robot_size
-    groups = {"base": list(range(3)), "arm": list(range(3, robot)), "object": list(range(robot, len(names)))}
+    groups = {
+        "base": list(range(3)),
+        "arm": list(range(3, robot)),
+        "object": list(range(robot, len(names))),
+    }
     return {name: columns for name, columns in groups.items() if columns}
 
 
@@ -129,8 +146,18 @@ def draw_joints(figure: FigureBase, plan: Judged) -> None:
             _draw(place, plan, quantity, group, own, moments, values)
     for row in axes:
         handles = row[0].get_legend_handles_labels()[0]
-        limited = [handle for place in row for handle in place.get_legend_handles_labels()[0] if handle.get_label() == "limit"]
-        row[-1].legend(handles=[*handles, *limited[:1]], loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
+        limited = [
+            handle
+            for place in row
+            for handle in place.get_legend_handles_labels()[0]
+            if handle.get_label() == "limit"
+        ]
+        row[-1].legend(
+            handles=[*handles, *limited[:1]],
+            loc="center left",
+            bbox_to_anchor=(1.0, 0.5),
+            fontsize=7.5,
+        )
     for place in axes.ravel():
         shade_phases(place, motion)
         place.margins(x=0.0)
@@ -140,12 +167,24 @@ def draw_joints(figure: FigureBase, plan: Judged) -> None:
         place.set_xlabel("time [s]")
 
 
-def _draw(place: Axes, plan: Judged, quantity: Quantity, group: str, columns: list[int], moments: Floats, values: Floats) -> None:
+def _draw(
+    place: Axes,
+    plan: Judged,
+    quantity: Quantity,
+    group: str,
+    columns: list[int],
+    moments: Floats,
+    values: Floats,
+) -> None:
     """Draw a quantity of some coordinates, and their limits."""
     names = plan.trajectory.names
     place.set_visible(bool(np.isfinite(values[:, columns]).any()))
     for k, column in enumerate(columns):
-        style = {"color": COLOURS[k % len(COLOURS)], "linewidth": 1.3, **quantity.style(plan.trajectory)}
+        style = {
+            "color": COLOURS[k % len(COLOURS)],
+            "linewidth": 1.3,
+            **quantity.style(plan.trajectory),
+        }
         place.plot(moments, values[:, column], label=names[column].removesuffix("_joint"), **style)
     limits = [quantity.limit(plan, names[column]) for column in columns]
     for limit in sorted(set(filter(np.isfinite, limits))):
@@ -165,4 +204,12 @@ def name_phases(axes: Axes, plan: Judged) -> None:
     for k, phase in enumerate(plan.trajectory.phases):
         middle = (times[phase.first] + times[phase.last]) / 2.0
         x = float(np.clip((middle - times[0]) / (times[-1] - times[0]), 0.12, 0.88))
-        axes.text(x, 1.02 + 0.09 * (k % 2), phase.name, transform=axes.transAxes, ha="center", fontsize=7.5, color="0.35")
+        axes.text(
+            x,
+            1.02 + 0.09 * (k % 2),
+            phase.name,
+            transform=axes.transAxes,
+            ha="center",
+            fontsize=7.5,
+            color="0.35",
+        )

@@ -20,7 +20,11 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["motion_html", "scene_html"]
 
-_SIDE, _DPI, _COLOURS = 4.4, 72, 96  # [inch] of the picture's longer side, its resolution, and its colours
+_SIDE, _DPI, _COLOURS = (
+    4.4,
+    72,
+    96,
+)  # [inch] of the picture's longer side, its resolution, and its colours
 _LISTED = 6  # violations and notes that are shown; the report has them all
 _GOOD, _BAD = "#1a7f37", "#c62828"
 
@@ -42,7 +46,9 @@ def scene_html(scene: Scene) -> str:
         ("objects", escape(", ".join(objects) or "none")),
         ("obstacles", str(len(scene.obstacle_names))),
     ]
-    return _beside(f"<b>{escape(scene.name)}</b>{_table(rows)}", _picture(scene, None, "the scene from above"))
+    return _beside(
+        f"<b>{escape(scene.name)}</b>{_table(rows)}", _picture(scene, None, "the scene from above")
+    )
 
 
 def motion_html(plan: Judged) -> str:
@@ -60,8 +66,13 @@ def motion_html(plan: Judged) -> str:
         ("planned in", _value(m, "planning_time", "s", 2)),
         ("seed", escape(f"{plan.initialization or 'unknown'}, random numbers {plan.seed}")),
     ]
-    found = [str(violation) for violation in plan.validation.violations] + list(plan.validation.notes)
-    lines = [*found[:_LISTED], *([f"... and {len(found) - _LISTED} more"] if len(found) > _LISTED else [])]
+    found = [str(violation) for violation in plan.validation.violations] + list(
+        plan.validation.notes
+    )
+    lines = [
+        *found[:_LISTED],
+        *([f"... and {len(found) - _LISTED} more"] if len(found) > _LISTED else []),
+    ]
     listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
     problems = f'<ul style="color: {_BAD}; margin: 4px 0">{listed}</ul>' if lines else ""
     view = _picture(plan.scene, plan.trajectory, "the motion from above")
@@ -95,7 +106,11 @@ def _picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
     wide, high = x_max - x_min, y_max - y_min
     scale = _SIDE / max(wide, high)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(max(2.6, scale * wide) + 0.4, max(1.8, scale * high) + 0.6), dpi=_DPI, layout="constrained")
+        figure = Figure(
+            figsize=(max(2.6, scale * wide) + 0.4, max(1.8, scale * high) + 0.6),
+            dpi=_DPI,
+            layout="constrained",
+        )
         canvas = cast(Any, FigureCanvasAgg(figure))  # its methods have no types
         draw_top_view(figure, World(scene), trajectory, columns=2)
         canvas.draw()
@@ -106,6 +121,10 @@ def _picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
     return f'<img alt="{escape(title)}" style="max-width: 100%" src="data:image/png;base64,{data}">'
 
 
-def _value(metrics: Mapping[str, float], name: str, unit: str, digits: int, factor: float = 1.0) -> str:
+def _value(
+    metrics: Mapping[str, float], name: str, unit: str, digits: int, factor: float = 1.0
+) -> str:
     value = metrics.get(name)
-    return f"{factor * value:.{digits}f} {unit}" if value is not None and np.isfinite(value) else "–"
+    return (
+        f"{factor * value:.{digits}f} {unit}" if value is not None and np.isfinite(value) else "–"
+    )

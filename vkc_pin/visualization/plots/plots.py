@@ -34,8 +34,9 @@ def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Fig
 
     Args:
         plan: What to draw.
-        path: A folder (made if need be) that gets `joints.png`, `clearance.png` and `top_view.png`; or a file ending with
-            .png, .svg or .pdf that gets all in one figure; None writes nothing. Files are written whole or not at all.
+        path: A folder (made if need be) that gets `joints.png`, `clearance.png` and `top_view.png`;
+            or a file ending with .png, .svg or .pdf that gets all in one figure; None writes
+            nothing. Files are written whole or not at all.
 
     Returns:
         With a folder the figures by name, otherwise the one figure.
@@ -50,7 +51,11 @@ def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Fig
     if target.is_file():
         expected = f"a folder, or a name ending with {', '.join(PICTURES)}"
         raise InputError("this is a file", field="path", file=target, expected=expected)
-    figures = {"joints": plot_joints(plan), "clearance": plot_clearance(plan), "top_view": plot_top_view(plan)}
+    figures = {
+        "joints": plot_joints(plan),
+        "clearance": plot_clearance(plan),
+        "top_view": plot_top_view(plan),
+    }
     for name, figure in figures.items():
         save_figure(figure, target / f"{name}.png")
     return figures
@@ -79,14 +84,18 @@ def plot_top_view(plan: Judged) -> Figure:
     _check(plan)
     x_min, x_max, y_min, y_max = plan.scene.arena
     with styled():
-        figure = new_figure(9.0, float(np.clip(9.0 * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0)))
+        figure = new_figure(
+            9.0, float(np.clip(9.0 * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0))
+        )
         draw_top_view(figure, World(plan.scene), plan.trajectory)
     return figure
 
 
 def _check(plan: Judged) -> None:
     if not isinstance(plan, Judged):
-        raise InputError("this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__)
+        raise InputError(
+            "this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__
+        )
 
 
 def _combined(plan: Judged) -> Figure:
@@ -98,13 +107,20 @@ def _combined(plan: Judged) -> Figure:
         left, right = lower.subfigures(1, 2, width_ratios=(1.0, 1.25))
         _draw_clearance(left, plan)
         draw_top_view(right, World(plan.scene), plan.trajectory)
-        figure.suptitle(f"{plan.scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}", fontweight="bold")
+        figure.suptitle(
+            f"{plan.scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
+            fontweight="bold",
+        )
     return figure
 
 
 def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
     axes, trajectory = figure.subplots(), plan.trajectory
-    times = np.unique(np.concatenate([np.linspace(trajectory.times[0], trajectory.times[-1], SAMPLES), trajectory.times]))
+    times = np.unique(
+        np.concatenate(
+            [np.linspace(trajectory.times[0], trajectory.times[-1], SAMPLES), trajectory.times]
+        )
+    )
     safe = plan.options.dist_safe
     lowest = 0.0
     for k, curve in enumerate(clearance_curves(plan.scene, trajectory, times)):
@@ -113,11 +129,24 @@ def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
         colour = "0.6" if touching else COLOURS[k % len(COLOURS)]
         label = f"{curve.name}: {1e3 * distance:.0f} mm, {pair}, {when:.1f} s"
         style = ":" if touching else "-"
-        axes.plot(curve.times, 1e3 * curve.distances, color=colour, linestyle=style, linewidth=1.5, label=label)
+        axes.plot(
+            curve.times,
+            1e3 * curve.distances,
+            color=colour,
+            linestyle=style,
+            linewidth=1.5,
+            label=label,
+        )
         if distance < _SHOWN:
             axes.plot([when], [1e3 * distance], "o", color=colour, markersize=4.5)
         lowest = min(lowest, distance)
-    axes.axhline(1e3 * safe, color="0.35", linestyle=(0, (5, 3)), linewidth=0.9, label=f"asked for: {1e3 * safe:.0f} mm")
+    axes.axhline(
+        1e3 * safe,
+        color="0.35",
+        linestyle=(0, (5, 3)),
+        linewidth=0.9,
+        label=f"asked for: {1e3 * safe:.0f} mm",
+    )
     if lowest < 0.0:
         axes.axhspan(1e3 * lowest * 1.1, 0.0, color="#d1495b", alpha=0.12, linewidth=0.0)
     axes.set_ylim(1e3 * lowest * 1.1, 1e3 * _SHOWN)

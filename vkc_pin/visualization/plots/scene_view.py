@@ -46,13 +46,17 @@ class Approach(NamedTuple):
 
 
 def plot_scene(
-    scene: Scene, approaches: Sequence[Approach] = (), stuck: Sequence[str] = (), path: str | Path | None = None
+    scene: Scene,
+    approaches: Sequence[Approach] = (),
+    stuck: Sequence[str] = (),
+    path: str | Path | None = None,
 ) -> Figure:
     """Draw a scene from above.
 
     Args:
         scene: The scene.
-        approaches: Arrows to draw, in blue if the hand gets there, with a dot where the base stands, otherwise in red.
+        approaches: Arrows to draw, in blue if the hand gets there, with a dot where the base
+            stands, otherwise in red.
         stuck: Labels of links and obstacles to outline in red.
         path: Where to write the picture, a name that ends with .png, .svg or .pdf; None: nowhere.
 
@@ -64,7 +68,10 @@ def plot_scene(
     target = None if path is None else file_path(path, "path")
     if target is not None and target.suffix.lower() not in PICTURES:
         raise InputError(
-            "not the name of a picture", field="path", expected=f"one that ends with {', '.join(PICTURES)}", got=path
+            "not the name of a picture",
+            field="path",
+            expected=f"one that ends with {', '.join(PICTURES)}",
+            got=path,
         )
     world, (blue, red) = World(scene), COLOURS[:2]
     with styled():
@@ -77,15 +84,25 @@ def plot_scene(
             if label in stuck and label != FLOOR:
                 where = data.oMi[shape.parentJoint] * shape.placement
                 corners = triangles(shape.geometry)[0] @ where.rotation.T + where.translation
-                axes.add_patch(Polygon(outline(corners), fill=False, edgecolor=red, linewidth=2.0, zorder=6))
+                axes.add_patch(
+                    Polygon(outline(corners), fill=False, edgecolor=red, linewidth=2.0, zorder=6)
+                )
         names: list[tuple[str, tuple[float, float], tuple[str, str]]] = []
         for name, at, direction, base in approaches:
             (x, y), (u, v) = at[:2].tolist(), (at[:2] - _ARROW * direction[:2]).tolist()
             colour = red if base is None else blue
-            axes.annotate("", (x, y), (u, v), arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.8}, zorder=7)
+            axes.annotate(
+                "",
+                (x, y),
+                (u, v),
+                arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.8},
+                zorder=7,
+            )
             owner, _, own = name.partition(".")
             beside = (
-                k for k, (_, place, one) in enumerate(names) if one == (owner, colour) and math.dist(place, (u, v)) < _BESIDE
+                k
+                for k, (_, place, one) in enumerate(names)
+                if one == (owner, colour) and math.dist(place, (u, v)) < _BESIDE
             )
             k = next(beside, None)
             if k is None:

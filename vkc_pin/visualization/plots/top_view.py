@@ -25,7 +25,9 @@ _ROBOT_HEIGHT = 1.8  # [m]: what hangs higher is drawn dashed
 _START, _END, _TOOL, _BASE = "#3a6bc4", "#1a9961", "#e03359", "#2b5f9e"
 
 
-def draw_top_view(figure: FigureBase, world: World, trajectory: Trajectory | None, *, columns: int = 4) -> None:
+def draw_top_view(
+    figure: FigureBase, world: World, trajectory: Trajectory | None, *, columns: int = 4
+) -> None:
     """Draw a motion from above into an empty figure, from the collision geometry.
 
     Args:
@@ -64,7 +66,9 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
 
     times = np.zeros(1) if trajectory is None else _moments(trajectory)
     motion = sample_motion(world, trajectory, times)
-    shades = LinearSegmentedColormap.from_list("time", [_START, _END])(np.linspace(0.0, 1.0, len(times)))
+    shades = LinearSegmentedColormap.from_list("time", [_START, _END])(
+        np.linspace(0.0, 1.0, len(times))
+    )
     robot, moving = [], []
     known: dict[int, Floats] = {}
     for i, shape in enumerate(world.shapes):
@@ -77,21 +81,53 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
         base = np.concatenate([_corners(world, i, motion.world[k, 1], known) for i in robot])
         drawn = {"edgecolor": colour, "linewidth": 1.6 if ends else 0.8, "zorder": 3}
         label = "start" if k == 0 else "end" if k == len(times) - 1 else None
-        axes.add_patch(Polygon(outline(base), facecolor=(*colour[:3], 0.22 if ends else 0.05), label=label, **drawn))
+        axes.add_patch(
+            Polygon(
+                outline(base), facecolor=(*colour[:3], 0.22 if ends else 0.05), label=label, **drawn
+            )
+        )
         if ends:
-            tail, nose = (motion.world[k, 1] @ np.array([[0.0, 0.0, 0.0, 1.0], [0.45, 0.0, 0.0, 1.0]]).T)[:2].T
-            axes.annotate("", nose, tail, arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.6}, zorder=4)
+            tail, nose = (
+                motion.world[k, 1] @ np.array([[0.0, 0.0, 0.0, 1.0], [0.45, 0.0, 0.0, 1.0]]).T
+            )[:2].T
+            axes.annotate(
+                "",
+                nose,
+                tail,
+                arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.6},
+                zorder=4,
+            )
         for i in moving:
             joint = world.shapes[i].parentJoint
-            if not ends and np.allclose(motion.world[k, joint], motion.world[k - 1, joint], atol=1e-3):
+            if not ends and np.allclose(
+                motion.world[k, joint], motion.world[k - 1, joint], atol=1e-3
+            ):
                 continue
             corners = _corners(world, i, motion.world[k, joint], known)
-            axes.add_patch(Polygon(outline(corners), facecolor=(*colour[:3], 0.35 if ends else 0.1), **drawn))
+            axes.add_patch(
+                Polygon(outline(corners), facecolor=(*colour[:3], 0.35 if ends else 0.1), **drawn)
+            )
     if trajectory is None:
         return
-    fine = sample_motion(world, trajectory, np.linspace(trajectory.times[0], trajectory.times[-1], 400))
-    axes.plot(fine.base[:, 0], fine.base[:, 1], color=_BASE, linewidth=1.6, zorder=4, label="path of the base")
-    axes.plot(fine.tool[:, 0], fine.tool[:, 1], color=_TOOL, linewidth=1.6, zorder=4, label="path of the tool")
+    fine = sample_motion(
+        world, trajectory, np.linspace(trajectory.times[0], trajectory.times[-1], 400)
+    )
+    axes.plot(
+        fine.base[:, 0],
+        fine.base[:, 1],
+        color=_BASE,
+        linewidth=1.6,
+        zorder=4,
+        label="path of the base",
+    )
+    axes.plot(
+        fine.tool[:, 0],
+        fine.tool[:, 1],
+        color=_TOOL,
+        linewidth=1.6,
+        zorder=4,
+        label="path of the tool",
+    )
     for path, name in ((fine.base, _BASE), (fine.tool, _TOOL)):
         axes.plot(*path[0, :2], "o", color=name, markersize=4.5, zorder=5)
         axes.plot(*path[-1, :2], "s", color=name, markersize=4.5, zorder=5)
@@ -102,10 +138,18 @@ def _moments(trajectory: Trajectory) -> Floats:
     fine = np.linspace(trajectory.times[0], trajectory.times[-1], 400)
     rows = trajectory.at(fine)
     objects = np.abs(np.diff(rows[:, trajectory.robot_size :], axis=0)).sum(axis=1)
-    travel = np.hypot(*np.diff(rows[:, :2], axis=0).T) + 0.3 * np.abs(np.diff(rows[:, 2])) + 0.5 * objects
+    travel = (
+        np.hypot(*np.diff(rows[:, :2], axis=0).T)
+        + 0.3 * np.abs(np.diff(rows[:, 2]))
+        + 0.5 * objects
+    )
     passed = np.concatenate([[0.0], np.cumsum(travel)])
     count = int(np.clip(np.ceil(passed[-1] / _STEP), 1, 14))
-    return np.unique(np.interp(np.linspace(0.0, passed[-1], count + 1), passed, fine)) if passed[-1] > 0.0 else fine[[0, -1]]
+    return (
+        np.unique(np.interp(np.linspace(0.0, passed[-1], count + 1), passed, fine))
+        if passed[-1] > 0.0
+        else fine[[0, -1]]
+    )
 
 
 def _corners(world: World, index: int, joint: Floats, known: dict[int, Floats]) -> Floats:

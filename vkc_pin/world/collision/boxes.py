@@ -39,7 +39,14 @@ class Boxes:
     """
 
     def __init__(
-        self, joints: Ints, rotations: Floats, centers: Floats, halves: Floats, pairs: Ints, *, threads: int | None = None
+        self,
+        joints: Ints,
+        rotations: Floats,
+        centers: Floats,
+        halves: Floats,
+        pairs: Ints,
+        *,
+        threads: int | None = None,
     ) -> None:
         self.threads = available_threads() if threads is None else threads
         self.pairs = pairs
@@ -52,17 +59,22 @@ class Boxes:
         other.compiled = self.compiled.placed(which, rotations, centers)
         return other
 
-    def near(self, reach: float, rotations: Floats, translations: Floats, *, standing: bool = True) -> tuple[Ints, Ints, Floats]:
+    def near(
+        self, reach: float, rotations: Floats, translations: Floats, *, standing: bool = True
+    ) -> tuple[Ints, Ints, Floats]:
         """Return (configuration, pair) of all pairs that bounding volumes cannot prove to be `reach` apart, in this order.
 
-        First balls (against boxes where they stand in the world), then what the face normals of both boxes separate. The third
-        array has lower bounds of the signed distances [m]. It makes no difference how many configurations are looked at together.
+        First balls (against boxes where they stand in the world), then what the face normals of
+        both boxes separate. The third array has lower bounds of the signed distances [m]. It makes
+        no difference how many configurations are looked at together.
 
         Args:
             reach: [m].
-            rotations: Of all joints in the world, shape (W, J, 3, 3); joint 0, the world, is among the J.
+            rotations: Of all joints in the world, shape (W, J, 3, 3); joint 0, the world, is among
+                the J.
             translations: Of all joints in the world, shape (W, J, 3) [m].
-            standing: Whether what stands in the world counts, too; otherwise only pairs of which both move.
+            standing: Whether what stands in the world counts, too; otherwise only pairs of which
+                both move.
 
         Raises:
             IndexError: A box is on none of these joints.

@@ -30,7 +30,8 @@ class Nearest(NamedTuple):
         distance: Signed, shape (C,) [m].
         margin: What the pair must keep there, shape (C,) [m].
         normal: From its first shape to its second, world frame, shape (C, 3).
-        first, second: The points that are closest, or deepest, on either, world frame, shape (C, 3) each [m].
+        first, second: The points that are closest, or deepest, on either, world frame, shape (C, 3)
+            each [m].
     """
 
     row: Ints
@@ -54,7 +55,9 @@ class Clearances:
         margins: What the pairs must keep.
     """
 
-    def __init__(self, placements: ShapePlacements, boxes: Boxes, shapes: Shapes, margins: Margins) -> None:
+    def __init__(
+        self, placements: ShapePlacements, boxes: Boxes, shapes: Shapes, margins: Margins
+    ) -> None:
         self.placements, self.boxes, self.shapes, self.margins = placements, boxes, shapes, margins
         self._parts = placements.compiled, boxes.compiled, shapes.compiled, margins.compiled
         self._nearest, self._first_blocked = compiled().nearest, compiled().first_blocked
@@ -64,7 +67,14 @@ class Clearances:
         return Clearances(self.placements, boxes, self.shapes.placed(where), self.margins)
 
     def nearest(
-        self, q: Floats, z: Floats, waypoints: Ints, *, reach: float, most: int | None = None, standing: bool = True
+        self,
+        q: Floats,
+        z: Floats,
+        waypoints: Ints,
+        *,
+        reach: float,
+        most: int | None = None,
+        standing: bool = True,
     ) -> Nearest:
         """Return, for each configuration, the pairs closer than `reach` that fall shortest of their margins.
 
@@ -81,12 +91,19 @@ class Clearances:
         """
         threads = max(1, min(self.shapes.threads, len(q) // _WORTH))
         limit = -1 if most is None else most
-        return Nearest(*self._nearest(*self._parts, q, z, waypoints, reach, limit, standing, _ROUNDING, threads))
+        return Nearest(
+            *self._nearest(
+                *self._parts, q, z, waypoints, reach, limit, standing, _ROUNDING, threads
+            )
+        )
 
-    def first_blocked(self, q: Floats, z: Floats, waypoint: int, *, reach: float, allowed: float) -> int:
+    def first_blocked(
+        self, q: Floats, z: Floats, waypoint: int, *, reach: float, allowed: float
+    ) -> int:
         """Return the first configuration in which a pair closer than `reach` falls short of its margin by more than `allowed`.
 
-        If there is none, the number of configurations. Nothing is looked at after it, nor any pair after that one.
+        If there is none, the number of configurations. Nothing is looked at after it, nor any pair
+        after that one.
 
         Args:
             q: Pinocchio's configurations, shape (W, nq).
@@ -101,18 +118,29 @@ class Clearances:
         return int(self._first_blocked(*self._parts, q, z, waypoint, reach, allowed, _ROUNDING))
 
     def lines(
-        self, places: Sequence[Ints], z: Floats, waypoint: int, *, weights: Floats, step: float, reach: float, allowed: float
+        self,
+        places: Sequence[Ints],
+        z: Floats,
+        waypoint: int,
+        *,
+        weights: Floats,
+        step: float,
+        reach: float,
+        allowed: float,
     ) -> Any:
         """Return what looks at straight lines from configuration to configuration: up to the first in which `first_blocked` is.
 
         Compiled searches are made with it. It must not outlive what this was made of.
 
         Args:
-            places: Where in Pinocchio's configurations the numbers of z go; see `world.models.coordinates.Coordinates.places`.
+            places: Where in Pinocchio's configurations the numbers of z go; see
+                `world.models.coordinates.Coordinates.places`.
             z: A configuration, shape (n,).
             waypoint: At which margins are looked up.
-            weights: For each coordinate that moves, the first ones of z, how much it counts, shape (m,).
-            step: How far each coordinate, times its weight, goes at most from one configuration to the next.
+            weights: For each coordinate that moves, the first ones of z, how much it counts, shape
+                (m,).
+            step: How far each coordinate, times its weight, goes at most from one configuration to
+                the next.
             reach: Pairs further apart do not count [m].
             allowed: By how much pairs may fall short of their margins [m].
 
@@ -121,4 +149,6 @@ class Clearances:
         """
         where = [np.ascontiguousarray(part, np.int64) for part in places]
         moved = np.ascontiguousarray(z, float), np.ascontiguousarray(weights, float)
-        return compiled().Lines(*self._parts, *where, *moved, step, waypoint, reach, allowed, _ROUNDING)
+        return compiled().Lines(
+            *self._parts, *where, *moved, step, waypoint, reach, allowed, _ROUNDING
+        )

@@ -35,7 +35,8 @@ class Margins:
 
     Args:
         usual: The pairs' clearances, shape (P,) [m].
-        eased: Pair → (first waypoint, last waypoint, margin [m]): between these it may come closer, so close.
+        eased: Pair → (first waypoint, last waypoint, margin [m]): between these it may come closer,
+            so close.
         places: Where pairs may come closer.
 
     Raises:
@@ -44,7 +45,10 @@ class Margins:
     """
 
     def __init__(
-        self, usual: Floats, eased: Mapping[int, Sequence[tuple[int, int, float]]], places: Iterable[Place] = ()
+        self,
+        usual: Floats,
+        eased: Mapping[int, Sequence[tuple[int, int, float]]],
+        places: Iterable[Place] = (),
     ) -> None:
         self.compiled: Any = compiled().Margins(usual)
         for pair, spans in eased.items():

@@ -40,7 +40,9 @@ class ShapePlacements:
         model.saveToBinary(described)
         content = bytes(described.view())  # as tobytes() does, which leaks a view at every call
         joints = np.array([shape.parentJoint for shape in shapes], np.int64)
-        self.compiled: Any = compiled().Bodies(content, joints, columns_of([shape.placement for shape in shapes]))
+        self.compiled: Any = compiled().Bodies(
+            content, joints, columns_of([shape.placement for shape in shapes])
+        )
 
     def at(self, q: Floats) -> Floats:
         """Return the placements in the world at Pinocchio's configurations, shape (W, nq): shape (W, M, 12), see `columns_of`."""

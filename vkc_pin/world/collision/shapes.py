@@ -26,7 +26,8 @@ class Witnesses(NamedTuple):
     Attributes:
         distance: Signed, negative where shapes overlap, shape (n,) [m].
         normal: From the first to the second, world frame, shape (n, 3).
-        first, second: The points that are closest, or deepest, on either, world frame, shape (n, 3) each [m].
+        first, second: The points that are closest, or deepest, on either, world frame, shape (n, 3)
+            each [m].
     """
 
     distance: Floats
@@ -38,16 +39,18 @@ class Witnesses(NamedTuple):
 class Shapes:
     """Shapes that move, then shapes that stand, G in all; coal's distances between them, whatever was asked before.
 
-    They are coal's to the last bit (`coal.distance` with a result of its own), however many threads look for them. States say
-    where what moves is: placements in the world, shape (W, M, 12), see `placements.columns_of`.
+    They are coal's to the last bit (`coal.distance` with a result of its own), however many threads
+    look for them. States say where what moves is: placements in the world, shape (W, M, 12), see
+    `placements.columns_of`.
 
     Args:
         geometries: coal's shapes, first those that move.
         standing: Where the last of them stand in the world, S of them; the other M move.
-        tolerance: Of GJK. At 1e-8 normals are good enough for gradients, at coal's own 1e-6 these are off by up to 5e-3. It takes
-            no longer. (Penetration keeps its tolerance: below 1e-6 it fails for cylinders.)
-        threads: How many look for distances at most; None: as many as there are cores for this process, 8 at most, or
-            `OMP_NUM_THREADS`.
+        tolerance: Of GJK. At 1e-8 normals are good enough for gradients, at coal's own 1e-6 these
+            are off by up to 5e-3. It takes no longer. (Penetration keeps its tolerance: below 1e-6
+            it fails for cylinders.)
+        threads: How many look for distances at most; None: as many as there are cores for this
+            process, 8 at most, or `OMP_NUM_THREADS`.
 
     Raises:
         InputError: A shape is of a kind that is not known; see `solids.solid_of`.
@@ -70,7 +73,9 @@ class Shapes:
         """Return the same with some that stand placed elsewhere in the world; `where` goes by their numbers among the G."""
         other = object.__new__(Shapes)
         other.threads = self.threads
-        other.compiled = self.compiled.placed(np.array(list(where), np.int64), columns_of(list(where.values())))
+        other.compiled = self.compiled.placed(
+            np.array(list(where), np.int64), columns_of(list(where.values()))
+        )
         return other
 
     def distances(self, moving: Floats, states: Ints, pairs: Ints) -> Floats:
@@ -89,7 +94,9 @@ class Shapes:
 
     def witnesses(self, moving: Floats, states: Ints, pairs: Ints) -> Witnesses:
         """Return distances, normals and the closest points; arguments and errors as of `distances`."""
-        return _witnesses(self.compiled.distances(moving, states, pairs, True, self._threads(len(pairs))))
+        return _witnesses(
+            self.compiled.distances(moving, states, pairs, True, self._threads(len(pairs)))
+        )
 
     def shortest(
         self,
@@ -114,8 +121,8 @@ class Shapes:
             margins: What distances are compared with, shape (n,) [m].
             bounds: What is known of distance − margin: at least so much, shape (n,) [m].
             reach: Pairs further apart are left out [m].
-            most: How many to return for each state; None: all. Pairs of which `bounds` shows that they are not among them are not
-                asked for.
+            most: How many to return for each state; None: all. Pairs of which `bounds` shows that
+                they are not among them are not asked for.
             rounding: How much larger than distance − margin `bounds` may be [m].
 
         Returns:
@@ -126,7 +133,9 @@ class Shapes:
         """
         limits, limit = np.column_stack([margins, bounds]), -1 if most is None else most
         threads = self._threads(len(pairs))
-        chosen, table = self.compiled.shortest(moving, edges, pairs, numbers, limits, reach, limit, rounding, threads)
+        chosen, table = self.compiled.shortest(
+            moving, edges, pairs, numbers, limits, reach, limit, rounding, threads
+        )
         return chosen, _witnesses(table)
 
     def _threads(self, rows: int) -> int:

@@ -23,7 +23,8 @@ def compiled() -> Any:
     """Return the compiled module, imported once and after coal and Pinocchio, whose libraries it uses.
 
     Raises:
-        BuildError: It is missing, or was compiled against another release of one of these than is installed.
+        BuildError: It is missing, or was compiled against another release of one of these than is
+            installed.
     """
     module = compiled_module("vkc_pin.world.collision._distances")
     for package, version, installed in (
@@ -42,14 +43,17 @@ def compiled() -> Any:
 def solid_of(shape: coal.CollisionGeometry) -> Any:
     """Return a coal shape as the compiled module has it, with the same numbers and the radius that is swept around it.
 
-    What is made of points and faces is kept as long as the shape lives and its points stay the same.
+    What is made of points and faces is kept as long as the shape lives and its points stay the
+    same.
 
     Raises:
         InputError: It is of a kind that is not known here.
         BuildError: See `compiled`.
     """
     if isinstance(shape, coal.Convex):
-        return _kept(shape, np.asarray(shape.points(), np.float64), float(shape.getSweptSphereRadius()))
+        return _kept(
+            shape, np.asarray(shape.points(), np.float64), float(shape.getSweptSphereRadius())
+        )
     if isinstance(shape, coal.BVHModelOBBRSS):
         return _kept(shape, np.asarray(shape.vertices(), np.float64), 0.0)
     if isinstance(shape, coal.Box):
@@ -66,8 +70,16 @@ def solid_of(shape: coal.CollisionGeometry) -> Any:
         numbers = (*shape.n, shape.d)
     else:
         known = "a primitive, a convex shape or a mesh (BVHModelOBBRSS)"
-        raise InputError("distances to this kind of shape are not known", expected=known, got=type(shape).__name__)
-    return compiled().primitive(type(shape).__name__, np.asarray(numbers, float).tolist(), float(shape.getSweptSphereRadius()))
+        raise InputError(
+            "distances to this kind of shape are not known",
+            expected=known,
+            got=type(shape).__name__,
+        )
+    return compiled().primitive(
+        type(shape).__name__,
+        np.asarray(numbers, float).tolist(),
+        float(shape.getSweptSphereRadius()),
+    )
 
 
 _known: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of a shape
@@ -81,6 +93,10 @@ def _kept(shape: Any, points: Floats, radius: float) -> Any:
         if owner() is shape and before == content and swept == radius:
             return solid
     faces = indices(shape)
-    solid = compiled().convex(points, faces, radius) if isinstance(shape, coal.Convex) else compiled().mesh(points, faces)
+    solid = (
+        compiled().convex(points, faces, radius)
+        if isinstance(shape, coal.Convex)
+        else compiled().mesh(points, faces)
+    )
     _known[key] = (weakref.ref(shape, lambda _: _known.pop(key, None)), content, radius, solid)
     return solid

@@ -25,30 +25,55 @@ class WorldBoxes:
         BuildError: See `solids.compiled`.
     """
 
-    def __init__(self, lower: Floats, upper: Floats, standing_lower: Floats, standing_upper: Floats) -> None:
-        corners = (np.ascontiguousarray(part, float) for part in (lower, upper, standing_lower, standing_upper))
+    def __init__(
+        self, lower: Floats, upper: Floats, standing_lower: Floats, standing_upper: Floats
+    ) -> None:
+        corners = (
+            np.ascontiguousarray(part, float)
+            for part in (lower, upper, standing_lower, standing_upper)
+        )
         self.compiled: Any = compiled().WorldBoxes(*corners)
 
     def near(
-        self, first: Ints, last: Ints, pairs: Ints, *, moved: Floats, moves: Bools, phases: Ints, limit: float
+        self,
+        first: Ints,
+        last: Ints,
+        pairs: Ints,
+        *,
+        moved: Floats,
+        moves: Bools,
+        phases: Ints,
+        limit: float,
     ) -> tuple[Ints, Ints]:
         """Return (k, pair) of all pairs that may come closer than `limit` [m] in a stretch k, by k and then by pair.
 
-        The distance of two shapes, b at the stretch's ends by their boxes, is at least (b + b' − relative motion) / 2 in between.
+        The distance of two shapes, b at the stretch's ends by their boxes, is at least (b + b' −
+        relative motion) / 2 in between.
 
         Args:
             first: States at which stretches begin, shape (K,).
-            last: States at which they end, shape (K,); with no motion in between they may be the same.
+            last: States at which they end, shape (K,); with no motion in between they may be the
+                same.
             pairs: Numbers of shapes, shape (P, 2).
-            moved: How far any point of each shape moves in a stretch, at most, shape (K, M + S) [m].
-            moves: Which shapes move in each phase, shape (phases, M + S). Pairs of which neither does are left out.
+            moved: How far any point of each shape moves in a stretch, at most, shape (K, M + S)
+                [m].
+            moves: Which shapes move in each phase, shape (phases, M + S). Pairs of which neither
+                does are left out.
             phases: Of the stretches, shape (K,).
             limit: [m].
 
         Raises:
             IndexError: There is no such state, phase or shape.
         """
-        numbers = (np.ascontiguousarray(part, np.int64) for part in (np.column_stack([first, last]), phases))
-        flags, rows = np.ascontiguousarray(moves).view(np.uint8), np.ascontiguousarray(pairs, np.int64)
-        at, which = self.compiled.near(*numbers, flags, rows, np.ascontiguousarray(moved, float), limit)
+        numbers = (
+            np.ascontiguousarray(part, np.int64)
+            for part in (np.column_stack([first, last]), phases)
+        )
+        flags, rows = (
+            np.ascontiguousarray(moves).view(np.uint8),
+            np.ascontiguousarray(pairs, np.int64),
+        )
+        at, which = self.compiled.near(
+            *numbers, flags, rows, np.ascontiguousarray(moved, float), limit
+        )
         return np.asarray(at), np.asarray(which)

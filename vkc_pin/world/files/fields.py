@@ -34,7 +34,9 @@ def fail(problem: str, expected: str) -> PydanticCustomError:
 
 
 def _number(value: Any) -> Any:
-    if isinstance(value, bool):  # YAML turns yes, no, on, off into booleans, and pydantic those into 1 and 0
+    if isinstance(
+        value, bool
+    ):  # YAML turns yes, no, on, off into booleans, and pydantic those into 1 and 0
         raise fail("wrong value", "a number")
     return value
 
@@ -68,14 +70,20 @@ def count(number: int) -> BeforeValidator:
     return BeforeValidator(counted)
 
 
-_bounded = require(lambda value: abs(value) <= LARGEST, "out of range", f"a number from {-LARGEST:g} to {LARGEST:g}")
+_bounded = require(
+    lambda value: abs(value) <= LARGEST,
+    "out of range",
+    f"a number from {-LARGEST:g} to {LARGEST:g}",
+)
 Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False), _bounded]
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
 Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
 _NAME = re.compile(r"[^\s./]([^./]*[^\s./])?")
 _is_name = require(
-    lambda name: name.isprintable() and _NAME.fullmatch(name), "not a name", "text without '.', '/' or spaces around it"
+    lambda name: name.isprintable() and _NAME.fullmatch(name),
+    "not a name",
+    "text without '.', '/' or spaces around it",
 )
 Name = Annotated[str, _is_name]
 

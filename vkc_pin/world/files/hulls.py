@@ -19,7 +19,9 @@ __all__ = ["FLAT", "compute_hull", "outer_hull", "thickened"]
 
 FLAT = 1e-3
 """What a part gets as thickness that has none [m]: a picture on a wall, a rug, a pane."""
-_THIN = 1e-5  # of the largest extent: thinner than 10 µm in a metre is drawn as a sheet, not as a solid
+_THIN = (
+    1e-5  # of the largest extent: thinner than 10 µm in a metre is drawn as a sheet, not as a solid
+)
 _GAP = 5e-4  # [m]: no cut takes away less
 _DIRECTIONS = 400  # of cuts, spread over the sphere
 # Options of Qhull, tried in this order: scaled to the unit cube, unscaled, and joggled.
@@ -91,8 +93,8 @@ def _orient(hull: ConvexHull) -> trimesh.Trimesh:
 def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     """Return a convex polytope of few vertices that contains `points`; what is flat is thickened first.
 
-    It starts as the box along the principal axes of the hull and is cut, again and again, by the plane that touches
-    the hull and lies deepest below one of the polytope's corners.
+    It starts as the box along the principal axes of the hull and is cut, again and again, by the
+    plane that touches the hull and lies deepest below one of the polytope's corners.
 
     Args:
         points: Shape (n, 3), [m].
@@ -116,13 +118,18 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
             order = np.argsort(-depth)[:12]
             trials = []
             for k in order[depth[order] > _GAP]:
-                planes = np.vstack([chosen_normals, normals[k]]), np.append(chosen_offsets, offsets[k])
+                planes = (
+                    np.vstack([chosen_normals, normals[k]]),
+                    np.append(chosen_offsets, offsets[k]),
+                )
                 trial = _intersect(*planes, corners)
                 if len(trial.vertices) <= vertices:
                     trials.append((trial, planes))
             if not trials:
                 break
-            polytope, (chosen_normals, chosen_offsets) = min(trials, key=lambda trial: trial[0].volume)
+            polytope, (chosen_normals, chosen_offsets) = min(
+                trials, key=lambda trial: trial[0].volume
+            )
         found.append(polytope)
     return compute_hull(min(found, key=lambda polytope: polytope.volume).points)
 
@@ -131,7 +138,9 @@ def _directions(hull: trimesh.Trimesh) -> Floats:
     """Return the normals worth trying: those of the hull's faces, and some spread evenly over the sphere."""
     k = np.arange(_DIRECTIONS) + 0.5
     z, turn = 1.0 - 2.0 * k / _DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
-    spread = np.stack([np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1)
+    spread = np.stack(
+        [np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1
+    )
     _, first = np.unique(np.asarray(hull.face_normals).round(2), axis=0, return_index=True)
     return np.vstack([np.asarray(hull.face_normals)[np.sort(first)], spread])
 

@@ -1,8 +1,8 @@
 """Reads mesh files and turns them into coal shapes, and checks that coal holds what the file holds.
 
-Meshes are read with trimesh: coal 3.0.3's own reader restarts the triangle indices at every object of an OBJ file, and
-what it makes of such a file collides where nothing is. Only COLLADA files (`.dae`), for which trimesh would need
-another package, are read by coal.
+Meshes are read with trimesh: coal 3.0.3's own reader restarts the triangle indices at every object
+of an OBJ file, and what it makes of such a file collides where nothing is. Only COLLADA files
+(`.dae`), for which trimesh would need another package, are read by coal.
 """
 
 from __future__ import annotations
@@ -27,7 +27,16 @@ from vkc_pin.world.files.xml import check_indices
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["MeshPart", "coarser", "convex_hull", "indices", "load_convex", "load_mesh", "load_parts", "to_bvh"]
+__all__ = [
+    "MeshPart",
+    "coarser",
+    "convex_hull",
+    "indices",
+    "load_convex",
+    "load_mesh",
+    "load_parts",
+    "to_bvh",
+]
 
 _NEIGHBOURS = 255  # coal's corners have no more
 _HULLS = 512  # that a process keeps: robots are loaded again and again
@@ -85,18 +94,31 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
     if np.shape(mesh.vertices)[1:] != (3,):
-        raise InputError("cannot read the mesh: its vertices have no three coordinates", file=file, expected="x, y and z of each")
+        raise InputError(
+            "cannot read the mesh: its vertices have no three coordinates",
+            file=file,
+            expected="x, y and z of each",
+        )
     if not np.isfinite(mesh.vertices).all():
-        raise InputError("the mesh has vertices that are no numbers", file=file, expected="finite coordinates")
+        raise InputError(
+            "the mesh has vertices that are no numbers", file=file, expected="finite coordinates"
+        )
     with np.errstate(over="ignore"):
         farthest = float(np.abs(mesh.vertices * factors).max())
     if farthest > LARGEST:
-        raise InputError("the mesh is out of range", file=file, expected=f"coordinates up to {LARGEST:g} m", got=f"{farthest:g}")
+        raise InputError(
+            "the mesh is out of range",
+            file=file,
+            expected=f"coordinates up to {LARGEST:g} m",
+            got=f"{farthest:g}",
+        )
     mesh.apply_transform(np.diag([*factors, 1.0]))
     return mesh
 
 
-def load_convex(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, about: str | None = None) -> coal.Convex:
+def load_convex(
+    path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, about: str | None = None
+) -> coal.Convex:
     """Return the convex hull of a mesh file as a coal shape, in the file's frame, [m].
 
     Args:
@@ -111,7 +133,11 @@ def load_convex(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, about: 
     if file.is_file():
         stat = file.stat()
         with contextlib.suppress(InputError):  # said below, with what it is a part of
-            kept = _hull(file.absolute(), (stat.st_mtime_ns, stat.st_size), tuple(_factors(file, scale).tolist()))
+            kept = _hull(
+                file.absolute(),
+                (stat.st_mtime_ns, stat.st_size),
+                tuple(_factors(file, scale).tolist()),
+            )
             if kept is not None:
                 return kept
     return convex_hull(load_mesh(path, scale).vertices, file=path, about=about)
@@ -124,10 +150,13 @@ def _hull(file: Path, version: tuple[int, int], scale: tuple[float, ...]) -> coa
     return None if thickened(np.asarray(points, float))[1] else convex_hull(points, file=file)
 
 
-def convex_hull(points: ArrayLike, *, file: str | Path | None = None, about: str | None = None) -> coal.Convex:
+def convex_hull(
+    points: ArrayLike, *, file: str | Path | None = None, about: str | None = None
+) -> coal.Convex:
     """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape.
 
-    Points in one plane, as of a picture on a wall, become a plate of 1 mm around that plane, with a warning.
+    Points in one plane, as of a picture on a wall, become a plate of 1 mm around that plane, with a
+    warning.
 
     Args:
         points: The points.
@@ -143,17 +172,29 @@ def convex_hull(points: ArrayLike, *, file: str | Path | None = None, about: str
     given, was_flat = thickened(given)
     if was_flat:
         named = " of ".join(str(part) for part in (about, file) if part is not None) or "a mesh"
-        warnings.warn(f"{named} is flat: it collides as a plate, {1e3 * FLAT:g} mm thick", stacklevel=2)
+        warnings.warn(
+            f"{named} is flat: it collides as a plate, {1e3 * FLAT:g} mm thick", stacklevel=2
+        )
     hull = compute_hull(given)
-    if np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
+    if (
+        np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS
+    ):  # the tip of a finely meshed cone, a fine disc
         hull = outer_hull(hull.vertices, vertices=60)
     vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     vertices.extend(np.asarray(hull.vertices, float))
     triangles.extend(coal.Triangle(*face) for face in np.asarray(hull.faces).tolist())
     shape = coal.Convex(vertices, triangles)
     corners = np.asarray(shape.points())[indices(shape)]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0
-    for what, held, wanted in (("volume", shape.computeVolume(), hull.volume), ("area", area, hull.area)):
+    area = (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        ).sum()
+        / 2.0
+    )
+    for what, held, wanted in (
+        ("volume", shape.computeVolume(), hull.volume),
+        ("area", area, hull.area),
+    ):
         if not abs(held - wanted) <= _TOLERANCE * abs(wanted) or wanted <= 0.0:
             problem = f"coal does not hold this hull: wrong {what}"
             raise InputError(problem, file=file, field=about, expected=wanted, got=held)
@@ -161,14 +202,17 @@ def convex_hull(points: ArrayLike, *, file: str | Path | None = None, about: str
     return shape
 
 
-def load_parts(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: float = 0.0) -> list[MeshPart]:
+def load_parts(
+    path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: float = 0.0
+) -> list[MeshPart]:
     """Read a mesh file for display: one part for each of its colours, those of textures averaged.
 
     Args:
         path: The mesh file, see `load_mesh`.
         scale: One factor per axis, or one for all, from the file's unit to [m].
-        detail: Vertices closer together than about this [m] become one; 0 keeps the file's own triangles. The mesh
-            that a maker publishes often has screws and bevels that make a page heavy and that nobody sees.
+        detail: Vertices closer together than about this [m] become one; 0 keeps the file's own
+            triangles. The mesh that a maker publishes often has screws and bevels that make a page
+            heavy and that nobody sees.
 
     Raises:
         InputError: As `load_mesh`.
@@ -183,7 +227,9 @@ def load_parts(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: 
     try:
         scene = trimesh.load_scene(file, process=False, group_material=True, split_object=False)
     except Exception as error:
-        raise InputError(f"cannot read the mesh: {error}", file=file, expected="an OBJ file") from error
+        raise InputError(
+            f"cannot read the mesh: {error}", file=file, expected="an OBJ file"
+        ) from error
     parts = [
         MeshPart(np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), _colour(mesh))
         for mesh in scene.geometry.values()
@@ -209,7 +255,9 @@ def coarser(part: MeshPart, detail: float) -> MeshPart:
     means = np.zeros((len(count), 3))
     np.add.at(means, group, part.vertices)
     faces = group[part.faces]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    faces = faces[
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    ]
     if len(faces) == 0:
         return part
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
@@ -228,16 +276,28 @@ def to_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
 
 def _factors(file: Path, scale: ArrayLike) -> Floats:
     factors = np.asarray(scale, float)
-    if factors.shape not in ((), (1,), (3,)) or not (np.isfinite(factors).all() and (factors != 0.0).all()):
-        raise InputError("wrong scale of a mesh", file=file, field="scale", expected="3 finite numbers other than 0", got=scale)
+    if factors.shape not in ((), (1,), (3,)) or not (
+        np.isfinite(factors).all() and (factors != 0.0).all()
+    ):
+        raise InputError(
+            "wrong scale of a mesh",
+            file=file,
+            field="scale",
+            expected="3 finite numbers other than 0",
+            got=scale,
+        )
     return np.broadcast_to(factors, (3,)).astype(float)
 
 
 def indices(shape: coal.Convex | coal.BVHModelBase) -> Ints:
     """Return the corners of the triangles of a coal shape, shape (m, 3)."""
     convex = isinstance(shape, coal.Convex)
-    count, item = (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
-    return np.array([[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64).reshape(-1, 3)
+    count, item = (
+        (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
+    )
+    return np.array(
+        [[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64
+    ).reshape(-1, 3)
 
 
 def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
@@ -255,14 +315,22 @@ def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
 def _settle_boxes() -> None:
     """Let coal take boxes as they are, whatever it is asked first.
 
-    coal 3.0.3 decides once per process, from the first direction in which it looks for a box's furthest corner, whether boxes are
-    1e-10 larger on their negative sides: yes if a component is zero (a `static` in `getShapeSupport`, gone in later versions). So
-    the first question of a process would decide on the last digits of every distance to a box. This one has no such component.
-    It is asked here, below all that asks for distances; compiled code asks the same library.
+    coal 3.0.3 decides once per process, from the first direction in which it looks for a box's
+    furthest corner, whether boxes are 1e-10 larger on their negative sides: yes if a component is
+    zero (a `static` in `getShapeSupport`, gone in later versions). So the first question of a
+    process would decide on the last digits of every distance to a box. This one has no such
+    component. It is asked here, below all that asks for distances; compiled code asks the same
+    library.
     """
     turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
-    box, here, there = coal.Box(1.0, 1.0, 1.0), coal.Transform3s(), coal.Transform3s(turned, np.array([3.0, 0.4, 0.2]))
-    plane = coal.Halfspace(np.array([0.36, 0.48, 0.8]), 0.0)  # for the other one, of shapes with a swept sphere
+    box, here, there = (
+        coal.Box(1.0, 1.0, 1.0),
+        coal.Transform3s(),
+        coal.Transform3s(turned, np.array([3.0, 0.4, 0.2])),
+    )
+    plane = coal.Halfspace(
+        np.array([0.36, 0.48, 0.8]), 0.0
+    )  # for the other one, of shapes with a swept sphere
     for shape, where in ((coal.Capsule(0.1, 0.5), there), (plane, here)):
         coal.distance(shape, here, box, where, coal.DistanceRequest(), coal.DistanceResult())
 

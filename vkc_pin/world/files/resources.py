@@ -73,7 +73,9 @@ def file_path(value: Any, field: str, expected: str = "a path") -> Path:
     except UnicodeEncodeError:
         coded = b""
     if not coded or b"\0" in coded or len(coded) >= 4096 or max(map(len, coded.split(b"/"))) > 255:
-        raise InputError("no file can be called that", field=field, expected=expected, got=shown(name))
+        raise InputError(
+            "no file can be called that", field=field, expected=expected, got=shown(name)
+        )
     return Path(value)
 
 

@@ -60,12 +60,15 @@ def read_groups(path: str | Path, urdf: ElementTree.Element) -> dict[str, SrdfGr
     above, moved = dict[str, tuple[str, str]](), dict[str, str]()
     for joint in urdf.findall("joint"):
         parent, child = (
-            element.get("link", "") if (element := joint.find(key)) is not None else "" for key in ("parent", "child")
+            element.get("link", "") if (element := joint.find(key)) is not None else ""
+            for key in ("parent", "child")
         )
         above[child], moved[joint.get("name", "")] = (joint.get("name", ""), parent), child
     groups: dict[str, SrdfGroup] = {}
     for group in read_xml(path, "SRDF")[1].findall("group"):
-        joints = [name for joint in group.findall("joint") if (name := joint.get("name", "")) in moved]
+        joints = [
+            name for joint in group.findall("joint") if (name := joint.get("name", "")) in moved
+        ]
         tip = moved[joints[-1]] if joints else ""
         for chain in group.findall("chain"):
             tip = below = chain.get("tip_link", "")
@@ -102,8 +105,17 @@ def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:
         pair = [element.get(key, "") for key in ("link1", "link2")]
         for name in pair:
             if name not in links:
-                line = next((number for number, line in enumerate(text.splitlines(), 1) if f'"{name}"' in line), None)
-                raise UnknownNameError("link", name, links, file=path, line=line, field="disable_collisions")
+                line = next(
+                    (
+                        number
+                        for number, line in enumerate(text.splitlines(), 1)
+                        if f'"{name}"' in line
+                    ),
+                    None,
+                )
+                raise UnknownNameError(
+                    "link", name, links, file=path, line=line, field="disable_collisions"
+                )
         first, second = sorted(pair)
         allowed[first, second] = element.get("reason", "")
     states: dict[str, dict[str, float]] = {}

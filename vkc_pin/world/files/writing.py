@@ -36,7 +36,8 @@ _SHOWN = 3  # files that a message names
 def write_atomically(path: str | Path, data: bytes) -> Path:
     """Write `data` to `path` whole or not at all, making its folder if need be; return the path.
 
-    A symbolic link stays, and what it names is written. A file that is there keeps its mode. Ctrl-C waits until it is done.
+    A symbolic link stays, and what it names is written. A file that is there keeps its mode. Ctrl-C
+    waits until it is done.
 
     Raises:
         InputError: The path names something else than a file, or it cannot be written.
@@ -62,7 +63,8 @@ def check_writable(path: str | Path, *, field: str | None = None) -> Path:
     """Return where `write_atomically` would write.
 
     Raises:
-        InputError: It cannot: the path, which `field` names, is that of something else, or nothing can be made there.
+        InputError: It cannot: the path, which `field` names, is that of something else, or nothing
+            can be made there.
     """
     with _told(path, field):
         target, _ = _target(path)
@@ -82,7 +84,9 @@ def check_writable(path: str | Path, *, field: str | None = None) -> Path:
     return target
 
 
-def check_outputs(files: Mapping[str, str | Path], *, kept: Mapping[str, str | Path] | None = None) -> None:
+def check_outputs(
+    files: Mapping[str, str | Path], *, kept: Mapping[str, str | Path] | None = None
+) -> None:
     """Check that files can be written, and do not get in each other's way.
 
     Args:
@@ -90,18 +94,34 @@ def check_outputs(files: Mapping[str, str | Path], *, kept: Mapping[str, str | P
         kept: Option or argument → a file that is read, and must not be written.
 
     Raises:
-        InputError: One of them cannot be written, names what another one does, or needs a folder where another one is a file.
+        InputError: One of them cannot be written, names what another one does, or needs a folder
+            where another one is a file.
     """
-    taken = {Path(os.path.realpath(file_path(path, field))): field for field, path in (kept or {}).items()}
+    taken = {
+        Path(os.path.realpath(file_path(path, field))): field
+        for field, path in (kept or {}).items()
+    }
     targets: dict[Path, str] = {}
     for field, path in files.items():
         target = check_writable(path, field=field)
         if (other := {**taken, **targets}.get(target)) is not None:
-            raise InputError("this file is named twice", file=path, field=field, expected=f"another file than {other}")
+            raise InputError(
+                "this file is named twice",
+                file=path,
+                field=field,
+                expected=f"another file than {other}",
+            )
         targets[target] = field
     for target, field in targets.items():
-        if (above := next((place for place in target.parents if place in targets), None)) is not None:
-            raise InputError("a file cannot be a folder", file=above, field=field, got=f"the file of {targets[above]}")
+        if (
+            above := next((place for place in target.parents if place in targets), None)
+        ) is not None:
+            raise InputError(
+                "a file cannot be a folder",
+                file=above,
+                field=field,
+                got=f"the file of {targets[above]}",
+            )
 
 
 def check_name(name: object, field: str, *, file: str | Path | None = None) -> str:
@@ -272,7 +292,9 @@ def _target(path: str | Path) -> tuple[Path, int | None]:
         return target, None
     if not stat.S_ISREG(found.st_mode):
         kinds = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
-        raise IsADirectoryError(next((name for is_kind, name in kinds.items() if is_kind(found.st_mode)), "a device"))
+        raise IsADirectoryError(
+            next((name for is_kind, name in kinds.items() if is_kind(found.st_mode)), "a device")
+        )
     if not os.access(target, os.W_OK):
         raise PermissionError("no permission to write it")
     return target, stat.S_IMODE(found.st_mode)
@@ -286,10 +308,14 @@ def _temporary(folder: Path) -> Path:
 @contextlib.contextmanager
 def _told(path: str | Path, field: str | None = None) -> Iterator[None]:
     """Say what is wrong with a path."""
-    path = path if isinstance(path, str) else file_path(path, "path")  # text may end with a slash, which paths forget
+    path = (
+        path if isinstance(path, str) else file_path(path, "path")
+    )  # text may end with a slash, which paths forget
     try:
         yield
     except (OSError, ValueError) as error:  # the latter: a NUL in the name
         got = getattr(error, "strerror", None) or str(error)
         expected = "a regular file or a new one"
-        raise InputError("cannot write this", file=str(path), field=field, expected=expected, got=got) from error
+        raise InputError(
+            "cannot write this", file=str(path), field=field, expected=expected, got=got
+        ) from error

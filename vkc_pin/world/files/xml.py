@@ -36,13 +36,16 @@ def line_of(element: ElementTree.Element) -> int | None:
     return getattr(element, "line", None)
 
 
-def read_xml(file: str | Path, kind: str, text: str | None = None) -> tuple[str, ElementTree.Element]:
+def read_xml(
+    file: str | Path, kind: str, text: str | None = None
+) -> tuple[str, ElementTree.Element]:
     """Return what a URDF or SRDF file (`kind`) says, as text and as its element <robot>.
 
     Args:
         file: The file.
         kind: "URDF" or "SRDF".
-        text: What it says, where that stands elsewhere: nothing is read then, and `file` is for messages alone.
+        text: What it says, where that stands elsewhere: nothing is read then, and `file` is for
+            messages alone.
 
     Raises:
         InputError: It cannot be read, is no XML, or is about something else than a robot.
@@ -50,7 +53,9 @@ def read_xml(file: str | Path, kind: str, text: str | None = None) -> tuple[str,
     text = read_text(file, kind) if text is None else text
     root = parse_xml(text, Path(file))
     if root.tag != "robot":
-        raise InputError(f"this is no {kind}", file=file, expected="an element <robot>", got=f"<{root.tag}>")
+        raise InputError(
+            f"this is no {kind}", file=file, expected="an element <robot>", got=f"<{root.tag}>"
+        )
     return text, root
 
 
@@ -62,7 +67,8 @@ def parse_xml(text: str, file: Path) -> ElementTree.Element:
         file: Where it stands, for messages.
 
     Raises:
-        InputError: It is no XML, or defines entities: with a few lines these make texts without end.
+        InputError: It is no XML, or defines entities: with a few lines these make texts without
+            end.
     """
     builder = ElementTree.TreeBuilder(element_factory=_Element)
     parser = expat.ParserCreate()
@@ -73,7 +79,11 @@ def parse_xml(text: str, file: Path) -> ElementTree.Element:
 
     def entity(name: str, *_: object) -> None:
         raise InputError(
-            "entities are not supported", file=file, line=parser.CurrentLineNumber, field=name, expected="plain text"
+            "entities are not supported",
+            file=file,
+            line=parser.CurrentLineNumber,
+            field=name,
+            expected="plain text",
         )
 
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
@@ -98,7 +108,8 @@ def quote(text: str) -> str:
 def check_indices(file: Path) -> None:
     """Check that the lists of indices in a COLLADA file hold whole numbers.
 
-    assimp, which reads these files, does not get past anything else in them, and takes ever more memory meanwhile.
+    assimp, which reads these files, does not get past anything else in them, and takes ever more
+    memory meanwhile.
 
     Raises:
         InputError: One holds something else, the file is no XML, or it cannot be read.
@@ -111,12 +122,23 @@ def check_indices(file: Path) -> None:
     def text(data: str) -> None:
         if inside and inside[-1] in _INDICES and data.strip("0123456789+- \t\r\n"):
             line, field = parser.CurrentLineNumber, f"<{inside[-1]}>"
-            raise InputError("not indices", file=file, line=line, field=field, expected="whole numbers", got=shown(data))
+            raise InputError(
+                "not indices",
+                file=file,
+                line=line,
+                field=field,
+                expected="whole numbers",
+                got=shown(data),
+            )
 
     def end(_: str) -> None:
         inside.pop()
 
-    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = (
+        start,
+        end,
+        text,
+    )
     try:
         parser.Parse(file.read_bytes(), True)
     except expat.ExpatError as error:

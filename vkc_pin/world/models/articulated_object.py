@@ -1,6 +1,7 @@
 """Articulated objects: what can be grasped and moved (a door, a drawer, a stick).
 
-An object is a URDF tree plus named attachments (where a tool takes hold of it, and what freedom that leaves) and latches.
+An object is a URDF tree plus named attachments (where a tool takes hold of it, and what freedom
+that leaves) and latches.
 """
 
 from __future__ import annotations
@@ -20,7 +21,14 @@ from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.dynamics.joint_resistance import Resistance
 from vkc_pin.world.models.dynamics.mass import mass_of
 
-__all__ = ["DEFAULT_ACCELERATION", "DEFAULT_VELOCITY", "ArticulatedObject", "Attachment", "Freedom", "Latch"]
+__all__ = [
+    "DEFAULT_ACCELERATION",
+    "DEFAULT_VELOCITY",
+    "ArticulatedObject",
+    "Attachment",
+    "Freedom",
+    "Latch",
+]
 
 DEFAULT_VELOCITY = 1.0
 """Velocity limit [rad/s] or [m/s] of an object's joint whose URDF states none (a continuous joint without limits)."""
@@ -37,7 +45,8 @@ class Freedom:
         kind: "revolute" or "prismatic".
         axis: Unit axis in the tool frame (after the freedoms before this one), shape (3,).
         lower, upper: Limits, [rad] or [m].
-        through: A point of the axis of one that turns, in the same frame, shape (3,) [m]: the middle of a rim, say.
+        through: A point of the axis of one that turns, in the same frame, shape (3,) [m]: the
+            middle of a rim, say.
     """
 
     suffix: str
@@ -65,23 +74,31 @@ class Freedom:
 class Attachment:
     """A place where a tool can take hold of a link, and the freedom that this kind of grasp leaves.
 
-    While grasped, the tool frame expressed in the frame of `link` is `placement · J(v) · offset`, with J(v) the motion
-    of the virtual joint at the values v and offset a translation by `-standoff` along the tool's z axis. The tool's z
-    axis points out of the palm (the direction of approach), its x axis along the direction in which the fingers close.
+    While grasped, the tool frame expressed in the frame of `link` is `placement · J(v) · offset`,
+    with J(v) the motion of the virtual joint at the values v and offset a translation by
+    `-standoff` along the tool's z axis. The tool's z axis points out of the palm (the direction of
+    approach), its x axis along the direction in which the fingers close.
 
     Attributes:
         name: Its name in the object.
         link: The link that is held.
-        placement: The tool frame in the link's frame at v = 0, were there no standoff: the virtual joint's centre.
-        joint: "fixed" (no freedom), "revolute", "prismatic", "cylindrical" (slides along an axis and turns about it),
-            "spherical" (turns about x, then y, then z) or "listed" (what its description lists).
-        freedoms: The virtual joint's coordinates, J(v) being the product of their motions in this order.
+        placement: The tool frame in the link's frame at v = 0, were there no standoff: the virtual
+            joint's centre.
+        joint: "fixed" (no freedom), "revolute", "prismatic", "cylindrical" (slides along an axis
+            and turns about it), "spherical" (turns about x, then y, then z) or "listed" (what its
+            description lists).
+        freedoms: The virtual joint's coordinates, J(v) being the product of their motions in this
+            order.
         standoff: How far before the joint's centre the tool stops, along its approach [m].
-        firm: Whether the hand clamps: v is chosen when grasping, and stays while the object is held.
-        clearance: What the hand keeps from the object's links near the grasp [m]; None: `Options.grasp_clearance`.
-        opening: How far the gripper is open on the way to it and while it holds on [m]; None: as the robot rests, fully open.
-        contact: "grasp": the hand closes on it, and moves it any way. "push": the hand's foremost point is where the tool frame
-            would be, against a face whose inward normal is `placement`'s z axis, and moves it that way only.
+        firm: Whether the hand clamps: v is chosen when grasping, and stays while the object is
+            held.
+        clearance: What the hand keeps from the object's links near the grasp [m]; None:
+            `Options.grasp_clearance`.
+        opening: How far the gripper is open on the way to it and while it holds on [m]; None: as
+            the robot rests, fully open.
+        contact: "grasp": the hand closes on it, and moves it any way. "push": the hand's foremost
+            point is where the tool frame would be, against a face whose inward normal is
+            `placement`'s z axis, and moves it that way only.
     """
 
     name: str
@@ -114,7 +131,9 @@ class Attachment:
         given = numbers(values, self.name)
         if given.shape != (len(self.freedoms),):
             expected = f"{len(self.freedoms)}, one a freedom"
-            raise InputError("wrong number of values", field=self.name, expected=expected, got=given)
+            raise InputError(
+                "wrong number of values", field=self.name, expected=expected, got=given
+            )
         placement = pin.SE3.Identity()
         for freedom, value in zip(self.freedoms, given, strict=True):
             placement = placement * freedom.motion(float(value))
@@ -164,9 +183,12 @@ class ArticulatedObject:
         attachments: By name; the first is the default.
         latches: Its latches.
         base_link: The name of its base link.
-        free: Whether it can be carried away (a stick), instead of standing fixed in the world (a door).
-        own_pairs: Pairs of its links that can meet; others are taken to be made so that they cannot.
-        resistance: Joint → friction, damping and spring that it resists with; nothing, where its description says nothing.
+        free: Whether it can be carried away (a stick), instead of standing fixed in the world (a
+            door).
+        own_pairs: Pairs of its links that can meet; others are taken to be made so that they
+            cannot.
+        resistance: Joint → friction, damping and spring that it resists with; nothing, where its
+            description says nothing.
     """
 
     name: str
@@ -187,7 +209,9 @@ class ArticulatedObject:
     resistance: Mapping[str, Resistance] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return f"<ArticulatedObject {self.name}: joints {', '.join(self.coordinates.names) or 'none'}>"
+        return (
+            f"<ArticulatedObject {self.name}: joints {', '.join(self.coordinates.names) or 'none'}>"
+        )
 
     @property
     def mass(self) -> float:
@@ -197,13 +221,17 @@ class ArticulatedObject:
     @property
     def links(self) -> tuple[str, ...]:
         """The names of its links."""
-        return tuple(str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY)
+        return tuple(
+            str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY
+        )
 
     def links_moved_by(self, joints: Set[str]) -> set[str]:
         """Return the links that any of some joints move."""
         above = [{str(self.model.names[k]) for k in support} for support in self.model.supports]
         bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
-        return {str(frame.name) for frame in bodies if not joints.isdisjoint(above[frame.parentJoint])}
+        return {
+            str(frame.name) for frame in bodies if not joints.isdisjoint(above[frame.parentJoint])
+        }
 
     def attachment(self, name: str | None = None) -> Attachment:
         """Return the attachment `name`, or the default one.
@@ -214,13 +242,20 @@ class ArticulatedObject:
         """
         if name is None:
             if not self.attachments:
-                raise InputError(f"object '{self.name}' has no attachment, so it cannot be grasped", field="attachment")
+                raise InputError(
+                    f"object '{self.name}' has no attachment, so it cannot be grasped",
+                    field="attachment",
+                )
             return next(iter(self.attachments.values()))
         return self.attachments[known(name, self.attachments, f"attachment of {self.name}")]
 
     def link_frame(self, link: str) -> int:
         """Return the index in `model` of the frame of `link`. Raises `UnknownNameError` if there is none."""
-        return int(self.model.getFrameId(known(link, self.links, f"link of {self.name}"), pin.FrameType.BODY))
+        return int(
+            self.model.getFrameId(
+                known(link, self.links, f"link of {self.name}"), pin.FrameType.BODY
+            )
+        )
 
     def link_placement(self, link: str, state: ArrayLike) -> pin.SE3:
         """Return the placement of `link` in the base link's frame at the joint values `state`, shape (n,)."""

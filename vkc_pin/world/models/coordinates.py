@@ -1,7 +1,8 @@
 """Minimal coordinates z of a Pinocchio model: one number per degree of freedom.
 
-Pinocchio stores a planar joint as (x, y, cos θ, sin θ) and a continuous joint as (cos θ, sin θ). Users and the
-optimiser work with (x, y, θ) and θ; this module maps one to the other, for numbers and for CasADi symbols.
+Pinocchio stores a planar joint as (x, y, cos θ, sin θ) and a continuous joint as (cos θ, sin θ).
+Users and the optimiser work with (x, y, θ) and θ; this module maps one to the other, for numbers
+and for CasADi symbols.
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ from vkc_pin.utils.arrays import Bools, Floats, Ints
 __all__ = ["Coordinates", "Moved", "wrapped"]
 
 _SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismaticUnaligned")
-_UNBOUNDED = ("JointModelRUBX", "JointModelRUBY", "JointModelRUBZ", "JointModelRevoluteUnboundedUnaligned")
+_UNBOUNDED = (
+    "JointModelRUBX",
+    "JointModelRUBY",
+    "JointModelRUBZ",
+    "JointModelRevoluteUnboundedUnaligned",
+)
 
 
 class Moved(NamedTuple):
@@ -42,19 +48,24 @@ class Moved(NamedTuple):
 class Coordinates:
     """The minimal coordinates of `model`.
 
-    A joint that follows another one (`pinocchio.JointModelMimic`) has none: the other one's coordinate moves both.
+    A joint that follows another one (`pinocchio.JointModelMimic`) has none: the other one's
+    coordinate moves both.
 
     Attributes:
-        names: One name per coordinate: the joint's, and for a planar joint `<joint>_x`, `<joint>_y`, `<joint>_yaw`; a free
-            joint has seven, `<joint>_x`, `_y`, `_z` [m] and a quaternion `_qx`, `_qy`, `_qz`, `_qw` of any length but zero,
-            so that it interpolates anywhere.
+        names: One name per coordinate: the joint's, and for a planar joint `<joint>_x`,
+            `<joint>_y`, `<joint>_yaw`; a free joint has seven, `<joint>_x`, `_y`, `_z` [m] and a
+            quaternion `_qx`, `_qy`, `_qz`, `_qw` of any length but zero, so that it interpolates
+            anywhere.
         units: For each coordinate "m" or "rad", and "1" for the parts of a quaternion.
         joints: For each coordinate, the index of the joint it belongs to.
-        moves: What each coordinate moves: that joint first, then those that follow it; ordered by coordinate.
-        lengths, turns: How far the joints that a coordinate moves go together, slide [m] and turn [rad] each, for a unit of it,
-            shape (n,): 1 and 0, or 0 and 1, but of joints that others follow.
+        moves: What each coordinate moves: that joint first, then those that follow it; ordered by
+            coordinate.
+        lengths, turns: How far the joints that a coordinate moves go together, slide [m] and turn
+            [rad] each, for a unit of it, shape (n,): 1 and 0, or 0 and 1, but of joints that others
+            follow.
         size: Their number n (equal to `model.nv`, without free joints).
-        lower, upper: Position limits, shape (n,), [m] or [rad]; infinite for continuous joints and the planar yaw.
+        lower, upper: Position limits, shape (n,), [m] or [rad]; infinite for continuous joints and
+            the planar yaw.
         velocity: Velocity limits, shape (n,), [m/s] or [rad/s].
 
     Raises:
@@ -71,15 +82,35 @@ class Coordinates:
         lower, upper = [], []
         followers = [int(index) for index in model.mimicking_joints]
         for index in range(1, model.njoints):
-            joint, name, i, j = model.joints[index], model.names[index], model.joints[index].idx_q, len(names)
+            joint, name, i, j = (
+                model.joints[index],
+                model.names[index],
+                model.joints[index].idx_q,
+                len(names),
+            )
             if joint.nv == 0 and index in followers:
                 continue
-            kind, limited, straight = joint.shortname(), 0, 0  # coordinates with limits, and those that are Pinocchio's own
+            kind, limited, straight = (
+                joint.shortname(),
+                0,
+                0,
+            )  # coordinates with limits, and those that are Pinocchio's own
             if kind == "JointModelPlanar":
                 parts, limited, straight = {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
                 angles.append((i + 2, j + 2))
             elif kind == "JointModelFreeFlyer":
-                parts, straight = {"_x": "m", "_y": "m", "_z": "m", "_qx": "1", "_qy": "1", "_qz": "1", "_qw": "1"}, 3
+                parts, straight = (
+                    {
+                        "_x": "m",
+                        "_y": "m",
+                        "_z": "m",
+                        "_qx": "1",
+                        "_qy": "1",
+                        "_qz": "1",
+                        "_qw": "1",
+                    },
+                    3,
+                )
                 quaternions.append((i + 3, j + 3))
             elif kind in _UNBOUNDED:
                 parts = {"": "rad"}
@@ -88,12 +119,20 @@ class Coordinates:
                 parts, limited, straight = {"": "m" if kind in _SLIDING else "rad"}, 1, 1
             else:
                 expected = "a planar joint or one of 1 degree of freedom"
-                raise InputError("this joint type is not supported", field=name, expected=expected, got=kind)
+                raise InputError(
+                    "this joint type is not supported", field=name, expected=expected, got=kind
+                )
             plain += [(i + k, j + k) for k in range(straight)]
             names += [name + part for part in parts]
             units += parts.values()
-            lower += [*model.lowerPositionLimit[i : i + limited], *[-np.inf] * (len(parts) - limited)]
-            upper += [*model.upperPositionLimit[i : i + limited], *[np.inf] * (len(parts) - limited)]
+            lower += [
+                *model.lowerPositionLimit[i : i + limited],
+                *[-np.inf] * (len(parts) - limited),
+            ]
+            upper += [
+                *model.upperPositionLimit[i : i + limited],
+                *[np.inf] * (len(parts) - limited),
+            ]
             joints += [index] * len(parts)
         self.names: tuple[str, ...] = tuple(names)
         self.units: tuple[str, ...] = tuple(units)
@@ -108,12 +147,19 @@ class Coordinates:
         for move in self.moves:
             (self.lengths if move.slides else self.turns)[move.coordinate] += abs(move.factor)
         self._joint_count = int(model.njoints)
-        self._plain, self._angles, self._quaternions, self._runs = plain, angles, quaternions, _runs(plain)
+        self._plain, self._angles, self._quaternions, self._runs = (
+            plain,
+            angles,
+            quaternions,
+            _runs(plain),
+        )
 
     @property
     def places(self) -> tuple[Ints, Ints, Ints]:
         """Where in q, and where in z, what `q` maps begins, shape (K, 2) each: equal numbers, angles, quaternions."""
-        plain, angles, quaternions = (np.array(p, int).reshape(-1, 2) for p in (self._plain, self._angles, self._quaternions))
+        plain, angles, quaternions = (
+            np.array(p, int).reshape(-1, 2) for p in (self._plain, self._angles, self._quaternions)
+        )
         return plain, angles, quaternions
 
     @property
@@ -123,15 +169,23 @@ class Coordinates:
 
     def _moves(self, model: pin.Model, followers: list[int]) -> tuple[Moved, ...]:
         """Return `moves`."""
-        moves = [Moved(k, joint, 1.0, 0.0, self.units[k] == "m") for k, joint in enumerate(self.joints)]
+        moves = [
+            Moved(k, joint, 1.0, 0.0, self.units[k] == "m") for k, joint in enumerate(self.joints)
+        ]
         if followers:
             data = model.createData()
             pin.forwardKinematics(model, data, pin.neutral(model))
             at = {model.joints[joint].idx_q: k for k, joint in enumerate(self.joints)}
-            for joint in followers:  # `mimicked_joints` of Pinocchio 4.1 are not always in the order of `mimicking_joints`
-                following, axis = model.joints[joint].extract(), np.asarray(data.joints[joint].S, float).ravel()
+            # `mimicked_joints` of Pinocchio 4.1 are not always in the order of `mimicking_joints`
+            for joint in followers:
+                following, axis = (
+                    model.joints[joint].extract(),
+                    np.asarray(data.joints[joint].S, float).ravel(),
+                )
                 factor, offset = float(following.scaling), float(following.offset)
-                moves.append(Moved(at[model.joints[joint].idx_q], joint, factor, offset, not axis[3:].any()))
+                moves.append(
+                    Moved(at[model.joints[joint].idx_q], joint, factor, offset, not axis[3:].any())
+                )
         return tuple(sorted(moves))
 
     def moved(self, changed: ArrayLike) -> Bools:
@@ -161,7 +215,12 @@ class Coordinates:
         """Return Pinocchio's configuration(s), shape (..., nq), of minimal coordinates `z`, shape (..., n)."""
         z = numbers(z, "z")
         if z.shape[-1:] != (self.size,):
-            raise InputError("wrong number of coordinates", field="z", expected=f"(..., {self.size})", got=z.shape)
+            raise InputError(
+                "wrong number of coordinates",
+                field="z",
+                expected=f"(..., {self.size})",
+                got=z.shape,
+            )
         q = np.empty((*z.shape[:-1], self.nq))
         for there, here in self._runs:
             q[..., there] = z[..., here]
@@ -169,14 +228,18 @@ class Coordinates:
             angle = z[..., j].copy()  # without gaps, where NumPy may compute otherwise
             q[..., i], q[..., i + 1] = np.cos(angle), np.sin(angle)
         for i, j in self._quaternions:
-            q[..., i : i + 4] = z[..., j : j + 4] / np.linalg.norm(z[..., j : j + 4], axis=-1, keepdims=True)
+            q[..., i : i + 4] = z[..., j : j + 4] / np.linalg.norm(
+                z[..., j : j + 4], axis=-1, keepdims=True
+            )
         return q
 
     def z(self, q: ArrayLike) -> Floats:
         """Return the minimal coordinates, shape (..., n), of `q`, shape (..., nq); angles in (-π, π]."""
         q = numbers(q, "q")
         if q.shape[-1:] != (self.nq,):
-            raise InputError("wrong size of configuration", field="q", expected=f"(..., {self.nq})", got=q.shape)
+            raise InputError(
+                "wrong size of configuration", field="q", expected=f"(..., {self.nq})", got=q.shape
+            )
         z = np.empty((*q.shape[:-1], self.size))
         for there, here in self._runs:
             z[..., here] = q[..., there]

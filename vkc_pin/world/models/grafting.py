@@ -1,8 +1,8 @@
 """Grafts one kinematic tree onto another, joint by joint.
 
-Pinocchio's own `appendModel` aborts on equal names and has placed sub-models of fixed joints wrongly
-(stack-of-tasks/pinocchio #2328, #2293, #2805); this adds every joint, inertia, frame and geometry explicitly and
-leaves collision pairs to the caller.
+Pinocchio's own `appendModel` aborts on equal names and has placed sub-models of fixed joints
+wrongly (stack-of-tasks/pinocchio #2328, #2293, #2805); this adds every joint, inertia, frame and
+geometry explicitly and leaves collision pairs to the caller.
 """
 
 from __future__ import annotations
@@ -26,7 +26,13 @@ def clean(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
 
 
 def add_joint(
-    model: pin.Model, parent: int, joint: pin.JointModel, placement: pin.SE3, *, like: tuple[pin.Model, int], prefix: str = ""
+    model: pin.Model,
+    parent: int,
+    joint: pin.JointModel,
+    placement: pin.SE3,
+    *,
+    like: tuple[pin.Model, int],
+    prefix: str = "",
 ) -> int:
     """Add `joint` to `model` with the name and limits that a joint of another model has.
 
@@ -44,11 +50,18 @@ def add_joint(
     source, index = like
     twin = source.joints[index]
     q, v = slice(twin.idx_q, twin.idx_q + twin.nq), slice(twin.idx_v, twin.idx_v + twin.nv)
-    limits = source.effortLimit[v], source.velocityLimit[v], source.lowerPositionLimit[q], source.upperPositionLimit[q]
+    limits = (
+        source.effortLimit[v],
+        source.velocityLimit[v],
+        source.lowerPositionLimit[q],
+        source.upperPositionLimit[q],
+    )
     return int(model.addJoint(parent, joint, placement, prefix + source.names[index], *limits))
 
 
-def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3, prefix: str = "") -> list[int]:
+def graft(
+    model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3, prefix: str = ""
+) -> list[int]:
     """Add every joint, inertia and frame of `tree` to `model`, its universe at `placement` in joint `parent`.
 
     Args:
@@ -67,20 +80,31 @@ def graft(model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3,
     for index in range(1, tree.njoints):
         joint, above = tree.joints[index], tree.parents[index]
         local = tree.jointPlacements[index] if above else placement * tree.jointPlacements[index]
-        added = add_joint(model, joints[above], joint, clean(local), like=(tree, index), prefix=prefix)
+        added = add_joint(
+            model, joints[above], joint, clean(local), like=(tree, index), prefix=prefix
+        )
         model.appendBodyToJoint(added, tree.inertias[index], pin.SE3.Identity())
         joints.append(added)
     bodies = {frame.name for frame in tree.frames if frame.type == pin.FrameType.BODY}
     for frame in tree.frames[1:]:
         if frame.type != pin.FrameType.BODY and frame.name in bodies:
-            continue  # a joint and a link may share a name in a URDF, but Pinocchio finds no frame by a name that two have
+            # a joint and a link may share a name in a URDF, but Pinocchio finds no frame by a name
+            # that two have
+            continue
         local = frame.placement if frame.parentJoint else placement * frame.placement
-        model.addFrame(pin.Frame(prefix + frame.name, joints[frame.parentJoint], 0, clean(local), frame.type))
+        model.addFrame(
+            pin.Frame(prefix + frame.name, joints[frame.parentJoint], 0, clean(local), frame.type)
+        )
     return joints
 
 
 def graft_geometry(
-    geometry: pin.GeometryModel, objects: Iterable[pin.GeometryObject], *, joints: list[int], placement: pin.SE3, prefix: str = ""
+    geometry: pin.GeometryModel,
+    objects: Iterable[pin.GeometryObject],
+    *,
+    joints: list[int],
+    placement: pin.SE3,
+    prefix: str = "",
 ) -> list[int]:
     """Add copies of `objects` to `geometry`, their parent joints mapped.
 
@@ -98,7 +122,11 @@ def graft_geometry(
     for original in objects:
         local = original.placement if original.parentJoint else placement * original.placement
         twin = pin.GeometryObject(original)
-        twin.name, twin.parentJoint, twin.parentFrame = prefix + original.name, joints[original.parentJoint], 0
+        twin.name, twin.parentJoint, twin.parentFrame = (
+            prefix + original.name,
+            joints[original.parentJoint],
+            0,
+        )
         twin.placement = local
         added.append(geometry.addGeometryObject(twin))
     return added

@@ -41,13 +41,26 @@ from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema, re
 from vkc_pin.world.models.dynamics.mass import weigh
 from vkc_pin.world.models.grafting import clean
 
-__all__ = ["AttachmentSchema", "FreedomSchema", "LatchSchema", "ObjectSchema", "described_object", "load_object"]
+__all__ = [
+    "AttachmentSchema",
+    "FreedomSchema",
+    "LatchSchema",
+    "ObjectSchema",
+    "described_object",
+    "load_object",
+]
 
 
 _around_zero = require(
-    lambda value: value[0] <= 0.0 <= value[1], "the limits do not contain 0", "limits [lower <= 0, upper >= 0]"
+    lambda value: value[0] <= 0.0 <= value[1],
+    "the limits do not contain 0",
+    "limits [lower <= 0, upper >= 0]",
 )
-_some_length = require(lambda value: np.linalg.norm(value) >= 1e-6, "a direction cannot be zero", "a vector of some length")
+_some_length = require(
+    lambda value: np.linalg.norm(value) >= 1e-6,
+    "a direction cannot be zero",
+    "a vector of some length",
+)
 Limits = Annotated[tuple[Number, Number], count(2), _around_zero]
 Direction = Annotated[Vector3, _some_length]
 
@@ -95,23 +108,54 @@ class AttachmentSchema(Schema):
     def _consistent(self) -> AttachmentSchema:
         given = sum(way is not None for way in (self.rpy, self.quaternion, self.approach))
         unclear = (self.approach is None) != (self.closing is None) or given > 1
-        slanted = self.approach is not None and self.closing is not None and abs(np.dot(self.approach, self.closing)) > 1e-9
-        has_axis, axis = self.joint in ("revolute", "prismatic", "cylindrical"), "joint revolute, prismatic or cylindrical"
+        slanted = (
+            self.approach is not None
+            and self.closing is not None
+            and abs(np.dot(self.approach, self.closing)) > 1e-9
+        )
+        has_axis, axis = (
+            self.joint in ("revolute", "prismatic", "cylindrical"),
+            "joint revolute, prismatic or cylindrical",
+        )
         turns = self.joint == "cylindrical"
         names = [freedom.name for freedom in self.freedoms]
         for wrong, problem, expected in (
-            (unclear, "the tool's direction is not clear", "rpy, quaternion, or approach and closing"),
+            (
+                unclear,
+                "the tool's direction is not clear",
+                "rpy, quaternion, or approach and closing",
+            ),
             (slanted, "approach and closing are not perpendicular", "two perpendicular directions"),
-            (has_axis != (self.axis is not None), "axis and joint do not fit", f"an axis with {axis}, and only there"),
-            (has_axis and self.limits is None, "limits missing", "limits [lower, upper] of the grasp's joint"),
-            (self.joint == "fixed" and self.limits is not None, "a fixed grasp has no limits", "no limits, or another joint"),
+            (
+                has_axis != (self.axis is not None),
+                "axis and joint do not fit",
+                f"an axis with {axis}, and only there",
+            ),
+            (
+                has_axis and self.limits is None,
+                "limits missing",
+                "limits [lower, upper] of the grasp's joint",
+            ),
+            (
+                self.joint == "fixed" and self.limits is not None,
+                "a fixed grasp has no limits",
+                "no limits, or another joint",
+            ),
             (
                 turns != (self.turn is not None),
                 "turn and joint do not fit",
                 "turn [lower, upper] with joint cylindrical, and only there",
             ),
-            (names and self.joint != "fixed", "freedoms and joint both say how the hand may move", "one of them"),
-            (self.contact == "push" and self.firm, "a hand that pushes does not clamp", "firm: false, or contact: grasp"),
+            (
+                names and self.joint != "fixed",
+                "freedoms and joint both say how the hand may move",
+                "one of them",
+            ),
+            (
+                self.contact == "push" and self.firm,
+                "a hand that pushes does not clamp",
+                "firm: false, or contact: grasp",
+            ),
             (len(names) > 6, "more freedoms than a body has", "at most 6"),
             (len(set(names)) < len(names), "two freedoms share a name", "different names"),
         ):
@@ -137,29 +181,39 @@ class ObjectSchema(Schema):
     free: bool = False
     mass: NotNegative | None = None
     joints: Mapping[str, ObjectJointSchema] = Field(default_factory=dict)
-    attachments: tuple[AttachmentSchema, ...]  # none, if it is said so: what no hand can open still stands in rooms
+    attachments: tuple[
+        AttachmentSchema, ...
+    ]  # none, if it is said so: what no hand can open still stands in rooms
     latches: tuple[LatchSchema, ...] = ()
     own_collisions: tuple[Annotated[tuple[str, ...], count(2)], ...] = ()
 
 
-def load_object(name_or_path: str | Path | Mapping[str, Any], *, folder: str | Path = ".") -> ArticulatedObject:
+def load_object(
+    name_or_path: str | Path | Mapping[str, Any], *, folder: str | Path = "."
+) -> ArticulatedObject:
     """Load an articulated object.
 
     Args:
-        name_or_path: The name of a description in `scenes/objects`, the path of one (.yaml), or a description itself.
+        name_or_path: The name of a description in `scenes/objects`, the path of one (.yaml), or a
+            description itself.
         folder: Where paths in a description that is handed over start from.
 
     Raises:
-        UnknownNameError: There is no such object, or its description names a field, link or joint that does not exist.
+        UnknownNameError: There is no such object, or its description names a field, link or joint
+            that does not exist.
         InputError: The description or its URDF is wrong.
     """
     if isinstance(name_or_path, Mapping):
-        return described_object(Document(mapping(name_or_path, "description")), file_path(folder, "folder"))
+        return described_object(
+            Document(mapping(name_or_path, "description")), file_path(folder, "folder")
+        )
     file = located(name_or_path, "scenes", "objects/*.yaml", what="object")
     return described_object(read_yaml(file), file.parent, file.stem)
 
 
-def described_object(document: Document, folder: Path, name: str | None = None) -> ArticulatedObject:
+def described_object(
+    document: Document, folder: Path, name: str | None = None
+) -> ArticulatedObject:
     """Return the object of a description.
 
     Args:
@@ -173,12 +227,22 @@ def described_object(document: Document, folder: Path, name: str | None = None) 
     """
     schema = check(document, ObjectSchema)
     text = schema.urdf if schema.urdf.lstrip().startswith("<") else None
-    urdf = folder / schema.urdf if text is None else Path(f"{document.file or folder / 'description'}: urdf")
+    urdf = (
+        folder / schema.urdf
+        if text is None
+        else Path(f"{document.file or folder / 'description'}: urdf")
+    )
     with document.at(("urdf",)):
         model, collision, visual = load_urdf(urdf, text=text)
         coordinates = Coordinates(model)
-    names, links = coordinates.names, [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
-    velocity, acceleration = coordinates.velocity.copy(), np.full(coordinates.size, DEFAULT_ACCELERATION)
+    names, links = (
+        coordinates.names,
+        [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY],
+    )
+    velocity, acceleration = (
+        coordinates.velocity.copy(),
+        np.full(coordinates.size, DEFAULT_ACCELERATION),
+    )
     velocity[np.isinf(velocity)] = DEFAULT_VELOCITY
     for joint, limits in schema.joints.items():
         if joint not in names:
@@ -192,7 +256,10 @@ def described_object(document: Document, folder: Path, name: str | None = None) 
         raise InputError(problem, file=urdf, field=field, expected="> 0", got=velocity.min())
     if schema.mass is not None:
         if not schema.free:
-            problem, expected = "what stands fixed is not carried", "masses of links in its URDF, or free: true"
+            problem, expected = (
+                "what stands fixed is not carried",
+                "masses of links in its URDF, or free: true",
+            )
             raise document.error(("mass",), problem, expected=expected, got=schema.mass)
         weigh(model, collision, schema.mass)
     attachments: dict[str, Attachment] = {}
@@ -200,15 +267,26 @@ def described_object(document: Document, folder: Path, name: str | None = None) 
         if item.link not in links:
             raise document.unknown(("attachments", index, "link"), "link", item.link, links)
         if item.name in attachments:
-            raise document.error(("attachments", index, "name"), "this name is taken", expected="a new name", got=item.name)
+            raise document.error(
+                ("attachments", index, "name"),
+                "this name is taken",
+                expected="a new name",
+                got=item.name,
+            )
         if schema.free and item.contact == "push":
             problem = "what stands free has nothing that leads it where it is pushed"
-            raise document.error(("attachments", index, "contact"), problem, expected="grasp", got=item.contact)
+            raise document.error(
+                ("attachments", index, "contact"), problem, expected="grasp", got=item.contact
+            )
         attachment = _attachment(item, firm=schema.free)
-        taken = {name for other in attachments.values() for name in other.coordinates}.intersection(attachment.coordinates)
+        taken = {name for other in attachments.values() for name in other.coordinates}.intersection(
+            attachment.coordinates
+        )
         if taken:  # "grip_slide" beside a "grip" that slides
             problem, got = "its coordinate's name is taken", ", ".join(taken)
-            raise document.error(("attachments", index, "name"), problem, expected="a new name", got=got)
+            raise document.error(
+                ("attachments", index, "name"), problem, expected="a new name", got=got
+            )
         attachments[item.name] = attachment
     return ArticulatedObject(
         name=name or str(model.name),
@@ -258,45 +336,77 @@ def _freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
         return tuple(_freedom(own) for own in item.freedoms)
     if item.joint == "spherical":
         limits = item.limits or (-np.pi, np.pi)
-        return tuple(Freedom(f"_{name}", "revolute", axis, *limits) for name, axis in zip("xyz", np.eye(3), strict=True))
+        return tuple(
+            Freedom(f"_{name}", "revolute", axis, *limits)
+            for name, axis in zip("xyz", np.eye(3), strict=True)
+        )
     if item.axis is None or item.limits is None:  # a fixed grasp, as the schema says
         return ()
     axis = np.array(item.axis) / np.linalg.norm(item.axis)
     if item.turn is not None:
-        return Freedom("_slide", "prismatic", axis, *item.limits), Freedom("_turn", "revolute", axis, *item.turn)
+        return Freedom("_slide", "prismatic", axis, *item.limits), Freedom(
+            "_turn", "revolute", axis, *item.turn
+        )
     return (Freedom("", item.joint, axis, *item.limits),)
 
 
 def _freedom(item: FreedomSchema) -> Freedom:
     kind, given = ("revolute", item.turn) if item.slide is None else ("prismatic", item.slide)
     axis = np.array(given, float)
-    return Freedom(f"_{item.name}", kind, axis / np.linalg.norm(axis), *item.limits, np.array(item.through or (0.0, 0.0, 0.0)))
+    return Freedom(
+        f"_{item.name}",
+        kind,
+        axis / np.linalg.norm(axis),
+        *item.limits,
+        np.array(item.through or (0.0, 0.0, 0.0)),
+    )
 
 
-def _own_pairs(document: Document, schema: ObjectSchema, links: Sequence[str]) -> frozenset[frozenset[str]]:
+def _own_pairs(
+    document: Document, schema: ObjectSchema, links: Sequence[str]
+) -> frozenset[frozenset[str]]:
     for number, pair in enumerate(schema.own_collisions):
         for place, link in enumerate(pair):
             if link not in links:
                 raise document.unknown(("own_collisions", number, place), "link", link, links)
         if pair[0] == pair[1]:
-            raise document.error(("own_collisions", number), "a link cannot meet itself", expected="two links", got=pair[0])
+            raise document.error(
+                ("own_collisions", number),
+                "a link cannot meet itself",
+                expected="two links",
+                got=pair[0],
+            )
     return frozenset(map(frozenset, schema.own_collisions))
 
 
-def _latches(document: Document, schema: ObjectSchema, coordinates: Coordinates) -> tuple[Latch, ...]:
+def _latches(
+    document: Document, schema: ObjectSchema, coordinates: Coordinates
+) -> tuple[Latch, ...]:
     latches = []
     for number, item in enumerate(schema.latches):
         at = ("latches", number)
-        for role, joint, value in (("joint", item.joint, item.held_at), ("released_by", item.released_by, item.threshold)):
+        for role, joint, value in (
+            ("joint", item.joint, item.held_at),
+            ("released_by", item.released_by, item.threshold),
+        ):
             if joint not in coordinates.names:
                 raise document.unknown((*at, role), "joint", joint, coordinates.names)
             index = coordinates.index(joint)
             lower, upper = coordinates.lower[index], coordinates.upper[index]
             if not lower <= value <= upper:
                 what = "held_at" if role == "joint" else "threshold"
-                raise document.error((*at, what), f"outside the limits of {joint}", expected=f"{lower:g} to {upper:g}", got=value)
+                raise document.error(
+                    (*at, what),
+                    f"outside the limits of {joint}",
+                    expected=f"{lower:g} to {upper:g}",
+                    got=value,
+                )
         if item.joint == item.released_by:
             problem = "a joint cannot release itself"
-            raise document.error((*at, "released_by"), problem, expected="another joint", got=item.released_by)
-        latches.append(Latch(item.joint, item.held_at, item.released_by, item.threshold, item.engaged_within))
+            raise document.error(
+                (*at, "released_by"), problem, expected="another joint", got=item.released_by
+            )
+        latches.append(
+            Latch(item.joint, item.held_at, item.released_by, item.threshold, item.engaged_within)
+        )
     return tuple(latches)

@@ -45,21 +45,27 @@ class Robot:
     Attributes:
         name: The robot's name.
         urdf: The URDF file it was read from.
-        model: Joint 1, named "base", is planar; the planned joints follow. All other joints of the URDF are locked.
-        collision: Convex shapes named `<link>_<k>`; the collision pairs are those that the robot must keep apart.
+        model: Joint 1, named "base", is planar; the planned joints follow. All other joints of the
+            URDF are locked.
+        collision: Convex shapes named `<link>_<k>`; the collision pairs are those that the robot
+            must keep apart.
         coordinates: The minimal coordinates of `model`.
         lower, upper: Position limits, shape (n,), infinite for the yaw and for continuous joints.
         velocity, acceleration: Limits, shape (n,).
         home: Where the arm rests, shape (n − 3,).
-        tool_frame: The frame of `model` that grasps: z is the approach direction, x the one in which fingers close.
-        base: How the base moves: "omni" in any direction, "differential" along its x axis and round, "ackermann" along its x axis
-            and in turns no tighter than `turning_radius`, "fixed" not at all.
+        tool_frame: The frame of `model` that grasps: z is the approach direction, x the one in
+            which fingers close.
+        base: How the base moves: "omni" in any direction, "differential" along its x axis and
+            round, "ackermann" along its x axis and in turns no tighter than `turning_radius`,
+            "fixed" not at all.
         touch_links: The links that may touch what is grasped.
         height: Of its root link above the floor [m].
         gripper: How its fingers open, if its description says so; otherwise they stand still.
-        wheels: The wheels of its base, if its description says; they limit bases that are "differential" or "ackermann".
+        wheels: The wheels of its base, if its description says; they limit bases that are
+            "differential" or "ackermann".
         turning_radius: The least radius on which the base's origin turns if it is "ackermann" [m].
-        tight: Pairs of links, each sorted, that are never, or not at home, 50 mm apart: how far they are at most, or there [m].
+        tight: Pairs of links, each sorted, that are never, or not at home, 50 mm apart: how far
+            they are at most, or there [m].
     """
 
     name: str
@@ -96,17 +102,23 @@ class Robot:
     def lever(self) -> float:
         """How far a radian moves the hand, on average over the arm's joints and over random postures [m/rad].
 
-        It is the metric of searches, and says what driving costs beside turning and reaching. One number for all turns: were
-        those of the wrist cheaper, searches would find long ones.
+        It is the metric of searches, and says what driving costs beside turning and reaching. One
+        number for all turns: were those of the wrist cheaper, searches would find long ones.
         """
-        rng, data, frame = np.random.default_rng(0), self.model.createData(), self.model.getFrameId(self.tool_frame)
+        rng, data, frame = (
+            np.random.default_rng(0),
+            self.model.createData(),
+            self.model.getFrameId(self.tool_frame),
+        )
         turns = [k for k, unit in enumerate(self.coordinates.units) if k > 2 and unit == "rad"]
         if not turns:
             return _LEAST_LEVER
         low, high = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
         squares = np.zeros(len(turns))
         for z in rng.uniform(low, np.maximum(low, high), (_POSTURES, len(low))):
-            jacobian = pin.computeFrameJacobian(self.model, data, self.coordinates.q(z), frame, pin.LOCAL_WORLD_ALIGNED)
+            jacobian = pin.computeFrameJacobian(
+                self.model, data, self.coordinates.q(z), frame, pin.LOCAL_WORLD_ALIGNED
+            )
             squares += (jacobian[:3, turns] ** 2).sum(axis=0)
         return max(float(np.sqrt(squares / _POSTURES).mean()), _LEAST_LEVER)
 
@@ -119,10 +131,18 @@ class Robot:
     def front(self) -> pin.SE3:
         """The foremost point of the hand in the tool frame, with its axes: as far along the approach as a touch link reaches."""
         frame = self.model.frames[self.model.getFrameId(self.tool_frame)]
-        ahead = coal.Halfspace(np.array([0.0, 0.0, -1.0]), -_AHEAD)  # all that is so far before the tool
+        ahead = coal.Halfspace(
+            np.array([0.0, 0.0, -1.0]), -_AHEAD
+        )  # all that is so far before the tool
         carried = [s for s in self.collision.geometryObjects if s.parentJoint == frame.parentJoint]
-        hand = [(s.geometry, frame.placement.actInv(s.placement)) for s in carried if link_name(s.name) in self.touch_links]
-        gaps = [shape_distance(geometry, where, ahead, pin.SE3.Identity()) for geometry, where in hand]
+        hand = [
+            (s.geometry, frame.placement.actInv(s.placement))
+            for s in carried
+            if link_name(s.name) in self.touch_links
+        ]
+        gaps = [
+            shape_distance(geometry, where, ahead, pin.SE3.Identity()) for geometry, where in hand
+        ]
         return pin.SE3(np.eye(3), np.array([0.0, 0.0, _AHEAD - min(gaps, default=_AHEAD)]))
 
     @cached_property
@@ -130,12 +150,18 @@ class Robot:
         """A digest of all that distances between its links depend on: shapes, where they are, limits, home, links and joints."""
         digest, data = hashlib.sha256(), self.model.createData()
         for joint in self.file.root.findall("joint"):
-            ends = [element.get("link") for key in ("parent", "child") if (element := joint.find(key)) is not None]
+            ends = [
+                element.get("link")
+                for key in ("parent", "child")
+                if (element := joint.find(key)) is not None
+            ]
             digest.update(repr((joint.get("name"), joint.get("type"), ends)).encode())
         digest.update(repr((self.coordinates.names, list(self.model.parents))).encode())
         for values in (self.lower, self.upper, self.home):
             digest.update(np.asarray(values, float).tobytes())
-        for z in np.random.default_rng(0).uniform(-3.0, 3.0, (3, len(self.lower))):  # axes and placements, by what they do
+        for z in np.random.default_rng(0).uniform(
+            -3.0, 3.0, (3, len(self.lower))
+        ):  # axes and placements, by what they do
             pin.forwardKinematics(self.model, data, self.coordinates.q(z))
             digest.update(np.array([place.homogeneous for place in data.oMi]).tobytes())
         for shape in self.collision.geometryObjects:
@@ -160,16 +186,25 @@ class Robot:
             return self
         if self.gripper is None:
             expected = "a `gripper` in its robot.yaml"
-            raise InputError(f"the gripper of '{self.name}' does not open", field="opening", expected=expected, got=opening)
+            raise InputError(
+                f"the gripper of '{self.name}' does not open",
+                field="opening",
+                expected=expected,
+                got=opening,
+            )
         if opening not in self._opened:
             model, collision = pin.Model(self.model), self.collision.copy()
             for name, placement in self.gripper.frames(opening).items():
                 model.frames[model.getFrameId(name)].placement = placement
             for shape in collision.geometryObjects:
-                old, new = (there.frames[shape.parentFrame].placement for there in (self.model, model))
+                old, new = (
+                    there.frames[shape.parentFrame].placement for there in (self.model, model)
+                )
                 if old != new:
                     shape.placement = clean(new * old.actInv(shape.placement))
-            self._opened[opening] = dataclasses.replace(self, model=model, collision=collision, _opened={})
+            self._opened[opening] = dataclasses.replace(
+                self, model=model, collision=collision, _opened={}
+            )
         return self._opened[opening]
 
     @property
@@ -213,4 +248,6 @@ class Robot:
     @property
     def links(self) -> tuple[str, ...]:
         """The links that have collision geometry, each once."""
-        return tuple(dict.fromkeys(link_name(shape.name) for shape in self.collision.geometryObjects))
+        return tuple(
+            dict.fromkeys(link_name(shape.name) for shape in self.collision.geometryObjects)
+        )

@@ -42,12 +42,20 @@ _BASES = get_args(Base)
 _PAIRS = ("srdf", "sampled", "all")
 _SAMPLES = 1000  # to find allowed pairs when a robot without an SRDF is loaded
 # Names under which example-robot-data loads URDF files called otherwise.
-_ALIASES = {"anymal_kinova": "anymal-kinova", "asr_twodof": "TwoDofs", "b1_z1": "b1-z1", "hyq": "hyq_no_sensors", "solo8": "solo"}
+_ALIASES = {
+    "anymal_kinova": "anymal-kinova",
+    "asr_twodof": "TwoDofs",
+    "b1_z1": "b1-z1",
+    "hyq": "hyq_no_sensors",
+    "solo8": "solo",
+}
 
 
 def known_robots() -> dict[str, Path]:
     """Return the names `load_robot` knows and their files: those in robots/, then those of example-robot-data."""
-    known = {path.parent.name: path for path in sorted(resources.folder("robots").glob("*/robot.yaml"))}
+    known = {
+        path.parent.name: path for path in sorted(resources.folder("robots").glob("*/robot.yaml"))
+    }
     folder = resources.example_robot_data()
     if folder is not None:
         files = sorted(folder.glob("robots/*/*/*.urdf"))
@@ -65,8 +73,8 @@ def find_robot(name: str | Path) -> Path:
     """Return the robot.yaml or URDF file of a robot.
 
     Args:
-        name: A name of `known_robots`, or the path of a URDF file, of a robot.yaml, or of a folder that holds one. Text is a path
-            if it has the ending of such a file or a slash in it.
+        name: A name of `known_robots`, or the path of a URDF file, of a robot.yaml, or of a folder
+            that holds one. Text is a path if it has the ending of such a file or a slash in it.
 
     Raises:
         UnknownNameError: It is neither.
@@ -76,7 +84,11 @@ def find_robot(name: str | Path) -> Path:
     if isinstance(name, Path) or path.suffix.lower() in (".urdf", ".yaml", ".yml") or "/" in name:
         file = path / "robot.yaml" if path.is_dir() else path
         if not file.is_file():
-            raise InputError("there is no such robot", file=file, expected="a URDF file, a robot.yaml, or a robot's name")
+            raise InputError(
+                "there is no such robot",
+                file=file,
+                expected="a URDF file, a robot.yaml, or a robot's name",
+            )
         return file
     known = known_robots()
     if name not in known:
@@ -100,59 +112,96 @@ def load_robot(
 ) -> Robot:
     """Load a robot and put it on a planar virtual base.
 
-    The joints between the root and the tool frame are planned. All others (wheels, heads, other arms, fingers) are
-    locked, as are joints of a type other than revolute, continuous and prismatic. Joints that follow one of these (<mimic>, or
-    `couplings` in robot.yaml) move with it, wherever they are: together they have one coordinate, that of the joint they follow.
+    The joints between the root and the tool frame are planned. All others (wheels, heads, other
+    arms, fingers) are locked, as are joints of a type other than revolute, continuous and
+    prismatic. Joints that follow one of these (<mimic>, or `couplings` in robot.yaml) move with it,
+    wherever they are: together they have one coordinate, that of the joint they follow.
 
-    Limits come from the URDF and from a `robot.yaml` beside it. Where neither names a velocity or an acceleration they
-    are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, 1 m/s, 2 rad/s, 3 m/s² and 6 rad/s² for the base, ±20 m.
+    Limits come from the URDF and from a `robot.yaml` beside it. Where neither names a velocity or
+    an acceleration they are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, 1 m/s, 2 rad/s, 3 m/s²
+    and 6 rad/s² for the base, ±20 m.
 
-    Where the URDF begins with joints that drive the robot about, the virtual base takes their place: they are locked at 0, with a
-    warning unless something says where, and unless `base` is "fixed".
+    Where the URDF begins with joints that drive the robot about, the virtual base takes their
+    place: they are locked at 0, with a warning unless something says where, and unless `base` is
+    "fixed".
 
-    Pairs of links that may touch come from the SRDF. Without one they are adjacent links and those that sampling
-    finds always, or never, in collision. In any case neighbours may that are always close, links that always overlap, and those
-    that overlap at home; see `vkc_pin.world.models.self_collisions`. There is a warning where these are not neighbours.
+    Pairs of links that may touch come from the SRDF. Without one they are adjacent links and those
+    that sampling finds always, or never, in collision. In any case neighbours may that are always
+    close, links that always overlap, and those that overlap at home; see
+    `vkc_pin.world.models.self_collisions`. There is a warning where these are not neighbours.
 
     Args:
-        name: A robot in robots/, one of example-robot-data ("panda", "tiago", "ur5"), or the path of a URDF.
-        base: "omni", "differential" (not sideways), "ackermann" (nor tighter than `turning_radius`) or "fixed" (limits of 0).
-        tool_frame: The frame that grasps; by default that of robot.yaml, else the last frame of the longest chain.
+        name: A robot in robots/, one of example-robot-data ("panda", "tiago", "ur5"), or the path
+            of a URDF.
+        base: "omni", "differential" (not sideways), "ackermann" (nor tighter than `turning_radius`)
+            or "fixed" (limits of 0).
+        tool_frame: The frame that grasps; by default that of robot.yaml, else the last frame of the
+            longest chain.
         arm: A group of the SRDF, instead of `tool_frame`: the link at its end grasps.
-        locked_joints: More joints to lock, and where, [m] or [rad]; joints locked anyway rest at 0 or the nearest limit.
-        home: Where joints rest, [m] or [rad]; by default what robot.yaml says, else a group state of the SRDF that
-            covers all planned joints (one called home if there is one), else 0, or the middle if 0 is outside the limits. Where
-            links overlap there, joints of which nobody says where they rest are moved, with a warning.
-        srdf: File of allowed collisions; by default the one robot.yaml names, or the one beside the URDF.
-        pairs: Where the allowed pairs come from: "srdf"; "sampled" whether there is an SRDF or not; "all" makes every pair
-            of links that move against each other a collision pair, even adjacent ones, to look at the geometry itself.
+        locked_joints: More joints to lock, and where, [m] or [rad]; joints locked anyway rest at 0
+            or the nearest limit.
+        home: Where joints rest, [m] or [rad]; by default what robot.yaml says, else a group state
+            of the SRDF that covers all planned joints (one called home if there is one), else 0, or
+            the middle if 0 is outside the limits. Where links overlap there, joints of which nobody
+            says where they rest are moved, with a warning.
+        srdf: File of allowed collisions; by default the one robot.yaml names, or the one beside the
+            URDF.
+        pairs: Where the allowed pairs come from: "srdf"; "sampled" whether there is an SRDF or not;
+            "all" makes every pair of links that move against each other a collision pair, even
+            adjacent ones, to look at the geometry itself.
         packages: Folders for `package://` addresses; others are looked for around the file.
         height: Of the root link above the floor [m]; by default what robot.yaml says, else 0.
-        turning_radius: Of an "ackermann" base, the least radius on which its root link turns [m]; by default robot.yaml's.
+        turning_radius: Of an "ackermann" base, the least radius on which its root link turns [m];
+            by default robot.yaml's.
 
     Raises:
-        UnknownNameError: There is no such robot, frame, joint or link; the error names the nearest one.
+        UnknownNameError: There is no such robot, frame, joint or link; the error names the nearest
+            one.
         InputError: A file or value is wrong, no joint would be planned, or nothing could collide.
     """
-    for value, field, choices, kind in ((base, "base", _BASES, "kind of base"), (pairs, "pairs", _PAIRS, "source of pairs")):
+    for value, field, choices, kind in (
+        (base, "base", _BASES, "kind of base"),
+        (pairs, "pairs", _PAIRS, "source of pairs"),
+    ):
         if not isinstance(value, str) or value not in choices:
-            raise InputError(f"wrong {kind}", field=field, expected=" or ".join(choices), got=shown(value))
-    for field, given_name, kind in (("tool_frame", tool_frame, "the name of a frame"), ("arm", arm, "the name of a group")):
+            raise InputError(
+                f"wrong {kind}", field=field, expected=" or ".join(choices), got=shown(value)
+            )
+    for field, given_name, kind in (
+        ("tool_frame", tool_frame, "the name of a frame"),
+        ("arm", arm, "the name of a group"),
+    ):
         if given_name is not None:
             text(given_name, field, kind)
     if arm is not None and tool_frame is not None:
-        raise InputError("both say what grasps", field="arm, tool_frame", expected="one of them", got=f"{arm}, {tool_frame}")
+        raise InputError(
+            "both say what grasps",
+            field="arm, tool_frame",
+            expected="one of them",
+            got=f"{arm}, {tool_frame}",
+        )
     positions = {}
     for field, values in (("locked_joints", locked_joints), ("home", home)):
         named = mapping({} if values is None else values, field, "joints, each with its position")
-        positions[field] = {joint: quantity(value, f"{field}.{joint}") for joint, value in named.items()}
+        positions[field] = {
+            joint: quantity(value, f"{field}.{joint}") for joint, value in named.items()
+        }
     home, locked_joints = positions["home"], positions["locked_joints"]
-    files = _read(name, mapping({} if packages is None else packages, "packages", "packages, each with its folder"))
+    files = _read(
+        name,
+        mapping({} if packages is None else packages, "packages", "packages, each with its folder"),
+    )
     urdf, settings = files.urdf, files.settings
     beside = file_path(srdf, "srdf") if srdf is not None else files.srdf()
-    semantics = read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
+    semantics = (
+        read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
+    )
     full = full_model(urdf)
-    tool = tool_frame if tool_frame is not None else files.tool_frame(arm, beside) or default_tool_frame(full, urdf)
+    tool = (
+        tool_frame
+        if tool_frame is not None
+        else files.tool_frame(arm, beside) or default_tool_frame(full, urdf)
+    )
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
     full = limited_together(full, urdf, tool)
@@ -172,7 +221,10 @@ def load_robot(
     if unsaid := ", ".join(joint for joint in replaced if joint not in said):
         problem = "the virtual base moves the robot; joints of its own that do are locked"
         warnings.warn(f"{urdf.path}: {problem}: {unsaid}", stacklevel=2)
-    raised, rest = settings.base.height if height is None else quantity(height, "height"), {**rest, **locked}
+    raised, rest = (
+        settings.base.height if height is None else quantity(height, "height"),
+        {**rest, **locked},
+    )
     model = planned_model(full, urdf, tool, rest, locked, height=raised)
     coordinates, lower, upper, velocity, acceleration = robot_limits(full, model, settings, base)
     files.check_followers(model, rest, given)
@@ -188,23 +240,39 @@ def load_robot(
         upper=upper,
         velocity=velocity,
         acceleration=acceleration,
-        home=np.clip([{**rest, **state}[joint] for joint in coordinates.names[3:]], lower[3:], upper[3:]),  # rounding
+        home=np.clip(
+            [{**rest, **state}[joint] for joint in coordinates.names[3:]], lower[3:], upper[3:]
+        ),  # rounding
         tool_frame=tool,
         base=base,
         touch_links=settings.touch_links,
         height=raised,
         **wheels_of(base, turning_radius, settings, files.source),
-        gripper=described_gripper(full, urdf, model, collision, tool, rest, settings.gripper, files.document, height=raised),
+        gripper=described_gripper(
+            full,
+            urdf,
+            model,
+            collision,
+            tool,
+            rest,
+            settings.gripper,
+            files.document,
+            height=raised,
+        ),
         file=urdf,
     )
     if pairs == "all":
         robot = with_collision_pairs(robot, ())
     else:
-        loose = [joint for joint in coordinates.names[3:] if joint not in given and joint not in state]
+        loose = [
+            joint for joint in coordinates.names[3:] if joint not in given and joint not in state
+        ]
         robot = surveyed(robot, semantics, loose, samples=_SAMPLES)
     if len(robot.collision.collisionPairs) == 0 and (pairs == "all" or semantics is not None):
         expected = "<collision> elements, and an SRDF that fits"
-        raise InputError("no pair of links is left that could collide", file=robot.urdf, expected=expected)
+        raise InputError(
+            "no pair of links is left that could collide", file=robot.urdf, expected=expected
+        )
     return robot
 
 
@@ -220,7 +288,11 @@ class _Files:
     @property
     def name(self) -> str:
         """The robot's name: that of its folder or its file."""
-        return self.source.resolve().parent.name if self.source.name == "robot.yaml" else self.source.stem
+        return (
+            self.source.resolve().parent.name
+            if self.source.name == "robot.yaml"
+            else self.source.stem
+        )
 
     def srdf(self) -> Path | None:
         """Return the SRDF that belongs to the URDF: named in robot.yaml, or found by its name."""
@@ -228,7 +300,11 @@ class _Files:
             return self.source.parent / self.settings.srdf
         path = self.urdf.path
         stems = (path.stem, path.stem.removesuffix("_robot"))
-        places = [folder / f"{stem}.srdf" for stem in stems for folder in (path.parent, path.parent.parent / "srdf")]
+        places = [
+            folder / f"{stem}.srdf"
+            for stem in stems
+            for folder in (path.parent, path.parent.parent / "srdf")
+        ]
         return next((place for place in places if place.is_file()), None)
 
     def tool_frame(self, arm: str | None, srdf: Path | None) -> str | None:
@@ -254,12 +330,25 @@ class _Files:
             low, high = full.lowerPositionLimit[moving.idx_q], full.upperPositionLimit[moving.idx_q]
             if not low - LIMIT_SLACK <= position <= high + LIMIT_SLACK:
                 problem, expected = "rests outside its limits", f"between {low:g} and {high:g}"
-                for key, said in (("locked_joints", self.settings.locked_joints), ("home", self.settings.home)):
+                for key, said in (
+                    ("locked_joints", self.settings.locked_joints),
+                    ("home", self.settings.home),
+                ):
                     if said.get(joint) == position:
-                        raise self.document.error((key, joint), problem, expected=expected, got=position)
-                raise InputError(problem, file=self.urdf.path, field=f"{field}.{joint}", expected=expected, got=position)
+                        raise self.document.error(
+                            (key, joint), problem, expected=expected, got=position
+                        )
+                raise InputError(
+                    problem,
+                    file=self.urdf.path,
+                    field=f"{field}.{joint}",
+                    expected=expected,
+                    got=position,
+                )
 
-    def check_followers(self, model: pin.Model, rest: Mapping[str, float], given: Collection[str]) -> None:
+    def check_followers(
+        self, model: pin.Model, rest: Mapping[str, float], given: Collection[str]
+    ) -> None:
         """Check that joints `given` a place to rest at follow those that they follow. Raises `InputError` if one does not."""
         coordinates = Coordinates(model)
         for move in coordinates.moves[3:]:
@@ -269,8 +358,16 @@ class _Files:
                 if abs(rest[joint] - follows) > LIMIT_SLACK:
                     problem, expected = f"this joint follows '{leader}'", f"{follows:g}, or nothing"
                     if joint in self.settings.home:
-                        raise self.document.error(("home", joint), problem, expected=expected, got=rest[joint])
-                    raise InputError(problem, file=self.urdf.path, field=f"home.{joint}", expected=expected, got=rest[joint])
+                        raise self.document.error(
+                            ("home", joint), problem, expected=expected, got=rest[joint]
+                        )
+                    raise InputError(
+                        problem,
+                        file=self.urdf.path,
+                        field=f"home.{joint}",
+                        expected=expected,
+                        got=rest[joint],
+                    )
 
 
 def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
@@ -284,14 +381,25 @@ def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
         source = source.parent / "robot.yaml" if beside.urdf == source.name else source
     if source.suffix == ".yaml":
         settings, document = read_robot(source)
-    folders = {key: file_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()}
-    folders = {**python_packages(tuple(p for p in settings.packages if p not in folders), document), **folders}
+    folders = {
+        key: file_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()
+    }
+    folders = {
+        **python_packages(tuple(p for p in settings.packages if p not in folders), document),
+        **folders,
+    }
     urdf = read_urdf(source.parent / settings.urdf, folders)
     couple(urdf, settings.couplings, document)
     return _Files(source, settings, document, urdf)
 
 
-def _state(model: pin.Model, arm: Sequence[str], semantics: Srdf | None, given: Collection[str]) -> dict[str, float]:
+def _state(
+    model: pin.Model, arm: Sequence[str], semantics: Srdf | None, given: Collection[str]
+) -> dict[str, float]:
     """Return where an SRDF says that the joints of an arm rest, those `given` otherwise left out."""
     state = {} if semantics is None else semantics.state(arm)
-    return {joint: nearest_position(model, joint, state[joint]) for joint in arm if joint in state and joint not in given}
+    return {
+        joint: nearest_position(model, joint, state[joint])
+        for joint in arm
+        if joint in state and joint not in given
+    }

@@ -12,7 +12,12 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import load_parts, to_bvh
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape, tree_model
-from vkc_pin.world.models.couplings.coupled_joints import Following, coupled_groups, followers, path_to
+from vkc_pin.world.models.couplings.coupled_joints import (
+    Following,
+    coupled_groups,
+    followers,
+    path_to,
+)
 from vkc_pin.world.models.couplings.mimic_joints import in_order, with_mimics
 from vkc_pin.world.models.grafting import add_joint, clean
 
@@ -30,7 +35,9 @@ __all__ = [
 ]
 
 ROOT = "base"  # the name of the planar joint
-_ROUNDING = 1e-9  # [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean expressions
+# [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean
+# expressions
+_ROUNDING = 1e-9
 _LEVEL = 1e-3  # sine of the angle up to which axes count as level or upright
 _FINGER = 7  # joints in the longest finger of a hand
 _ARM = 4  # joints, at least, that carry a hand
@@ -58,7 +65,8 @@ def planned_model(
 ) -> pin.Model:
     """Return `full` with all joints locked but those between the base and `tool_frame`, and those that move with them.
 
-    Joints that follow others are `pinocchio.JointModelMimic`: the model has no coordinate of theirs.
+    Joints that follow others are `pinocchio.JointModelMimic`: the model has no coordinate of
+    theirs.
 
     Args:
         full: See `full_model`.
@@ -73,20 +81,48 @@ def planned_model(
     """
     follows, groups = followers(file.root), coupled_groups(full, file, tool_frame)
     groups = {leader: group for leader, group in groups.items() if leader not in locked}
-    if stuck := [(joint, led.leader) for group in groups.values() for joint, led in group.items() if joint in locked]:
-        problem, (joint, leader), expected = "a locked joint follows one that moves", stuck[0], "the joint locked that it follows"
-        raise InputError(problem, file=file.path, field=f"locked_joints.{joint}", expected=expected, got=f"'{leader}' moves")
+    if stuck := [
+        (joint, led.leader)
+        for group in groups.values()
+        for joint, led in group.items()
+        if joint in locked
+    ]:
+        problem, (joint, leader), expected = (
+            "a locked joint follows one that moves",
+            stuck[0],
+            "the joint locked that it follows",
+        )
+        raise InputError(
+            problem,
+            file=file.path,
+            field=f"locked_joints.{joint}",
+            expected=expected,
+            got=f"'{leader}' moves",
+        )
     alone = {str(full.names[j]) for j in path_to(full, tool_frame) if j > 1} - {*locked, *follows}
     moving = alone.union(groups, *groups.values())
-    planned = [j for j in range(2, full.njoints) if full.names[j] in moving and full.names[j] in rest]
+    planned = [
+        j for j in range(2, full.njoints) if full.names[j] in moving and full.names[j] in rest
+    ]
     if not planned:
         expected = "a frame at the end of an arm"
-        raise InputError("no joint moves this frame", file=file.path, field="tool_frame", expected=expected, got=tool_frame)
+        raise InputError(
+            "no joint moves this frame",
+            file=file.path,
+            field="tool_frame",
+            expected=expected,
+            got=tool_frame,
+        )
     return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}), height, follows)
 
 
 def unlocked_model(
-    full: pin.Model, file: UrdfFile, model: pin.Model, joints: Collection[str], rest: Mapping[str, float], height: float
+    full: pin.Model,
+    file: UrdfFile,
+    model: pin.Model,
+    joints: Collection[str],
+    rest: Mapping[str, float],
+    height: float,
 ) -> pin.Model:
     """Return `model`, which `planned_model` made of `full`, with more `joints` that are not locked, all of them after its own.
 
@@ -98,7 +134,9 @@ def unlocked_model(
         rest: Where the rest is locked, [m] or [rad].
         height: As for `planned_model` [m].
     """
-    own, last = ([full.getJointId(str(name)) for name in names] for names in (list(model.names)[1:], joints))
+    own, last = (
+        [full.getJointId(str(name)) for name in names] for names in (list(model.names)[1:], joints)
+    )
     follows = {joint: led for joint, led in followers(file.root).items() if joint not in joints}
     return _reduced(full, {*own, *last}, configuration(full, rest), height, follows, last)
 
@@ -106,14 +144,21 @@ def unlocked_model(
 def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) -> dict[str, float]:
     """Return for each joint of 1 degree of freedom where it rests, [m] or [rad].
 
-    That is what `given` says, else where the joint that it follows has it, else 0, or the middle of limits without 0.
+    That is what `given` says, else where the joint that it follows has it, else 0, or the middle of
+    limits without 0.
     """
     rest = {}
     for j in range(2, full.njoints):
         if full.joints[j].nv == 1:
             i = full.joints[j].idx_q
-            low, high = (-np.inf, np.inf) if full.joints[j].nq == 2 else (full.lowerPositionLimit[i], full.upperPositionLimit[i])
-            rest[full.names[j]] = float(given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high)))
+            low, high = (
+                (-np.inf, np.inf)
+                if full.joints[j].nq == 2
+                else (full.lowerPositionLimit[i], full.upperPositionLimit[i])
+            )
+            rest[full.names[j]] = float(
+                given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high))
+            )
     for name, led in followers(file.root).items():
         if name in rest and led.leader in rest and name not in given:
             rest[name] = led.factor * rest[led.leader] + led.offset
@@ -133,11 +178,13 @@ def nearest_position(model: pin.Model, joint: str, position: float) -> float:
     return float(np.clip(position, low, high))
 
 
-def neighbours(file: UrdfFile, links: Collection[str]) -> tuple[Set[tuple[str, str]], Set[tuple[str, str]]]:
+def neighbours(
+    file: UrdfFile, links: Collection[str]
+) -> tuple[Set[tuple[str, str]], Set[tuple[str, str]]]:
     """Return two sets of pairs of `links`, each sorted.
 
-    The first has those that one joint connects, or only links that are not among them; the second those that one joint connects
-    that moves, and links that are fixed to either.
+    The first has those that one joint connects, or only links that are not among them; the second
+    those that one joint connects that moves, and links that are fixed to either.
     """
     parents = dict[str, tuple[str, str]]()
     for joint in file.root.findall("joint"):
@@ -166,25 +213,34 @@ def _rigid(link: str, parents: Mapping[str, tuple[str, str]]) -> str:
 def own_base(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
     """Return the joints that move a robot in the plane on their own, or none: then its URDF has a base that drives, too.
 
-    They are the first three, one after the other: two that slide along the floor, in different directions, and one that turns
-    about the vertical, in any order. Nothing that could collide is in front of the last.
+    They are the first three, one after the other: two that slide along the floor, in different
+    directions, and one that turns about the vertical, in any order. Nothing that could collide is
+    in front of the last.
     """
     data, slides, found, joint = full.createData(), list[Floats](), list[str](), 1
     pin.computeJointJacobians(full, data, pin.neutral(full))
     solid = {shape.link for shape in file.shapes("collision")}
-    carries = {frame.parentJoint for frame in full.frames if frame.type == pin.FrameType.BODY and frame.name in solid}
+    carries = {
+        frame.parentJoint
+        for frame in full.frames
+        if frame.type == pin.FrameType.BODY and frame.name in solid
+    }
     while len(found) < 3:
         after = [j for j in range(2, full.njoints) if full.parents[j] == joint]
         if joint in carries or len(after) != 1 or full.joints[after[0]].nv != 1:
             return ()
         (joint,) = after
-        twist = pin.getJointJacobian(full, data, joint, pin.LOCAL_WORLD_ALIGNED)[:, full.joints[joint].idx_v]
+        twist = pin.getJointJacobian(full, data, joint, pin.LOCAL_WORLD_ALIGNED)[
+            :, full.joints[joint].idx_v
+        ]
         if np.abs(twist[3:]).max() < _LEVEL and abs(twist[2]) < _LEVEL:
             slides.append(twist[:2])
         elif abs(twist[5]) < 1.0 - _LEVEL:
             return ()
         found.append(full.names[joint])
-    crossing = len(slides) == 2 and abs(slides[0][0] * slides[1][1] - slides[0][1] * slides[1][0]) > _LEVEL
+    crossing = (
+        len(slides) == 2 and abs(slides[0][0] * slides[1][1] - slides[0][1] * slides[1][0]) > _LEVEL
+    )
     return tuple(found) if crossing else ()
 
 
@@ -194,7 +250,9 @@ def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
     for j in range(1, model.njoints):
         joint, value = model.joints[j], positions.get(model.names[j])
         if value is not None and joint.nv == 1:
-            q[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else (np.cos(value), np.sin(value))
+            q[joint.idx_q : joint.idx_q + joint.nq] = (
+                value if joint.nq == 1 else (np.cos(value), np.sin(value))
+            )
     return q
 
 
@@ -212,29 +270,44 @@ def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
         hand = len(children[joint]) > 1 and depth[joint] <= _FINGER
         if hand and above >= _ARM:
             break
-        joint, above = max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)), above + 1
-    return str([frame.name for frame in full.frames if frame.parentJoint == joint and frame.name != full.names[joint]][-1])
+        joint, above = (
+            max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)),
+            above + 1,
+        )
+    return str(
+        [
+            frame.name
+            for frame in full.frames
+            if frame.parentJoint == joint and frame.name != full.names[joint]
+        ][-1]
+    )
 
 
 def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """Return the collision shapes of `file` on the joints of `model`, named `<link>_<k>`, meshes as their convex hulls.
 
     Raises:
-        InputError: A shape is not understood, a mesh cannot be read or is flat, or there is no shape.
+        InputError: A shape is not understood, a mesh cannot be read or is flat, or there is no
+            shape.
     """
     geometry = pin.GeometryModel()
     for shape in file.few_shapes("collision"):
         geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), _GREY))
     if len(geometry.geometryObjects) == 0:
-        raise InputError("nothing of this robot can collide", file=file.path, expected="<collision> elements", got="none")
+        raise InputError(
+            "nothing of this robot can collide",
+            file=file.path,
+            expected="<collision> elements",
+            got="none",
+        )
     return geometry
 
 
 def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """Return what `file` looks like on the joints of `model`: one shape per colour, light enough for a web page.
 
-    The shapes hold triangles (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that viewers draw what is
-    here and load no file themselves.
+    The shapes hold triangles (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that
+    viewers draw what is here and load no file themselves.
 
     Raises:
         InputError: A shape is not understood, or a mesh cannot be read.
@@ -242,7 +315,9 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     geometry = pin.GeometryModel()
     for shape in file.few_shapes("visual"):
         if shape.file is None:
-            geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), shape.colour or _GREY))
+            geometry.addGeometryObject(
+                _geometry_object(model, shape, shape.name, shape.solid(), shape.colour or _GREY)
+            )
             continue
         parts = load_parts(shape.file, shape.size, detail=_DETAIL)
         for k, part in enumerate(parts):
@@ -262,20 +337,33 @@ def _reduced(
 ) -> pin.Model:
     """Return `full` with the joints that are not `planned` locked at `q`, and all on joint 1 higher by `height`.
 
-    `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many are. Here, the frame of
-    such a joint is left out, so that every frame's name is the only one. Joints come after those they follow, `last` ones last.
+    `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many
+    are. Here, the frame of such a joint is left out, so that every frame's name is the only one.
+    Joints come after those they follow, `last` ones last.
     """
     data = full.createData()
     pin.forwardKinematics(full, data, q)
     model = pin.Model()
     model.name = full.name
     placed = {0: (0, pin.SE3.Identity())}
-    coupled = {j: led for j in sorted(planned) if (led := follows.get(full.names[j])) and full.getJointId(led.leader) in planned}
-    before = {j: {full.getJointId(led.leader)} for j, led in coupled.items()} | {j: {*planned} - {*last} for j in last}
+    coupled = {
+        j: led
+        for j in sorted(planned)
+        if (led := follows.get(full.names[j])) and full.getJointId(led.leader) in planned
+    }
+    before = {j: {full.getJointId(led.leader)} for j, led in coupled.items()} | {
+        j: {*planned} - {*last} for j in last
+    }
     for j in in_order(full, before):
         joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
         if j in planned:
-            index = add_joint(model, parent, joint, clean(placement * full.jointPlacements[j], _ROUNDING), like=(full, j))
+            index = add_joint(
+                model,
+                parent,
+                joint,
+                clean(placement * full.jointPlacements[j], _ROUNDING),
+                like=(full, j),
+            )
             placed[j] = (index, pin.SE3(np.eye(3), np.array([0.0, 0.0, height if j == 1 else 0.0])))
         else:
             placed[j] = (parent, placement * data.liMi[j])
@@ -284,16 +372,24 @@ def _reduced(
     for frame in full.frames[1:]:
         if frame.type == pin.FrameType.BODY or frame.name not in links:
             parent, placement = placed[frame.parentJoint]
-            model.addFrame(pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type))
+            model.addFrame(
+                pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type)
+            )
     return with_mimics(model, [coupled[j] for j in coupled], [placed[j][0] for j in coupled])
 
 
 def _geometry_object(
-    model: pin.Model, shape: UrdfShape, name: str, solid: coal.CollisionGeometry, colour: tuple[float, ...]
+    model: pin.Model,
+    shape: UrdfShape,
+    name: str,
+    solid: coal.CollisionGeometry,
+    colour: tuple[float, ...],
 ) -> pin.GeometryObject:
     """Return `solid` as the geometry of an element of the URDF, on the joint of its link."""
     frame = model.getFrameId(shape.link, pin.FrameType.BODY)
     parent = model.frames[frame]
-    added = pin.GeometryObject(name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid)
+    added = pin.GeometryObject(
+        name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid
+    )
     added.meshColor = np.array(colour)
     return added

@@ -11,7 +11,15 @@ from pydantic import Field
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import quantity
 from vkc_pin.world.files.documents import Document, check, read_yaml
-from vkc_pin.world.files.fields import JointSchema, NotNegative, Number, Positive, Schema, require, text_for
+from vkc_pin.world.files.fields import (
+    JointSchema,
+    NotNegative,
+    Number,
+    Positive,
+    Schema,
+    require,
+    text_for,
+)
 
 __all__ = [
     "BaseSchema",
@@ -27,7 +35,10 @@ __all__ = [
 
 
 Limits = Annotated[
-    tuple[Number, Number], require(lambda value: value[0] <= value[1], "lower limit above the upper one", "[lower, upper]")
+    tuple[Number, Number],
+    require(
+        lambda value: value[0] <= value[1], "lower limit above the upper one", "[lower, upper]"
+    ),
 ]
 
 
@@ -35,7 +46,8 @@ class Wheels(Schema):
     """The driven wheels of a base, half of them left, half right.
 
     Attributes:
-        track: How far left is from right, as far as turning is concerned [m]: where wheels skid in turns, more than it measures.
+        track: How far left is from right, as far as turning is concerned [m]: where wheels skid in
+            turns, more than it measures.
         radius: Of a wheel [m].
         speed: How fast one turns at most [rad/s].
     """
@@ -81,7 +93,9 @@ class CouplingSchema(Schema):
     """A joint that follows `joint`: it is at multiplier · position + offset, [m] or [rad], as <mimic> in a URDF says."""
 
     joint: str
-    multiplier: Annotated[Number, require(bool, "a joint that stands still", "a number but 0, or `locked_joints`")] = 1.0
+    multiplier: Annotated[
+        Number, require(bool, "a joint that stands still", "a number but 0, or `locked_joints`")
+    ] = 1.0
     offset: Number = 0.0
 
 
@@ -106,18 +120,28 @@ def read_robot(file: Path) -> tuple[RobotSchema, Document]:
     """Read a robot.yaml.
 
     Raises:
-        InputError: It cannot be read, or a field of it is wrong; the error names file, line and field.
+        InputError: It cannot be read, or a field of it is wrong; the error names file, line and
+            field.
     """
     document = read_yaml(file)
     if not isinstance(document.data, dict):
-        raise InputError("not a robot", file=file, expected="fields (name: value)", got=type(document.data).__name__)
+        raise InputError(
+            "not a robot",
+            file=file,
+            expected="fields (name: value)",
+            got=type(document.data).__name__,
+        )
     settings = check(document, RobotSchema)
     if settings.arm is not None and settings.tool_frame is not None:
-        raise document.error(("arm",), "tool_frame says what grasps, too", expected="one of them", got=settings.arm)
+        raise document.error(
+            ("arm",), "tool_frame says what grasps, too", expected="one of them", got=settings.arm
+        )
     return settings, document
 
 
-def wheels_of(base: str, least: float | None, settings: RobotSchema, source: Path) -> dict[str, Any]:
+def wheels_of(
+    base: str, least: float | None, settings: RobotSchema, source: Path
+) -> dict[str, Any]:
     """Return the fields of a `Robot` that its wheels are about.
 
     Args:
@@ -133,14 +157,27 @@ def wheels_of(base: str, least: float | None, settings: RobotSchema, source: Pat
     if base != "ackermann":
         if least is not None:
             expected = "none, unless the base is ackermann"
-            raise InputError(f"a base that is {base} has no turning radius", field="turning_radius", expected=expected, got=least)
+            raise InputError(
+                f"a base that is {base} has no turning radius",
+                field="turning_radius",
+                expected=expected,
+                got=least,
+            )
         return {"wheels": wheels}
     radius = settings.base.turning_radius if least is None else quantity(least, "turning_radius")
     if radius is None:
         expected = "turning_radius [m], beside the base, or under `base` in its robot.yaml"
-        raise InputError("nothing says how tightly it turns", file=source, field="turning_radius", expected=expected, got="none")
+        raise InputError(
+            "nothing says how tightly it turns",
+            file=source,
+            field="turning_radius",
+            expected=expected,
+            got="none",
+        )
     if radius <= 0.0:
-        raise InputError("out of range", field="turning_radius", expected="a number > 0 [m]", got=radius)
+        raise InputError(
+            "out of range", field="turning_radius", expected="a number > 0 [m]", got=radius
+        )
     return {"wheels": wheels, "turning_radius": radius}
 
 
@@ -155,6 +192,8 @@ def python_packages(names: tuple[str, ...], document: Document) -> dict[str, Pat
         spec = importlib.util.find_spec(name) if name.isidentifier() else None
         if spec is None or not spec.submodule_search_locations:
             problem = "the Python package with the robot's meshes is not installed"
-            raise document.error(("packages", index), problem, expected=f"pip install {name.replace('_', '-')}")
+            raise document.error(
+                ("packages", index), problem, expected=f"pip install {name.replace('_', '-')}"
+            )
         folders[name] = Path(next(iter(spec.submodule_search_locations)))
     return folders

@@ -28,15 +28,29 @@ from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances
 Pair = tuple[str, str]
 Parts = list[tuple[int, int]]
 
-__all__ = ["HOME_DISTANCE", "Survey", "sample_allowed_pairs", "survey", "surveyed", "with_collision_pairs", "write_srdf"]
+__all__ = [
+    "HOME_DISTANCE",
+    "Survey",
+    "sample_allowed_pairs",
+    "survey",
+    "surveyed",
+    "with_collision_pairs",
+    "write_srdf",
+]
 
 _VERSION = 1  # of what is kept on disk: another one whenever the same robot would get other pairs
 _SAMPLES = 20_000
-_FAR = 0.05  # [m]: links that come no closer in any sample are not driven together; neighbours that are always closer are exempt
-HOME_DISTANCE = 0.02  # [m] as `Options.self_distance`: links that are that far apart do not count against a home
+# [m]: links that come no closer in any sample are not driven together; neighbours that are always
+# closer are exempt
+_FAR = 0.05
+# [m] as `Options.self_distance`: links that are that far apart do not count against a home
+HOME_DISTANCE = 0.02
 _STARTS, _STEPS = 4, 200  # how often and in how many steps the others are
 _TOUCHING = 1e-3  # [m]: links that never get further apart touch; validation sees no less
-_SEARCH, _TRIES = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0), 100  # a free home: shares of the joints' ranges, and postures in each
+_SEARCH, _TRIES = (
+    (0.05, 0.1, 0.2, 0.4, 0.7, 1.0),
+    100,
+)  # a free home: shares of the joints' ranges, and postures in each
 
 
 class Survey(NamedTuple):
@@ -44,7 +58,8 @@ class Survey(NamedTuple):
 
     Attributes:
         allowed: Pairs of links that need not be kept apart, each sorted, with the reason.
-        tight: How far apart pairs are at most, or at home if that is less [m], of those that are never or not there 50 mm apart.
+        tight: How far apart pairs are at most, or at home if that is less [m], of those that are
+            never or not there 50 mm apart.
         home: Where the planned joints rest, shape (n - 3,).
     """
 
@@ -70,7 +85,9 @@ def with_collision_pairs(robot: Robot, allowed: Collection[Pair]) -> Robot:
     return dataclasses.replace(robot, collision=collision)
 
 
-def surveyed(robot: Robot, semantics: Srdf | None, loose: Collection[str], *, samples: int) -> Robot:
+def surveyed(
+    robot: Robot, semantics: Srdf | None, loose: Collection[str], *, samples: int
+) -> Robot:
     """Return a robot with its collision pairs and its home; see `survey`. There is a warning of what nobody would expect.
 
     Args:
@@ -82,23 +99,42 @@ def surveyed(robot: Robot, semantics: Srdf | None, loose: Collection[str], *, sa
     listed = None if semantics is None else semantics.allowed
     found, names = survey(robot, listed, loose, samples=samples), robot.coordinates.names[3:]
     home, said = np.array(found.home), f"{robot.urdf}: "
-    if moved := [f"{name}: {value:.3g}" for name, value, was in zip(names, home, robot.home, strict=True) if value != was]:
+    if moved := [
+        f"{name}: {value:.3g}"
+        for name, value, was in zip(names, home, robot.home, strict=True)
+        if value != was
+    ]:
         said += "links overlap where the arm would rest; home has joints elsewhere of which nobody says where they rest"
         warnings.warn(f"{said}: {', '.join(moved)}", stacklevel=3)
-    unsaid = {"Home": "overlap at home", **({} if listed is None else {"Always": "always overlap or touch"})}
+    unsaid = {
+        "Home": "overlap at home",
+        **({} if listed is None else {"Always": "always overlap or touch"}),
+    }
     for reason, what in unsaid.items():
-        links = [" – ".join(pair) for pair, why in found.allowed.items() if why == reason and pair not in (listed or {})]
+        links = [
+            " – ".join(pair)
+            for pair, why in found.allowed.items()
+            if why == reason and pair not in (listed or {})
+        ]
         if links:
-            warnings.warn(f"{robot.urdf}: links that {what} are not kept apart: {', '.join(links)}", stacklevel=3)
-    return with_collision_pairs(dataclasses.replace(robot, home=home, tight=found.tight), found.allowed)
+            warnings.warn(
+                f"{robot.urdf}: links that {what} are not kept apart: {', '.join(links)}",
+                stacklevel=3,
+            )
+    return with_collision_pairs(
+        dataclasses.replace(robot, home=home, tight=found.tight), found.allowed
+    )
 
 
-def survey(robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[str] = (), *, samples: int) -> Survey:
+def survey(
+    robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[str] = (), *, samples: int
+) -> Survey:
     """Return which links need not be kept apart, how far others can be, and a home at which none overlap.
 
-    To those `listed`, or else found by `sample_allowed_pairs`, come pairs that no motion keeps apart: neighbours that are always
-    close ("Adjacent"), links that always overlap or touch ("Always"), and those that overlap at home ("Home"). Where they do
-    although nobody says that the robot rests there, the nearest posture found in which the fewest do is the home.
+    To those `listed`, or else found by `sample_allowed_pairs`, come pairs that no motion keeps
+    apart: neighbours that are always close ("Adjacent"), links that always overlap or touch
+    ("Always"), and those that overlap at home ("Home"). Where they do although nobody says that the
+    robot rests there, the nearest posture found in which the fewest do is the home.
 
     Args:
         robot: The robot; its own collision pairs play no part.
@@ -106,18 +142,32 @@ def survey(robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[st
         loose: The planned joints of which nobody says where they rest.
         samples: How many configurations to look at.
     """
-    about = ("pairs", _VERSION, samples, sorted((listed or {}).items()), listed is None, sorted(loose), robot.fingerprint)
+    about = (
+        "pairs",
+        _VERSION,
+        samples,
+        sorted((listed or {}).items()),
+        listed is None,
+        sorted(loose),
+        robot.fingerprint,
+    )
     key = json.dumps(about).encode()
     allowed, tight, home = record(key, lambda: _plain(_survey(robot, listed, loose, samples)))
-    return Survey({(a, b): why for a, b, why in allowed}, {(a, b): gap for a, b, gap in tight}, tuple(home))
+    return Survey(
+        {(a, b): why for a, b, why in allowed}, {(a, b): gap for a, b, gap in tight}, tuple(home)
+    )
 
 
-def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0) -> dict[tuple[str, str], str]:
+def sample_allowed_pairs(
+    robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
+) -> dict[tuple[str, str], str]:
     """Return the pairs of links that need not be kept apart, each sorted, with the reason.
 
-    "Adjacent": a joint connects them, or one joint and fixed links while they are never 50 mm apart. "Always": they collide in
-    every sample. "Never": they collide in no sample, and those that came closer than 50 mm not even when they are driven together
-    from their closest samples. Samples are uniform within the joints' limits (±π where there are none), the base standing still.
+    "Adjacent": a joint connects them, or one joint and fixed links while they are never 50 mm
+    apart. "Always": they collide in every sample. "Never": they collide in no sample, and those
+    that came closer than 50 mm not even when they are driven together from their closest samples.
+    Samples are uniform within the joints' limits (±π where there are none), the base standing
+    still.
 
     Args:
         robot: The robot; its own collision pairs play no part.
@@ -128,7 +178,11 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
     allowed = {links: "Adjacent" for links in groups if links in joined}
     groups = {links: parts for links, parts in groups.items() if links not in joined}
     rng, distances, (low, high) = np.random.default_rng(seed), _distances(robot), _ranges(robot)
-    look, undecided, (free, hit) = LinkDistances(distances, groups), np.arange(len(groups)), np.zeros((2, len(groups)), bool)
+    look, undecided, (free, hit) = (
+        LinkDistances(distances, groups),
+        np.arange(len(groups)),
+        np.zeros((2, len(groups)), bool),
+    )
     closest: list[list[tuple[float, tuple[float, ...]]]] = [[] for _ in groups]
     for z in rng.uniform(low, high, (samples, len(low))):
         distances.place(z)
@@ -138,7 +192,11 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
             distance = look.between(k, min(_FAR, best[-1][0]) if len(best) == _STARTS else _FAR)
             free[pair] |= distance > 0.0
             hit[pair] |= distance <= 0.0
-            if distance < _FAR and not hit[pair] and (len(best) < _STARTS or distance < best[-1][0]):
+            if (
+                distance < _FAR
+                and not hit[pair]
+                and (len(best) < _STARTS or distance < best[-1][0])
+            ):
                 closest[pair] = sorted([*best, (distance, tuple(z))])[:_STARTS]
         look.keep(left := ~(free & hit)[undecided])
         undecided = undecided[left]
@@ -149,12 +207,18 @@ def sample_allowed_pairs(robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
             starts = (np.array(z) for _, z in closest[pair])
             if not any(_drive_together(distances, parts, z, (low, high), rng) for z in starts):
                 allowed[links] = "Never"
-    unsure = {links: groups[links] for links in welded & groups.keys() if allowed.get(links) != "Never"}
-    allowed |= {links: "Adjacent" for links, room in _rooms(robot, unsure, samples).items() if room < _FAR}
+    unsure = {
+        links: groups[links] for links in welded & groups.keys() if allowed.get(links) != "Never"
+    }
+    allowed |= {
+        links: "Adjacent" for links, room in _rooms(robot, unsure, samples).items() if room < _FAR
+    }
     return dict(sorted(allowed.items()))
 
 
-def _survey(robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[str], samples: int) -> Survey:
+def _survey(
+    robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[str], samples: int
+) -> Survey:
     allowed = dict(sample_allowed_pairs(robot, samples=samples) if listed is None else listed)
     groups = {links: parts for links, parts in _groups(robot).items() if links not in allowed}
     rooms = {links: room for links, room in _rooms(robot, groups, samples).items() if room < _FAR}
@@ -177,12 +241,16 @@ def _survey(robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[s
     return Survey(dict(sorted(allowed.items())), dict(sorted(tight.items())), home)
 
 
-def _plain(found: Survey) -> tuple[list[tuple[str, str, str]], list[tuple[str, str, float]], list[float]]:
+def _plain(
+    found: Survey,
+) -> tuple[list[tuple[str, str, str]], list[tuple[str, str, float]], list[float]]:
     allowed = [(*links, reason) for links, reason in found.allowed.items()]
     return allowed, [(*links, gap) for links, gap in found.tight.items()], list(found.home)
 
 
-def _free_home(robot: Robot, groups: Mapping[Pair, Parts], loose: Collection[str]) -> tuple[float, ...]:
+def _free_home(
+    robot: Robot, groups: Mapping[Pair, Parts], loose: Collection[str]
+) -> tuple[float, ...]:
     """Return the robot's home, or another in which the fewest of some pairs overlap, with only the `loose` joints elsewhere."""
     distances, (low, high), rng = _distances(robot), _ranges(robot), np.random.default_rng(0)
     moves = np.array([name in loose for name in robot.coordinates.names])
@@ -194,7 +262,11 @@ def _free_home(robot: Robot, groups: Mapping[Pair, Parts], loose: Collection[str
         count = 0
         for links, parts in groups.items():
             least = robot.own_margin(links, margin)
-            count += distances.between(parts, least) < least if margin else distances.between(parts, 0.0) <= 0.0
+            count += (
+                distances.between(parts, least) < least
+                if margin
+                else distances.between(parts, 0.0) <= 0.0
+            )
             if count > most:
                 break
         return count
@@ -203,8 +275,14 @@ def _free_home(robot: Robot, groups: Mapping[Pair, Parts], loose: Collection[str
     if not fewest or not moves.any():
         return tuple(best[3:].tolist())
     for share in _SEARCH:
-        tries = rest + np.where(moves, share * (rng.uniform(low, high, (_TRIES, len(rest))) - rest), 0.0)
-        for z in tries[np.argsort((np.abs(tries - rest) / np.maximum(high - low, 1e-9)).max(axis=1), kind="stable")]:
+        tries = rest + np.where(
+            moves, share * (rng.uniform(low, high, (_TRIES, len(rest))) - rest), 0.0
+        )
+        for z in tries[
+            np.argsort(
+                (np.abs(tries - rest) / np.maximum(high - low, 1e-9)).max(axis=1), kind="stable"
+            )
+        ]:
             if (count := short(z, HOME_DISTANCE, fewest - 1)) < fewest:
                 best, fewest = z, count
             if not fewest:
@@ -231,14 +309,19 @@ def _rooms(robot: Robot, groups: Mapping[Pair, Parts], samples: int) -> dict[Pai
             break
         distances.place(z)
         for k, (links, bound) in enumerate(zip(look.links, look.bounds(), strict=True)):
-            rooms[links] = max(rooms[links], float(bound) if bound > _FAR else look.between(k, _FAR))
+            rooms[links] = max(
+                rooms[links], float(bound) if bound > _FAR else look.between(k, _FAR)
+            )
         look.keep([rooms[links] < _FAR for links in look.links])
     return rooms
 
 
 def _ranges(robot: Robot) -> tuple[Floats, Floats]:
     """Return within which bounds configurations are looked at, shape (n,)."""
-    low, high = np.where(np.isfinite(robot.lower), robot.lower, -np.pi), np.where(np.isfinite(robot.upper), robot.upper, np.pi)
+    low, high = (
+        np.where(np.isfinite(robot.lower), robot.lower, -np.pi),
+        np.where(np.isfinite(robot.upper), robot.upper, np.pi),
+    )
     low[:3] = high[:3] = 0.0
     return low, high
 
@@ -283,7 +366,11 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
 
 
 def _drive_together(
-    distances: ShapeDistances, parts: Parts, z: Floats, limits: tuple[Floats, Floats], rng: np.random.Generator
+    distances: ShapeDistances,
+    parts: Parts,
+    z: Floats,
+    limits: tuple[Floats, Floats],
+    rng: np.random.Generator,
 ) -> bool:
     """Return whether random steps from `z` that lessen the distance end in a collision."""
     low, high = limits

@@ -40,7 +40,12 @@ def within_limits(value: float, lower: float, upper: float, field: str | None) -
     if not np.isfinite(value):
         raise InputError("not a finite number", field=field, expected="a finite number", got=value)
     if not lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK:
-        raise InputError("outside the joint's limits", field=field, expected=f"{lower:g} to {upper:g}", got=f"{value:g}")
+        raise InputError(
+            "outside the joint's limits",
+            field=field,
+            expected=f"{lower:g} to {upper:g}",
+            got=f"{value:g}",
+        )
     return float(min(max(value, lower), upper))
 
 
@@ -61,7 +66,9 @@ def own_name(shape_name: str) -> str:
     return shape_name.partition(".")[2]
 
 
-def placed_shapes(shapes: Iterable[pin.GeometryObject]) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
+def placed_shapes(
+    shapes: Iterable[pin.GeometryObject],
+) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
     """Return (shape, placement) for shapes that stand in the world, for `clearance`."""
     return [(shape.geometry, shape.placement) for shape in shapes]
 
@@ -83,7 +90,8 @@ def clearance(
     boxes = np.array([world_box(shape, placement) for shape, placement in others]).reshape(-1, 2, 3)
     for shape, placement in first:
         low, high = world_box(shape, placement)
-        # Moved apart by as much as their boxes overlap, shapes are separate: a bound also where it is negative.
+        # Moved apart by as much as their boxes overlap, shapes are separate: a bound also where it
+        # is negative.
         gaps = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
         for k in np.argsort(gaps, kind="stable").tolist():
             if gaps[k] >= nearest:
@@ -93,10 +101,16 @@ def clearance(
 
 
 def shape_distance(
-    first: coal.CollisionGeometry, first_placement: pin.SE3, second: coal.CollisionGeometry, second_placement: pin.SE3
+    first: coal.CollisionGeometry,
+    first_placement: pin.SE3,
+    second: coal.CollisionGeometry,
+    second_placement: pin.SE3,
 ) -> float:
     """Return the signed distance [m] between two shapes, each at its placement in a common frame; negative: they overlap."""
-    a, b = (coal.Transform3s(where.rotation, where.translation) for where in (first_placement, second_placement))
+    a, b = (
+        coal.Transform3s(where.rotation, where.translation)
+        for where in (first_placement, second_placement)
+    )
     return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
 
 
@@ -128,7 +142,9 @@ def triangles(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]
         points = shape.points() if isinstance(shape, coal.Convex) else shape.vertices()
         return np.array(points, float), indices(shape)
     else:
-        raise InputError("this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__)
+        raise InputError(
+            "this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__
+        )
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
 
 
@@ -155,7 +171,12 @@ class ShapeDistances:
         shapes: The shapes.
     """
 
-    def __init__(self, model: pin.Model, configuration: Callable[[Floats], Floats], shapes: Sequence[pin.GeometryObject]) -> None:
+    def __init__(
+        self,
+        model: pin.Model,
+        configuration: Callable[[Floats], Floats],
+        shapes: Sequence[pin.GeometryObject],
+    ) -> None:
         self._model, self._configuration, self._data = model, configuration, model.createData()
         self._solids = [shape.geometry for shape in shapes]
         self._joints = np.array([shape.parentJoint for shape in shapes])
@@ -163,7 +184,12 @@ class ShapeDistances:
         for solid in self._solids:
             solid.computeLocalAABB()
         self._radii = np.array([solid.aabb_radius for solid in self._solids])
-        self._middles = np.array([place.act(solid.aabb_center) for place, solid in zip(self._locals, self._solids, strict=True)])
+        self._middles = np.array(
+            [
+                place.act(solid.aabb_center)
+                for place, solid in zip(self._locals, self._solids, strict=True)
+            ]
+        )
         self._turns = np.array([place.rotation for place in self._locals])
         self._halves = np.array([_half_extents(solid) for solid in self._solids])
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
@@ -186,7 +212,9 @@ class ShapeDistances:
         """Return lower bounds of the distances of pairs of shapes, shape (pairs, 2): those of balls around them [m]."""
         first, second = pairs[:, 0], pairs[:, 1]
         gaps = self._centres[first] - self._centres[second]
-        return np.asarray(np.sqrt(np.einsum("ki,ki->k", gaps, gaps)) - self._radii[first] - self._radii[second])
+        return np.asarray(
+            np.sqrt(np.einsum("ki,ki->k", gaps, gaps)) - self._radii[first] - self._radii[second]
+        )
 
     def between(self, parts: Iterable[tuple[int, int]], worth: float = np.inf) -> float:
         """Return the smallest distance [m] of pairs of shapes; a lower bound of it where it is larger than `worth`."""
@@ -196,7 +224,9 @@ class ShapeDistances:
             bound = float(np.sqrt(gap @ gap) - self._radii[first] - self._radii[second])
             if bound <= min(smallest, worth):
                 self._result.clear()
-                one, other = ((self._solids[shape], self._place(shape)) for shape in (first, second))
+                one, other = (
+                    (self._solids[shape], self._place(shape)) for shape in (first, second)
+                )
                 bound = coal.distance(*one, *other, self._request, self._result)
             smallest = min(smallest, float(bound))
         return smallest
@@ -211,7 +241,8 @@ class ShapeDistances:
 class LinkDistances:
     """Distances of pairs of links, each by the pairs of their shapes, at one configuration after the other.
 
-    Most pairs of links are far apart in most configurations; balls around the shapes say so for all of them at once.
+    Most pairs of links are far apart in most configurations; balls around the shapes say so for all
+    of them at once.
 
     Args:
         distances: Of the shapes.
@@ -223,14 +254,23 @@ class LinkDistances:
 
     links: list[tuple[str, str]]
 
-    def __init__(self, distances: ShapeDistances, groups: Mapping[tuple[str, str], Sequence[tuple[int, int]]]) -> None:
-        self._distances, self._groups = distances, {links: np.array(parts, np.int64) for links, parts in groups.items()}
+    def __init__(
+        self, distances: ShapeDistances, groups: Mapping[tuple[str, str], Sequence[tuple[int, int]]]
+    ) -> None:
+        self._distances, self._groups = (
+            distances,
+            {links: np.array(parts, np.int64) for links, parts in groups.items()},
+        )
         self._gather()
 
     def keep(self, chosen: Sequence[bool] | Bools) -> None:
         """Look only at some of the pairs of links from now on: those `chosen`, shape (links,)."""
         if not all(chosen):
-            self._groups = {links: parts for (links, parts), keep in zip(self._groups.items(), chosen, strict=True) if keep}
+            self._groups = {
+                links: parts
+                for (links, parts), keep in zip(self._groups.items(), chosen, strict=True)
+                if keep
+            }
             self._gather()
 
     def bounds(self) -> Floats:

@@ -1,10 +1,11 @@
 """Finds pairs of shapes that violate the clearance margin in the initial scene, and where they are exempt from it.
 
-Homes are built tightly: a door's leaf stands in its wall, a refrigerator's door beside the kitchen. Such neighbours are found in
-the scene alone: shapes of articulated objects against all other fixed shapes, in the initial state and with all joints at zero,
-as they were built. A pair of shapes stays exempt on the range of joint values around that state on which it is closer than the
-margin: its distance there depends on these joints alone, so that no motion could do better. An exemption never extends to other
-shapes of the same links.
+Homes are built tightly: a door's leaf stands in its wall, a refrigerator's door beside the kitchen.
+Such neighbours are found in the scene alone: shapes of articulated objects against all other fixed
+shapes, in the initial state and with all joints at zero, as they were built. A pair of shapes stays
+exempt on the range of joint values around that state on which it is closer than the margin: its
+distance there depends on these joints alone, so that no motion could do better. An exemption never
+extends to other shapes of the same links.
 """
 
 from __future__ import annotations
@@ -22,7 +23,12 @@ from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.collision.shapes import Shapes
 from vkc_pin.world.models.shapes import link_name, shape_distance, world_box
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import PlacedObject, link_shapes, moved_shapes, standing_geometry
+from vkc_pin.world.scene.placed_object import (
+    PlacedObject,
+    link_shapes,
+    moved_shapes,
+    standing_geometry,
+)
 
 __all__ = [
     "CONTACT",
@@ -89,7 +95,11 @@ class Close(NamedTuple):
     distance: float
 
     def __str__(self) -> str:
-        apart = f"are {1e3 * self.distance:.1f} mm apart" if self.distance >= 0.0 else f"overlap by {-1e3 * self.distance:.1f} mm"
+        apart = (
+            f"are {1e3 * self.distance:.1f} mm apart"
+            if self.distance >= 0.0
+            else f"overlap by {-1e3 * self.distance:.1f} mm"
+        )
         return f"{self.first} – {self.second} {apart}"
 
 
@@ -99,9 +109,12 @@ class Allowance:
 
     Attributes:
         first, second: The links' labels.
-        margin: The clearance they must keep instead [m]; negative: an allowed penetration; -inf: any distance.
-        distance: Their distance in the initial state, or as built [m]; `margin` for what the scene's description allows.
-        ranges: Coordinate "<object>.<joint>" → (lower, upper) between which the exemption holds, [rad] or [m]; none: always.
+        margin: The clearance they must keep instead [m]; negative: an allowed penetration; -inf:
+            any distance.
+        distance: Their distance in the initial state, or as built [m]; `margin` for what the
+            scene's description allows.
+        ranges: Coordinate "<object>.<joint>" → (lower, upper) between which the exemption holds,
+            [rad] or [m]; none: always.
         shapes: The exempt shape of each link, see `shape_keys`; None: all shapes of both links.
     """
 
@@ -148,7 +161,8 @@ def shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
     It is the shape's own name, with its object before it: "door.leaf_0", "wall_2".
 
     Args:
-        labels: Of each shape, "<object>.<link>" or the name of an obstacle or of a link of the robot.
+        labels: Of each shape, "<object>.<link>" or the name of an obstacle or of a link of the
+            robot.
         names: Of each shape, in the model of its object or in one that has several.
     """
     keys = []
@@ -162,21 +176,33 @@ def allowances(scene: Surroundings, dist_safe: float) -> tuple[Allowance, ...]:
     """Return all pairs that may be closer than `dist_safe` [m]: links that the scene allows, and neighbouring shapes."""
 
     def found() -> tuple[Allowance, ...]:
-        listed = [Allowance(min(pair), max(pair), margin, margin) for pair, margin in scene.allowed.items() if len(pair) == 2]
+        listed = [
+            Allowance(min(pair), max(pair), margin, margin)
+            for pair, margin in scene.allowed.items()
+            if len(pair) == 2
+        ]
         return *listed, *_neighbours(scene, dist_safe)
 
-    return _kept(scene, ("allowances", dist_safe, *(_key(placed) for placed in scene.objects.values())), found)
+    return _kept(
+        scene,
+        ("allowances", dist_safe, *(_key(placed) for placed in scene.objects.values())),
+        found,
+    )
 
 
 def close_pairs(scene: Surroundings, reach: float) -> list[Close]:
     """Return what can move and stands closer than `reach` [m] to something, but for what the hand holds.
 
-    Links of one object, what a scene allows, and the floor below what is not free do not count; nor does what a free object
-    stands on, unless it stands in it.
+    Links of one object, what a scene allows, and the floor below what is not free do not count; nor
+    does what a free object stands on, unless it stands in it.
     """
     standing, found = Standing(scene, scene.objects), []
     for (first, second), distance in standing.nearest(reach).items():
-        free = any(scene.objects[label.partition(".")[0]].object.free for label in (first, second) if "." in label)
+        free = any(
+            scene.objects[label.partition(".")[0]].object.free
+            for label in (first, second)
+            if "." in label
+        )
         if frozenset((first, second)) not in scene.allowed and (not free or distance < -CONTACT):
             found.append(Close(first, second, distance))
     return sorted(found, key=lambda pair: pair.distance)
@@ -186,7 +212,9 @@ def warn_of_overlaps(scene: Surroundings, name: str) -> None:
     """Warn of what stands inside something else and can move, if there is any, in a scene that is called so."""
     found = [pair for pair in close_pairs(scene, 0.0) if pair.distance < -CONTACT]
     if found:
-        told = "; ".join(map(str, found[:_TOLD])) + (f"; and {len(found) - _TOLD} more" if len(found) > _TOLD else "")
+        told = "; ".join(map(str, found[:_TOLD])) + (
+            f"; and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
+        )
         hint = "They may, until they have been apart; `allow:` in the scene says that they may touch, `vkc-pin check` names all."
         warnings.warn(f"{name}: things that can move stand in others: {told}. {hint}", stacklevel=4)
 
@@ -194,22 +222,33 @@ def warn_of_overlaps(scene: Surroundings, name: str) -> None:
 def _neighbours(scene: Surroundings, dist_safe: float) -> Iterator[Allowance]:
     """Yield shapes of fixed objects that are closer than `dist_safe` to another, there or with all joints at zero."""
     jointed = {name: placed for name, placed in scene.objects.items() if not placed.object.free}
-    neutral = {name: np.clip(0.0, placed.object.lower, placed.object.upper) for name, placed in jointed.items()}
-    zero = {name: dataclasses.replace(placed, state=neutral[name]) for name, placed in jointed.items()}
-    states = [jointed, *([zero] if any(np.any(zero[name].state != jointed[name].state) for name in zero) else [])]
+    neutral = {
+        name: np.clip(0.0, placed.object.lower, placed.object.upper)
+        for name, placed in jointed.items()
+    }
+    zero = {
+        name: dataclasses.replace(placed, state=neutral[name]) for name, placed in jointed.items()
+    }
+    states = [
+        jointed,
+        *([zero] if any(np.any(zero[name].state != jointed[name].state) for name in zero) else []),
+    ]
     known = set[tuple[tuple[str, str], float, tuple[tuple[str, tuple[float, float]], ...]]]()
     for objects in states:
         standing = Standing(scene, objects)
         for (i, j), distance in standing.near(dist_safe - _NEARLY).items():
             ranges, least = standing.ranges(i, j, dist_safe)
-            # The distance is a function of one joint; with several, each alone shows how deep they may be.
+            # The distance is a function of one joint; with several, each alone shows how deep they
+            # may be.
             deep = -np.inf if len(ranges) == 1 else min(least, distance)
             margin = 0.0 if distance > -CONTACT else deep
             shapes = (standing.keys[i], standing.keys[j])
             key = (shapes, margin, tuple(ranges.items()))
             if key not in known:
                 known.add(key)
-                yield Allowance(standing.labels[i], standing.labels[j], margin, distance, ranges, shapes)
+                yield Allowance(
+                    standing.labels[i], standing.labels[j], margin, distance, ranges, shapes
+                )
 
 
 class Standing:
@@ -225,14 +264,21 @@ class Standing:
     """
 
     def __init__(self, scene: Surroundings, objects: Mapping[str, PlacedObject]) -> None:
-        self.scene, self.objects = scene, {n: p for n, p in objects.items() if not (p.object.free and n in scene.held)}
+        self.scene, self.objects = (
+            scene,
+            {n: p for n, p in objects.items() if not (p.object.free and n in scene.held)},
+        )
         self._shapes, self.labels = list[pin.GeometryObject](), list[str]()
         for name, placed in self.objects.items():
             shapes = standing_geometry(placed)
             self._shapes += shapes
             self.labels += [f"{name}.{link_name(shape.name)}" for shape in shapes]
         free = {name for name, placed in self.objects.items() if placed.object.free}
-        self._moving = {label for label in set(self.labels) if label.partition(".")[0] in free or self.joints(label)}
+        self._moving = {
+            label
+            for label in set(self.labels)
+            if label.partition(".")[0] in free or self.joints(label)
+        }
         if self._moving:
             self._shapes += scene.obstacles
             self.labels += scene.obstacle_labels
@@ -249,14 +295,18 @@ class Standing:
         for i, (label, shape) in enumerate(zip(self.labels, self._shapes, strict=True)):
             if label not in self._moving:
                 continue
-            close = ((lower < upper[:, [i]] + reach) & (upper > lower[:, [i]] - reach)).all(axis=0) & (owners != owners[i])
+            close = ((lower < upper[:, [i]] + reach) & (upper > lower[:, [i]] - reach)).all(
+                axis=0
+            ) & (owners != owners[i])
             if not self.objects[str(owners[i])].object.free:
                 close &= ~floor  # it hangs as its makers hung it
             for j in np.flatnonzero(close).tolist():
                 if (j, i) in found:
                     continue
                 other = self._shapes[j]
-                distance = shape_distance(shape.geometry, shape.placement, other.geometry, other.placement)
+                distance = shape_distance(
+                    shape.geometry, shape.placement, other.geometry, other.placement
+                )
                 if distance < reach:
                     found[i, j] = distance
         return found
@@ -273,7 +323,8 @@ class Standing:
     def ranges(self, i: int, j: int, reach: float) -> tuple[dict[str, tuple[float, float]], float]:
         """Return coordinate → (lower, upper): how far each joint alone can go until two shapes are `reach` [m] apart.
 
-        A limit of the joint before that is infinite here. The second result is the least distance on these ranges [m].
+        A limit of the joint before that is infinite here. The second result is the least distance
+        on these ranges [m].
         """
         found, least = dict[str, tuple[float, float]](), np.inf
         for own, other in ((i, j), (j, i)):
@@ -281,8 +332,18 @@ class Standing:
             for joint in self.joints(self.labels[own]):
                 names = (owner, self.labels[other].partition(".")[0])
                 where = [self.objects[name] for name in names if name in self.objects]
-                key = ("neighbours", self.keys[own], self.labels[other], self.keys[other], joint, reach, *map(_key, where))
-                lower, upper, deepest = _kept(self.scene, key, partial(self._range, own, other, joint, reach))
+                key = (
+                    "neighbours",
+                    self.keys[own],
+                    self.labels[other],
+                    self.keys[other],
+                    joint,
+                    reach,
+                    *map(_key, where),
+                )
+                lower, upper, deepest = _kept(
+                    self.scene, key, partial(self._range, own, other, joint, reach)
+                )
                 found[f"{owner}.{joint}"] = (lower, upper)
                 least = min(least, deepest)
         return found, least
@@ -293,19 +354,28 @@ class Standing:
         at, ends, least = float(placed.state[index]), list[float](), np.inf
 
         def distance(values: Floats) -> Floats:
-            found: Floats = self.distances(self.labels[own], index, values, [other], reach)[:, self._number(own), 0]
+            found: Floats = self.distances(self.labels[own], index, values, [other], reach)[
+                :, self._number(own), 0
+            ]
             return found
 
-        for limit, beyond in ((placed.object.lower[index], -_TURN), (placed.object.upper[index], _TURN)):
+        for limit, beyond in (
+            (placed.object.lower[index], -_TURN),
+            (placed.object.upper[index], _TURN),
+        ):
             end = float(limit) if np.isfinite(limit) else at + beyond
             low, high, left = at, end, False
             for _ in range(2):
                 values = np.linspace(low, high, _STEPS + 1)
                 apart = distance(values)
-                inside = apart[: int(np.argmax(apart >= reach))] if (apart >= reach).any() else apart
+                inside = (
+                    apart[: int(np.argmax(apart >= reach))] if (apart >= reach).any() else apart
+                )
                 if len(inside) and not left:
                     k = int(np.argmin(inside))
-                    around = np.linspace(values[max(k - 1, 0)], values[min(k + 1, _STEPS)], _STEPS + 1)
+                    around = np.linspace(
+                        values[max(k - 1, 0)], values[min(k + 1, _STEPS)], _STEPS + 1
+                    )
                     least = min(least, float(inside[k]), float(distance(around).min()))
                 if len(inside) == len(apart):
                     break
@@ -322,7 +392,9 @@ class Standing:
         """Return the shapes of links or obstacles, by their labels."""
         return [k for k, label in enumerate(self.labels) if label in labels]
 
-    def distances(self, label: str, index: int, values: Floats, others: Sequence[int], reach: float) -> Floats:
+    def distances(
+        self, label: str, index: int, values: Floats, others: Sequence[int], reach: float
+    ) -> Floats:
         """Return the distances of a link's shapes from others while one of its coordinates takes values [m].
 
         Args:
@@ -337,7 +409,9 @@ class Standing:
         """
         own = link_shapes(self.objects[label.partition(".")[0]], label.partition(".")[2])
         standing = [self._shapes[k] for k in others]
-        shapes = Shapes([shape.geometry for shape in (*own, *standing)], [shape.placement for shape in standing])
+        shapes = Shapes(
+            [shape.geometry for shape in (*own, *standing)], [shape.placement for shape in standing]
+        )
         where, near = self._moved(label, index, values, standing, reach)
         row, k, j = np.nonzero(near)
         found = np.full(near.shape, np.inf)
@@ -350,12 +424,20 @@ class Standing:
         return {self.labels[j] for j in np.flatnonzero(near.any(axis=(0, 1)))}
 
     def _moved(
-        self, label: str, index: int, values: Floats, others: Sequence[pin.GeometryObject], reach: float
+        self,
+        label: str,
+        index: int,
+        values: Floats,
+        others: Sequence[pin.GeometryObject],
+        reach: float,
     ) -> tuple[Floats, Bools]:
         """Return where a link's shapes are at values of a coordinate, (V, K, 12), and which are near `others`, (V, K, others)."""
         owner, _, link = label.partition(".")
         where, lower, upper = moved_shapes(self.objects[owner], link, index, values)
-        lows, highs = (np.array(side) for side in zip(*(world_box(s.geometry, s.placement) for s in others), strict=True))
+        lows, highs = (
+            np.array(side)
+            for side in zip(*(world_box(s.geometry, s.placement) for s in others), strict=True)
+        )
         near = (lows < upper[:, :, None] + reach) & (highs > lower[:, :, None] - reach)
         return where, np.asarray(near.all(axis=3))
 

@@ -1,23 +1,28 @@
 """What may be close to what, and for how long: the rules that the program and its independent check keep, each in its own way.
 
-- A hand keeps the attachment's clearance from the whole object that it takes hold of, for `EASED_TIME` before it is held, as long
-  as it is held, and for `EASED_TIME` after. Without a clearance of its own that is `Options.grasp_clearance`. What is held
-  through another link, and that link, need none.
+- A hand keeps the attachment's clearance from the whole object that it takes hold of, for
+  `EASED_TIME` before it is held, as long as it is held, and for `EASED_TIME` after. Without a
+  clearance of its own that is `Options.grasp_clearance`. What is held through another link, and
+  that link, need none.
 - The hand and the link that it holds move as one, unless the grasp leaves a freedom.
-- A hand that pushes touches the link with its foremost point. It needs no clearance from that link, overlaps it nowhere, and
-  moves it ahead of it only.
-- What is lifted, put down, or begins or ends a ride, and what is next to it there, may be as near as they are there for
-  `EASED_TIME`. So may a link that touches something, and what is at that place.
+- A hand that pushes touches the link with its foremost point. It needs no clearance from that link,
+  overlaps it nowhere, and moves it ahead of it only.
+- What is lifted, put down, or begins or ends a ride, and what is next to it there, may be as near
+  as they are there for `EASED_TIME`. So may a link that touches something, and what is at that
+  place.
 - What rides and what it stands on move as one.
-- Shapes of articulated objects that are closer than `Options.dist_safe` to other fixed shapes, at the start or with all joints at
-  zero, keep no clearance until their joints have taken them so far apart. They overlap only if they did there, and no deeper than
-  one joint alone takes them; see `neighbours`.
-- What a free object stands in where it is lifted for the first time, it may leave within `EASED_TIME`.
-- What is in the hand at the start is lifted there: what it is next to, or in, it may leave within `EASED_TIME`.
+- Shapes of articulated objects that are closer than `Options.dist_safe` to other fixed shapes, at
+  the start or with all joints at zero, keep no clearance until their joints have taken them so far
+  apart. They overlap only if they did there, and no deeper than one joint alone takes them; see
+  `neighbours`.
+- What a free object stands in where it is lifted for the first time, it may leave within
+  `EASED_TIME`.
+- What is in the hand at the start is lifted there: what it is next to, or in, it may leave within
+  `EASED_TIME`.
 - What the scene allows keeps the margin that the scene says, or none; see `Scene.allowed`.
 
-The gripper is as far open as the attachment says that it holds, or comes to next; it opens and closes where something is grasped
-or let go, and before the motion. Afterwards it stays as it is.
+The gripper is as far open as the attachment says that it holds, or comes to next; it opens and
+closes where something is grasped or let go, and before the motion. Afterwards it stays as it is.
 """
 
 from __future__ import annotations
@@ -72,12 +77,19 @@ def hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> flo
     attachment = scene.objects[hold.object].object.attachments[hold.attachment]
     if (hold.by or attachment.contact == "push") and link == grasped(scene, hold):
         return 0.0
-    return min(options.grasp_clearance if attachment.clearance is None else attachment.clearance, options.dist_safe)
+    return min(
+        options.grasp_clearance if attachment.clearance is None else attachment.clearance,
+        options.dist_safe,
+    )
 
 
 def hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
     """Return what of the hand is brought to an attachment, in the tool frame: that itself, or the foremost point that pushes."""
-    return robot.opened(robot.opening(attachment.opening)).front if attachment.contact == "push" else pin.SE3.Identity()
+    return (
+        robot.opened(robot.opening(attachment.opening)).front
+        if attachment.contact == "push"
+        else pin.SE3.Identity()
+    )
 
 
 def moves_as_one(scene: Scene, hold: Hold) -> bool:
@@ -93,7 +105,9 @@ def in_gripper(holds: Iterable[Hold]) -> Hold | None:
 
 def opening_for(scene: Scene, hold: Hold) -> float | None:
     """Return how far the robot's gripper is open when it takes, or has, what it holds [m]; None: as at rest."""
-    return scene.robot.opening(scene.objects[hold.object].object.attachments[hold.attachment].opening)
+    return scene.robot.opening(
+        scene.objects[hold.object].object.attachments[hold.attachment].opening
+    )
 
 
 def opening_at_start(scene: Scene) -> float | None:

@@ -19,7 +19,16 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import clearance, placed_shapes, within_limits
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 
-__all__ = ["Hold", "Solids", "checked_holds", "holds_of", "in_hand", "in_order", "misdirected", "warn_of_openings"]
+__all__ = [
+    "Hold",
+    "Solids",
+    "checked_holds",
+    "holds_of",
+    "in_hand",
+    "in_order",
+    "misdirected",
+    "warn_of_openings",
+]
 
 Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
 """Shapes, each with where it is."""
@@ -35,14 +44,17 @@ MOST_HELD = 50
 class Hold:
     """One object held at one of its attachments, by the robot's tool or through another object that is held.
 
-    Two holds are the same if what is held, where and through what is the same, whatever values `at` has.
+    Two holds are the same if what is held, where and through what is the same, whatever values `at`
+    has.
 
     Attributes:
         object: Its name in the scene.
         attachment: Where it is held.
-        by: The hold of the object that it is held through (a stick); None: the robot's tool holds it.
+        by: The hold of the object that it is held through (a stick); None: the robot's tool holds
+            it.
         link: The link of that object which takes the place of the tool frame.
-        at: Values of the attachment's freedoms at the start of a scene that has this hold, [m] and [rad]; empty elsewhere.
+        at: Values of the attachment's freedoms at the start of a scene that has this hold, [m] and
+            [rad]; empty elsewhere.
     """
 
     object: str
@@ -57,7 +69,9 @@ class Hold:
                 text(getattr(self, name), f"Hold.{name}", "a name")
         if self.by is not None:
             instance(self.by, Hold, "Hold.by")
-        object.__setattr__(self, "at", tuple(numbers(self.at, "Hold.at", "a list of numbers").ravel().tolist()))
+        object.__setattr__(
+            self, "at", tuple(numbers(self.at, "Hold.at", "a list of numbers").ravel().tolist())
+        )
 
     @property
     def frame(self) -> str | None:
@@ -69,7 +83,9 @@ class Hold:
 
 
 def holds_of(
-    held: Mapping[str, str], by: Mapping[str, str] | None = None, at: Mapping[str, Sequence[float]] | None = None
+    held: Mapping[str, str],
+    by: Mapping[str, str] | None = None,
+    at: Mapping[str, Sequence[float]] | None = None,
 ) -> tuple[Hold, ...]:
     """Return the holds that mappings describe, as files do, each after the one it depends on.
 
@@ -80,12 +96,15 @@ def holds_of(
 
     Raises:
         UnknownNameError: `by` or `at` name an object that is not held.
-        InputError: Objects hold each other in a circle, `by` is not of that form, or more is held than anybody can.
+        InputError: Objects hold each other in a circle, `by` is not of that form, or more is held
+            than anybody can.
     """
     held = mapping(held, "held", "object names, each with that of an attachment")
     by, at = mapping({} if by is None else by, "by"), mapping({} if at is None else at, "at")
     if len(held) > MOST_HELD:
-        raise InputError("too many things are held", field="held", expected=f"at most {MOST_HELD}", got=len(held))
+        raise InputError(
+            "too many things are held", field="held", expected=f"at most {MOST_HELD}", got=len(held)
+        )
     for field_name, names in (("by", by), ("at", at)):
         for name in names:
             if name not in held:
@@ -94,14 +113,23 @@ def holds_of(
 
     def find(name: str, above: tuple[str, ...]) -> Hold:
         if name in above:
-            raise InputError("objects hold each other in a circle", field="by", got=", ".join(sorted(above)))
+            raise InputError(
+                "objects hold each other in a circle", field="by", got=", ".join(sorted(above))
+            )
         if name not in found:
             holder, link = None, None
             if name in by:
                 expected = "<object>.<link>, e.g. stick.tip"
-                owner, _, link = by[name].partition(".") if isinstance(by[name], str) else ("", "", "")
+                owner, _, link = (
+                    by[name].partition(".") if isinstance(by[name], str) else ("", "", "")
+                )
                 if not link:
-                    raise InputError("not a link of an object", field="by", expected=expected, got=shown(by[name]))
+                    raise InputError(
+                        "not a link of an object",
+                        field="by",
+                        expected=expected,
+                        got=shown(by[name]),
+                    )
                 if owner not in held:
                     raise UnknownNameError("held object", owner, held, field="by")
                 holder = find(owner, (*above, name))
@@ -118,7 +146,9 @@ def in_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
     holds = items(holds, "holds", "a list of Hold", Hold)
     for number, hold in enumerate(holds):
         if hold.by not in (None, *holds[:number]):
-            raise InputError("held through what is not held before it", field="holds", got=str(hold))
+            raise InputError(
+                "held through what is not held before it", field="holds", got=str(hold)
+            )
     return holds
 
 
@@ -127,24 +157,37 @@ def checked_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
 
     Raises:
         UnknownNameError: There is no such object, attachment or link.
-        InputError: Values that do not fit the attachment's freedoms, or one is held through what cannot hold it.
+        InputError: Values that do not fit the attachment's freedoms, or one is held through what
+            cannot hold it.
     """
     found: dict[Hold, Hold] = {}
     for hold in in_order(holds):
         if hold.object not in objects:
             raise UnknownNameError("object", hold.object, objects, field="held")
-        where, freedoms = f"held.{hold.object}.at", objects[hold.object].object.attachment(hold.attachment).freedoms
+        where, freedoms = (
+            f"held.{hold.object}.at",
+            objects[hold.object].object.attachment(hold.attachment).freedoms,
+        )
         values = hold.at or (0.0,) * len(freedoms)
         if len(values) != len(freedoms):
-            raise InputError("wrong number of values", field=where, expected=f"{len(freedoms)}, one a freedom", got=len(values))
+            raise InputError(
+                "wrong number of values",
+                field=where,
+                expected=f"{len(freedoms)}, one a freedom",
+                got=len(values),
+            )
         for value, freedom in zip(values, freedoms, strict=True):
             within_limits(value, freedom.lower, freedom.upper, where)
         if hold.by is not None:
             objects[hold.by.object].link_placement(str(hold.link))
             if not (objects[hold.object].object.free and objects[hold.by.object].object.free):
-                problem = "only a free object can be held through another, and only through a free one"
+                problem = (
+                    "only a free object can be held through another, and only through a free one"
+                )
                 raise InputError(problem, field=f"held.{hold.object}.by", got=hold.frame)
-        found[hold] = dataclasses.replace(hold, at=values, by=None if hold.by is None else found[hold.by])
+        found[hold] = dataclasses.replace(
+            hold, at=values, by=None if hold.by is None else found[hold.by]
+        )
     return tuple(found.values())
 
 
@@ -169,7 +212,9 @@ def in_hand(
     return MappingProxyType(placed)
 
 
-def misdirected(objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids) -> list[Hold]:
+def misdirected(
+    objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids
+) -> list[Hold]:
     """Return those of some holds whose hand comes out of the object or from below the floor, and would not from the other side.
 
     Args:
@@ -188,7 +233,9 @@ def misdirected(objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robo
         if hold.by is not None and hold.link is not None:
             holder = objects[hold.by.object]
             back = holder.link_placement(hold.link).inverse()
-            hand = [(shape, back * where) for shape, where in placed_shapes(standing_geometry(holder))]
+            hand = [
+                (shape, back * where) for shape, where in placed_shapes(standing_geometry(holder))
+            ]
         solids = [*placed_shapes(standing_geometry(placed)), *floor]
         if hold.attachment in placed.reversed or _free(placed, hold.attachment, hand, solids):
             continue
@@ -197,7 +244,9 @@ def misdirected(objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robo
     return found
 
 
-def warn_of_openings(objects: Mapping[str, PlacedObject], robot: Robot, start: float | None, where: str) -> None:
+def warn_of_openings(
+    objects: Mapping[str, PlacedObject], robot: Robot, start: float | None, where: str
+) -> None:
     """Warn of openings that a robot's gripper cannot stand at: it stands as near to them as it can.
 
     Args:
@@ -213,12 +262,22 @@ def warn_of_openings(objects: Mapping[str, PlacedObject], robot: Robot, start: f
     said = ", ".join(f"{what} {1e3 * opening:g} mm" for what, opening in asked.items())
     if robot.gripper is None and asked:
         hint = "it stays as it rests; `gripper` in its robot.yaml says how it opens"
-        warnings.warn(f"{where}: the gripper of '{robot.name}' does not open as asked for ({said}): {hint}", stacklevel=4)
+        warnings.warn(
+            f"{where}: the gripper of '{robot.name}' does not open as asked for ({said}): {hint}",
+            stacklevel=4,
+        )
     elif robot.gripper is not None:
         least, most = robot.gripper.narrowest, robot.gripper.widest
-        beyond = {what: opening for what, opening in asked.items() if abs(robot.gripper.nearest(opening) - opening) > _ROUNDING}
+        beyond = {
+            what: opening
+            for what, opening in asked.items()
+            if abs(robot.gripper.nearest(opening) - opening) > _ROUNDING
+        }
         for what, opening in beyond.items():
-            can, nearest = f"{1e3 * least:.1f} to {1e3 * most:.1f} mm", 1e3 * robot.gripper.nearest(opening)
+            can, nearest = (
+                f"{1e3 * least:.1f} to {1e3 * most:.1f} mm",
+                1e3 * robot.gripper.nearest(opening),
+            )
             text = f"the gripper of '{robot.name}' opens from {can}, not {1e3 * opening:g} mm as asked for {what}"
             warnings.warn(f"{where}: {text}: it opens to {nearest:.1f} mm", stacklevel=4)
 
@@ -230,7 +289,12 @@ def _free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -
     for values in product(*({freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms)):
         tool = where * grasp.tool(values)
         way = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _WAY]
-        if clearance([(shape, at * local) for at in way for shape, local in hand], solids, reach=-_DEEP) >= -_DEEP:
+        if (
+            clearance(
+                [(shape, at * local) for at in way for shape, local in hand], solids, reach=-_DEEP
+            )
+            >= -_DEEP
+        ):
             return True
     return False
 

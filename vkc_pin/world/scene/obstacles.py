@@ -19,7 +19,9 @@ __all__ = ["FLOOR", "floor_shape", "obstacle_shapes"]
 FLOOR = "floor"
 """Name of the floor among a scene's obstacles."""
 _FLOOR_THICKNESS = 0.1
-_FLOOR_BORDER = 2.0  # the floor reaches this far beyond the arena [m]: an arm may hang over its edge
+_FLOOR_BORDER = (
+    2.0  # the floor reaches this far beyond the arena [m]: an arm may hang over its edge
+)
 
 
 def obstacle_shapes(
@@ -68,7 +70,9 @@ def floor_shape(arena: tuple[float, float, float, float]) -> pin.GeometryObject:
     return _shape(FLOOR, pin.SE3(np.eye(3), centre), coal.Box(*size), (0.80, 0.78, 0.74, 1.0))
 
 
-def _from_urdf(item: schema.UrdfSchema, pose: pin.SE3, file: Path) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
+def _from_urdf(
+    item: schema.UrdfSchema, pose: pin.SE3, file: Path
+) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
     """Return what to draw and what collides of a URDF, with all of its joints at zero."""
     from vkc_pin.world.files.urdf import load_urdf
 
@@ -78,7 +82,9 @@ def _from_urdf(item: schema.UrdfSchema, pose: pin.SE3, file: Path) -> tuple[list
     both = []
     for geometry in (visual, collision):
         shapes = geometry.geometryObjects
-        names = [item.name] if len(shapes) == 1 else [f"{item.name}_{k}" for k in range(len(shapes))]
+        names = (
+            [item.name] if len(shapes) == 1 else [f"{item.name}_{k}" for k in range(len(shapes))]
+        )
         both.append(
             [
                 copy_shape(shape, name, pose * data.oMi[shape.parentJoint] * shape.placement)
@@ -91,7 +97,10 @@ def _from_urdf(item: schema.UrdfSchema, pose: pin.SE3, file: Path) -> tuple[list
 
 
 def _shape(
-    name: str, pose: pin.SE3, shape: coal.CollisionGeometry, colour: tuple[float, float, float, float]
+    name: str,
+    pose: pin.SE3,
+    shape: coal.CollisionGeometry,
+    colour: tuple[float, float, float, float],
 ) -> pin.GeometryObject:
     made = pin.GeometryObject(name, 0, 0, pose, shape)
     made.meshColor, made.overrideMaterial = np.array(colour), True

@@ -19,7 +19,9 @@ from vkc_pin.world.models.shapes import bounding_box, copy_shape, link_name, wit
 
 __all__ = ["PlacedObject", "link_shapes", "moved_shapes", "standing_geometry"]
 
-_OTHER_SIDE = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # half a turn about the line on which fingers close
+_OTHER_SIDE = pin.SE3(
+    np.diag([1.0, -1.0, -1.0]), np.zeros(3)
+)  # half a turn about the line on which fingers close
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,8 @@ class PlacedObject:
         name: Its name in the scene.
         object: What it is.
         placement: Its base link in the world frame.
-        state: Its joint values, shape (n,), [rad] or [m], in the order of `object.coordinates.names`.
+        state: Its joint values, shape (n,), [rad] or [m], in the order of
+            `object.coordinates.names`.
         reversed: The attachments that are approached from the other side than its description says.
     """
 
@@ -41,7 +44,9 @@ class PlacedObject:
     reversed: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        state = ", ".join(f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True))
+        state = ", ".join(
+            f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True)
+        )
         return f"<PlacedObject {self.name}: {self.object.name}{f', {state}' if state else ''}>"
 
     def with_state(self, values: Mapping[str, float]) -> PlacedObject:
@@ -54,9 +59,13 @@ class PlacedObject:
         state, coordinates = self.state.copy(), self.object.coordinates
         for joint, given in mapping(values, "values", "joints, each with its value").items():
             if joint not in coordinates.names:
-                raise UnknownNameError(f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}")
+                raise UnknownNameError(
+                    f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}"
+                )
             index, value = coordinates.index(joint), number(given, f"{self.name}.{joint}")
-            state[index] = within_limits(value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}")
+            state[index] = within_limits(
+                value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}"
+            )
         return dataclasses.replace(self, state=state)
 
     def with_reversed(self, attachment: str) -> PlacedObject:
@@ -66,11 +75,18 @@ class PlacedObject:
             UnknownNameError: It has no such attachment.
         """
         given = self.object.attachment(attachment)
-        turned = [dataclasses.replace(freedom, axis=_OTHER_SIDE.rotation @ freedom.axis) for freedom in given.freedoms]
-        changed = dataclasses.replace(given, placement=given.placement * _OTHER_SIDE, freedoms=tuple(turned))
+        turned = [
+            dataclasses.replace(freedom, axis=_OTHER_SIDE.rotation @ freedom.axis)
+            for freedom in given.freedoms
+        ]
+        changed = dataclasses.replace(
+            given, placement=given.placement * _OTHER_SIDE, freedoms=tuple(turned)
+        )
         attachments = MappingProxyType({**self.object.attachments, attachment: changed})
         listed = tuple(sorted({*self.reversed} ^ {attachment}))
-        return dataclasses.replace(self, object=dataclasses.replace(self.object, attachments=attachments), reversed=listed)
+        return dataclasses.replace(
+            self, object=dataclasses.replace(self.object, attachments=attachments), reversed=listed
+        )
 
     def link_placement(self, link: str) -> pin.SE3:
         """Return the placement of `link` in the world frame. Raises `UnknownNameError` if there is none."""
@@ -87,21 +103,30 @@ def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin
     Returns:
         The shapes in the object's own order, with their names in the object (`<link>_<number>`).
     """
-    model, geometry = placed.object.model, placed.object.visual if visual else placed.object.collision
+    model, geometry = (
+        placed.object.model,
+        placed.object.visual if visual else placed.object.collision,
+    )
     data = model.createData()
     pin.forwardKinematics(model, data, placed.object.coordinates.q(placed.state))
     return [
-        copy_shape(shape, shape.name, placed.placement * data.oMi[shape.parentJoint] * shape.placement)
+        copy_shape(
+            shape, shape.name, placed.placement * data.oMi[shape.parentJoint] * shape.placement
+        )
         for shape in geometry.geometryObjects
     ]
 
 
 def link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
     """Return the convex shapes of a link of an object, in the frames of their joints."""
-    return [shape for shape in placed.object.collision.geometryObjects if link_name(shape.name) == link]
+    return [
+        shape for shape in placed.object.collision.geometryObjects if link_name(shape.name) == link
+    ]
 
 
-def moved_shapes(placed: PlacedObject, link: str, index: int, values: Floats) -> tuple[Floats, Floats, Floats]:
+def moved_shapes(
+    placed: PlacedObject, link: str, index: int, values: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Return where a link's shapes are in the world while one coordinate of the object takes values, shape (V,).
 
     Args:
@@ -111,7 +136,8 @@ def moved_shapes(placed: PlacedObject, link: str, index: int, values: Floats) ->
         values: [rad] or [m].
 
     Returns:
-        Placements, shape (V, K, 12), see `placements.columns_of`, and the corners of boxes around the shapes, both (V, K, 3) [m].
+        Placements, shape (V, K, 12), see `placements.columns_of`, and the corners of boxes around
+        the shapes, both (V, K, 3) [m].
     """
     model, data, own, state = (
         placed.object.model,
@@ -120,11 +146,16 @@ def moved_shapes(placed: PlacedObject, link: str, index: int, values: Floats) ->
         placed.state.copy(),
     )
     boxes = [bounding_box(shape) for shape in own]
-    where, lower, upper = np.empty((len(values), len(own), 12)), *np.empty((2, len(values), len(own), 3))
+    where, lower, upper = (
+        np.empty((len(values), len(own), 12)),
+        *np.empty((2, len(values), len(own), 3)),
+    )
     for row, value in enumerate(values):
         state[index] = value
         pin.forwardKinematics(model, data, placed.object.coordinates.q(state))
-        placements = [placed.placement * data.oMi[shape.parentJoint] * shape.placement for shape in own]
+        placements = [
+            placed.placement * data.oMi[shape.parentJoint] * shape.placement for shape in own
+        ]
         where[row] = columns_of(placements)
         for k, (placement, (center, half)) in enumerate(zip(placements, boxes, strict=True)):
             middle, extent = placement.act(center), np.abs(placement.rotation) @ half

@@ -21,14 +21,17 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
     """Return `pose` as a `pinocchio.SE3`.
 
     Args:
-        pose: An SE3, a 4 × 4 homogeneous matrix, (x, y, z, roll, pitch, yaw) in [m] and [rad], or (x, y, z, qx, qy, qz, qw) with
-            a unit quaternion, the scalar last.
+        pose: An SE3, a 4 × 4 homogeneous matrix, (x, y, z, roll, pitch, yaw) in [m] and [rad], or
+            (x, y, z, qx, qy, qz, qw) with a unit quaternion, the scalar last.
         name: The argument's name, for the message.
 
     Raises:
-        InputError: It is none of these, not finite, further away than `LARGEST`, or its rotation is no rotation.
+        InputError: It is none of these, not finite, further away than `LARGEST`, or its rotation is
+            no rotation.
     """
-    array = numbers(pose.homogeneous if isinstance(pose, pin.SE3) else pose, name, _POSE, problem="not a pose")
+    array = numbers(
+        pose.homogeneous if isinstance(pose, pin.SE3) else pose, name, _POSE, problem="not a pose"
+    )
     if array.shape not in ((6,), (7,), (4, 4)):
         got = f"an array of shape {array.shape}" if array.ndim else shown(pose)
         raise InputError("not a pose", field=name, expected=_POSE, got=got)
@@ -42,13 +45,22 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
     if array.shape == (7,):
         norm = float(np.linalg.norm(array[3:]))
         if abs(norm - 1.0) > _UNIT:
-            raise InputError("not a rotation", field=name, expected="a unit quaternion (x, y, z, w)", got=array[3:].tolist())
+            raise InputError(
+                "not a rotation",
+                field=name,
+                expected="a unit quaternion (x, y, z, w)",
+                got=array[3:].tolist(),
+            )
         return pin.SE3(pin.Quaternion(array[3:] / norm).matrix(), array[:3])
     rotation = array[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
-        raise InputError("its upper left 3 x 3 block is not a rotation", field=name, got=rotation.tolist())
+        raise InputError(
+            "its upper left 3 x 3 block is not a rotation", field=name, got=rotation.tolist()
+        )
     if np.abs(array[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
-        raise InputError("its last row is wrong", field=name, expected=[0, 0, 0, 1], got=array[3].tolist())
+        raise InputError(
+            "its last row is wrong", field=name, expected=[0, 0, 0, 1], got=array[3].tolist()
+        )
     return pin.SE3(rotation, array[:3, 3])
 
 
@@ -60,7 +72,9 @@ def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]
     """
     if isinstance(target, pin.SE3):
         return as_placement(target, name=name)
-    point = numbers(target, name, f"a point (x, y, z), or a pose: {_POSE}", problem="not a pose or a point")
+    point = numbers(
+        target, name, f"a point (x, y, z), or a pose: {_POSE}", problem="not a pose or a point"
+    )
     if point.ndim < 2 and point.shape not in ((3,), (6,), (7,)):
         expected = f"a point (x, y, z), or a pose: {_POSE}"
         raise InputError("not a pose or a point", field=name, expected=expected, got=shown(target))

@@ -39,12 +39,16 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         folder: Where relative paths in it start from.
 
     Raises:
-        InputError: The description is wrong; `UnknownNameError` where it names something that does not exist.
+        InputError: The description is wrong; `UnknownNameError` where it names something that does
+            not exist.
     """
     description = check(document, schema.SceneSchema)
     robot = _robot(document, description, folder)
     _unique_names(document, description)
-    objects = {item.name: _object(document, ("objects", index), item, folder) for index, item in enumerate(description.objects)}
+    objects = {
+        item.name: _object(document, ("objects", index), item, folder)
+        for index, item in enumerate(description.objects)
+    }
     arena = (*description.arena.x, *description.arena.y)
     obstacles, visual, labels = list[pin.GeometryObject](), list[pin.GeometryObject](), list[str]()
     for index, item in enumerate(description.obstacles):
@@ -80,26 +84,45 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
 def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain data from which `scene_fields` makes these parts of a scene again.
 
-    What stands where it was described keeps the words of the description; what does not is described by position and rpy.
+    What stands where it was described keeps the words of the description; what does not is
+    described by position and rpy.
 
     Args:
         fields: The attributes of a `Scene`, by name.
     """
-    described, start, objects, region = (fields[key] for key in ("described", "start", "objects", "start_region"))
-    plain = described.model_dump(mode="json", include={"robot", "obstacles", "objects", "allow"}, exclude_none=True)
+    described, start, objects, region = (
+        fields[key] for key in ("described", "start", "objects", "start_region")
+    )
+    plain = described.model_dump(
+        mode="json", include={"robot", "obstacles", "objects", "allow"}, exclude_none=True
+    )
     held = {}
     for hold in fields["holds"]:
-        said = {"attachment": hold.attachment, "by": hold.frame, "at": list(hold.at) if any(hold.at) else None}
+        said = {
+            "attachment": hold.attachment,
+            "by": hold.frame,
+            "at": list(hold.at) if any(hold.at) else None,
+        }
         held[hold.object] = {key: value for key, value in said.items() if value is not None}
     for item, entry in zip(described.objects, plain["objects"], strict=True):
         placed = objects[item.name]
-        names, neutral = placed.object.coordinates.names, np.clip(0.0, placed.object.lower, placed.object.upper)
+        names, neutral = (
+            placed.object.coordinates.names,
+            np.clip(0.0, placed.object.lower, placed.object.upper),
+        )
         entry["state"] = dict(zip(names, placed.state.tolist(), strict=True))
         in_hand = placed.object.free and item.name in held
-        moved = not in_hand and not np.array_equal(placed.placement.homogeneous, _pose(item).homogeneous)
+        moved = not in_hand and not np.array_equal(
+            placed.placement.homogeneous, _pose(item).homogeneous
+        )
         entry.pop("reversed", None)
-        as_described = not moved and entry["state"] == {**dict(zip(names, neutral.tolist(), strict=True)), **item.state}
-        if placed.reversed or item.reversed is not None or not as_described:  # else whoever reads this finds the same
+        as_described = not moved and entry["state"] == {
+            **dict(zip(names, neutral.tolist(), strict=True)),
+            **item.state,
+        }
+        if (
+            placed.reversed or item.reversed is not None or not as_described
+        ):  # else whoever reads this finds the same
             entry["reversed"] = list(placed.reversed)
         if moved:
             for orientation in ("yaw", "quaternion"):
@@ -118,7 +141,11 @@ def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
             "held": held,
         },
         "arena": {"x": list(fields["arena"][:2]), "y": list(fields["arena"][2:])},
-        **({"start_region": {key: list(value) for key, value in vars(region).items() if value}} if region else {}),
+        **(
+            {"start_region": {key: list(value) for key, value in vars(region).items() if value}}
+            if region
+            else {}
+        ),
         "floor": fields["floor"],
         "obstacles": plain["obstacles"],
         "objects": plain["objects"],
@@ -133,7 +160,9 @@ def _robot(document: Document, description: schema.SceneSchema, folder: Path) ->
     with document.at(("robot",) if short else ("robot", "name")):
         name = folder / item.name if by_path else item.name
         turning = item.turning_radius
-        return load_robot(name, base=item.base, tool_frame=item.tool_frame, height=height, turning_radius=turning)
+        return load_robot(
+            name, base=item.base, tool_frame=item.tool_frame, height=height, turning_radius=turning
+        )
 
 
 def _unique_names(document: Document, description: schema.SceneSchema) -> None:
@@ -142,20 +171,37 @@ def _unique_names(document: Document, description: schema.SceneSchema) -> None:
         for index, item in enumerate(items):
             path = (group, index, "name")
             if item.name in taken:
-                raise document.error(path, "this name is taken", expected="a new name", got=f"{item.name}, as {taken[item.name]}")
+                raise document.error(
+                    path,
+                    "this name is taken",
+                    expected="a new name",
+                    got=f"{item.name}, as {taken[item.name]}",
+                )
             line = document.line(path)
             taken[item.name] = f"{group}[{index}]" + (f" in line {line}" if line else "")
 
 
-def _check_places(document: Document, description: schema.SceneSchema, arena: tuple[float, float, float, float]) -> None:
-    for axis, low, high, value in (("x", *arena[:2], description.start.base[0]), ("y", *arena[2:], description.start.base[1])):
+def _check_places(
+    document: Document, description: schema.SceneSchema, arena: tuple[float, float, float, float]
+) -> None:
+    for axis, low, high, value in (
+        ("x", *arena[:2], description.start.base[0]),
+        ("y", *arena[2:], description.start.base[1]),
+    ):
         if not low <= value <= high:
             entry = ("start", "base", 0 if axis == "x" else 1)
-            raise document.error(entry, "outside the arena", expected=f"{axis} from {low:g} to {high:g}", got=value)
+            raise document.error(
+                entry, "outside the arena", expected=f"{axis} from {low:g} to {high:g}", got=value
+            )
         interval = getattr(description.start_region, axis, None)
         if interval is not None and not low <= interval[0] <= interval[1] <= high:
             path = ("start_region", axis)
-            raise document.error(path, "outside the arena", expected=f"{axis} from {low:g} to {high:g}", got=list(interval))
+            raise document.error(
+                path,
+                "outside the arena",
+                expected=f"{axis} from {low:g} to {high:g}",
+                got=list(interval),
+            )
 
 
 def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats:
@@ -163,7 +209,9 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats
     names = robot.coordinates.names[3:]
     if len(arm) != len(names):
         expected = f"{len(names)} values: {', '.join(names)}"
-        raise document.error(("start", "arm"), "wrong number of arm joints", expected=expected, got=len(arm))
+        raise document.error(
+            ("start", "arm"), "wrong number of arm joints", expected=expected, got=len(arm)
+        )
     start = np.concatenate([item.base, arm])
     lower, upper = robot.start_limits
     for index, name in enumerate(robot.coordinates.names):
@@ -173,7 +221,9 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats
     return start
 
 
-def _holds(document: Document, held: Mapping[str, schema.HeldSchema], objects: Mapping[str, PlacedObject]) -> tuple[Hold, ...]:
+def _holds(
+    document: Document, held: Mapping[str, schema.HeldSchema], objects: Mapping[str, PlacedObject]
+) -> tuple[Hold, ...]:
     attachments = {name: item.attachment for name, item in held.items()}
     by = {name: item.by for name, item in held.items() if item.by is not None}
     at = {name: item.at for name, item in held.items() if item.at is not None}
@@ -184,34 +234,48 @@ def _holds(document: Document, held: Mapping[str, schema.HeldSchema], objects: M
         with document.at(path):
             owner = by.get(name, "").partition(".")[0]
             both = {one: attachments[one] for one in (owner, name) if one in held}
-            through, values = {name: by[name]} if name in by else {}, {name: at[name]} if name in at else {}
+            through, values = (
+                {name: by[name]} if name in by else {},
+                {name: at[name]} if name in at else {},
+            )
             checked_holds(objects, holds_of(both, through, values))
     with document.at(("start", "held")):
         return checked_holds(objects, holds_of(attachments, by, at))
 
 
 def _allowed(
-    document: Document, description: schema.SceneSchema, folder: Path, robot: Robot, objects: Mapping[str, PlacedObject]
+    document: Document,
+    description: schema.SceneSchema,
+    folder: Path,
+    robot: Robot,
+    objects: Mapping[str, PlacedObject],
 ) -> dict[frozenset[str], float]:
     """Return pairs of labels of links that may be close, and their margin [m]; of those named twice the least."""
     labels = {link: [link] for link in robot.links}
     for name, placed in objects.items():
         own = [f"{name}.{link}" for link in placed.object.links]
         labels |= {label: [label] for label in own} | {name: own}
-    labels |= {item.name: [item.name] for item in description.obstacles} | ({FLOOR: [FLOOR]} if description.floor else {})
+    labels |= {item.name: [item.name] for item in description.obstacles} | (
+        {FLOOR: [FLOOR]} if description.floor else {}
+    )
     found: dict[frozenset[str], float] = {}
     for number, item in enumerate(description.allow):
         pairs: Iterable[tuple[str, ...]] = [item.pair] if item.pair is not None else []
         if item.srdf is not None:
             short = isinstance(document.data["allow"][number], str)
-            file = _file(document, ("allow", number, *(() if short else ("srdf",))), folder, item.srdf)
+            file = _file(
+                document, ("allow", number, *(() if short else ("srdf",))), folder, item.srdf
+            )
             pairs = read_srdf(file, links=labels).allowed
         for pair in pairs:
             for place, name in enumerate(pair):
                 if name not in labels:
                     short = isinstance(document.data["allow"][number], list | tuple)
                     raise document.unknown(
-                        ("allow", number, *(() if short else ("pair",)), place), "link, object or obstacle", name, labels
+                        ("allow", number, *(() if short else ("pair",)), place),
+                        "link, object or obstacle",
+                        name,
+                        labels,
                     )
             margin = -np.inf if item.margin is None else item.margin
             for both in itertools.product(*(labels[name] for name in pair)):
@@ -232,7 +296,9 @@ def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: s
         file = file_path(folder / name, "file", "the name of a file")
     if not file.is_file():
         near = _nearest(file)
-        expected = f"a file in {folder}" + (f", perhaps {Path(name).with_name(near)}" if near else "")
+        expected = f"a file in {folder}" + (
+            f", perhaps {Path(name).with_name(near)}" if near else ""
+        )
         raise document.error(path, "there is no such file", expected=expected, got=name)
     return file
 
@@ -240,11 +306,16 @@ def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: s
 def _nearest(file: Path) -> str | None:
     """Return the name in a missing file's folder that resembles its own most, of files of its kind."""
     with contextlib.suppress(OSError):
-        return nearest_name(file.name, sorted(one.name for one in file.parent.iterdir() if one.suffix == file.suffix))
+        return nearest_name(
+            file.name,
+            sorted(one.name for one in file.parent.iterdir() if one.suffix == file.suffix),
+        )
     return None
 
 
-def _object(document: Document, path: tuple[str | int, ...], item: schema.PlacedObjectSchema, folder: Path) -> PlacedObject:
+def _object(
+    document: Document, path: tuple[str | int, ...], item: schema.PlacedObjectSchema, folder: Path
+) -> PlacedObject:
     at, kind = (*path, "type"), item.type
     with document.at(at):
         if isinstance(kind, dict):
@@ -266,7 +337,9 @@ def _object(document: Document, path: tuple[str | int, ...], item: schema.Placed
 def _part(document: Document, path: tuple[str | int, ...]) -> Document:
     """Return the data at `path` as a document of its own, which knows file and lines; its fields are named from there."""
     inside, data = len(path), functools.reduce(lambda data, key: data[key], path, document.data)
-    lines = {place[inside:]: line for place, line in document.lines.items() if place[:inside] == path}
+    lines = {
+        place[inside:]: line for place, line in document.lines.items() if place[:inside] == path
+    }
     return Document(data, document.file, lines)
 
 

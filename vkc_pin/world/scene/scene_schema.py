@@ -68,7 +68,10 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 def _colour(value: Any) -> Any:
     if isinstance(value, str):
         if value not in COLOURS:
-            raise fail(f"unknown colour '{value}'", f"one of {', '.join(COLOURS)}, or [red, green, blue] from 0 to 1")
+            raise fail(
+                f"unknown colour '{value}'",
+                f"one of {', '.join(COLOURS)}, or [red, green, blue] from 0 to 1",
+            )
         return (*COLOURS[value], 1.0)
     if isinstance(value, list | tuple) and len(value) == 3:
         return (*value, 1.0)
@@ -76,7 +79,11 @@ def _colour(value: Any) -> Any:
 
 
 def _triple(value: Any) -> Any:
-    return (value, value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+    return (
+        (value, value, value)
+        if isinstance(value, int | float) and not isinstance(value, bool)
+        else value
+    )
 
 
 def _arm(value: Any) -> Any:
@@ -95,13 +102,21 @@ def _heading(value: Any) -> Any:
 
 Fraction = Annotated[Number, Field(ge=0.0, le=1.0)]
 Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
-Colour = Annotated[tuple[Fraction, Fraction, Fraction, Fraction], count(4), BeforeValidator(_colour)]
+Colour = Annotated[
+    tuple[Fraction, Fraction, Fraction, Fraction], count(4), BeforeValidator(_colour)
+]
 Interval = Annotated[
-    tuple[Number, Number], count(2), require(lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]")
+    tuple[Number, Number],
+    count(2),
+    require(lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]"),
 ]
 Description = Annotated[
     Any,
-    require(lambda value: isinstance(value, str | dict), "wrong value", "the name or file of an object, or its description"),
+    require(
+        lambda value: isinstance(value, str | dict),
+        "wrong value",
+        "the name or file of an object, or its description",
+    ),
 ]
 Scale = Annotated[Size, BeforeValidator(_triple)]
 
@@ -176,15 +191,16 @@ class UrdfSchema(PoseSchema):
 
 
 ObstacleSchema = Annotated[
-    BoxSchema | SphereSchema | CylinderSchema | CapsuleSchema | MeshSchema | UrdfSchema, Field(discriminator="type")
+    BoxSchema | SphereSchema | CylinderSchema | CapsuleSchema | MeshSchema | UrdfSchema,
+    Field(discriminator="type"),
 ]
 
 
 class PlacedObjectSchema(PoseSchema):
     """An articulated object: `type` names its description or its file, or is one; `state` its joint values (others are 0).
 
-    Attachments that are `reversed` are approached from the other side than the object's description says; None: those whose hand
-    would come out of the object or from below the floor.
+    Attachments that are `reversed` are approached from the other side than the object's description
+    says; None: those whose hand would come out of the object or from below the floor.
     """
 
     name: Name
@@ -213,8 +229,8 @@ class HeldSchema(Schema):
 class StartSchema(Schema):
     """Where the robot starts: base [x, y, yaw], arm joints [rad], and object → attachment (or more) of what it holds.
 
-    `z` is the height of the robot's root link [m], all the time; the robot's own if it is left out. `opening` is how far its
-    gripper is open [m]; as the robot rests if it is left out.
+    `z` is the height of the robot's root link [m], all the time; the robot's own if it is left out.
+    `opening` is how far its gripper is open [m]; as the robot rests if it is left out.
     """
 
     base: Vector3
@@ -260,8 +276,13 @@ class AllowSchema(Schema):
 
     @model_validator(mode="after")
     def _one_of_both(self) -> AllowSchema:
-        if (self.pair is None) == (self.srdf is None) or (self.srdf is not None and self.margin is not None):
-            raise fail("not what may be close", "[one, other], {pair: [one, other], margin: 0.005}, or the name of an SRDF file")
+        if (self.pair is None) == (self.srdf is None) or (
+            self.srdf is not None and self.margin is not None
+        ):
+            raise fail(
+                "not what may be close",
+                "[one, other], {pair: [one, other], margin: 0.005}, or the name of an SRDF file",
+            )
         return self
 
 

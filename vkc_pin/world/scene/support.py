@@ -59,13 +59,17 @@ def supports(placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObjec
         if label in found:
             continue
         lower, upper = world_box(shape.geometry, shape.placement)
-        near = ((low < upper + RESTING).all() and (high > lower - RESTING).all() for low, high in boxes)
+        near = (
+            (low < upper + RESTING).all() and (high > lower - RESTING).all() for low, high in boxes
+        )
         if any(_bears(shape, one) for one, close in zip(own, near, strict=True) if close):
             found.add(label)
     return found
 
 
-def borne(objects: Mapping[str, PlacedObject], moving: Mapping[str, Collection[str]], free: Iterable[str]) -> dict[str, str]:
+def borne(
+    objects: Mapping[str, PlacedObject], moving: Mapping[str, Collection[str]], free: Iterable[str]
+) -> dict[str, str]:
     """Return what rides on links that move: free object → "<object>.<link>" of these, also where others are between.
 
     Args:

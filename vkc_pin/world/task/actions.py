@@ -26,7 +26,9 @@ def actions_of(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
     for step in steps:
         last = actions[-1] if actions else ()
         grasp = last[-1] if last and isinstance(last[-1], Grasp) else None
-        taken = grasp is not None and isinstance(step, Actuate | Place) and step.object == grasp.object
+        taken = (
+            grasp is not None and isinstance(step, Actuate | Place) and step.object == grasp.object
+        )
         if last and (taken or isinstance(step, Release)):
             actions[-1] = (*last, step)
         else:
@@ -41,11 +43,14 @@ def is_open(scene: Scene, step: Step) -> bool:
     return len(scene.objects[step.object].object.attachments) > 1
 
 
-def alternatives(scene: Scene, task: Task, *, anew: bool = False) -> Iterator[tuple[str, tuple[Step, ...]]]:
+def alternatives(
+    scene: Scene, task: Task, *, anew: bool = False
+) -> Iterator[tuple[str, tuple[Step, ...]]]:
     """Yield the steps of a task by attachments that it does not use, each with "<object>.<attachment>".
 
-    There are some only where a single one of its steps leaves that open: of several, each is planned alone before. What is held
-    already may have been grasped where it cannot be moved from, or put down: then it is let go of, and taken anew.
+    There are some only where a single one of its steps leaves that open: of several, each is
+    planned alone before. What is held already may have been grasped where it cannot be moved from,
+    or put down: then it is let go of, and taken anew.
 
     Args:
         scene: Where the task begins.
@@ -55,14 +60,21 @@ def alternatives(scene: Scene, task: Task, *, anew: bool = False) -> Iterator[tu
     if anew and (again := _taken_anew(scene, task.steps[0])):
         named = again[-1]
         yield f"{named.object}.{named.attachment}, taken anew", (*again, *task.steps[1:])
-    own = [(number, step) for number, step in enumerate(task.steps) if isinstance(step, Actuate) and is_open(scene, step)]
+    own = [
+        (number, step)
+        for number, step in enumerate(task.steps)
+        if isinstance(step, Actuate) and is_open(scene, step)
+    ]
     for number, step in own if len(own) == 1 else ():
         used = {hold.attachment for hold in task.holds if hold.object == step.object}
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
         for name in driving(scene.objects[step.object], {}, values, f"steps[{number}]"):
             if name not in used:
                 changed = dataclasses.replace(step, attachment=name)
-                yield f"{step.object}.{name}", (*task.steps[:number], changed, *task.steps[number + 1 :])
+                yield (
+                    f"{step.object}.{name}",
+                    (*task.steps[:number], changed, *task.steps[number + 1 :]),
+                )
 
 
 def _taken_anew(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None:
@@ -111,7 +123,9 @@ def _ideally_after(scene: Scene, task: Task) -> Scene:
             name, _, joint = coordinate.partition(".")
             thing = scene.objects[name].object
             index = thing.coordinates.index(joint)
-            scene = scene.with_state(name, {joint: float(np.clip(value, thing.lower[index], thing.upper[index]))})
+            scene = scene.with_state(
+                name, {joint: float(np.clip(value, thing.lower[index], thing.upper[index]))}
+            )
         for hold, placement in phase.lowered.items():
             scene = scene.with_placement(hold.object, placement)
     return scene.with_held(task.after)

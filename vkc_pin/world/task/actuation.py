@@ -19,16 +19,28 @@ from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.lookup import attachment_of, joint_limits, path_joints
 
-__all__ = ["advance", "check_drives", "clash", "driven", "driver", "driving", "latched", "pushed_ways"]
+__all__ = [
+    "advance",
+    "check_drives",
+    "clash",
+    "driven",
+    "driver",
+    "driving",
+    "latched",
+    "pushed_ways",
+]
 
-_PARTS = 9  # values of a freedom that turns, about points elsewhere, at which the contact is looked at; a slide's ends are enough
+# values of a freedom that turns, about points elsewhere, at which the contact is looked at; a
+# slide's ends are enough
+_PARTS = 9
 _LEAST = 1e-3  # [m] a radian, or of a metre: what moves the contact less is not pushed
 
 
 def advance(placed: PlacedObject, attachment: Attachment, joint: str) -> tuple[float, float]:
     """Return how far the contact moves into its face when a joint does, [m/rad] or 1: the least and the most over the region.
 
-    The velocity of the link at the contact is linear in where that is, so a region of slides has its extremes at corners.
+    The velocity of the link at the contact is linear in where that is, so a region of slides has
+    its extremes at corners.
 
     Args:
         placed: The object, at the state at which that is asked.
@@ -38,7 +50,9 @@ def advance(placed: PlacedObject, attachment: Attachment, joint: str) -> tuple[f
     model, data = placed.object.model, placed.object.model.createData()
     frame, index = placed.object.link_frame(attachment.link), model.getJointId(joint)
     q = placed.object.coordinates.q(placed.state)
-    jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL).reshape(6, -1)  # of one joint it has one dimension
+    jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL).reshape(
+        6, -1
+    )  # of one joint it has one dimension
     column = jacobian[:, model.joints[index].idx_v]
     into = attachment.placement.rotation[:, 2]
     found = [into @ (column[:3] + np.cross(column[3:], point)) for point in _region(attachment)]
@@ -48,7 +62,11 @@ def advance(placed: PlacedObject, attachment: Attachment, joint: str) -> tuple[f
 def _region(attachment: Attachment) -> list[Floats]:
     """Return points of the region that may be touched, in the link's frame, among them its corners."""
     ranges = [
-        np.linspace(own.lower, own.upper, 2 if own.kind == "prismatic" else _PARTS if own.through.any() else 1)
+        np.linspace(
+            own.lower,
+            own.upper,
+            2 if own.kind == "prismatic" else _PARTS if own.through.any() else 1,
+        )
         for own in attachment.freedoms
     ]
     points = []
@@ -61,7 +79,11 @@ def _region(attachment: Attachment) -> list[Floats]:
 
 
 def pushed_ways(
-    placed: PlacedObject, attachment: Attachment, state: Mapping[str, float], values: Mapping[str, float], where: str
+    placed: PlacedObject,
+    attachment: Attachment,
+    state: Mapping[str, float],
+    values: Mapping[str, float],
+    where: str,
 ) -> dict[str, int]:
     """Return which way a push moves each of some coordinates, 1 up or -1 down; nothing where the hand takes hold.
 
@@ -73,11 +95,16 @@ def pushed_ways(
         where: The field that asks for it, for errors.
 
     Raises:
-        InputError: Pushing there does not move a joint, or not all of the region moves it the same way, or not that way.
+        InputError: Pushing there does not move a joint, or not all of the region moves it the same
+            way, or not that way.
     """
     if attachment.contact != "push":
         return {}
-    own = {name.partition(".")[2]: value for name, value in state.items() if name.partition(".")[0] == placed.name}
+    own = {
+        name.partition(".")[2]: value
+        for name, value in state.items()
+        if name.partition(".")[0] == placed.name
+    }
     placed, ways = placed.with_state(own), dict[str, int]()
     at = f"'{placed.name}' at '{attachment.name}'"
     for coordinate, value in values.items():
@@ -85,50 +112,67 @@ def pushed_ways(
         least, most = advance(placed, attachment, joint)
         if least * most <= 0.0 or min(abs(least), abs(most)) < _LEAST:
             problem = f"pushing {at} does not move '{joint}' one way"
-            raise InputError(problem, field=where, expected="a face all of which lies on one side of the joint's axis")
+            raise InputError(
+                problem,
+                field=where,
+                expected="a face all of which lies on one side of the joint's axis",
+            )
         ways[coordinate] = way = 1 if least > 0.0 else -1
         begin = state[coordinate]
         lower, upper = joint_limits(placed, coordinate)
         if (min(max(value, lower), upper) - begin) * way < 0.0:
             problem = f"pushing {at} moves '{joint}' {'up' if way > 0 else 'down'} only: a hand that pushes cannot pull"
-            other = [name for name, one in placed.object.attachments.items() if one.contact != "push"]
+            other = [
+                name for name, one in placed.object.attachments.items() if one.contact != "push"
+            ]
             expected = f"{'≥' if way > 0 else '≤'} {begin:g}"
             expected += f", or an attachment to hold it by: {', '.join(other)}" if other else ""
             raise InputError(problem, field=where, expected=expected, got=value)
     return ways
 
 
-def latched(placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float]) -> Iterator[Latch]:
+def latched(
+    placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float]
+) -> Iterator[Latch]:
     """Yield the latches of an object that hold joints which are to move from where they are.
 
     What is added to `values` meanwhile counts: what releases a latch may be latched itself.
 
     Args:
         placed: The object.
-        state: Coordinate "<object>.<joint>" → value at the begin [rad] or [m]; those it lacks are as the scene has them.
+        state: Coordinate "<object>.<joint>" → value at the begin [rad] or [m]; those it lacks are
+            as the scene has them.
         values: The same at the end, for the joints that are to move.
     """
     for latch in placed.object.latches:
         coordinate = f"{placed.name}.{latch.joint}"
-        now = state.get(coordinate, float(placed.state[placed.object.coordinates.index(latch.joint)]))
+        now = state.get(
+            coordinate, float(placed.state[placed.object.coordinates.index(latch.joint)])
+        )
         if values.get(coordinate, now) != now and abs(now - latch.held_at) <= latch.engaged_within:
             yield latch
 
 
 def check_drives(
-    placed: PlacedObject, attachment: Attachment, state: Mapping[str, float], values: Mapping[str, float], where: str
+    placed: PlacedObject,
+    attachment: Attachment,
+    state: Mapping[str, float],
+    values: Mapping[str, float],
+    where: str,
 ) -> None:
     """Check that a hand which has an object at an attachment can bring joints to values.
 
     Args:
         placed: The object.
         attachment: Where the hand has it.
-        state: Coordinate "<object>.<joint>" → value at the begin [rad] or [m]; those it lacks are as the scene has them.
+        state: Coordinate "<object>.<joint>" → value at the begin [rad] or [m]; those it lacks are
+            as the scene has them.
         values: The same at the end, for the joints that are to move.
         where: The step that asks for it, for errors.
 
     Raises:
-        InputError: A joint, or what releases its latch, does not move with the attachment, or a push cannot move it that way.
+        InputError: A joint, or what releases its latch, does not move with the attachment, or a
+            push cannot move it that way.
     """
     name, path = placed.name, path_joints(placed, attachment)
     for joint in (coordinate.partition(".")[2] for coordinate in values):
@@ -137,7 +181,10 @@ def check_drives(
             expected = f"one of {', '.join(path)}" if path else "an attachment that moves with it"
             raise InputError(problem, field=f"{where}.joints", expected=expected)
     joints = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
-    state, wanted = {f"{name}.{joint}": value for joint, value in joints} | dict(state), dict(values)
+    state, wanted = (
+        {f"{name}.{joint}": value for joint, value in joints} | dict(state),
+        dict(values),
+    )
     for latch in latched(placed, state, wanted):
         release = f"{name}.{latch.released_by}"
         if latch.released_by in path:
@@ -145,11 +192,17 @@ def check_drives(
         elif state[release] < latch.threshold:
             problem = f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, does not move when "
             problem += f"'{name}' is held at '{attachment.name}'"
-            raise InputError(problem, field=f"{where}.attachment", expected=f"an attachment that moves '{latch.released_by}'")
+            raise InputError(
+                problem,
+                field=f"{where}.attachment",
+                expected=f"an attachment that moves '{latch.released_by}'",
+            )
     pushed_ways(placed, attachment, state, values, f"{where}.joints")
 
 
-def driving(placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float], where: str) -> list[str]:
+def driving(
+    placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float], where: str
+) -> list[str]:
     """Return the attachments at which a hand can bring joints of an object to values, in the object's order.
 
     Args:
@@ -173,13 +226,23 @@ def driving(placed: PlacedObject, state: Mapping[str, float], values: Mapping[st
         raise errors[0]
     if not found:
         asked = " and ".join(f"'{coordinate.partition('.')[2]}'" for coordinate in values)
-        moved = {name: ", ".join(path_joints(placed, one)) or "nothing" for name, one in placed.object.attachments.items()}
+        moved = {
+            name: ", ".join(path_joints(placed, one)) or "nothing"
+            for name, one in placed.object.attachments.items()
+        }
         problem = f"no attachment of '{placed.name}' can bring {asked} there"
         if all(error.problem.startswith("joint ") for error in errors):
             expected = f"joints that one attachment moves: {'; '.join(f'{name} moves {path}' for name, path in moved.items())}"
         else:
-            expected = "one that can; " + "; ".join(f"{name}: {error.problem}" for name, error in zip(moved, errors, strict=True))
-        raise InputError(problem, field=f"{where}.joints", expected=expected, got=", ".join(map(str, values.values())))
+            expected = "one that can; " + "; ".join(
+                f"{name}: {error.problem}" for name, error in zip(moved, errors, strict=True)
+            )
+        raise InputError(
+            problem,
+            field=f"{where}.joints",
+            expected=expected,
+            got=", ".join(map(str, values.values())),
+        )
     return found
 
 
@@ -196,7 +259,8 @@ def driver(
     Args:
         placed: The object.
         named: By the step; None leaves it open.
-        used: Attachments that come before the others then: the one in the hand, and the one that was.
+        used: Attachments that come before the others then: the one in the hand, and the one that
+            was.
         state: As for `check_drives`.
         values: As for `check_drives`.
         where: The step that asks for it, for errors.
@@ -216,7 +280,10 @@ def driver(
 def driven(scene: Scene, hold: Hold) -> list[str]:
     """Return the coordinates "<object>.<joint>" that a hold can move, base first."""
     placed = scene.objects[hold.object]
-    return [f"{placed.name}.{joint}" for joint in path_joints(placed, placed.object.attachments[hold.attachment])]
+    return [
+        f"{placed.name}.{joint}"
+        for joint in path_joints(placed, placed.object.attachments[hold.attachment])
+    ]
 
 
 def clash(scene: Scene, holds: Iterable[Hold]) -> str | None:

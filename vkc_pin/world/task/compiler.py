@@ -15,9 +15,27 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actuation import clash, driven, driver, latched, pushed_ways
-from vkc_pin.world.task.lookup import attachment_of, check_link, joint_limits, openings, path_joints, placed_object, robot_frame
+from vkc_pin.world.task.lookup import (
+    attachment_of,
+    check_link,
+    joint_limits,
+    openings,
+    path_joints,
+    placed_object,
+    robot_frame,
+)
 from vkc_pin.world.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
-from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch, as_list
+from vkc_pin.world.task.steps import (
+    Actuate,
+    GoTo,
+    Grasp,
+    Place,
+    Reach,
+    Release,
+    Step,
+    Touch,
+    as_list,
+)
 from vkc_pin.world.task.supported_objects import Riders
 
 __all__ = ["compile_task", "nothing_to_do"]
@@ -33,7 +51,11 @@ class _Compiler:
         self.holds: list[Hold] = list(self.held)
         self.initial: dict[str, float] = {}
         self.state: dict[str, float] = {}
-        self.standing = {n: p.placement for n, p in scene.objects.items() if p.object.free and n not in scene.held}
+        self.standing = {
+            n: p.placement
+            for n, p in scene.objects.items()
+            if p.object.free and n not in scene.held
+        }
         self.left: dict[str, tuple[Hold, int]] = {}
         self.riders = Riders(scene, self.standing)
         for hold in self.held:
@@ -48,21 +70,44 @@ class _Compiler:
             self.state.setdefault(f"{placed.name}.{joint}", value)
 
     def _move(
-        self, kind: PhaseKind, hold: Hold, where: str, values: dict[str, float], ranges: Mapping[str, tuple[float, float]]
+        self,
+        kind: PhaseKind,
+        hold: Hold,
+        where: str,
+        values: dict[str, float],
+        ranges: Mapping[str, tuple[float, float]],
     ) -> None:
         """Add a phase in which joints move of what stands fixed and is held, with all that stands on it."""
-        self.riders.begin(hold, {coordinate.partition(".")[2] for coordinate in ranges}, self.state, where)
+        self.riders.begin(
+            hold, {coordinate.partition(".")[2] for coordinate in ranges}, self.state, where
+        )
         segments = self.options.move_waypoints if kind == "move" else self.options.turn_waypoints
         placed = self.scene.objects[hold.object]
-        ways = pushed_ways(placed, placed.object.attachments[hold.attachment], self.state, values, f"{where}.joints")
+        ways = pushed_ways(
+            placed,
+            placed.object.attachments[hold.attachment],
+            self.state,
+            values,
+            f"{where}.joints",
+        )
         self._append(kind, tuple(values), segments, ranges=ranges, values=values, pushed=ways)
         self.riders.end(self.state, where)
 
-    def _append(self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any) -> None:
+    def _append(
+        self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any
+    ) -> None:
         last = self.phases[-1] if self.phases else None
         before = (*last.held, *last.grasps) if last else self.scene.holds
         leaves = tuple(hold for hold in before if hold not in self.held)
-        lifted = {hold: last.standing[hold.object] for hold in last.grasps if hold.object in last.standing} if last else {}
+        lifted = (
+            {
+                hold: last.standing[hold.object]
+                for hold in last.grasps
+                if hold.object in last.standing
+            }
+            if last
+            else {}
+        )
         phase = Phase(
             kind,
             about,
@@ -77,7 +122,10 @@ class _Compiler:
             **details,
         )
         self.phases.append(phase)
-        for coordinate, value in phase.values.items():  # a goal beyond a limit is approached as far as it goes
+        for (
+            coordinate,
+            value,
+        ) in phase.values.items():  # a goal beyond a limit is approached as far as it goes
             lower, upper = joint_limits(self.scene.objects[coordinate.split(".", 1)[0]], coordinate)
             self.state[coordinate] = min(max(value, lower), upper)
 
@@ -88,25 +136,42 @@ class _Compiler:
         """Let go of what stands fixed in the world, which cannot come along."""
         self.held = tuple(hold for hold in self.held if self.scene.objects[hold.object].object.free)
 
-    def grasp(self, name: str, attachment_name: str | None, where: str, by: str | None = None) -> Hold:
+    def grasp(
+        self, name: str, attachment_name: str | None, where: str, by: str | None = None
+    ) -> Hold:
         """Add the phase that takes hold of an object, unless it is held; return the hold."""
         placed = placed_object(self.scene, name, f"{where}.object")
-        earlier = next((hold.attachment for hold in self.holds if hold.object == name and hold.frame == by), None)
+        earlier = next(
+            (hold.attachment for hold in self.holds if hold.object == name and hold.frame == by),
+            None,
+        )
         attachment = attachment_of(placed, attachment_name or earlier, f"{where}.attachment")
         through = self._through(by, name, f"{where}.by") if by is not None else None
         hold = Hold(name, attachment.name, *(through or (None, None)))
         if hold in self.held:
             return hold
         if (held := self._hold_of(name)) is not None and placed.object.free:
-            raise InputError(f"'{name}' is held already, as {held}", field=where, expected="Release or Place before")
+            raise InputError(
+                f"'{name}' is held already, as {held}",
+                field=where,
+                expected="Release or Place before",
+            )
         if through is None:
             self._let_go_of_fixed()
             if self.held:
                 kind = "the robot has one hand, and it holds"
-                raise InputError(f"{kind} {self.held[0]}", field=f"{where}.object", expected="Place or Release before", got=name)
+                raise InputError(
+                    f"{kind} {self.held[0]}",
+                    field=f"{where}.object",
+                    expected="Place or Release before",
+                    got=name,
+                )
         if not placed.object.free and through is not None:
             raise InputError(
-                f"'{name}' stands fixed in the world", field=f"{where}.by", expected="the hand itself", got=shown(by)
+                f"'{name}' stands fixed in the world",
+                field=f"{where}.by",
+                expected="the hand itself",
+                got=shown(by),
             )
         if name in self.left:
             problem = f"where '{name}' stands by then is known only after planning"
@@ -140,13 +205,28 @@ class _Compiler:
         """Return the hold and link of `frame`, "<object>.<link>", that object `name` is to be held through."""
         owner, dot, link = str(frame).partition(".")
         if not dot:
-            raise InputError("not a link of an object", field=where, expected="<object>.<link>, e.g. stick.tip", got=shown(frame))
+            raise InputError(
+                "not a link of an object",
+                field=where,
+                expected="<object>.<link>, e.g. stick.tip",
+                got=shown(frame),
+            )
         placed = placed_object(self.scene, owner, where)
         hold = self._hold_of(owner)
         if hold is None or not placed.object.free:
-            held = ", ".join(str(h) for h in self.held if self.scene.objects[h.object].object.free) or "nothing"
-            problem = f"'{name}' cannot be grasped through '{owner}', which the robot does not carry"
-            raise InputError(problem, field=where, expected=f"a link of what it carries ({held})", got=shown(frame))
+            held = (
+                ", ".join(str(h) for h in self.held if self.scene.objects[h.object].object.free)
+                or "nothing"
+            )
+            problem = (
+                f"'{name}' cannot be grasped through '{owner}', which the robot does not carry"
+            )
+            raise InputError(
+                problem,
+                field=where,
+                expected=f"a link of what it carries ({held})",
+                got=shown(frame),
+            )
         check_link(placed, link, where)
         return hold, link
 
@@ -155,15 +235,26 @@ class _Compiler:
         names = placed.object.coordinates.names
         for joint in step.joints:
             if joint not in names:
-                raise UnknownNameError(f"joint of '{step.object}'", joint, names, field=f"{where}.joints")
+                raise UnknownNameError(
+                    f"joint of '{step.object}'", joint, names, field=f"{where}.joints"
+                )
         if placed.object.free:
             problem = f"'{step.object}' stands free: its joints are not driven by a hand"
             raise InputError(problem, field=f"{where}.object", expected="a fixed object")
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
-        used = [one.attachment for one in (*self.held, *reversed(self.holds)) if one.object == step.object]
-        hold = self.grasp(step.object, driver(placed, step.attachment, used, self.state, values, where), where)
+        used = [
+            one.attachment
+            for one in (*self.held, *reversed(self.holds))
+            if one.object == step.object
+        ]
+        hold = self.grasp(
+            step.object, driver(placed, step.attachment, used, self.state, values, where), where
+        )
         ranges = {coordinate: joint_limits(placed, coordinate) for coordinate in values}
-        path, after = path_joints(placed, placed.object.attachments[hold.attachment]), dict[str, float]()
+        path, after = (
+            path_joints(placed, placed.object.attachments[hold.attachment]),
+            dict[str, float](),
+        )
         for latch in latched(placed, self.state, values):
             release = f"{step.object}.{latch.released_by}"
             if latch.released_by not in path:  # and is where it lets go
@@ -178,7 +269,13 @@ class _Compiler:
             values[release] = turned if release in after else values.get(release, turned)
         self._move("move", hold, where, values, ranges)
         if after:
-            self._move("turn", hold, where, after, {release: joint_limits(placed, release) for release in after})
+            self._move(
+                "turn",
+                hold,
+                where,
+                after,
+                {release: joint_limits(placed, release) for release in after},
+            )
 
     def touch(self, step: Touch, where: str) -> None:
         """Add the phase that brings a frame to its target, carrying on what is carried."""
@@ -188,7 +285,11 @@ class _Compiler:
             placed = self.scene.objects[owner]
             if not placed.object.free:
                 problem = f"'{owner}' stands fixed in the world and cannot be carried anywhere"
-                raise InputError(problem, field=f"{where}.frame", expected="a link of a free object, or a frame of the robot")
+                raise InputError(
+                    problem,
+                    field=f"{where}.frame",
+                    expected="a link of a free object, or a frame of the robot",
+                )
             check_link(placed, link, f"{where}.frame")
             hold = self._hold_of(owner) or self.grasp(owner, None, where)
         elif dot and step.frame not in [f.name for f in self.scene.robot.model.frames]:
@@ -205,29 +306,50 @@ class _Compiler:
         """Add the phases that bring an object to its place and leave it there."""
         placed = placed_object(self.scene, step.object, f"{where}.object")
         if not placed.object.free:
-            raise InputError(f"'{step.object}' stands fixed in the world", field=f"{where}.object", expected="a free object")
+            raise InputError(
+                f"'{step.object}' stands fixed in the world",
+                field=f"{where}.object",
+                expected="a free object",
+            )
         hold = self._hold_of(step.object) or self.grasp(step.object, step.attachment, where)
         if step.attachment is not None and hold.attachment != step.attachment:
-            raise InputError("it is held elsewhere", field=f"{where}.attachment", expected=hold.attachment, got=step.attachment)
+            raise InputError(
+                "it is held elsewhere",
+                field=f"{where}.attachment",
+                expected=hold.attachment,
+                got=step.attachment,
+            )
         upright = not isinstance(step.pose, pin.SE3)
         # As it stands; what is in the hand from the start stands with its z axis up.
         stands = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
         pose = pin.SE3(stands, np.array(step.pose)) if upright else step.pose
         goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
-        self._append("place", (step.object,), self.options.reach_waypoints, frames=(goal,), lowered={hold: pose})
+        self._append(
+            "place",
+            (step.object,),
+            self.options.reach_waypoints,
+            frames=(goal,),
+            lowered={hold: pose},
+        )
         self._release(hold, pose, nearly=upright)
 
     def release(self, step: Release, where: str) -> None:
         """Let go of one thing, or of everything."""
         if not self.held:
-            raise InputError("the hand is empty", field=where, expected="something held", got=shown(step))
+            raise InputError(
+                "the hand is empty", field=where, expected="something held", got=shown(step)
+            )
         if step.object is not None and self._hold_of(step.object) is None:
             held = [hold.object for hold in self.held]
             raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
         let_go = [hold for hold in reversed(self.held) if step.object in (None, hold.object)]
         if not (moved := bool(self.phases)):
             objects = self.scene.objects
-            lowered = {hold: objects[hold.object].placement for hold in let_go if objects[hold.object].object.free}
+            lowered = {
+                hold: objects[hold.object].placement
+                for hold in let_go
+                if objects[hold.object].object.free
+            }
             self._append("stand", (), self.options.turn_waypoints, lowered=lowered)
         for hold in let_go:
             if hold in self.held:
@@ -254,13 +376,20 @@ class _Compiler:
         elif isinstance(step, Reach):
             frame = robot_frame(self.scene, step.frame, f"{where}.frame")
             self._let_go_of_fixed()
-            self._append("reach", (frame,), self.options.reach_waypoints, frames=(FrameGoal(frame, step.pose),))
+            self._append(
+                "reach",
+                (frame,),
+                self.options.reach_waypoints,
+                frames=(FrameGoal(frame, step.pose),),
+            )
         elif isinstance(step, GoTo):
             self._let_go_of_fixed()
             self._append("go", (), self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
 
 
-def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False, first: int = 0) -> Task:
+def compile_task(
+    scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False, first: int = 0
+) -> Task:
     """Return the phases that bring about `steps`, beginning at the scene's start.
 
     Args:
@@ -271,14 +400,16 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothi
         first: The number of the first of `steps` in the user's list, for messages.
 
     Raises:
-        InputError: No steps, an unknown object, joint, attachment or frame, a joint that cannot be moved that way, or a
-            hand that is asked to hold a second thing.
+        InputError: No steps, an unknown object, joint, attachment or frame, a joint that cannot be
+            moved that way, or a hand that is asked to hold a second thing.
     """
     steps = as_list(steps)
     compiler, marks = _Compiler(scene, options), list[Mark]()
     for index, step in enumerate(steps, start=first):
         compiler.add(step, f"steps[{index}]")
-        marks.append(Mark(len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held))
+        marks.append(
+            Mark(len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held)
+        )
     if not compiler.phases and not nothing:
         raise nothing_to_do()
     # Objects that are grasped later stand as they are at the start until then.
@@ -286,7 +417,10 @@ def compile_task(scene: Scene, steps: Sequence[Step], options: Options, *, nothi
     phases = tuple(
         replace(
             phase,
-            before={**initial, **{name: value for name, value in phase.before.items() if name in initial}},
+            before={
+                **initial,
+                **{name: value for name, value in phase.before.items() if name in initial},
+            },
             opening=opening,
         )
         for phase, opening in zip(compiler.phases, openings(scene, compiler.phases), strict=True)

@@ -15,20 +15,26 @@ from vkc_pin.utils.arrays import Floats
 
 __all__ = ["Formula", "State"]
 
-ROUNDING = 1e-8  # added under every root: a root has no slope at zero, where the norm of a velocity is at rest
+# added under every root: a root has no slope at zero, where the norm of a velocity is at rest
+ROUNDING = 1e-8
 _COMPARISONS = ("lt", "le", "eq", "ne", "and", "or", "not")
 
 
 class State:
     """What a term may ask for at a waypoint, as CasADi symbols.
 
-    Coordinates are those of the robot (`base_x`, `elbow_joint`) and of objects (`door.hinge`); frames are those of the robot,
-    links among them, and links of objects (`cup.cup`, `door.panel`), whoever holds them. Everything is in the world frame.
-    All methods raise `UnknownNameError` for a name that does not exist. Where it is not known yet what there will be (None), any
-    name does.
+    Coordinates are those of the robot (`base_x`, `elbow_joint`) and of objects (`door.hinge`);
+    frames are those of the robot, links among them, and links of objects (`cup.cup`, `door.panel`),
+    whoever holds them. Everything is in the world frame. All methods raise `UnknownNameError` for a
+    name that does not exist. Where it is not known yet what there will be (None), any name does.
     """
 
-    def __init__(self, frames: Sequence[str] | None, coordinates: Sequence[str] | None, field: str | None = None) -> None:
+    def __init__(
+        self,
+        frames: Sequence[str] | None,
+        coordinates: Sequence[str] | None,
+        field: str | None = None,
+    ) -> None:
         self._field = field  # for errors
         self._known = {"frame": frames, "coordinate": coordinates}
         self._symbols: Mapping[str, dict[str, tuple[Any, Any]]] = {"frame": {}, "coordinate": {}}
@@ -70,11 +76,20 @@ class State:
         else:
             known(name, choices, kind, self._field)
         size = 12 if kind == "frame" else 1
-        return self._symbols[kind].setdefault(name, (ca.SX.sym("now", size), ca.SX.sym("before", size)))
+        return self._symbols[kind].setdefault(
+            name, (ca.SX.sym("now", size), ca.SX.sym("before", size))
+        )
 
     def formula(self, value: Any) -> Formula:
         """Return an expression of this state's symbols, shape (rows, 1), as data."""
-        columns = [[pair[when] for kind in ("frame", "coordinate") for pair in self._symbols[kind].values()] for when in (0, 1)]
+        columns = [
+            [
+                pair[when]
+                for kind in ("frame", "coordinate")
+                for pair in self._symbols[kind].values()
+            ]
+            for when in (0, 1)
+        ]
         inputs = ca.vertcat(*columns[0], *columns[1], self._dt)
         function = ca.Function("term", [inputs], [ca.densify(value)])
         code = []
@@ -83,16 +98,23 @@ class State:
             read, written = function.instruction_input(k), function.instruction_output(k)
             if name == "const":
                 constant = float(function.instruction_constant(k))
-            code.append((name, tuple(read[1:] if name == "input" else read), int(written[-1]), constant))
-        return Formula(tuple(self._symbols["frame"]), tuple(self._symbols["coordinate"]), value.numel(), tuple(code))
+            code.append(
+                (name, tuple(read[1:] if name == "input" else read), int(written[-1]), constant)
+            )
+        return Formula(
+            tuple(self._symbols["frame"]),
+            tuple(self._symbols["coordinate"]),
+            value.numel(),
+            tuple(code),
+        )
 
 
 @dataclass(frozen=True)
 class Formula:
     """An expression as plain data: equal ones are equal, files can hold it, and reading it runs nothing.
 
-    Its inputs, in one column: of every frame rotation (by columns) and position, the coordinates, both again one step before,
-    and the time of that step.
+    Its inputs, in one column: of every frame rotation (by columns) and position, the coordinates,
+    both again one step before, and the time of that step.
 
     Attributes:
         frames, coordinates: Names of what it depends on.
@@ -151,17 +173,27 @@ class Formula:
             elif name == "output":
                 results[written] = operands[0]
             elif len(operands) == 1:
-                work[written] = ca.SX.unary(numbers[name], operands[0] + (ROUNDING if name == "sqrt" else 0.0))
+                work[written] = ca.SX.unary(
+                    numbers[name], operands[0] + (ROUNDING if name == "sqrt" else 0.0)
+                )
             else:
                 work[written] = ca.SX.binary(numbers[name], *operands)
         return ca.Function("term", [inputs], [ca.vertcat(*results)])
 
     def values(self, inputs: Floats) -> Floats:
         """Return its values, shape (S, rows), at inputs of shape (S, 2·half + 1)."""
-        return np.asarray(self.function(np.ascontiguousarray(inputs.T)), float).reshape(self.rows, len(inputs)).T
+        return (
+            np.asarray(self.function(np.ascontiguousarray(inputs.T)), float)
+            .reshape(self.rows, len(inputs))
+            .T
+        )
 
 
 @cache
 def _operations() -> dict[int, str]:
     """Return CasADi's operations by number; files name them."""
-    return {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}
+    return {
+        getattr(ca, name): name.removeprefix("OP_").lower()
+        for name in dir(ca)
+        if name.startswith("OP_")
+    }

@@ -14,7 +14,15 @@ from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase
 
-__all__ = ["attachment_of", "check_link", "joint_limits", "openings", "path_joints", "placed_object", "robot_frame"]
+__all__ = [
+    "attachment_of",
+    "check_link",
+    "joint_limits",
+    "openings",
+    "path_joints",
+    "placed_object",
+    "robot_frame",
+]
 
 
 def placed_object(scene: Scene, name: str, where: str) -> PlacedObject:
@@ -41,7 +49,9 @@ def attachment_of(placed: PlacedObject, name: str | None, where: str) -> Attachm
     attachments = placed.object.attachments
     if name is None:
         if not attachments:
-            raise InputError(f"object '{placed.name}' has no attachment, so it cannot be grasped", field=where)
+            raise InputError(
+                f"object '{placed.name}' has no attachment, so it cannot be grasped", field=where
+            )
         return next(iter(attachments.values()))
     if name not in attachments:
         raise UnknownNameError(f"attachment of '{placed.name}'", name, attachments, field=where)
@@ -83,9 +93,13 @@ def joint_limits(placed: PlacedObject, coordinate: str) -> tuple[float, float]:
 def openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None]:
     """Return how far the gripper is open in each phase [m]; None: as the robot rests.
 
-    That is what the attachment says which it holds or comes to next. After the last one it stays as it is.
+    That is what the attachment says which it holds or comes to next. After the last one it stays as
+    it is.
     """
-    taken, found = [in_gripper((*phase.held, *phase.grasps)) for phase in phases], list[float | None]()
+    taken, found = (
+        [in_gripper((*phase.held, *phase.grasps)) for phase in phases],
+        list[float | None](),
+    )
     for number in range(len(phases)):
         hold = next((one for one in taken[number:] if one is not None), None)
         before = found[-1] if found else opening_at_start(scene)

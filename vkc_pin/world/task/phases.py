@@ -36,7 +36,8 @@ class FrameGoal:
     Attributes:
         frame: Of the robot, or a link of the object that `hold` holds.
         placement: Where; of a point only the translation counts.
-        kind: "pose", "point", or "upright": the point, and the vertical as `placement` has it, at any heading.
+        kind: "pose", "point", or "upright": the point, and the vertical as `placement` has it, at
+            any heading.
         hold: What holds the object that the frame belongs to; None for a frame of the robot.
         touches: Whether the frame's link may come as close to what is there as it likes.
     """
@@ -56,22 +57,29 @@ class Phase:
     """A stretch of the motion in which the same things are held.
 
     Attributes:
-        kind: What happens in it: "grasp", "reach" of a frame, "touch", "place", "turn" what releases a latch, "move" joints of an
-            object, "go" of the base, or "stand" still.
-        about: What that happens to: object and attachment (and the link that holds it, or ""), frame, object or coordinates.
-        segments: Steps of time; the phase has `segments + 1` waypoints, the first shared with the phase before.
+        kind: What happens in it: "grasp", "reach" of a frame, "touch", "place", "turn" what
+            releases a latch, "move" joints of an object, "go" of the base, or "stand" still.
+        about: What that happens to: object and attachment (and the link that holds it, or ""),
+            frame, object or coordinates.
+        segments: Steps of time; the phase has `segments + 1` waypoints, the first shared with the
+            phase before.
         held: What is held, each after the hold it depends on.
-        ranges: Object coordinate → (lower, upper) for every waypoint after the first; all others stand still.
+        ranges: Object coordinate → (lower, upper) for every waypoint after the first; all others
+            stand still.
         values: Object coordinate → value at the last waypoint.
-        pushed: Object coordinate → 1 or -1, for those that may only go up or down, because the hand pushes.
+        pushed: Object coordinate → 1 or -1, for those that may only go up or down, because the hand
+            pushes.
         frames: Frame goals at the last waypoint.
         base: (x, y, yaw or None) at the last waypoint, in the world.
         grasps: What is grasped at the last waypoint.
         leaves: What was let go of just before.
-        before: Object coordinate → value at the first waypoint, for the joints that this task's grasps can move.
-        standing: Free object → its placement, for those that nobody holds and this task has to do with.
-        left: Free object → the hold that left it where it stands, and the number of the phase at whose end it did, for
-            those of `standing` that stand there only nearly: where exactly, the motion decides.
+        before: Object coordinate → value at the first waypoint, for the joints that this task's
+            grasps can move.
+        standing: Free object → its placement, for those that nobody holds and this task has to do
+            with.
+        left: Free object → the hold that left it where it stands, and the number of the phase at
+            whose end it did, for those of `standing` that stand there only nearly: where exactly,
+            the motion decides.
         lifted: Hold → placement in which its free object stood when it was grasped just before.
         lowered: Hold → placement in which its free object stands when it is let go of at the end.
         rides: What stands on something that moves, and moves along.
@@ -132,7 +140,8 @@ class Task:
         steps: The user's steps.
         phases: In order; at least one.
         holds: Everything that is held at any time, each after the hold it depends on.
-        state: Object coordinate (`<object>.<joint>`) → value at the start, for the joints that `holds` can move.
+        state: Object coordinate (`<object>.<joint>`) → value at the start, for the joints that
+            `holds` can move.
         after: What is held when all is done.
         marks: For every step, how much of the task there is when it is done.
     """
@@ -159,10 +168,19 @@ class Task:
         mark = self.marks[count - 1]
         state = dict(islice(self.state.items(), mark.state))
         phases = (
-            replace(phase, before={name: value for name, value in phase.before.items() if name in state})
+            replace(
+                phase, before={name: value for name, value in phase.before.items() if name in state}
+            )
             for phase in self.phases[: mark.phases]
         )
-        return Task(self.steps[:count], tuple(phases), self.holds[: mark.holds], state, mark.after, self.marks[:count])
+        return Task(
+            self.steps[:count],
+            tuple(phases),
+            self.holds[: mark.holds],
+            state,
+            mark.after,
+            self.marks[:count],
+        )
 
 
 def stretches(task: Task) -> list[tuple[str, tuple[str, ...]]]:

@@ -60,8 +60,8 @@ class Grasp:
     Attributes:
         object: Its name in the scene.
         attachment: Where to grasp it; None is the object's first attachment.
-        by: Through what: "<object>.<link>", a link of an object in the hand (a stick's tip), which takes the place of the
-            tool frame; None is the hand itself.
+        by: Through what: "<object>.<link>", a link of an object in the hand (a stick's tip), which
+            takes the place of the tool frame; None is the hand itself.
     """
 
     object: str
@@ -79,8 +79,9 @@ class Actuate:
     Attributes:
         object: The object's name in the scene.
         joints: Joint name → value at the end, [rad] or [m].
-        attachment: Where to grasp it if it is not held there; None leaves that open: it is held on to if the joints move so, else
-            taken by the object's first attachment that moves them, and where planning with that one fails, by the others that do.
+        attachment: Where to grasp it if it is not held there; None leaves that open: it is held on
+            to if the joints move so, else taken by the object's first attachment that moves them,
+            and where planning with that one fails, by the others that do.
     """
 
     object: str
@@ -91,9 +92,16 @@ class Actuate:
         _names(self, object=False, attachment=True)
         expected = "a mapping such as {'hinge': 1.2}"
         if not isinstance(self.joints, Mapping) or not self.joints:
-            raise InputError("nothing to actuate", field="Actuate.joints", expected=expected, got=shown(self.joints))
+            raise InputError(
+                "nothing to actuate",
+                field="Actuate.joints",
+                expected=expected,
+                got=shown(self.joints),
+            )
         given = mapping(self.joints, "Actuate.joints", expected)
-        joints = {name: quantity(value, f"Actuate.joints[{name!r}]") for name, value in given.items()}
+        joints = {
+            name: quantity(value, f"Actuate.joints[{name!r}]") for name, value in given.items()
+        }
         object.__setattr__(self, "joints", joints)
 
 
@@ -102,8 +110,10 @@ class Touch:
     """Bring a frame of what is held, or of the robot, to a point or a pose.
 
     Attributes:
-        frame: "<object>.<link>", a link of a free object, which is grasped first unless it is held; or a frame of the robot.
-        target: In the world frame: a point (x, y, z) [m], at any orientation, or a pose; see `as_placement`.
+        frame: "<object>.<link>", a link of a free object, which is grasped first unless it is held;
+            or a frame of the robot.
+        target: In the world frame: a point (x, y, z) [m], at any orientation, or a pose; see
+            `as_placement`.
     """
 
     frame: str
@@ -120,8 +130,9 @@ class Place:
 
     Attributes:
         object: Its name in the scene.
-        pose: Of its base link in the world frame: a pose (see `as_placement`), or a point (x, y, z) [m], where it then
-            stands as upright as it does before the plan, at any heading; with its z axis up if it is in the hand then.
+        pose: Of its base link in the world frame: a pose (see `as_placement`), or a point (x, y, z)
+            [m], where it then stands as upright as it does before the plan, at any heading; with
+            its z axis up if it is in the hand then.
         attachment: Where to grasp it if it is not held yet; None is the object's first attachment.
     """
 
@@ -180,14 +191,23 @@ def as_list(steps: Sequence[Step]) -> tuple[Step, ...]:
         InputError: They are no list, or an empty one.
     """
     if isinstance(steps, STEPS):
-        raise InputError("one step alone", field="steps", expected="a list of steps", got=shown(steps))
+        raise InputError(
+            "one step alone", field="steps", expected="a list of steps", got=shown(steps)
+        )
     found: tuple[Step, ...] = items(steps, "steps", "a list of steps")
     if not found:
-        raise InputError("there is nothing to do", field="steps", expected="at least one step", got="an empty list")
+        raise InputError(
+            "there is nothing to do",
+            field="steps",
+            expected="at least one step",
+            got="an empty list",
+        )
     for number, step in enumerate(found):
         if not isinstance(step, STEPS):
             expected = ", ".join(kind.__name__ for kind in STEPS)
-            raise InputError("not a step", field=f"steps[{number}]", expected=expected, got=shown(step))
+            raise InputError(
+                "not a step", field=f"steps[{number}]", expected=expected, got=shown(step)
+            )
     return found
 
 

@@ -75,7 +75,9 @@ class Riders:
         return (*self.carried, *self._rides)
 
 
-def where_now(scene: Scene, state: Mapping[str, float], standing: Mapping[str, pin.SE3]) -> dict[str, PlacedObject]:
+def where_now(
+    scene: Scene, state: Mapping[str, float], standing: Mapping[str, pin.SE3]
+) -> dict[str, PlacedObject]:
     """Return the objects that stand somewhere at some time of a task, free or not.
 
     Args:
@@ -87,19 +89,26 @@ def where_now(scene: Scene, state: Mapping[str, float], standing: Mapping[str, p
     for name, placed in scene.objects.items():
         if placed.object.free and name not in standing:
             continue
-        values = {c.removeprefix(f"{name}."): v for c, v in state.items() if c.startswith(f"{name}.")}
-        found[name] = replace(placed, placement=standing.get(name, placed.placement)).with_state(values)
+        values = {
+            c.removeprefix(f"{name}."): v for c, v in state.items() if c.startswith(f"{name}.")
+        }
+        found[name] = replace(placed, placement=standing.get(name, placed.placement)).with_state(
+            values
+        )
     return found
 
 
-def rides_of(scene: Scene, now: Mapping[str, PlacedObject], hold: Hold, joints: Set[str], where: str) -> tuple[Ride, ...]:
+def rides_of(
+    scene: Scene, now: Mapping[str, PlacedObject], hold: Hold, joints: Set[str], where: str
+) -> tuple[Ride, ...]:
     """Return what will ride on an object that is held.
 
     Args:
         scene: The scene.
         now: The objects that stand somewhere when that begins, and the one that is held.
         hold: What is held.
-        joints: Its joints that will move, of an object that stands fixed; a free one moves with all of its links.
+        joints: Its joints that will move, of an object that stands fixed; a free one moves with all
+            of its links.
         where: The step, for messages.
 
     Raises:
@@ -124,10 +133,22 @@ def rides_of(scene: Scene, now: Mapping[str, PlacedObject], hold: Hold, joints: 
         other = min(supports(now[name], still), default=None)
         if other is not None and not thing.free:
             problem = f"'{name}' stands on what moves and on what does not: '{label}' and '{other}'"
-            raise InputError(problem, field=where, expected="that it is taken off, or stands on one of them alone")
+            raise InputError(
+                problem,
+                field=where,
+                expected="that it is taken off, or stands on one of them alone",
+            )
         link = label.partition(".")[2]
         carrier = now[hold.object]
-        found.append(Ride(name, hold, link, carrier.link_placement(link).actInv(now[name].placement), carrier.placement))
+        found.append(
+            Ride(
+                name,
+                hold,
+                link,
+                carrier.link_placement(link).actInv(now[name].placement),
+                carrier.placement,
+            )
+        )
     return tuple(found)
 
 
@@ -140,5 +161,10 @@ def after_ride(ride: Ride, before: PlacedObject, after: PlacedObject, where: str
     link = after.link_placement(ride.link)
     if (angle := tilt(before.link_placement(ride.link), link)) > LEVEL:
         problem, got = f"'{ride.object}' stands on '{ride.on}', which would tip", f"{angle:.2f} rad"
-        raise InputError(problem, field=where, expected=f"that it is taken off before, or at most {LEVEL:g} rad", got=got)
+        raise InputError(
+            problem,
+            field=where,
+            expected=f"that it is taken off before, or at most {LEVEL:g} rad",
+            got=got,
+        )
     return link * ride.local

@@ -1,7 +1,8 @@
 """A user's own constraints and costs: CasADi expressions of coordinates and frames.
 
-The user's function is called once, with symbols, and what it returns is kept as plain data (`formula`). The program composes
-that with its kinematics; validation evaluates the same on placements of its own.
+The user's function is called once, with symbols, and what it returns is kept as plain data
+(`formula`). The program composes that with its kinematics; validation evaluates the same on
+placements of its own.
 """
 
 from __future__ import annotations
@@ -49,30 +50,52 @@ class _Term:
 
     def _check(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise InputError("not a name", field=f"{type(self).__name__}.name", expected="text", got=shown(self.name))
+            raise InputError(
+                "not a name",
+                field=f"{type(self).__name__}.name",
+                expected="text",
+                got=shown(self.name),
+            )
         if not callable(self.expression) and not isinstance(self.expression, Formula):
             expected = "a function of a State, e.g. lambda s: s.coordinate('elbow_joint')"
             raise self.error("not a function", "expression", expected, shown(self.expression))
         if self.during is not None:
             names = (self.during,) if isinstance(self.during, str) else self.during
-            if not isinstance(names, list | tuple) or not names or not all(isinstance(name, str) for name in names):
-                raise self.error("not phases", "during", "names of phases, e.g. ['place cup']", shown(self.during))
+            if (
+                not isinstance(names, list | tuple)
+                or not names
+                or not all(isinstance(name, str) for name in names)
+            ):
+                raise self.error(
+                    "not phases",
+                    "during",
+                    "names of phases, e.g. ['place cup']",
+                    shown(self.during),
+                )
             object.__setattr__(self, "during", tuple(names))
         if self.holding is not None and not isinstance(self.holding, str):
             raise self.error("not an object", "holding", "an object's name", shown(self.holding))
 
-    def error(self, problem: str, field: str, expected: object = None, got: object = None) -> InputError:
+    def error(
+        self, problem: str, field: str, expected: object = None, got: object = None
+    ) -> InputError:
         """Return (not raise) the error that says that one of its fields is wrong."""
-        return InputError(problem, field=f"terms[{self.name!r}].{field}", expected=expected, got=got)
+        return InputError(
+            problem, field=f"terms[{self.name!r}].{field}", expected=expected, got=got
+        )
 
     def positive(self, field: str) -> None:
         """Check that a field is a positive number."""
         where, expected = f"terms[{self.name!r}].{field}", "a positive finite number"
-        object.__setattr__(self, field, number(getattr(self, field), where, expected, low=0.0, above=True))
+        object.__setattr__(
+            self, field, number(getattr(self, field), where, expected, low=0.0, above=True)
+        )
 
     def active(self, phase: str, held: Iterable[str]) -> bool:
         """Return whether it holds in a phase of this name, in which these objects are held."""
-        return (self.during is None or phase in self.during) and (self.holding is None or self.holding in held)
+        return (self.during is None or phase in self.during) and (
+            self.holding is None or self.holding in held
+        )
 
     @property
     def formula(self) -> Formula:
@@ -88,13 +111,13 @@ class Constraint(_Term):
 
     Attributes:
         name: What reports call it.
-        expression: Given a `State`, returns a CasADi number or column. Roots are taken of x + 1e-8 instead of x, so that norms
-            have a slope at zero; comparisons are said by the bounds.
+        expression: Given a `State`, returns a CasADi number or column. Roots are taken of x + 1e-8
+            instead of x, so that norms have a slope at zero; comparisons are said by the bounds.
         lower, upper: Bounds, numbers or one per entry; None is no bound.
         during: Names of phases, e.g. "place cup" (`plan.trajectory.phases` has them); None is all.
         holding: The object that must be held for it; None is none.
-        tolerance: By how much validation lets it be off at a waypoint, in the expression's own unit; ten times as much between
-            two waypoints, where the program asks for nothing.
+        tolerance: By how much validation lets it be off at a waypoint, in the expression's own
+            unit; ten times as much between two waypoints, where the program asks for nothing.
     """
 
     _: KW_ONLY
@@ -112,7 +135,12 @@ class Constraint(_Term):
         self.box(self.expression.rows if isinstance(self.expression, Formula) else None)
 
     def _bound(self, field: str, value: Any) -> float | tuple[float, ...]:
-        given = numbers(value, f"terms[{self.name!r}].{field}", "a number or a list of them", problem="not a number")
+        given = numbers(
+            value,
+            f"terms[{self.name!r}].{field}",
+            "a number or a list of them",
+            problem="not a number",
+        )
         wrong = np.isnan(given) | (given == (np.inf if field == "lower" else -np.inf))
         if given.ndim > 1 or not given.size or wrong.any():
             raise self.error("no such bound", field, "a number or a list of them", shown(value))
@@ -124,19 +152,38 @@ class Constraint(_Term):
         Raises:
             InputError: They do not fit the expression, or each other.
         """
-        given = [-np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper]
+        given = [
+            -np.inf if self.lower is None else self.lower,
+            np.inf if self.upper is None else self.upper,
+        ]
         try:
             if rows is None:
                 lower, upper = np.broadcast_arrays(*given)
             else:
                 lower, upper = (np.broadcast_to(bound, (rows,)) for bound in given)
         except ValueError:
-            expected = "as many lower as upper ones" if rows is None else f"one number, or {rows}, like the expression"
-            raise self.error("wrong number of bounds", "lower, upper", expected, shown((self.lower, self.upper))) from None
+            expected = (
+                "as many lower as upper ones"
+                if rows is None
+                else f"one number, or {rows}, like the expression"
+            )
+            raise self.error(
+                "wrong number of bounds", "lower, upper", expected, shown((self.lower, self.upper))
+            ) from None
         if not (np.isfinite(lower) | np.isfinite(upper)).all():
-            raise self.error("no bound", "lower, upper", "at least one of them, finite", shown((self.lower, self.upper)))
+            raise self.error(
+                "no bound",
+                "lower, upper",
+                "at least one of them, finite",
+                shown((self.lower, self.upper)),
+            )
         if (lower > upper).any():
-            raise self.error("lower is more than upper", "lower, upper", "lower <= upper", shown((self.lower, self.upper)))
+            raise self.error(
+                "lower is more than upper",
+                "lower, upper",
+                "lower <= upper",
+                shown((self.lower, self.upper)),
+            )
         return lower, upper
 
 
@@ -178,7 +225,9 @@ def traced(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
     joints = [f"{name}.{joint}" for name, thing in things for joint in thing.coordinates.names]
     for term in terms:
         if term.holding is not None and term.holding not in scene.objects:
-            raise UnknownNameError("object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding")
+            raise UnknownNameError(
+                "object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding"
+            )
     return _all_traced(terms, frames, [*scene.robot.coordinates.names, *joints])
 
 
@@ -188,7 +237,9 @@ def as_data(terms: Sequence[Term]) -> tuple[Term, ...]:
     Raises:
         InputError: They are no terms, two share a name, or an expression is none.
     """
-    return _all_traced(items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None)
+    return _all_traced(
+        items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None
+    )
 
 
 def renamed(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -> Term:
@@ -204,11 +255,18 @@ def renamed(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -
     return replace(term, expression=formula, holding=objects.get(term.holding or "", term.holding))
 
 
-def _all_traced(terms: Sequence[Term], frames: Sequence[str] | None, coordinates: Sequence[str] | None) -> tuple[Term, ...]:
+def _all_traced(
+    terms: Sequence[Term], frames: Sequence[str] | None, coordinates: Sequence[str] | None
+) -> tuple[Term, ...]:
     found: list[Term] = []
     for term in terms:
         if term.name in (other.name for other in found):
-            raise InputError("two terms share a name", field="terms", expected="different names", got=shown(term.name))
+            raise InputError(
+                "two terms share a name",
+                field="terms",
+                expected="different names",
+                got=shown(term.name),
+            )
         found.append(_traced(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
     return tuple(found)
 
@@ -222,22 +280,47 @@ def _traced(term: Term, state: State) -> Term:
     except UnknownNameError:
         raise
     except Exception as error:
-        raise term.error("it cannot be evaluated", "expression", "CasADi operations only", str(error)) from error
+        raise term.error(
+            "it cannot be evaluated", "expression", "CasADi operations only", str(error)
+        ) from error
     if isinstance(value, int | float | np.ndarray | np.number | ca.DM):
-        raise term.error("it does not depend on the state", "expression", "an expression of what a State returns", shown(value))
+        raise term.error(
+            "it does not depend on the state",
+            "expression",
+            "an expression of what a State returns",
+            shown(value),
+        )
     if not isinstance(value, ca.SX):
-        raise term.error("no CasADi expression", "expression", "a number or a column, e.g. of ca.vertcat", shown(value))
-    if not value.is_vector() or value.is_empty() or (isinstance(term, Cost) and not value.is_scalar()):
+        raise term.error(
+            "no CasADi expression",
+            "expression",
+            "a number or a column, e.g. of ca.vertcat",
+            shown(value),
+        )
+    if (
+        not value.is_vector()
+        or value.is_empty()
+        or (isinstance(term, Cost) and not value.is_scalar())
+    ):
         expected = "a number" if isinstance(term, Cost) else "a number or a column"
         raise term.error("wrong shape", "expression", expected, f"shape {value.shape}")
     try:
         formula = state.formula(ca.vec(value))
     except RuntimeError as error:
-        raise term.error("it has symbols of its own", "expression", "only those of its State", str(error)) from error
+        raise term.error(
+            "it has symbols of its own", "expression", "only those of its State", str(error)
+        ) from error
     if not formula.inputs:
-        raise term.error("it does not depend on the state", "expression", "an expression of what a State returns", str(value))
+        raise term.error(
+            "it does not depend on the state",
+            "expression",
+            "an expression of what a State returns",
+            str(value),
+        )
     if formula.compares:
-        raise term.error("a comparison", "expression", "an expression that lower and upper bound", str(value))
+        raise term.error(
+            "a comparison", "expression", "an expression that lower and upper bound", str(value)
+        )
     return replace(term, expression=formula)
 
 
@@ -258,7 +341,9 @@ def check_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str
             if name not in names:
                 raise UnknownNameError("phase", name, names, field=f"terms[{term.name!r}].during")
         if not any(term.active(name, held) for name, held in phases):
-            held = ", ".join(f"{name!r} holds {', '.join(held) or 'nothing'}" for name, held in phases)
+            held = ", ".join(
+                f"{name!r} holds {', '.join(held) or 'nothing'}" for name, held in phases
+            )
             raise term.error("never held in these phases", "holding", held, shown(term.holding))
 
 
@@ -278,10 +363,22 @@ def term_from_dict(data: Mapping[str, Any]) -> Term:
     try:
         given = fields.pop("expression")
         code = tuple(
-            (str(name), tuple(map(int, read)), int(written), float(value)) for name, read, written, value in given["code"]
+            (str(name), tuple(map(int, read)), int(written), float(value))
+            for name, read, written, value in given["code"]
         )
-        formula = Formula(tuple(given["frames"]), tuple(given["coordinates"]), int(given["rows"]), code)
+        formula = Formula(
+            tuple(given["frames"]), tuple(given["coordinates"]), int(given["rows"]), code
+        )
         formula.function  # noqa: B018 - what cannot be built is no expression
         return kinds[fields.pop("term")](expression=formula, **fields)
-    except (LookupError, TypeError, ValueError, OverflowError, NotImplementedError, RuntimeError) as error:
-        raise InputError("not a saved term", field="terms", expected="what Plan.save wrote", got=str(error)) from error
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        OverflowError,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
+        raise InputError(
+            "not a saved term", field="terms", expected="what Plan.save wrote", got=str(error)
+        ) from error

@@ -25,8 +25,8 @@ _LARGEST = 1e12  # [m] or [rad] of a coordinate, and of its rate [m/s], [rad/s]
 class Curve:
     """Cubics in time between knots, with the same velocity on both sides of each (cubic Hermite splines).
 
-    Controllers that are given positions and velocities go along the same curve (`ros2_control`'s joint trajectory controller,
-    "cubic").
+    Controllers that are given positions and velocities go along the same curve (`ros2_control`'s
+    joint trajectory controller, "cubic").
 
     Attributes:
         times: Of the knots, shape (K,), increasing [s].
@@ -34,7 +34,8 @@ class Curve:
         rates: Velocities, shape (K, n), [m/s] and [rad/s].
 
     Raises:
-        InputError: Numbers that are not finite or beyond all measure, shapes that do not fit, or times that do not increase.
+        InputError: Numbers that are not finite or beyond all measure, shapes that do not fit, or
+            times that do not increase.
     """
 
     times: Floats
@@ -42,18 +43,27 @@ class Curve:
     rates: Floats
 
     def __post_init__(self) -> None:
-        times, positions, rates = (numbers(getattr(self, name), f"curve.{name}") for name in ("times", "positions", "rates"))
+        times, positions, rates = (
+            numbers(getattr(self, name), f"curve.{name}")
+            for name in ("times", "positions", "rates")
+        )
         if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) >= SHORTEST):
             expected = f"at least 2 numbers, each {SHORTEST:g} s after the one before or more"
             raise InputError("times do not increase", field="curve.times", expected=expected)
         if positions.ndim != 2 or len(positions) != len(times):
             expected = f"({len(times)}, n)"
-            raise InputError("wrong shape", field="curve.positions", expected=expected, got=positions.shape)
+            raise InputError(
+                "wrong shape", field="curve.positions", expected=expected, got=positions.shape
+            )
         if rates.shape != positions.shape:
-            raise InputError("wrong shape", field="curve.rates", expected=positions.shape, got=rates.shape)
+            raise InputError(
+                "wrong shape", field="curve.rates", expected=positions.shape, got=rates.shape
+            )
         for name, array in (("times", times), ("positions", positions), ("rates", rates)):
             if not np.abs(array).max(initial=0.0) <= _LARGEST:
-                raise InputError("out of range", field=f"curve.{name}", expected=f"numbers up to {_LARGEST:g}")
+                raise InputError(
+                    "out of range", field=f"curve.{name}", expected=f"numbers up to {_LARGEST:g}"
+                )
             array = np.array(array, float)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
@@ -75,14 +85,24 @@ class Curve:
         k = np.clip(np.searchsorted(self.times, moments, side="right") - 1, 0, len(self.times) - 2)
         h = np.diff(self.times)[k]
         s = (np.clip((moments - self.times[k]) / h, 0.0, 1.0))[..., None]
-        h, p, c, d, q = (array[..., None] if array.ndim == k.ndim else array for array in (h, *self._control(k)))
+        h, p, c, d, q = (
+            array[..., None] if array.ndim == k.ndim else array for array in (h, *self._control(k))
+        )
         if derivative == 0:
             return _bernstein(s, p, c, d, q)
         inside = ((moments >= self.times[0]) & (moments <= self.times[-1]))[..., None]
         if derivative == 1:
             r = 1.0 - s
-            return np.asarray(np.where(inside, 3.0 / h * (r**2 * (c - p) + 2.0 * s * r * (d - c) + s**2 * (q - d)), 0.0))
-        return np.asarray(np.where(inside, 6.0 / h**2 * ((1.0 - s) * (p - 2.0 * c + d) + s * (c - 2.0 * d + q)), 0.0))
+            return np.asarray(
+                np.where(
+                    inside, 3.0 / h * (r**2 * (c - p) + 2.0 * s * r * (d - c) + s**2 * (q - d)), 0.0
+                )
+            )
+        return np.asarray(
+            np.where(
+                inside, 6.0 / h**2 * ((1.0 - s) * (p - 2.0 * c + d) + s * (c - 2.0 * d + q)), 0.0
+            )
+        )
 
     def _control(self, k: Ints) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the control points of the cubics with these numbers: each lies in their convex hull."""
@@ -96,11 +116,19 @@ class Curve:
         first, middle, last = c - p, d - c, q - d
         bend, sides = first - 2.0 * middle + last, [p, q]
         root = np.sqrt(np.maximum(middle**2 - first * last, 0.0))
-        for sign in (-1.0, 1.0):  # where the velocity, first·(1−s)² + 2·middle·s(1−s) + last·s², is zero: bend·s² + ... + first
+        for sign in (
+            -1.0,
+            1.0,
+            # where the velocity, first·(1−s)² + 2·middle·s(1−s) + last·s², is zero: bend·s² + ... +
+            # first
+        ):
             straight = first - middle + sign * root
             other = first - middle - sign * root
             at = np.divide(
-                straight, bend, out=np.divide(first, other, out=np.zeros_like(p), where=other != 0.0), where=bend != 0.0
+                straight,
+                bend,
+                out=np.divide(first, other, out=np.zeros_like(p), where=other != 0.0),
+                where=bend != 0.0,
             )
             sides.append(_bernstein(np.clip(at, 0.0, 1.0), p, c, d, q))
         return np.asarray(np.min(sides, axis=0)), np.asarray(np.max(sides, axis=0))
@@ -111,8 +139,12 @@ class Curve:
         p, c, d, q = self._control(np.arange(len(h)))
         first, middle, last = (3.0 / h * part for part in (c - p, d - c, q - d))
         bend = first - 2.0 * middle + last
-        at = np.divide(first - middle, bend, out=np.full_like(bend, -1.0), where=np.abs(bend) > 1e-12)
-        at = np.where((at > 0.0) & (at < 1.0), at, 0.0)  # where the velocity, a parabola, turns round
+        at = np.divide(
+            first - middle, bend, out=np.full_like(bend, -1.0), where=np.abs(bend) > 1e-12
+        )
+        at = np.where(
+            (at > 0.0) & (at < 1.0), at, 0.0
+        )  # where the velocity, a parabola, turns round
         between = (1.0 - at) ** 2 * first + 2.0 * at * (1.0 - at) * middle + at**2 * last
         fastest = np.max(np.abs([first, last, between]), axis=0)
         strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)
@@ -132,8 +164,13 @@ class Curve:
 
     def part(self, begin: float, end: float, columns: Sequence[int] | slice = slice(None)) -> Curve:
         """Return what lies between two of the knots' times [s], of some columns."""
-        rows = slice(int(np.searchsorted(self.times, begin)), int(np.searchsorted(self.times, end, side="right")))
-        return Curve(self.times[rows], self.positions[rows][:, columns], self.rates[rows][:, columns])
+        rows = slice(
+            int(np.searchsorted(self.times, begin)),
+            int(np.searchsorted(self.times, end, side="right")),
+        )
+        return Curve(
+            self.times[rows], self.positions[rows][:, columns], self.rates[rows][:, columns]
+        )
 
     def check_through(self, times: Floats, positions: Floats) -> None:
         """Check that it leads from the first of some waypoints through all others to the last.
@@ -143,18 +180,30 @@ class Curve:
             positions: Shape (T, n).
 
         Raises:
-            InputError: It does not; every waypoint must be one of the knots, in time to the last bit.
+            InputError: It does not; every waypoint must be one of the knots, in time to the last
+                bit.
         """
         if self.positions.shape[1] != positions.shape[1]:
             expected, got = positions.shape[1], self.positions.shape[1]
-            raise InputError("wrong number of coordinates", field="curve.positions", expected=expected, got=got)
+            raise InputError(
+                "wrong number of coordinates", field="curve.positions", expected=expected, got=got
+            )
         at = np.minimum(np.searchsorted(self.times, times), len(self.times) - 1)
         if at[0] != 0 or at[-1] != len(self.times) - 1 or not np.array_equal(self.times[at], times):
-            raise InputError("a waypoint is none of its knots", field="curve.times", expected="the times of all waypoints")
+            raise InputError(
+                "a waypoint is none of its knots",
+                field="curve.times",
+                expected="the times of all waypoints",
+            )
         apart = np.abs(self.positions[at] - positions).max(axis=1)
         if not apart.max() <= _OFF:
             where, got = f"positions[{int(np.argmax(apart))}]", f"{apart.max():g} apart"
-            raise InputError("the curve does not lead through a waypoint", field=where, expected=f"at most {_OFF:g}", got=got)
+            raise InputError(
+                "the curve does not lead through a waypoint",
+                field=where,
+                expected=f"at most {_OFF:g}",
+                got=got,
+            )
 
     def shifted(self, time: float) -> Curve:
         """Return the same, later by some time [s]."""
@@ -162,7 +211,11 @@ class Curve:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it."""
-        return {"times": self.times.tolist(), "positions": self.positions.tolist(), "rates": self.rates.tolist()}
+        return {
+            "times": self.times.tolist(),
+            "positions": self.positions.tolist(),
+            "rates": self.rates.tolist(),
+        }
 
 
 def _bernstein(s: Floats, p: Floats, c: Floats, d: Floats, q: Floats) -> Floats:

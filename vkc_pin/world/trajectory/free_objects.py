@@ -18,14 +18,16 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["FreeObjects", "as_numbers"]
 
-_STILL = 1e-12  # [m] and [rad] by which a grasp that is kept differs between samples: what interpolation rounds
+# [m] and [rad] by which a grasp that is kept differs between samples: what interpolation rounds
+_STILL = 1e-12
 
 
 class FreeObjects:
     """The free objects of a scene along a motion, every one of which moves rigidly with whatever carries it.
 
-    What is held moves with what holds it, from where it was when that took hold. What stands on a link that moves, or that is
-    held, rides on it (see `world.scene.support`). Everything else stays where it is.
+    What is held moves with what holds it, from where it was when that took hold. What stands on a
+    link that moves, or that is held, rides on it (see `world.scene.support`). Everything else stays
+    where it is.
 
     Args:
         scene: The scene at the start.
@@ -39,7 +41,8 @@ class FreeObjects:
     def at(self, times: Floats) -> dict[str, Floats]:
         """Return name → coordinates of the placement in the world at some times [s], shape (K,), in order: shape (K, 7).
 
-        Of the two quaternions of one orientation it is the nearer to the one before, so that rows can be interpolated.
+        Of the two quaternions of one orientation it is the nearer to the one before, so that rows
+        can be interpolated.
         """
         trajectory, rows = self.trajectory, {name: np.empty((len(times), 7)) for name in self.names}
         for number, phase in enumerate(trajectory.phases):
@@ -49,11 +52,19 @@ class FreeObjects:
             if not (len(now) and rows):
                 continue
             where, rides = self._begins[number]
-            moving = self._within(phase, np.clip(np.concatenate([[begin], times[now]]), begin, end), where, rides)
+            moving = self._within(
+                phase, np.clip(np.concatenate([[begin], times[now]]), begin, end), where, rides
+            )
             for name, placement in where.items():
-                rows[name][now] = [as_numbers(p) for p in moving[name][1:]] if name in moving else as_numbers(placement)
+                rows[name][now] = (
+                    [as_numbers(p) for p in moving[name][1:]]
+                    if name in moving
+                    else as_numbers(placement)
+                )
         for row in rows.values():
-            flips = np.concatenate([[1.0], np.sign(np.einsum("kc,kc->k", row[1:, 3:], row[:-1, 3:]))])
+            flips = np.concatenate(
+                [[1.0], np.sign(np.einsum("kc,kc->k", row[1:, 3:], row[:-1, 3:]))]
+            )
             row[:, 3:] *= np.cumprod(np.where(flips == 0.0, 1.0, flips))[:, None]
         return rows
 
@@ -73,18 +84,28 @@ class FreeObjects:
         for phase in self.trajectory.phases:
             rides = self._rides(phase, where) if where else {}
             found.append((where, rides))
-            ends = self._within(phase, self.trajectory.times[[phase.first, phase.last]], where, rides) if where else {}
+            ends = (
+                self._within(phase, self.trajectory.times[[phase.first, phase.last]], where, rides)
+                if where
+                else {}
+            )
             where = {**where, **{name: placements[-1] for name, placements in ends.items()}}
         return found
 
     def _within(
-        self, phase: PhaseSpan, times: Floats, where: Mapping[str, pin.SE3], rides: Mapping[str, str]
+        self,
+        phase: PhaseSpan,
+        times: Floats,
+        where: Mapping[str, pin.SE3],
+        rides: Mapping[str, str],
     ) -> dict[str, list[pin.SE3]]:
         """Return the placements of what moves in a phase at times, the first of which is its begin, where they are `where`."""
         held = self._held(phase, times, where)
         return {**held, **self._riding(rides, times, where, held)}
 
-    def _held(self, phase: PhaseSpan, times: Floats, where: Mapping[str, pin.SE3]) -> dict[str, list[pin.SE3]]:
+    def _held(
+        self, phase: PhaseSpan, times: Floats, where: Mapping[str, pin.SE3]
+    ) -> dict[str, list[pin.SE3]]:
         values, robot = self.trajectory.at(times), self.scene.robot
         data = robot.model.createData()
         tool = robot.model.getFrameId(robot.tool_frame)
@@ -95,7 +116,11 @@ class FreeObjects:
             if not placed.object.free:
                 continue
             if hold.by is None:
-                for q in robot.coordinates.q(values[:, : self.trajectory.robot_size]) if not tools else ():
+                for q in (
+                    robot.coordinates.q(values[:, : self.trajectory.robot_size])
+                    if not tools
+                    else ()
+                ):
                     pin.forwardKinematics(robot.model, data, q)
                     tools.append(pin.updateFramePlacement(robot.model, data, tool).copy())
                 holders = tools
@@ -107,12 +132,17 @@ class FreeObjects:
             grasped = placed.object.link_placement(attachment.link, placed.state)
             names = [f"{hold.object}.{name}" for name in attachment.coordinates]
             freedom = values[:, [self.trajectory.names.index(name) for name in names]]
-            still = attachment.tool(freedom[0]) if np.all(np.ptp(freedom, axis=0) <= _STILL) else None
+            still = (
+                attachment.tool(freedom[0]) if np.all(np.ptp(freedom, axis=0) <= _STILL) else None
+            )
             ideal = [
-                holder * (grasped * (still if still is not None else attachment.tool(row))).inverse()
+                holder
+                * (grasped * (still if still is not None else attachment.tool(row))).inverse()
                 for holder, row in zip(holders, freedom, strict=True)
             ]
-            offset = ideal[0].inverse() * where[hold.object]  # the hand may close a hair beside the attachment
+            offset = (
+                ideal[0].inverse() * where[hold.object]
+            )  # the hand may close a hair beside the attachment
             found[hold.object] = [placement * offset for placement in ideal]
         return found
 
@@ -123,7 +153,11 @@ class FreeObjects:
         where: Mapping[str, pin.SE3],
         held: Mapping[str, Sequence[pin.SE3]],
     ) -> dict[str, list[pin.SE3]]:
-        values = dict(zip(self.trajectory.names, self.trajectory.at(times).T, strict=True)) if rides else {}
+        values = (
+            dict(zip(self.trajectory.names, self.trajectory.at(times).T, strict=True))
+            if rides
+            else {}
+        )
         found: dict[str, list[pin.SE3]] = {}
         for name, label in rides.items():
             owner, _, link = label.partition(".")
@@ -132,7 +166,10 @@ class FreeObjects:
             for column, joint in enumerate(carrier.object.coordinates.names):
                 states[:, column] = values.get(f"{owner}.{joint}", states[:, column])
             bases = held.get(owner, [carrier.placement] * len(times))
-            links = [base * carrier.object.link_placement(link, state) for base, state in zip(bases, states, strict=True)]
+            links = [
+                base * carrier.object.link_placement(link, state)
+                for base, state in zip(bases, states, strict=True)
+            ]
             local = links[0].actInv(where[name])
             found[name] = [placement * local for placement in links]
         return found
@@ -140,16 +177,24 @@ class FreeObjects:
     def _rides(self, phase: PhaseSpan, where: Mapping[str, pin.SE3]) -> dict[str, str]:
         """Return free object → "<object>.<link>" of what rides in a phase, before which free objects are at `where`."""
         names, (low, high) = self.trajectory.names, self._ranges
-        spreads = high[phase.first : phase.last].max(axis=0) - low[phase.first : phase.last].min(axis=0)
+        spreads = high[phase.first : phase.last].max(axis=0) - low[phase.first : phase.last].min(
+            axis=0
+        )
         moved = {name for name, spread in zip(names, spreads, strict=True) if spread > 0.0}
         begin = dict(zip(names, self.trajectory.positions[phase.first].tolist(), strict=True))
         moving, objects = dict[str, set[str]](), dict[str, PlacedObject]()
         for name, placed in self.scene.objects.items():
             joints = placed.object.coordinates.names
             state = np.array(
-                [begin.get(f"{name}.{joint}", value) for joint, value in zip(joints, placed.state, strict=True)], float
+                [
+                    begin.get(f"{name}.{joint}", value)
+                    for joint, value in zip(joints, placed.state, strict=True)
+                ],
+                float,
             )
-            objects[name] = dataclasses.replace(placed, placement=where.get(name, placed.placement), state=state)
+            objects[name] = dataclasses.replace(
+                placed, placement=where.get(name, placed.placement), state=state
+            )
             driven = {joint for joint in joints if f"{name}.{joint}" in moved}
             if placed.object.free:
                 moving |= {name: set(placed.object.links)} if name in phase.held else {}

@@ -21,8 +21,8 @@ class PhaseSpan:
         name: What happens in it, e.g. "reach door.handle".
         first, last: Its waypoints; `last` is the next phase's `first`.
         holds: All that is held in it, each hold after the one it depends on.
-        opening: How far the gripper is open in it [m]; None: as the robot rests. If it was otherwise in the phase before, the
-            fingers move from the first waypoint to the second.
+        opening: How far the gripper is open in it [m]; None: as the robot rests. If it was
+            otherwise in the phase before, the fingers move from the first waypoint to the second.
 
     Raises:
         InputError: Something is held through what is not, or an opening is none.
@@ -40,7 +40,11 @@ class PhaseSpan:
             object.__setattr__(self, name, whole(getattr(self, name), f"PhaseSpan.{name}", low=0))
         object.__setattr__(self, "holds", in_order(self.holds))
         if self.opening is not None:
-            object.__setattr__(self, "opening", number(self.opening, "PhaseSpan.opening", "a distance [m]", low=0.0, high=1.0))
+            object.__setattr__(
+                self,
+                "opening",
+                number(self.opening, "PhaseSpan.opening", "a distance [m]", low=0.0, high=1.0),
+            )
 
     @property
     def held(self) -> dict[str, str]:
@@ -50,7 +54,13 @@ class PhaseSpan:
     def to_dict(self) -> dict[str, Any]:
         """Return plain data of it; `by` names the link, "<object>.<link>", for what is held through another object."""
         by = {hold.object: hold.frame for hold in self.holds if hold.by}
-        data = {"name": self.name, "first": self.first, "last": self.last, "held": self.held, "by": by}
+        data = {
+            "name": self.name,
+            "first": self.first,
+            "last": self.last,
+            "held": self.held,
+            "by": by,
+        }
         return data if self.opening is None else {**data, "opening": self.opening}
 
     @classmethod

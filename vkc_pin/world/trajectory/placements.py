@@ -14,7 +14,8 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Motion", "key_times", "sample_motion"]
 
-_TURN = 1.0  # [rad] or [m] between two key frames at most: beyond π a rotation would take the shorter way round
+# [rad] or [m] between two key frames at most: beyond π a rotation would take the shorter way round
+_TURN = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,8 @@ class Motion:
     Attributes:
         times: Shape (K,) [s].
         local: Placement of every joint in its parent joint's frame: [joint][k].
-        world: Placement of every joint in the world frame, shape (K, joints, 4, 4); the universe is joint 0.
+        world: Placement of every joint in the world frame, shape (K, joints, 4, 4); the universe is
+            joint 0.
         tool: Path of the tool frame's origin in the world frame, shape (K, 3) [m].
         base: Path of the base's origin in the world frame, shape (K, 3) [m].
         moving: For every joint, whether its placement in its parent changes.
@@ -44,13 +46,16 @@ class Motion:
         """
         difference = np.abs(self.world[:, joints] - self.world[row, joints])
         turned, shifted = difference[..., :3, :3], difference[..., :3, 3]
-        return np.asarray((0.5 * turned.max(axis=(1, 2, 3)) > 0.15) | (shifted.max(axis=(1, 2)) > 0.15))
+        return np.asarray(
+            (0.5 * turned.max(axis=(1, 2, 3)) > 0.15) | (shifted.max(axis=(1, 2)) > 0.15)
+        )
 
 
 def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None) -> Floats:
     """Return the waypoints' times and as many in between that no joint moves by more than 1 rad or m, shape (K,) [s].
 
-    Between these a viewer's own interpolation of positions and quaternions, joint by joint, is exact.
+    Between these a viewer's own interpolation of positions and quaternions, joint by joint, is
+    exact.
 
     Args:
         trajectory: The motion.
@@ -60,15 +65,25 @@ def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None
     steps = np.abs(np.diff(trajectory.positions, axis=0) / most).max(axis=1)
     counts = np.maximum(1, np.ceil(steps)).astype(int)
     edges = zip(trajectory.times[:-1], trajectory.times[1:], counts, strict=True)
-    return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for a, b, n in edges), trajectory.times[-1:]])
+    return np.concatenate(
+        [*(np.linspace(a, b, n, endpoint=False) for a, b, n in edges), trajectory.times[-1:]]
+    )
 
 
-def sample_motion(world: World, trajectory: Trajectory | None, times: Floats | None = None) -> Motion:
+def sample_motion(
+    world: World, trajectory: Trajectory | None, times: Floats | None = None
+) -> Motion:
     """Return the world's motion at `times` [s], shape (K,), or at `key_times`; without a trajectory, its start."""
     if trajectory is None:
         times, rows = np.zeros(1), world.start[None]
     else:
-        strides = dict(zip(world.coordinates.names, world.coordinates.strides(_TURN, _TURN).tolist(), strict=True))
+        strides = dict(
+            zip(
+                world.coordinates.names,
+                world.coordinates.strides(_TURN, _TURN).tolist(),
+                strict=True,
+            )
+        )
         times = key_times(trajectory, strides) if times is None else np.asarray(times, float)
         rows = world.positions(trajectory, times)
     model, data = world.model, world.model.createData()
@@ -83,4 +98,6 @@ def sample_motion(world: World, trajectory: Trajectory | None, times: Floats | N
             placements[k, j] = data.oMi[j].homogeneous
         tools[k] = pin.updateFramePlacement(model, data, tool).translation
     moving = world.coordinates.moved(np.abs(rows - rows[0]).max(axis=0) > 1e-9)
-    return Motion(np.asarray(times), local, placements, tools, placements[:, 1, :3, 3].copy(), moving)
+    return Motion(
+        np.asarray(times), local, placements, tools, placements[:, 1, :3, 3].copy(), moving
+    )

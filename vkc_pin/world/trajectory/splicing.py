@@ -20,7 +20,8 @@ def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
     """Return motions one after the other as one.
 
     Args:
-        parts: Each begins where the one before it ends. A coordinate that a part does not have keeps its value there.
+        parts: Each begins where the one before it ends. A coordinate that a part does not have
+            keeps its value there.
         pause: How long the robot waits between two parts where the hand closes or opens [s].
 
     Raises:
@@ -38,9 +39,16 @@ def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
             apart = np.abs(part.positions[0, :robot] - waypoints.last(part.names[:robot])).max()
             if not apart <= 1e-6:
                 where = f"parts[{number}]"
-                raise InputError("a motion does not begin where the one before it ends", field=where, got=f"{apart:g} apart")
+                raise InputError(
+                    "a motion does not begin where the one before it ends",
+                    field=where,
+                    got=f"{apart:g} apart",
+                )
             before, after = phases[-1], part.phases[0]
-            shift, waits = len(waypoints) - 1, set(before.holds) != set(after.holds) or before.opening != after.opening
+            shift, waits = (
+                len(waypoints) - 1,
+                set(before.holds) != set(after.holds) or before.opening != after.opening,
+            )
         rest = pause if waits else 0.0
         waypoints.add(part.names, part.times, part.positions, rest)
         if curve is not None:
@@ -48,7 +56,11 @@ def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
         for k, phase in enumerate(part.phases):
             first = phases[-1].last if phases else 0
             last = phase.last + shift + int(waits)
-            phases.append(replace(phase, first=first if k == 0 else phase.first + shift + int(waits), last=last))
+            phases.append(
+                replace(
+                    phase, first=first if k == 0 else phase.first + shift + int(waits), last=last
+                )
+            )
     whole = None if any(curve is None for curve in curves) else knots.curve()
     return Trajectory(tuple(names), waypoints.at(), waypoints.filled(), tuple(phases), robot, whole)
 
@@ -65,11 +77,24 @@ class _Rows:
     def __len__(self) -> int:
         return len(self.times)
 
-    def add(self, names: Sequence[str], times: Floats, positions: Floats, rest: float, rates: Floats | None = None) -> None:
+    def add(
+        self,
+        names: Sequence[str],
+        times: Floats,
+        positions: Floats,
+        rest: float,
+        rates: Floats | None = None,
+    ) -> None:
         """Add rows of some coordinates, after a rest [s]; the first row is the last that there is, unless there is a rest."""
-        columns, begin = [self.names.index(name) for name in names], 0.0 if not self.times else self.times[-1] + rest
+        columns, begin = (
+            [self.names.index(name) for name in names],
+            0.0 if not self.times else self.times[-1] + rest,
+        )
         skipped = 1 if self.times and not rest else 0
-        values, slopes = np.full((len(times), len(self.names)), np.nan), np.zeros((len(times), len(self.names)))
+        values, slopes = (
+            np.full((len(times), len(self.names)), np.nan),
+            np.zeros((len(times), len(self.names))),
+        )
         values[:, columns] = positions
         slopes[:, columns] = 0.0 if rates is None else rates
         moments = begin + (times - times[0])
@@ -107,7 +132,11 @@ def filled(table: Floats) -> Floats:
     for column in table.T:
         known = np.flatnonzero(~np.isnan(column))
         if len(known):
-            column[:] = column[known[np.maximum(np.searchsorted(known, np.arange(len(column)), side="right") - 1, 0)]]
+            column[:] = column[
+                known[
+                    np.maximum(np.searchsorted(known, np.arange(len(column)), side="right") - 1, 0)
+                ]
+            ]
     return table
 
 
@@ -123,7 +152,9 @@ def cut(trajectory: Trajectory, names: Sequence[str], begin: int, end: int | Non
     phases = trajectory.phases[begin:end]
     first, last = phases[0].first, phases[-1].last
     columns = [trajectory.names.index(name) for name in names]
-    spans = tuple(replace(phase, first=phase.first - first, last=phase.last - first) for phase in phases)
+    spans = tuple(
+        replace(phase, first=phase.first - first, last=phase.last - first) for phase in phases
+    )
     rows, curve = slice(first, last + 1), trajectory.curve
     times, positions = trajectory.times[rows], trajectory.positions[rows][:, columns]
     if curve is not None:

@@ -29,16 +29,19 @@ class Trajectory:
     """Waypoints over time, and how the motion goes on between them: along a curve, or else linearly in the coordinates.
 
     Attributes:
-        names: The coordinates' names, n of them: base x, y, yaw, arm joints, then `<object>.<joint>`.
+        names: The coordinates' names, n of them: base x, y, yaw, arm joints, then
+            `<object>.<joint>`.
         times: Of the waypoints, shape (T,), increasing [s].
         positions: Shape (T, n), [m] and [rad]; angles are not wrapped, so that they interpolate.
-        phases: Which stretch of it does what; each begins where the one before ends, and together they cover it all.
+        phases: Which stretch of it does what; each begins where the one before ends, and together
+            they cover it all.
         robot_size: How many of the coordinates are the robot's (3 for the base, then the arm).
         curve: Where it is at every moment; None: on the straight line between two waypoints.
 
     Raises:
-        InputError: Names that occur twice, numbers that are not finite, shapes that do not fit, times that do not increase,
-            phases that leave a gap, or a curve that does not lead from the first waypoint through all others to the last.
+        InputError: Names that occur twice, numbers that are not finite, shapes that do not fit,
+            times that do not increase, phases that leave a gap, or a curve that does not lead from
+            the first waypoint through all others to the last.
     """
 
     names: tuple[str, ...]
@@ -50,30 +53,50 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         listed: tuple[Any, ...] = items(self.names, "Trajectory.names", "a list of names")
-        names = tuple(text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed))
+        names = tuple(
+            text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed)
+        )
         phases = items(self.phases, "Trajectory.phases", "a list of PhaseSpan", PhaseSpan)
-        times, positions = finite(self.times, "Trajectory.times"), finite(self.positions, "Trajectory.positions")
+        times, positions = (
+            finite(self.times, "Trajectory.times"),
+            finite(self.positions, "Trajectory.positions"),
+        )
         counts = Counter(names)
         if (twice := next((name for name in names if counts[name] > 1), None)) is not None:
             raise InputError("a name occurs twice", field="Trajectory.names", got=twice)
         if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
-            raise InputError("times do not increase", field="Trajectory.times", expected="at least 2 increasing numbers")
+            raise InputError(
+                "times do not increase",
+                field="Trajectory.times",
+                expected="at least 2 increasing numbers",
+            )
         shape = (len(times), len(names))
         if positions.shape != shape:
-            raise InputError("wrong shape", field="Trajectory.positions", expected=shape, got=positions.shape)
+            raise InputError(
+                "wrong shape", field="Trajectory.positions", expected=shape, got=positions.shape
+            )
         size = whole(self.robot_size, "Trajectory.robot_size", low=3, high=len(names))
         edges = [0, *(phase.last for phase in phases)]
         if edges[-1] != len(times) - 1 or any(
-            phase.first != before or phase.last <= before for phase, before in zip(phases, edges, strict=False)
+            phase.first != before or phase.last <= before
+            for phase, before in zip(phases, edges, strict=False)
         ):
             problem = "phases do not follow one another from the first waypoint to the last"
             got = ", ".join(f"{phase.first} to {phase.last}" for phase in phases[:20]) or "none"
-            raise InputError(problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got)
+            raise InputError(
+                problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got
+            )
         if self.curve is not None:
             instance(self.curve, Curve, "Trajectory.curve").check_through(times, positions)
         for array in (times, positions):
             array.setflags(write=False)
-        kept = {"names": names, "times": times, "positions": positions, "phases": phases, "robot_size": size}
+        kept = {
+            "names": names,
+            "times": times,
+            "positions": positions,
+            "phases": phases,
+            "robot_size": size,
+        }
         for key, value in kept.items():
             object.__setattr__(self, key, value)
 
@@ -96,13 +119,16 @@ class Trajectory:
     def velocity(self, time: ArrayLike) -> Floats:
         """Return the velocities, shape (..., n) [m/s], [rad/s], at `time` [s], shape (...,); outside the motion, 0.
 
-        Without a curve they jump at waypoints, to those of the segment after. Raises `InputError` for what is no time.
+        Without a curve they jump at waypoints, to those of the segment after. Raises `InputError`
+        for what is no time.
         """
         time = finite(time, "time")
         if self.curve is not None:
             return self.curve.velocity(time)
         inside = ((time >= self.times[0]) & (time <= self.times[-1]))[..., None]
-        segment = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2)
+        segment = np.clip(
+            np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2
+        )
         return np.asarray(np.where(inside, self.velocities()[segment], 0.0))
 
     def acceleration(self, time: ArrayLike) -> Floats:
@@ -124,7 +150,12 @@ class Trajectory:
         rate = number(rate, "rate", "samples a second, more than 0", low=0.0, above=True)
         duration = float(self.times[-1] - self.times[0])
         if duration * rate > MOST_SAMPLES:
-            raise InputError("too many samples", field="rate", expected=f"at most {MOST_SAMPLES / duration:.4g}", got=rate)
+            raise InputError(
+                "too many samples",
+                field="rate",
+                expected=f"at most {MOST_SAMPLES / duration:.4g}",
+                got=rate,
+            )
         times = evenly(self.times, rate)
         return times, self.at(times)
 
@@ -139,10 +170,14 @@ class Trajectory:
     def ranges(self) -> tuple[Floats, Floats]:
         """Return the least and the largest position between every two waypoints, both among them, shape (T − 1, n) each."""
         if self.curve is None:
-            return np.minimum(self.positions[:-1], self.positions[1:]), np.maximum(self.positions[:-1], self.positions[1:])
+            return np.minimum(self.positions[:-1], self.positions[1:]), np.maximum(
+                self.positions[:-1], self.positions[1:]
+            )
         begins = np.searchsorted(self.curve.times, self.times[:-1])
         low, high = self.curve.extremes()
-        return np.asarray(np.minimum.reduceat(low, begins)), np.asarray(np.maximum.reduceat(high, begins))
+        return np.asarray(np.minimum.reduceat(low, begins)), np.asarray(
+            np.maximum.reduceat(high, begins)
+        )
 
     def velocities(self) -> Floats:
         """Return the mean velocity of every segment between two waypoints, shape (T − 1, n), [m/s] and [rad/s]."""
@@ -151,12 +186,17 @@ class Trajectory:
     def accelerations(self) -> Floats:
         """Return the acceleration at every waypoint, shape (T, n), [m/s²] and [rad/s²].
 
-        It is the step of the mean velocities there over the shorter of the two segments' durations, as eq. 5 has it; the motion
-        starts and ends at rest. The accelerations of a curve are `acceleration`'s.
+        It is the step of the mean velocities there over the shorter of the two segments' durations,
+        as eq. 5 has it; the motion starts and ends at rest. The accelerations of a curve are
+        `acceleration`'s.
         """
         durations = np.diff(self.times)
-        velocity = np.vstack([np.zeros(len(self.names)), self.velocities(), np.zeros(len(self.names))])
-        spans = np.concatenate([durations[:1], np.minimum(durations[1:], durations[:-1]), durations[-1:]])
+        velocity = np.vstack(
+            [np.zeros(len(self.names)), self.velocities(), np.zeros(len(self.names))]
+        )
+        spans = np.concatenate(
+            [durations[:1], np.minimum(durations[1:], durations[:-1]), durations[-1:]]
+        )
         return np.asarray(np.diff(velocity, axis=0) / spans[:, None])
 
     def base_effort(self) -> float:
@@ -186,7 +226,9 @@ class Trajectory:
                 times=self.times[span],
                 positions=self.positions[span],
                 phases=(phase,),
-                curve=None if self.curve is None else self.curve.part(self.times[span.start], self.times[span.stop - 1]),
+                curve=None
+                if self.curve is None
+                else self.curve.part(self.times[span.start], self.times[span.stop - 1]),
             )
             for span, phase in zip(spans, alone, strict=True)
         ]
@@ -222,10 +264,14 @@ class Trajectory:
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
         listed: tuple[Any, ...] = items(part_of(data, "phases"), "phases", "a list of phases")
         phases = [PhaseSpan.from_dict(item, f"phases[{k}]") for k, item in enumerate(listed)]
-        names, times, positions, size = (part_of(data, key) for key in ("names", "times", "positions", "robot_size"))
+        names, times, positions, size = (
+            part_of(data, key) for key in ("names", "times", "positions", "robot_size")
+        )
         curve = data.get("curve")
         if curve is not None:
-            curve = Curve(*(part_of(mapping(curve, "curve"), key) for key in ("times", "positions", "rates")))
+            curve = Curve(
+                *(part_of(mapping(curve, "curve"), key) for key in ("times", "positions", "rates"))
+            )
         return cls(names, times, positions, tuple(phases), size, curve)
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
@@ -249,7 +295,8 @@ class Trajectory:
         """Return the trajectory in a table such as `to_csv` writes; see `tables.read_csv`.
 
         Raises:
-            InputError: The file is missing, or something in it does not fit; the error names line and column.
+            InputError: The file is missing, or something in it does not fit; the error names line
+                and column.
         """
         return cls._read(tables.read_csv(path, **options), path)
 
@@ -258,7 +305,8 @@ class Trajectory:
         """Return the trajectory in a file that `to_json`, `Plan.to_json` or `vkc-pin plan --json` wrote.
 
         Raises:
-            InputError: The file is missing, is no JSON, or something in it does not fit; the error names line or field.
+            InputError: The file is missing, is no JSON, or something in it does not fit; the error
+                names line or field.
         """
         data = tables.read_json(path)
         if isinstance(data, dict) and "trajectory" in data:
@@ -267,7 +315,11 @@ class Trajectory:
 
     @classmethod
     def from_ros(
-        cls, message: Mapping[str, Any] | str | Path, *, like: Trajectory | None = None, robot_size: int | None = None
+        cls,
+        message: Mapping[str, Any] | str | Path,
+        *,
+        like: Trajectory | None = None,
+        robot_size: int | None = None,
     ) -> Trajectory:
         """Return the trajectory of data such as `to_ros` returns, or of a JSON file with them; see `ros.from_ros`.
 
@@ -285,4 +337,6 @@ class Trajectory:
             return cls.from_dict(data)
         except InputError as error:
             field = ".".join(part for part in (inside, error.field) if part) or None
-            raise InputError(error.problem, file=file, field=field, expected=error.expected, got=error.got) from error
+            raise InputError(
+                error.problem, file=file, field=field, expected=error.expected, got=error.got
+            ) from error

@@ -1,8 +1,9 @@
 """How a base on wheels moves in a step: along, not aside, and turning no tighter than it steers.
 
-A step goes from one pose of the base to the next, (x, y, yaw), all three linear in time. With the heading θ̄ at its middle it
-goes c = cos θ̄·δx + sin θ̄·δy along and −sin θ̄·δx + cos θ̄·δy aside, and turns by δθ. An arc of a circle is such a step: its chord
-points where the base heads at its middle.
+A step goes from one pose of the base to the next, (x, y, yaw), all three linear in time. With the
+heading θ̄ at its middle it goes c = cos θ̄·δx + sin θ̄·δy along and −sin θ̄·δx + cos θ̄·δy aside,
+and turns by δθ. An arc of a circle is such a step: its chord points where the base heads at its
+middle.
 """
 
 from __future__ import annotations
@@ -62,7 +63,11 @@ class Rolling:
         known = np.flatnonzero(gear)
         if not len(known):
             return np.ones(len(gear))
-        return np.asarray(gear[known[np.maximum(np.searchsorted(known, np.arange(len(gear)), side="right") - 1, 0)]])
+        return np.asarray(
+            gear[
+                known[np.maximum(np.searchsorted(known, np.arange(len(gear)), side="right") - 1, 0)]
+            ]
+        )
 
     def times(self, path: Floats) -> Floats:
         """Return how long each step takes its wheels at least, shape (N,) [s]."""

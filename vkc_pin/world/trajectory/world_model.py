@@ -1,7 +1,8 @@
 """The scene as one plain tree, nothing inverted: robot and objects side by side, rooted in the world.
 
-Validation, pictures and plots use it; being built without the chain, it can catch the chain's mistakes. A free object has
-a free joint, where `carrying` has it: it moves rigidly with what holds it or what it stands on. Fingers that open are joints.
+Validation, pictures and plots use it; being built without the chain, it can catch the chain's
+mistakes. A free object has a free joint, where `carrying` has it: it moves rigidly with what holds
+it or what it stands on. Fingers that open are joints.
 """
 
 from __future__ import annotations
@@ -36,15 +37,19 @@ class World:
     """A scene's robot, objects and obstacles in one `pinocchio.Model`.
 
     Attributes:
-        model: Robot (joint 1 is the planar base, fingers come last), then every object's own tree; joints of objects are
-            `<object>.<joint>`, the free joint of one that can be carried `<object>.placement`, frames `<object>.<link>`.
+        model: Robot (joint 1 is the planar base, fingers come last), then every object's own tree;
+            joints of objects are `<object>.<joint>`, the free joint of one that can be carried
+            `<object>.placement`, frames `<object>.<link>`.
         coordinates: Its minimal coordinates, n of them: the robot's, then the objects'.
         bodies: Collision geometry of robot and objects.
-        shapes: These shapes, then those of the obstacles, which stand in the world (parent joint 0).
-        collision, visual: All geometry in one, put together when first asked for; what stands still has parent joint 0.
-        collision_labels, visual_labels: For each geometry, the link or obstacle it belongs to, e.g. "forearm_link",
-            "door.panel", "sofa".
-        collision_keys: For each of `shapes`, its key in every model of the scene, see `neighbours.shape_keys`.
+        shapes: These shapes, then those of the obstacles, which stand in the world (parent joint
+            0).
+        collision, visual: All geometry in one, put together when first asked for; what stands still
+            has parent joint 0.
+        collision_labels, visual_labels: For each geometry, the link or obstacle it belongs to, e.g.
+            "forearm_link", "door.panel", "sofa".
+        collision_keys: For each of `shapes`, its key in every model of the scene, see
+            `neighbours.shape_keys`.
         start: The scene's start and the objects' placements and states, shape (n,).
     """
 
@@ -57,20 +62,39 @@ class World:
         for name, placed in scene.objects.items():
             parent, placement = 0, placed.placement
             if placed.object.free:
-                parent = self.model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"{name}.{FREE_JOINT}")
+                parent = self.model.addJoint(
+                    0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"{name}.{FREE_JOINT}"
+                )
                 placement = pin.SE3.Identity()
-            self._joints[name] = graft(self.model, placed.object.model, parent=parent, placement=placement, prefix=f"{name}.")
+            self._joints[name] = graft(
+                self.model,
+                placed.object.model,
+                parent=parent,
+                placement=placement,
+                prefix=f"{name}.",
+            )
         objects = {name: placed.object.collision for name, placed in scene.objects.items()}
         self.bodies = self._geometry(robot.collision, objects)
         self.shapes = (*self.bodies.geometryObjects, *scene.obstacles)
-        self.collision_labels = [*(link_name(shape.name) for shape in self.bodies.geometryObjects), *scene.obstacle_labels]
-        self.collision_keys = shape_keys(self.collision_labels, [shape.name for shape in self.shapes])
+        self.collision_labels = [
+            *(link_name(shape.name) for shape in self.bodies.geometryObjects),
+            *scene.obstacle_labels,
+        ]
+        self.collision_keys = shape_keys(
+            self.collision_labels, [shape.name for shape in self.shapes]
+        )
         self.coordinates = Coordinates(self.model)
         states = [
-            np.concatenate([as_numbers(placed.placement) if placed.object.free else [], placed.state])
+            np.concatenate(
+                [as_numbers(placed.placement) if placed.object.free else [], placed.state]
+            )
             for placed in scene.objects.values()
         ]
-        fingers = np.zeros(0) if robot.gripper is None else robot.gripper.positions(opening_at_start(scene))
+        fingers = (
+            np.zeros(0)
+            if robot.gripper is None
+            else robot.gripper.positions(opening_at_start(scene))
+        )
         self.start: Floats = np.concatenate([np.asarray(scene.start), fingers, *states])
 
     @cached_property
@@ -85,7 +109,9 @@ class World:
         """What to draw; put together when first asked for, since meshes for display are large."""
         objects = {name: placed.object.visual for name, placed in self.scene.objects.items()}
         geometry = self._geometry(self.scene.robot.visual, objects)
-        graft_geometry(geometry, self.scene.obstacle_visual, joints=[0], placement=pin.SE3.Identity())
+        graft_geometry(
+            geometry, self.scene.obstacle_visual, joints=[0], placement=pin.SE3.Identity()
+        )
         return geometry
 
     @cached_property
@@ -97,12 +123,16 @@ class World:
         labels = []
         for shape in shapes[:moving]:
             label = link_name(shape.name)
-            while label not in links and "_" in label:  # a mesh of several parts is `<link>_<number>_<part>`
+            while (
+                label not in links and "_" in label
+            ):  # a mesh of several parts is `<link>_<number>_<part>`
                 label = label.rpartition("_")[0]
             labels.append(label)
         return labels + [shape.name for shape in shapes[moving:]]
 
-    def _geometry(self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel]) -> pin.GeometryModel:
+    def _geometry(
+        self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel]
+    ) -> pin.GeometryModel:
         """Return the shapes of robot and objects, in this order."""
         geometry, here, gripper = pin.GeometryModel(), pin.SE3.Identity(), self.scene.robot.gripper
         own = list(robot.geometryObjects)
@@ -111,14 +141,26 @@ class World:
         for name, source in objects.items():
             placed = self.scene.objects[name]
             where = here if placed.object.free else placed.placement
-            graft_geometry(geometry, source.geometryObjects, joints=self._joints[name], placement=where, prefix=f"{name}.")
+            graft_geometry(
+                geometry,
+                source.geometryObjects,
+                joints=self._joints[name],
+                placement=where,
+                prefix=f"{name}.",
+            )
         return geometry
 
-    def positions(self, trajectory: Trajectory, times: ArrayLike | None = None, free: FreeObjects | None = None) -> Floats:
+    def positions(
+        self,
+        trajectory: Trajectory,
+        times: ArrayLike | None = None,
+        free: FreeObjects | None = None,
+    ) -> Floats:
         """Return minimal coordinates, shape (K, n), of the world along `trajectory`.
 
         Args:
-            trajectory: A motion in this scene; what it does not name stays as it is at the start, unless it is carried.
+            trajectory: A motion in this scene; what it does not name stays as it is at the start,
+                unless it is carried.
             times: [s], shape (K,), in increasing order; None takes the waypoints.
             free: The scene's free objects along it, if somebody has them already.
         """
@@ -135,7 +177,9 @@ class World:
         gripper = self.scene.robot.gripper
         if gripper is not None:
             first = len(self.scene.start)
-            rows[:, first : first + len(gripper.names)] = _fingers(gripper, opening_at_start(self.scene), trajectory, times)
+            rows[:, first : first + len(gripper.names)] = _fingers(
+                gripper, opening_at_start(self.scene), trajectory, times
+            )
         return rows
 
     def joints_of(self, name: str) -> list[int]:
@@ -154,17 +198,21 @@ class World:
         return slice(first, first + 7)
 
 
-def _fingers(gripper: Gripper, start: float | None, trajectory: Trajectory, times: Floats) -> Floats:
+def _fingers(
+    gripper: Gripper, start: float | None, trajectory: Trajectory, times: Floats
+) -> Floats:
     """Return where a gripper's fingers are along a motion, shape (K, k), [m] or [rad].
 
-    They move from one phase's opening to the next one's between the first two waypoints of that. They are at the first opening
-    from the start, unless the robot stands still there.
+    They move from one phase's opening to the next one's between the first two waypoints of that.
+    They are at the first opening from the start, unless the robot stands still there.
     """
     before, moments, values = gripper.positions(start), list[float](), list[Floats]()
     robot = trajectory.positions[:, : trajectory.robot_size]
     for number, phase in enumerate(trajectory.phases):
         here = gripper.positions(phase.opening)
-        begin, then, end = (float(trajectory.times[k]) for k in (phase.first, phase.first + 1, phase.last))
+        begin, then, end = (
+            float(trajectory.times[k]) for k in (phase.first, phase.first + 1, phase.last)
+        )
         still = number > 0 or np.array_equal(robot[0], robot[1])
         moments += [begin, then, end]
         values += [before if still else here, here, here]
@@ -185,7 +233,9 @@ def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> 
     def end(coordinate: str, lower: float, upper: float) -> float:
         return float(np.clip(last[coordinate], lower, upper))
 
-    robot = np.clip(trajectory.positions[-1, : trajectory.robot_size], scene.robot.lower, scene.robot.upper)
+    robot = np.clip(
+        trajectory.positions[-1, : trajectory.robot_size], scene.robot.lower, scene.robot.upper
+    )
     robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
     after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
     world = World(scene)
@@ -195,14 +245,20 @@ def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> 
         if thing.free:
             after = after.with_placement(name, world.placement(name, row))
         joints = zip(thing.coordinates.names, thing.lower, thing.upper, strict=True)
-        state = {joint: end(f"{name}.{joint}", low, high) for joint, low, high in joints if f"{name}.{joint}" in last}
+        state = {
+            joint: end(f"{name}.{joint}", low, high)
+            for joint, low, high in joints
+            if f"{name}.{joint}" in last
+        }
         if state:
             after = after.with_state(name, state)
     held = []
     for hold in holds:
         attachment = scene.objects[hold.object].object.attachment(hold.attachment)
         freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
-        at = tuple(end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms)
+        at = tuple(
+            end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms
+        )
         held.append(dataclasses.replace(hold, at=at))
     return dataclasses.replace(after.with_held(held), opening=trajectory.phases[-1].opening)
 
@@ -211,8 +267,13 @@ def units_of(scene: Scene) -> dict[str, str]:
     """Return coordinate → "m" or "rad" of everything that can move in a scene: robot, objects, and the freedoms of grasps."""
     units = dict(zip(scene.robot.coordinates.names, scene.robot.coordinates.units, strict=True))
     for owner, placed in scene.objects.items():
-        own = dict(zip(placed.object.coordinates.names, placed.object.coordinates.units, strict=True))
+        own = dict(
+            zip(placed.object.coordinates.names, placed.object.coordinates.units, strict=True)
+        )
         for attachment in placed.object.attachments.values():
-            own |= {name: freedom.unit for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)}
+            own |= {
+                name: freedom.unit
+                for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
+            }
         units |= {f"{owner}.{name}": unit for name, unit in own.items()}
     return units

@@ -36,10 +36,16 @@ def read(path: Path) -> UrdfFile:
 
 def test_chains_end_at_the_one_that_leads(tmp_path: Path) -> None:
     """j3 = -0.5·j2 + 0.2 and j2 = 2·j1 + 0.1, whatever comes first in the file."""
-    found = followers(read(file_of(tmp_path, "", mimic("j1", 2.0, 0.1), mimic("j2", -0.5, 0.2))).root)
+    found = followers(
+        read(file_of(tmp_path, "", mimic("j1", 2.0, 0.1), mimic("j2", -0.5, 0.2))).root
+    )
     assert found.keys() == {"j2", "j3"}
     assert found["j2"] == Following("j1", 2.0, 0.1)
-    assert (found["j3"].leader, found["j3"].factor, found["j3"].offset) == ("j1", -1.0, pytest.approx(0.15))
+    assert (found["j3"].leader, found["j3"].factor, found["j3"].offset) == (
+        "j1",
+        -1.0,
+        pytest.approx(0.15),
+    )
 
 
 def test_a_leader_that_hangs_on_its_follower_follows(tmp_path: Path) -> None:
@@ -56,15 +62,23 @@ def test_the_second_coupling_of_a_joint_in_a_urdf_is_not_read(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("inside", "said"),
     [
-        (("", mimic("j3"), mimic("j2")), "j2: joints that follow each other in a circle.* j2 → j3 → j2"),
+        (
+            ("", mimic("j3"), mimic("j2")),
+            "j2: joints that follow each other in a circle.* j2 → j3 → j2",
+        ),
         (("", mimic("j2")), "j2: joints that follow each other in a circle.* j2 → j2"),
         (("", mimic("other")), "j2: .*follows one that cannot lead.*'other', which does not exist"),
         (("", mimic("still")), "j2: .*follows one that cannot lead.*'still', which is fixed"),
-        (("", mimic("j3"), mimic("still")), "j2: .*follows one that cannot lead.*'still', which is fixed"),
+        (
+            ("", mimic("j3"), mimic("still")),
+            "j2: .*follows one that cannot lead.*'still', which is fixed",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*there is no joint")
-def test_what_cannot_lead_the_way_to_the_tool_is_refused(tmp_path: Path, inside: tuple[str, ...], said: str) -> None:
+def test_what_cannot_lead_the_way_to_the_tool_is_refused(
+    tmp_path: Path, inside: tuple[str, ...], said: str
+) -> None:
     path = file_of(tmp_path, *inside)
     fixed = link("aside") + joint("still", "fixed", "root", "aside")
     path.write_text(path.read_text().replace("</robot>", fixed + "</robot>"))
@@ -94,12 +108,24 @@ def test_a_robot_yaml_has_the_last_word(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("couplings", "field", "said"),
     [
-        ("out_2: out1", "couplings.out_2", "no joint that turns or slides 'out1'; did you mean 'out_1'"),
-        ("oat_2: out_1", "couplings.oat_2", "no joint that turns or slides 'oat_2'; did you mean 'out_2'"),
+        (
+            "out_2: out1",
+            "couplings.out_2",
+            "no joint that turns or slides 'out1'; did you mean 'out_1'",
+        ),
+        (
+            "oat_2: out_1",
+            "couplings.oat_2",
+            "no joint that turns or slides 'oat_2'; did you mean 'out_2'",
+        ),
         ("out_2: hand_joint", "couplings.out_2", "no joint that turns or slides 'hand_joint'"),
         ("out_2: out_3, out_3: out_2", "couplings.out_2", "in a circle"),
         ("out_2: out_2", "couplings.out_2", "in a circle"),
-        ("out_2: {joint: out_1, multiplier: 0}", "couplings.out_2.multiplier", "a joint that stands still"),
+        (
+            "out_2: {joint: out_1, multiplier: 0}",
+            "couplings.out_2.multiplier",
+            "a joint that stands still",
+        ),
         ("out_2: {joint: out_1, multiplier: yes}", "couplings.out_2.multiplier", "a number"),
         ("out_2: {joint: out_1, offset: .nan}", "couplings.out_2.offset", "number"),
         ("out_2: {joint: out_1, factor: 2}", "couplings.out_2.factor", "multiplier"),
@@ -120,8 +146,14 @@ def test_wrong_couplings_are_named(tmp_path: Path, couplings: str, field: str, s
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ("locked_joints: {out_3: 0.0}", "locked_joints.out_3: a locked joint follows one that moves.*'out_1' moves"),
-        ("home: {out_1: 0.1, out_3: 0.0}", "home.out_3: this joint follows 'out_1'.*0.1, or nothing.*got 0"),
+        (
+            "locked_joints: {out_3: 0.0}",
+            "locked_joints.out_3: a locked joint follows one that moves.*'out_1' moves",
+        ),
+        (
+            "home: {out_1: 0.1, out_3: 0.0}",
+            "home.out_3: this joint follows 'out_1'.*0.1, or nothing.*got 0",
+        ),
         ("home: {out_1: 0.2}", "home.out_1: rests outside its limits"),
     ],
 )
@@ -133,7 +165,11 @@ def test_joints_rest_where_they_can_follow(tmp_path: Path, more: str, said: str)
 def test_a_locked_leader_locks_what_follows(tmp_path: Path) -> None:
     robot = vkc.load_robot(write_telescope(tmp_path, more="locked_joints: {out_1: 0.1}\n"))
     assert robot.coordinates.names[3:] == ("lift", "yaw_joint", "pitch_joint", "roll_joint")
-    free = vkc.load_robot(write_telescope(tmp_path / "free", more="home: {out_1: 0.1, out_2: 0.1}\n"))
+    free = vkc.load_robot(
+        write_telescope(tmp_path / "free", more="home: {out_1: 0.1, out_2: 0.1}\n")
+    )
     tool = [one.model.frames[one.model.getFrameId("tool")] for one in (robot, free)]
     assert tool[0].placement.isApprox(tool[1].placement, 1e-12)
-    assert robot.model.jointPlacements[3].translation[0] == pytest.approx(4 * 0.1 + 0.05 + 3 * 0.005 + 0.24)
+    assert robot.model.jointPlacements[3].translation[0] == pytest.approx(
+        4 * 0.1 + 0.05 + 3 * 0.005 + 0.24
+    )

@@ -30,7 +30,17 @@ def two(
     """Return a robot of two joints, of which the second follows the first."""
     parts = [link(f"l{k}", "0.1 0.1 0.1", f"0 0 {k}") for k in range(3)]
     parts += [joint("one", kinds[0], "l0", "l1", limits=first, velocity=0.4)]
-    parts += [joint("two", kinds[1], "l1", "l2", limits=second, velocity=0.6, inside=f'<mimic joint="one" {inside}/>')]
+    parts += [
+        joint(
+            "two",
+            kinds[1],
+            "l1",
+            "l2",
+            limits=second,
+            velocity=0.6,
+            inside=f'<mimic joint="one" {inside}/>',
+        )
+    ]
     (tmp_path / "robot.urdf").write_text(f'<robot name="robot">{"".join(parts)}</robot>')
     (tmp_path / "robot.yaml").write_text(f"urdf: robot.urdf\ntool_frame: l2\n{yaml}")
     return vkc.load_robot(tmp_path, pairs="all")
@@ -48,11 +58,17 @@ def two(
     ],
 )
 def test_the_nearest_limit_and_the_slowest_joint_count(
-    tmp_path: Path, inside: str, second: tuple[float, float], limits: tuple[float, float], velocity: float
+    tmp_path: Path,
+    inside: str,
+    second: tuple[float, float],
+    limits: tuple[float, float],
+    velocity: float,
 ) -> None:
     robot = two(tmp_path, inside, second=second)
     assert robot.coordinates.names[3:] == ("one",)
-    np.testing.assert_allclose([robot.lower[3], robot.upper[3], robot.velocity[3]], [*limits, velocity], rtol=1e-12)
+    np.testing.assert_allclose(
+        [robot.lower[3], robot.upper[3], robot.velocity[3]], [*limits, velocity], rtol=1e-12
+    )
     assert robot.lower[3] <= robot.home[0] <= robot.upper[3]
 
 
@@ -62,7 +78,11 @@ def test_the_home_is_where_all_can_be(tmp_path: Path) -> None:
 
 
 def test_a_robot_yaml_may_slow_any_of_them(tmp_path: Path) -> None:
-    robot = two(tmp_path, 'multiplier="2"', yaml="joints: {one: {acceleration: 3.0}, two: {velocity: 0.1, acceleration: 4.0}}\n")
+    robot = two(
+        tmp_path,
+        'multiplier="2"',
+        yaml="joints: {one: {acceleration: 3.0}, two: {velocity: 0.1, acceleration: 4.0}}\n",
+    )
     assert (robot.velocity[3], robot.acceleration[3]) == (0.05, 2.0)
 
 
@@ -82,7 +102,8 @@ def test_without_limits_the_fastest_joint_has_the_usual_ones(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("kinds", "limits"), [(("continuous", "revolute"), (-0.5, 0.5)), (("continuous", "continuous"), (-np.inf, np.inf))]
+    ("kinds", "limits"),
+    [(("continuous", "revolute"), (-0.5, 0.5)), (("continuous", "continuous"), (-np.inf, np.inf))],
 )
 def test_what_turns_without_end_leads_as_far_as_the_others_can(
     tmp_path: Path, kinds: tuple[str, str], limits: tuple[float, float]
@@ -96,7 +117,9 @@ def test_what_turns_without_end_leads_as_far_as_the_others_can(
 
 
 def test_limits_that_leave_nothing_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(vkc.InputError, match=r"one: 'two', which follows it, has nowhere to go.*2 to 3.*-1 to 1"):
+    with pytest.raises(
+        vkc.InputError, match=r"one: 'two', which follows it, has nowhere to go.*2 to 3.*-1 to 1"
+    ):
         two(tmp_path, 'multiplier="1"', second=(2.0, 3.0))
 
 
@@ -107,16 +130,29 @@ def test_within_the_limits_of_a_coordinate_all_joints_are_within_theirs(seed: in
     rng = np.random.default_rng(seed)
     parts, bounds, speeds = [link("l0", "0.1 0.1 0.1")], {}, {}
     for k in range(4):
-        bounds[f"j{k}"], speeds[f"j{k}"] = (-rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.0)), rng.uniform(0.1, 2.0)
+        bounds[f"j{k}"], speeds[f"j{k}"] = (
+            (-rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.0)),
+            rng.uniform(0.1, 2.0),
+        )
         factor, offset = rng.uniform(0.2, 3.0) * rng.choice([-1.0, 1.0]), rng.uniform(-0.05, 0.05)
         inside = f'<mimic joint="j0" multiplier="{factor}" offset="{offset}"/>' if k else ""
         kind = ("revolute", "prismatic")[k % 2]
-        moved = joint(f"j{k}", kind, f"l{k}", f"l{k + 1}", limits=bounds[f"j{k}"], velocity=speeds[f"j{k}"], inside=inside)
+        moved = joint(
+            f"j{k}",
+            kind,
+            f"l{k}",
+            f"l{k + 1}",
+            limits=bounds[f"j{k}"],
+            velocity=speeds[f"j{k}"],
+            inside=inside,
+        )
         parts += [link(f"l{k + 1}"), moved]
     file = read_urdf(Path("robot.urdf"), text=f'<robot name="robot">{"".join(parts)}</robot>')
     full = limited_together(full_model(file), file, "l4")
     model = planned_model(full, file, "l4", rest_positions(full, file, {}), {})
-    coordinates, lower, upper, velocity, _ = robot_limits(full, model, RobotSchema(urdf="robot.urdf"), "omni")
+    coordinates, lower, upper, velocity, _ = robot_limits(
+        full, model, RobotSchema(urdf="robot.urdf"), "omni"
+    )
     assert coordinates.names[3:] == ("j0",)
     reached = []
     for move in Coordinates(model).moves[3:]:
@@ -126,5 +162,10 @@ def test_within_the_limits_of_a_coordinate_all_joints_are_within_theirs(seed: in
         assert low - 1e-9 <= ends[0]
         assert ends[1] <= high + 1e-9
         assert abs(move.factor) * velocity[3] <= speeds[name] + 1e-9
-        reached.append((min(ends[0] - low, high - ends[1]) < 1e-9, abs(abs(move.factor) * velocity[3] - speeds[name]) < 1e-9))
+        reached.append(
+            (
+                min(ends[0] - low, high - ends[1]) < 1e-9,
+                abs(abs(move.factor) * velocity[3] - speeds[name]) < 1e-9,
+            )
+        )
     assert all(any(column) for column in zip(*reached, strict=True))

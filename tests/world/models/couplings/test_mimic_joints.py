@@ -19,7 +19,12 @@ from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.couplings.coupled_joints import Following, followers
 from vkc_pin.world.models.couplings.limits import limited_together
 from vkc_pin.world.models.couplings.mimic_joints import in_order
-from vkc_pin.world.models.robot_model import configuration, full_model, planned_model, rest_positions
+from vkc_pin.world.models.robot_model import (
+    configuration,
+    full_model,
+    planned_model,
+    rest_positions,
+)
 
 KINDS = ("revolute", "prismatic", "continuous")
 
@@ -28,9 +33,17 @@ def random_robot(rng: np.random.Generator) -> tuple[str, str]:
     """Return a URDF of a random tree whose joints follow each other at random, and its tool's link."""
     count = int(rng.integers(3, 8))
     parts, order = [link("l0", "0.1 0.1 0.1")], rng.permutation(count)
-    leads = {int(one): int(other) for k, one in enumerate(order) for other in order[:k] if rng.random() < 0.3}
+    leads = {
+        int(one): int(other)
+        for k, one in enumerate(order)
+        for other in order[:k]
+        if rng.random() < 0.3
+    }
     for k in range(count):
-        numbers = {"multiplier": rng.uniform(0.3, 2.0) * rng.choice([-1, 1]), "offset": rng.uniform(-0.3, 0.3)}
+        numbers = {
+            "multiplier": rng.uniform(0.3, 2.0) * rng.choice([-1, 1]),
+            "offset": rng.uniform(-0.3, 0.3),
+        }
         said = " ".join(f'{key}="{value}"' for key, value in numbers.items())
         inside = f'<mimic joint="j{leads[k]}" {said}/>' if k in leads else ""
         above = f"l{k if rng.random() < 0.7 else rng.integers(0, k + 1)}"
@@ -63,8 +76,14 @@ def test_all_links_are_where_all_joints_have_them(seed: int) -> None:
     for move in coordinates.moves[3:]:
         joint, leader = str(model.names[move.joint]), coordinates.names[move.coordinate]
         led = follows.get(joint, Following(joint, 1.0, 0.0))
-        assert (leader, move.factor, move.offset) == (led.leader, pytest.approx(led.factor), pytest.approx(led.offset))
-        assert move.slides == (single.joints[single.getJointId(joint)].shortname().startswith("JointModelP"))
+        assert (leader, move.factor, move.offset) == (
+            led.leader,
+            pytest.approx(led.factor),
+            pytest.approx(led.offset),
+        )
+        assert move.slides == (
+            single.joints[single.getJointId(joint)].shortname().startswith("JointModelP")
+        )
 
     def everything(z: np.ndarray) -> np.ndarray:
         values = dict(zip(coordinates.names, z, strict=True))
@@ -92,10 +111,16 @@ def test_all_links_are_where_all_joints_have_them(seed: int) -> None:
         turn = pin.log3(ends[0].rotation @ ends[1].rotation.T)
         return np.concatenate([ends[0].translation - ends[1].translation, turn]) / 2e-6
 
-    differences = np.column_stack([column(k) for k in range(2, coordinates.size)])  # x and y are those of the world in z
-    numeric = pin.computeFrameJacobian(model, data, coordinates.q(z), model.getFrameId(tool), pin.LOCAL_WORLD_ALIGNED)
+    differences = np.column_stack(
+        [column(k) for k in range(2, coordinates.size)]
+    )  # x and y are those of the world in z
+    numeric = pin.computeFrameJacobian(
+        model, data, coordinates.q(z), model.getFrameId(tool), pin.LOCAL_WORLD_ALIGNED
+    )
     np.testing.assert_allclose(numeric[:, 2:], differences, atol=1e-6)
-    np.testing.assert_allclose(np.array(cpin.frame_jacobian(model, tool)(coordinates.q(z)))[:, 2:], differences, atol=1e-6)
+    np.testing.assert_allclose(
+        np.array(cpin.frame_jacobian(model, tool)(coordinates.q(z)))[:, 2:], differences, atol=1e-6
+    )
     v = ca.SX.sym("z", coordinates.size)
     placed = cpin.frame_placements(model, [tool])(coordinates.q_symbolic(v))
     slope = np.array(ca.Function("slope", [v], [ca.jacobian(placed[9:], v)])(z))
@@ -110,12 +135,20 @@ def test_masses_move_with_all_joints(tmp_path: Path) -> None:
         model.inertias[j] = pin.Inertia.Random()
     z, v, a = rng.uniform(-0.5, 0.5, model.nv), rng.normal(size=model.nv), rng.normal(size=model.nv)
     q, data = robot.coordinates.q(z), model.createData()
-    np.testing.assert_allclose(np.array(cpin.rnea(model)(q, v, a)).ravel(), pin.rnea(model, data, q, v, a), atol=1e-9)
+    np.testing.assert_allclose(
+        np.array(cpin.rnea(model)(q, v, a)).ravel(), pin.rnea(model, data, q, v, a), atol=1e-9
+    )
     center = cpin.center_of_mass(model)
-    np.testing.assert_allclose(np.array(center(q)).ravel(), pin.centerOfMass(model, data, q), atol=1e-9)
+    np.testing.assert_allclose(
+        np.array(center(q)).ravel(), pin.centerOfMass(model, data, q), atol=1e-9
+    )
 
     def energy(z: np.ndarray) -> float:
-        return float(-model.gravity.linear @ np.array(center(robot.coordinates.q(z))).ravel() * pin.computeTotalMass(model))
+        return float(
+            -model.gravity.linear
+            @ np.array(center(robot.coordinates.q(z))).ravel()
+            * pin.computeTotalMass(model)
+        )
 
     slopes = [(energy(z + step) - energy(z - step)) / 2e-6 for step in 1e-6 * np.eye(model.nv)[3:]]
     np.testing.assert_allclose(pin.rnea(model, data, q, 0.0 * v, 0.0 * a)[3:], slopes, atol=1e-5)
@@ -125,7 +158,10 @@ def test_a_model_that_is_kept_is_the_same(tmp_path: Path) -> None:
     """Programs are found again by what a model looks like as text: another multiplier is another model."""
     texts = set()
     for k, multiplier in enumerate((1.0, 2.0)):
-        said = ", ".join(f"{joint}: {{joint: {leader}, multiplier: {multiplier}}}" for joint, leader in FOLLOWERS.items())
+        said = ", ".join(
+            f"{joint}: {{joint: {leader}, multiplier: {multiplier}}}"
+            for joint, leader in FOLLOWERS.items()
+        )
         model = vkc.load_robot(write_telescope(tmp_path / str(k), couplings=said)).model
         again = pin.Model()
         again.loadFromString(model.saveToString())
@@ -148,8 +184,14 @@ def test_joints_wait_for_those_that_lead_them() -> None:
 
 def test_a_leader_may_be_on_another_branch_and_come_later(tmp_path: Path) -> None:
     """As the bars of a palletizer: the follower is on the way to the tool, what it follows is not."""
-    parts = [link("root", "0.1 0.1 0.1"), link("a", "0.1 0.1 0.1"), link("b", "0.1 0.1 0.1", "0 0 1")]
-    parts += [joint("follower", "revolute", "root", "a", inside='<mimic joint="leader" multiplier="-1"/>')]
+    parts = [
+        link("root", "0.1 0.1 0.1"),
+        link("a", "0.1 0.1 0.1"),
+        link("b", "0.1 0.1 0.1", "0 0 1"),
+    ]
+    parts += [
+        joint("follower", "revolute", "root", "a", inside='<mimic joint="leader" multiplier="-1"/>')
+    ]
     parts += [joint("leader", "revolute", "root", "b")]
     file = tmp_path / "robot.urdf"
     file.write_text(f'<robot name="robot">{"".join(parts)}</robot>')
@@ -158,4 +200,8 @@ def test_a_leader_may_be_on_another_branch_and_come_later(tmp_path: Path) -> Non
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.coordinates.q([0.0, 0.0, 0.0, 0.4]))
     for name, angle in (("a", -0.4), ("b", 0.4)):
-        np.testing.assert_allclose(data.oMf[robot.model.getFrameId(name)].rotation, pin.utils.rotate("z", angle), atol=1e-12)
+        np.testing.assert_allclose(
+            data.oMf[robot.model.getFrameId(name)].rotation,
+            pin.utils.rotate("z", angle),
+            atol=1e-12,
+        )

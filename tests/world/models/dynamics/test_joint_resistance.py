@@ -31,24 +31,50 @@ def test_a_urdf_states_friction_and_damping_and_a_description_overrides_each_by_
     urdf = with_dynamics('friction="2" damping="0.5"')
     plain = load_text(urdf, f"urdf: thing.urdf\n{TAIL}").resistance["hinge"]
     assert plain == Resistance(friction=2.0, damping=0.5)
-    text = f"urdf: thing.urdf\njoints: {{hinge: {{friction: 0, stiffness: 4, springref: -2}}}}\n{TAIL}"
-    assert load_text(urdf, text).resistance["hinge"] == Resistance(friction=0.0, damping=0.5, stiffness=4.0, springref=-2.0)
+    text = (
+        f"urdf: thing.urdf\njoints: {{hinge: {{friction: 0, stiffness: 4, springref: -2}}}}\n{TAIL}"
+    )
+    assert load_text(urdf, text).resistance["hinge"] == Resistance(
+        friction=0.0, damping=0.5, stiffness=4.0, springref=-2.0
+    )
 
 
 def test_limits_and_resistance_of_a_joint_stand_side_by_side() -> None:
-    thing = load_text(URDF, f"urdf: thing.urdf\njoints: {{hinge: {{acceleration: 3, velocity: 0.5, damping: 1}}}}\n{TAIL}")
-    assert (thing.velocity[0], thing.acceleration[0], thing.resistance["hinge"].damping) == (0.5, 3.0, 1.0)
+    thing = load_text(
+        URDF,
+        f"urdf: thing.urdf\njoints: {{hinge: {{acceleration: 3, velocity: 0.5, damping: 1}}}}\n{TAIL}",
+    )
+    assert (thing.velocity[0], thing.acceleration[0], thing.resistance["hinge"].damping) == (
+        0.5,
+        3.0,
+        1.0,
+    )
 
 
-@given(REAL, REAL, st.builds(Resistance, friction=REAL.map(abs), damping=REAL.map(abs), stiffness=REAL.map(abs), springref=REAL))
+@given(
+    REAL,
+    REAL,
+    st.builds(
+        Resistance,
+        friction=REAL.map(abs),
+        damping=REAL.map(abs),
+        stiffness=REAL.map(abs),
+        springref=REAL,
+    ),
+)
 def test_what_moves_a_joint_loses_to_friction_and_damping_and_gains_what_the_spring_keeps(
     position: float, velocity: float, resistance: Resistance
 ) -> None:
     passive = Resistance(stiffness=resistance.stiffness, springref=resistance.springref)
     lost = (resistance.force(position, velocity) - passive.force(position, velocity)) * velocity
-    assert lost == pytest.approx(resistance.friction * abs(velocity) + resistance.damping * velocity**2, rel=1e-6, abs=1e-6)
+    assert lost == pytest.approx(
+        resistance.friction * abs(velocity) + resistance.damping * velocity**2, rel=1e-6, abs=1e-6
+    )
     step = 1e-3
-    energy = [resistance.stiffness / 2.0 * (position + sign * step - resistance.springref) ** 2 for sign in (-1.0, 1.0)]
+    energy = [
+        resistance.stiffness / 2.0 * (position + sign * step - resistance.springref) ** 2
+        for sign in (-1.0, 1.0)
+    ]
     gained = (energy[1] - energy[0]) / (2.0 * step)
     assert passive.force(position, velocity) == pytest.approx(gained, rel=1e-6, abs=1e-3)
 
@@ -73,10 +99,14 @@ def test_unknown_terms_are_refused_with_the_nearest_that_exists() -> None:
         load_text(URDF, f"urdf: thing.urdf\njoints: {{hinge: {{frictionloss: 1}}}}\n{TAIL}")
 
 
-@pytest.mark.parametrize("attributes", ['friction="-1"', 'damping="much"', 'damping="1 2"', 'friction="inf"'])
+@pytest.mark.parametrize(
+    "attributes", ['friction="-1"', 'damping="much"', 'damping="1 2"', 'friction="inf"']
+)
 def test_wrong_dynamics_of_a_urdf_are_refused_by_file_line_and_joint(attributes: str) -> None:
     with pytest.raises(InputError) as caught:
-        load_text(with_dynamics(attributes).replace("<link", "\n<link"), f"urdf: thing.urdf\n{TAIL}")
+        load_text(
+            with_dynamics(attributes).replace("<link", "\n<link"), f"urdf: thing.urdf\n{TAIL}"
+        )
     assert caught.value.line == 4
     assert caught.value.field == f"hinge: dynamics {attributes.partition('=')[0]}"
     assert str(caught.value.file).endswith("thing.urdf")

@@ -21,7 +21,10 @@ def block(inside: str, more: str = "mass: 6.0") -> ArticulatedObject:
 
 def test_masses_of_the_urdf_are_scaled_each_by_the_same() -> None:
     plain = load_object("broom")
-    heavy = load_object({"urdf": "broom.urdf", "free": True, "mass": 6.5, "attachments": []}, folder="scenes/objects")
+    heavy = load_object(
+        {"urdf": "broom.urdf", "free": True, "mass": 6.5, "attachments": []},
+        folder="scenes/objects",
+    )
     assert plain.mass == pytest.approx(0.65)
     assert heavy.mass == pytest.approx(6.5)
     for before, after in zip(plain.model.inertias, heavy.model.inertias, strict=True):
@@ -50,7 +53,11 @@ def test_what_states_nothing_weighs_nothing_and_zero_can_be_stated() -> None:
 
 
 def test_the_mass_of_several_links_is_that_of_all() -> None:
-    assert load_object("door").mass == pytest.approx(sum(i.mass for i in load_object("door").model.inertias)) == 45.3
+    assert (
+        load_object("door").mass
+        == pytest.approx(sum(i.mass for i in load_object("door").model.inertias))
+        == 45.3
+    )
 
 
 @pytest.mark.parametrize("value", ["-1.0", "heavy", ".inf"])
@@ -62,12 +69,17 @@ def test_wrong_masses_are_refused(value: str) -> None:
 
 def test_what_stands_fixed_has_no_payload() -> None:
     with pytest.raises(InputError, match="what stands fixed is not carried") as caught:
-        load_text('<robot name="t"><link name="a"/></robot>', "urdf: thing.urdf\nmass: 3\nattachments: []\n")
+        load_text(
+            '<robot name="t"><link name="a"/></robot>',
+            "urdf: thing.urdf\nmass: 3\nattachments: []\n",
+        )
     assert (caught.value.field, caught.value.line) == ("mass", 2)
 
 
 def test_a_mass_changes_nothing_but_weight() -> None:
-    heavy = load_object({"urdf": "cup.urdf", "free": True, "mass": 2.0, "attachments": []}, folder="scenes/objects")
+    heavy = load_object(
+        {"urdf": "cup.urdf", "free": True, "mass": 2.0, "attachments": []}, folder="scenes/objects"
+    )
     plain = load_object("cup")
     assert isinstance(heavy.model, pin.Model)
     assert heavy.links == plain.links

@@ -10,7 +10,10 @@ from vkc_pin.world.models.grippers.bar_width import EXACT, bar_fits, widest_bar
 
 def walls(left: float, right: float) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
     """Return two walls whose faces are so far from the origin along x [m]."""
-    return [(coal.Box(0.1, 1.0, 1.0), pin.SE3(np.eye(3), np.array([x, 0.0, 0.0]))) for x in (-left - 0.05, right + 0.05)]
+    return [
+        (coal.Box(0.1, 1.0, 1.0), pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])))
+        for x in (-left - 0.05, right + 0.05)
+    ]
 
 
 @pytest.mark.parametrize(("left", "right"), [(0.04, 0.04), (0.01, 0.04), (0.1, 0.02)])
@@ -26,5 +29,8 @@ def test_nothing_fits_where_there_is_no_room() -> None:
 
 
 def test_what_is_beside_the_bar_does_not_count() -> None:
-    shapes = [(shape, place * pin.SE3(np.eye(3), np.array([0.0, 0.6, 0.0]))) for shape, place in walls(0.04, 0.04)]
+    shapes = [
+        (shape, place * pin.SE3(np.eye(3), np.array([0.0, 0.6, 0.0])))
+        for shape, place in walls(0.04, 0.04)
+    ]
     assert widest_bar(shapes) > 0.4

@@ -24,7 +24,9 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
 def faces(robot: Robot) -> list[np.ndarray]:
     """Return the middles of the fingers' shapes in the tool frame."""
     data, shapes = robot.model.createData(), robot.collision.createData()
-    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(at_rest(robot)))
+    pin.updateGeometryPlacements(
+        robot.model, data, robot.collision, shapes, robot.coordinates.q(at_rest(robot))
+    )
     tool = placement(robot, robot.tool_frame, at_rest(robot))
     fingers = [k for k in range(len(shapes.oMg)) if robot.link_of(k).startswith("finger")]
     return [tool.actInv(shapes.oMg[k]).translation for k in fingers]
@@ -59,7 +61,11 @@ def test_only_the_fingers_move(robot: Robot) -> None:
     assert list(opened.model.names) == list(robot.model.names)
     assert opened.own_margins(0.02) == robot.own_margins(0.02)
     shapes = zip(robot.collision.geometryObjects, opened.collision.geometryObjects, strict=True)
-    moved = {robot.link_of(k) for k, (one, other) in enumerate(shapes) if one.placement != other.placement}
+    moved = {
+        robot.link_of(k)
+        for k, (one, other) in enumerate(shapes)
+        if one.placement != other.placement
+    }
     assert moved == {"finger_a", "finger_b"}
 
 
@@ -89,7 +95,9 @@ def test_fingers_that_turn_need_no_formula(tmp_path: Path) -> None:
         straight = f'<joint name="finger_{name}_joint" type="prismatic"><origin xyz="0 0 0.06"/>'
         turning = f'<joint name="finger_{name}_joint" type="revolute"><origin xyz="0 {sign * 0.01} 0.06"/>'
         assert straight in text
-        text = text.replace(straight, turning).replace(f'<axis xyz="0 {sign} 0"/>', f'<axis xyz="{-sign} 0 0"/>')
+        text = text.replace(straight, turning).replace(
+            f'<axis xyz="0 {sign} 0"/>', f'<axis xyz="{-sign} 0 0"/>'
+        )
     urdf.write_text(text.replace('upper="0.04"', 'upper="0.5"'), encoding="utf-8")
     gripper = vkc.load_robot(file).gripper
     assert gripper is not None
@@ -113,13 +121,22 @@ def test_an_arm_that_is_locked_otherwise_wins(tmp_path: Path) -> None:
     [
         ("gripper: {finger_c_joint: {closed: 0, open: 0.04}}", "finger_a_joint"),
         ("gripper: {finger_a_joint: {closed: 0}}", r"gripper\.finger_a_joint\.open.*missing"),
-        ("gripper: {finger_a_joint: {closed: 0, open: wide}}", r"gripper\.finger_a_joint\.open.*number"),
+        (
+            "gripper: {finger_a_joint: {closed: 0, open: wide}}",
+            r"gripper\.finger_a_joint\.open.*number",
+        ),
         ("gripper: {finger_a_joint: {closed: 0, opened: 0.04}}", "did you mean 'open'"),
         ("gripper: {finger_a_joint: {closed: 0, open: 0.4}}", "between 0 and 0.04"),
-        ("gripper: {finger_a_joint: {closed: -0.1, open: 0.04}}", r"gripper\.finger_a_joint\.closed"),
+        (
+            "gripper: {finger_a_joint: {closed: -0.1, open: 0.04}}",
+            r"gripper\.finger_a_joint\.closed",
+        ),
         ("gripper: {finger_a_joint: {closed: 0.04, open: 0.04}}", "does not move"),
         ("gripper: {finger_a_joint: {closed: 0.04, open: 0.0}}", "does not open"),
-        ("gripper: {finger_b_joint: {closed: 0, open: 0.04}}", "'finger_a_joint', which it follows"),
+        (
+            "gripper: {finger_b_joint: {closed: 0, open: 0.04}}",
+            "'finger_a_joint', which it follows",
+        ),
         ("gripper: {arm_5_joint: {closed: 0, open: 0.04}}", "none of a finger"),
         ("gripper: open", "gripper"),
     ],

@@ -17,7 +17,10 @@ REAL = st.floats(-1.0, 1.0)
 
 def motion(**coordinates: tuple[float, float, float]) -> Motion:
     """Return one moment: coordinate (`_` for `.`) → position, velocity, acceleration."""
-    parts = ({name.replace("_", ".", 1): np.array([row[k]]) for name, row in coordinates.items()} for k in range(3))
+    parts = (
+        {name.replace("_", ".", 1): np.array([row[k]]) for name, row in coordinates.items()}
+        for k in range(3)
+    )
     return Motion(*parts)
 
 
@@ -28,7 +31,11 @@ def drawer(**resistance: float) -> vkc.Scene:
 @pytest.mark.parametrize("riding", [0.0, 2.5])
 def test_a_drawer_is_pulled_along_its_slide_by_all_that_resists(riding: float) -> None:
     scene = drawer(friction=8.0, damping=20.0, stiffness=50.0, springref=-0.1)
-    handle = Handle(scene, vkc.Hold("drawer", "handle"), [(1, pin.Inertia(riding, np.zeros(3), np.zeros((3, 3))))])
+    handle = Handle(
+        scene,
+        vkc.Hold("drawer", "handle"),
+        [(1, pin.Inertia(riding, np.zeros(3), np.zeros((3, 3))))],
+    )
     (wrench,) = handle.wrenches(motion(drawer_slide=(0.2, 0.3, 0.5)))
     expected = 8.0 + 20.0 * 0.3 + 50.0 * 0.3 + (5.0 + riding) * 0.5
     placed = scene.objects["drawer"]
@@ -39,7 +46,9 @@ def test_a_drawer_is_pulled_along_its_slide_by_all_that_resists(riding: float) -
 
 def test_friction_pulls_back_whichever_way_and_not_at_rest() -> None:
     handle = Handle(drawer(friction=8.0), vkc.Hold("drawer", "handle"))
-    ahead, back, rest = (handle.forces(motion(drawer_slide=(0.2, v, 0.0)))[0, 0] for v in (0.1, -0.1, 0.0))
+    ahead, back, rest = (
+        handle.forces(motion(drawer_slide=(0.2, v, 0.0)))[0, 0] for v in (0.1, -0.1, 0.0)
+    )
     assert (ahead, back, rest) == pytest.approx((8.0, -8.0, 0.0))
 
 
@@ -52,21 +61,34 @@ def test_a_hand_does_the_work_that_the_joints_ask_for_and_none_along_its_freedom
     scene = closer(stiffness=5.0, springref=-2.0, damping=3.0)
     attached = scene.objects["door"].object.attachment(attachment)
     values = dict.fromkeys(attached.coordinates, (0.1 * turn, 0.0, 0.0))
-    now = motion(door_hinge=(q, v, a), door_knob=(knob, other, 0.0), **{f"door_{name}": row for name, row in values.items()})
+    now = motion(
+        door_hinge=(q, v, a),
+        door_knob=(knob, other, 0.0),
+        **{f"door_{name}": row for name, row in values.items()},
+    )
     handle, placed = Handle(scene, vkc.Hold("door", attachment)), scene.objects["door"]
     (wrench,), (asked,) = handle.wrenches(now), handle.forces(now)
 
     def tool(hinge: float, lever: float, freedom: float) -> pin.SE3:
         where = placed.placement * placed.object.link_placement(attached.link, [hinge, lever])
-        return where * attached.tool([freedom, *(0.1 * turn for _ in attached.coordinates[1:])][: len(attached.coordinates)])
+        return where * attached.tool(
+            [freedom, *(0.1 * turn for _ in attached.coordinates[1:])][: len(attached.coordinates)]
+        )
 
     def work(*nudged: tuple[float, float, float]) -> float:
         more, less = (tool(*row) for row in nudged)
         turned = pin.log3(more.rotation @ less.rotation.T)
-        return float(wrench[:3] @ (more.translation - less.translation) + wrench[3:] @ turned) / 2e-5
+        return (
+            float(wrench[:3] @ (more.translation - less.translation) + wrench[3:] @ turned) / 2e-5
+        )
 
     def around(column: int) -> float:
-        return work(*((np.array([q, knob, 0.1 * turn]) + sign * 1e-5 * np.eye(3)[column]) for sign in (1.0, -1.0)))
+        return work(
+            *(
+                (np.array([q, knob, 0.1 * turn]) + sign * 1e-5 * np.eye(3)[column])
+                for sign in (1.0, -1.0)
+            )
+        )
 
     assert around(0) == pytest.approx(asked[0], rel=1e-5, abs=1e-6)
     if attachment != "push":
@@ -85,7 +107,9 @@ def test_no_other_wrench_that_does_it_is_less() -> None:
     (wrench,) = handle.wrenches(motion(door_hinge=(0.6, 0.2, 0.1), door_knob=(0.5, 0.0, 0.0)))
     weigh = np.array([1.0] * 3 + [0.1] * 3)
     force = float(np.linalg.norm(wrench[:3]))
-    assert force == pytest.approx(13.0 / 0.74, rel=0.1)  # Q over the lever, and the inertia of the panel
+    assert force == pytest.approx(
+        13.0 / 0.74, rel=0.1
+    )  # Q over the lever, and the inertia of the panel
     assert float(np.linalg.norm(wrench / weigh)) == pytest.approx(force, rel=0.1)
 
 

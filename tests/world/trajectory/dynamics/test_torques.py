@@ -33,7 +33,9 @@ def swung(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
     rates = np.zeros_like(positions)
     rates[1:-1, :size] = scale * rng.uniform(-1.0, 1.0, (4, size))
     phase = PhaseSpan("swing", 0, 5, scene.holds)
-    return scene, Trajectory(names, times, positions, (phase,), size, Curve(times, positions, rates))
+    return scene, Trajectory(
+        names, times, positions, (phase,), size, Curve(times, positions, rates)
+    )
 
 
 def energy(world: World, motion: Trajectory, moment: float) -> float:
@@ -49,7 +51,9 @@ def energy(world: World, motion: Trajectory, moment: float) -> float:
         inertia = world.model.inertias[j]
         speed = (places[2][j] * inertia.lever - places[0][j] * inertia.lever) / (2.0 * h)
         spin = pin.log3(places[0][j].rotation.T @ places[2][j].rotation) / (2.0 * h)
-        found += 0.5 * inertia.mass * speed @ speed + 0.5 * spin @ np.asarray(inertia.inertia) @ spin
+        found += (
+            0.5 * inertia.mass * speed @ speed + 0.5 * spin @ np.asarray(inertia.inertia) @ spin
+        )
         found += 9.81 * inertia.mass * (places[1][j] * inertia.lever)[2]
     return found
 
@@ -61,7 +65,9 @@ def test_motors_give_the_energy_that_arm_and_payload_gain(mass: float) -> None:
     for moment in (0.35, 0.8, 1.3):
         torques, rates = Torques(scene, motion).along(np.array([moment])), motion.velocity(moment)
         power = float(torques[0] @ rates[: motion.robot_size])
-        gained = (energy(world, motion, moment + 1e-3) - energy(world, motion, moment - 1e-3)) / 2e-3
+        gained = (
+            energy(world, motion, moment + 1e-3) - energy(world, motion, moment - 1e-3)
+        ) / 2e-3
         assert power == pytest.approx(gained, rel=2e-3, abs=2e-2)
 
 
@@ -70,7 +76,9 @@ def test_a_payload_at_rest_weighs_by_its_lever() -> None:
     for mass in (0.0, 3.0):
         scene, motion = swung(mass)
         still = np.zeros_like(motion.positions[:1])
-        torques.append(Torques(scene, motion).at(np.zeros(1, int), motion.positions[:1], still, still)[0])
+        torques.append(
+            Torques(scene, motion).at(np.zeros(1, int), motion.positions[:1], still, still)[0]
+        )
     world = World(scene)
     (q,) = world.coordinates.q(world.positions(motion, motion.times[:1]))
     data = world.model.createData()
@@ -114,7 +122,9 @@ def test_and_with_a_tray_and_what_stands_on_it(tmp_path: Path) -> None:
     assert plan.success
     own, other = seen(plan, tmp_path / "tray.npz")
     np.testing.assert_allclose(own, other, rtol=0.02, atol=0.05)
-    alone = Torques(changed(changed(plan.scene, "tray", mass=0.0), "cup", mass=0.0), plan.trajectory)
+    alone = Torques(
+        changed(changed(plan.scene, "tray", mass=0.0), "cup", mass=0.0), plan.trajectory
+    )
     assert "tray" in alone.weightless
 
 
@@ -122,5 +132,10 @@ def test_acceleration_of_the_base_pulls_at_the_arm() -> None:
     scene, motion = swung(2.0, base=0.4)
     _, still = swung(2.0)
     times = np.array([0.4, 0.9])
-    assert np.abs(Torques(scene, motion).along(times) - Torques(scene, still).along(times))[:, 3:].max() > 0.5
+    assert (
+        np.abs(Torques(scene, motion).along(times) - Torques(scene, still).along(times))[
+            :, 3:
+        ].max()
+        > 0.5
+    )
     assert not Torques(scene, motion).along(times)[:, :3].any()

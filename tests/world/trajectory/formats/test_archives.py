@@ -60,50 +60,103 @@ def test_what_is_written_is_read(tmp_path: Path, saved: Path) -> None:
     whole = {**about, "trajectory": {**about["trajectory"], **arrays}}
     again = write_archive(tmp_path / "again", whole)
     assert json.dumps(read_archive(again)[0]) == json.dumps(about)
-    for found, kept in ((read_archive(again)[1], arrays), (read_archive(again)[1]["curve"], arrays["curve"])):
+    for found, kept in (
+        (read_archive(again)[1], arrays),
+        (read_archive(again)[1]["curve"], arrays["curve"]),
+    ):
         assert found.keys() == kept.keys()
-        assert all(found[name].tobytes() == kept[name].tobytes() for name in kept if name != "curve")
-    other = {"times": packed(arrays["times"].astype(">f8")), "positions": packed(np.asfortranarray(arrays["positions"]))}
-    for name, array in read_archive(written(tmp_path / "other", {**parts(saved), **other}))[1].items():
+        assert all(
+            found[name].tobytes() == kept[name].tobytes() for name in kept if name != "curve"
+        )
+    other = {
+        "times": packed(arrays["times"].astype(">f8")),
+        "positions": packed(np.asfortranarray(arrays["positions"])),
+    }
+    for name, array in read_archive(written(tmp_path / "other", {**parts(saved), **other}))[
+        1
+    ].items():
         for key, values in array.items() if name == "curve" else [(name, array)]:
-            np.testing.assert_array_equal(values, arrays["curve"][key] if name == "curve" else arrays[key])
+            np.testing.assert_array_equal(
+                values, arrays["curve"][key] if name == "curve" else arrays[key]
+            )
     straight = {name: value for name, value in whole["trajectory"].items() if name != "curve"}
-    assert set(read_archive(write_archive(tmp_path / "straight", {**about, "trajectory": straight}))[1]) == {"times", "positions"}
+    assert set(
+        read_archive(write_archive(tmp_path / "straight", {**about, "trajectory": straight}))[1]
+    ) == {"times", "positions"}
 
 
 DESCRIPTIONS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda about: about.pop("metrics"), "metrics: missing"),
     (lambda about: about.update(metrics=[1, 2]), "metrics: wrong value"),
     (lambda about: about["metrics"].pop("base_effort"), "metrics.base_effort: missing"),
-    (lambda about: about["metrics"].update(arm_effort=math.nan), "metrics.arm_effort: wrong value .expected a finite number"),
+    (
+        lambda about: about["metrics"].update(arm_effort=math.nan),
+        "metrics.arm_effort: wrong value .expected a finite number",
+    ),
     (lambda about: about["metrics"].update(rounds=-1), "metrics.rounds: out of range"),
     (lambda about: about["metrics"].update(rounds=10**400), "metrics.rounds: wrong value"),
-    (lambda about: about["metrics"].update(duration="long"), "metrics.duration: wrong value .expected a number"),
+    (
+        lambda about: about["metrics"].update(duration="long"),
+        "metrics.duration: wrong value .expected a number",
+    ),
     (lambda about: about["metrics"].update(more=None), "metrics: the metric 'more' is none"),
     (lambda about: about["metrics"].update(clearance=math.nan), "metrics.clearance: out of range"),
-    (lambda about: about["metrics"].update(base_effort=0.1), r"metrics.base_effort: not that of motion and report .*got 0.1"),
-    (lambda about: about["metrics"].update(clearance=0.1), r"metrics.clearance: not that of motion and report .*got 0.1"),
-    (lambda about: about["validation"].update(clearance=math.nan), r"validation.clearance: out of range"),
-    (lambda about: about["validation"].update(closure_error=math.inf), r"validation.closure_error: wrong value"),
-    (lambda about: about["validation"].update(states="many"), r"validation.states: wrong value .expected a whole number"),
+    (
+        lambda about: about["metrics"].update(base_effort=0.1),
+        r"metrics.base_effort: not that of motion and report .*got 0.1",
+    ),
+    (
+        lambda about: about["metrics"].update(clearance=0.1),
+        r"metrics.clearance: not that of motion and report .*got 0.1",
+    ),
+    (
+        lambda about: about["validation"].update(clearance=math.nan),
+        r"validation.clearance: out of range",
+    ),
+    (
+        lambda about: about["validation"].update(closure_error=math.inf),
+        r"validation.closure_error: wrong value",
+    ),
+    (
+        lambda about: about["validation"].update(states="many"),
+        r"validation.states: wrong value .expected a whole number",
+    ),
     (
         lambda about: about["validation"].update(violations=[{"constraint": "goal"}]),
         r"validation.violations\[0\].subject: missing",
     ),
     (lambda about: about["validation"].update(ok=True), r"validation.ok: there is no field 'ok'"),
     (lambda about: about.update(success=True), "success: there is no field 'success'"),
-    (lambda about: about.update(status="sucess"), "status: there is no status 'sucess'; did you mean 'success'"),
+    (
+        lambda about: about.update(status="sucess"),
+        "status: there is no status 'sucess'; did you mean 'success'",
+    ),
     (lambda about: about.update(status=1), "status: there is no status '1'"),
     (lambda about: about.update(seed=-1), "seed: out of range"),
     (lambda about: about.update(seed=0.5), "seed: wrong value .expected a whole number"),
     (lambda about: about.update(seed=True), "seed: wrong value .expected a whole number"),
     (lambda about: about.update(initialization=None), "initialization: wrong value .expected text"),
     (lambda about: about.update(history={}), "history: wrong value .expected a list"),
-    (lambda about: about.update(history=[{"round": 1}, {"round": "two"}]), r"history\[1\]: 'round' is no number"),
-    (lambda about: about["trajectory"].update(robot_size=0.5), r"trajectory.robot_size: wrong value"),
-    (lambda about: about["trajectory"]["phases"][0].update(first=-1), r"trajectory.phases\[0\].first: out of range"),
-    (lambda about: about["trajectory"]["phases"][0].update(held=["door"]), r"trajectory.phases\[0\].held: wrong value"),
-    (lambda about: about["trajectory"].update(names=[1]), r"trajectory.names\[0\]: wrong value .expected text"),
+    (
+        lambda about: about.update(history=[{"round": 1}, {"round": "two"}]),
+        r"history\[1\]: 'round' is no number",
+    ),
+    (
+        lambda about: about["trajectory"].update(robot_size=0.5),
+        r"trajectory.robot_size: wrong value",
+    ),
+    (
+        lambda about: about["trajectory"]["phases"][0].update(first=-1),
+        r"trajectory.phases\[0\].first: out of range",
+    ),
+    (
+        lambda about: about["trajectory"]["phases"][0].update(held=["door"]),
+        r"trajectory.phases\[0\].held: wrong value",
+    ),
+    (
+        lambda about: about["trajectory"].update(names=[1]),
+        r"trajectory.names\[0\]: wrong value .expected text",
+    ),
     (lambda about: about.update(folder={"package": "../../etc"}), "folder: no folder of a scene"),
     (lambda about: about.update(steps=[{"step": "Actuate"}]), "Actuate.object: this is missing"),
     (lambda about: about.update(steps=[{"step": "GoTo", "x": "a", "y": 0}]), "GoTo.x"),
@@ -113,8 +166,12 @@ DESCRIPTIONS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("change", "said"), DESCRIPTIONS, ids=lambda value: value[:40] if isinstance(value, str) else "")
-def test_a_wrong_description(tmp_path: Path, saved: Path, change: Callable[[dict[str, Any]], Any], said: str) -> None:
+@pytest.mark.parametrize(
+    ("change", "said"), DESCRIPTIONS, ids=lambda value: value[:40] if isinstance(value, str) else ""
+)
+def test_a_wrong_description(
+    tmp_path: Path, saved: Path, change: Callable[[dict[str, Any]], Any], said: str
+) -> None:
     path = changed(tmp_path / "wrong", saved, change)
     with pytest.raises(vkc.InputError, match=said) as caught:
         vkc.Plan.load(path)
@@ -137,19 +194,33 @@ def _back(times: np.ndarray) -> np.ndarray:
         ("positions", _holes, r"positions\[3, 4\]: not finite"),
         ("times", _back, "times do not increase"),
         ("times", lambda times: times[:-1], "phases do not follow|wrong shape"),
-        ("times", lambda times: times[:, None], "not a saved plan .*times is an array of float64 and shape"),
+        (
+            "times",
+            lambda times: times[:, None],
+            "not a saved plan .*times is an array of float64 and shape",
+        ),
         ("positions", lambda positions: positions[:, :-1], "wrong shape"),
-        ("positions", lambda positions: positions.astype(complex), "positions is an array of complex128"),
+        (
+            "positions",
+            lambda positions: positions.astype(complex),
+            "positions is an array of complex128",
+        ),
         ("positions", lambda positions: positions.astype("S8"), r"positions is an array of \|S8"),
         ("about", lambda about: np.array(b"{}"), r"about is an array of \|S2"),
         ("about", lambda about: np.array(["{}"]), r"about is an array of <U2"),
         ("about", lambda about: np.array(""), "not JSON"),
         ("about", lambda about: np.array("[" * 100_000 + "]" * 100_000), "JSON|too many lists"),
-        ("about", lambda about: np.array('{"a":' * 60 + "1" + "}" * 60), "too many lists and objects inside each other"),
+        (
+            "about",
+            lambda about: np.array('{"a":' * 60 + "1" + "}" * 60),
+            "too many lists and objects inside each other",
+        ),
         ("about", lambda about: np.array("9" * 5000), "not JSON"),
     ],
 )
-def test_a_wrong_array(tmp_path: Path, saved: Path, name: str, change: Callable[[Any], Any], said: str) -> None:
+def test_a_wrong_array(
+    tmp_path: Path, saved: Path, name: str, change: Callable[[Any], Any], said: str
+) -> None:
     found = parts(saved)
     array = np.load(io.BytesIO(found[name]))
     path = written(tmp_path / "wrong", {**found, name: packed(change(array.copy()))})
@@ -159,7 +230,10 @@ def test_a_wrong_array(tmp_path: Path, saved: Path, name: str, change: Callable[
 
 
 def _header(shape: str, dtype: str = "<f8") -> bytes:
-    text = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
+    text = (
+        f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117)
+        + b"\n"
+    )
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
 
 
@@ -176,7 +250,10 @@ def _many(found: dict[str, bytes]) -> dict[str, bytes]:
 
 
 def _lists(found: dict[str, bytes]) -> dict[str, bytes]:
-    return {**found, "about": packed(np.array('{"format": 1, "history": [' + "[]," * 3_000_000 + "[]]}"))}
+    return {
+        **found,
+        "about": packed(np.array('{"format": 1, "history": [' + "[]," * 3_000_000 + "[]]}")),
+    }
 
 
 def _numbers(found: dict[str, bytes]) -> dict[str, bytes]:
@@ -207,7 +284,9 @@ print(int(peak[1]) / 1e3, time.process_time() - before)
 
 
 @pytest.mark.parametrize("make", [_bomb, _tall_tale, _many, _lists, _numbers, _held])
-def test_what_is_large_when_unpacked_is_refused_before(tmp_path: Path, saved: Path, make: Callable[[Any], Any]) -> None:
+def test_what_is_large_when_unpacked_is_refused_before(
+    tmp_path: Path, saved: Path, make: Callable[[Any], Any]
+) -> None:
     """In less than 500 MB, and 2 s of the processor on a machine that does nothing else."""
     path = written(tmp_path / "large", make(parts(saved)))
     run = [sys.executable, "-c", LOAD, str(saved), str(path)]
@@ -220,7 +299,9 @@ def test_what_is_large_when_unpacked_is_refused_before(tmp_path: Path, saved: Pa
     assert seconds < 10.0, said
 
 
-def test_files_that_are_no_files_or_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, saved: Path) -> None:
+def test_files_that_are_no_files_or_too_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, saved: Path
+) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path, said in (
         (tmp_path / "pipe", "a pipe or a device"),
@@ -256,10 +337,13 @@ def test_no_byte_makes_anything_else_than_an_input_error(tmp_path: Path, saved: 
 
 def test_every_status_and_metric_is_known(door_plan: vkc.Plan) -> None:
     assert set(door_plan.metrics) == set(METRICS)
-    told = re.findall(r'"([\w ]+)"', (vkc.Plan.__doc__ or "").split("status:")[1].split("metrics:")[0])
+    told = re.findall(
+        r'"([\w ]+)"', (vkc.Plan.__doc__ or "").split("status:")[1].split("metrics:")[0]
+    )
     ended = set(
         re.findall(
-            r'FailedError\("([\w ]+)"|(?:cause = |found, )"([\w ]+)"', inspect.getsource(attempt) + inspect.getsource(following)
+            r'FailedError\("([\w ]+)"|(?:cause = |found, )"([\w ]+)"',
+            inspect.getsource(attempt) + inspect.getsource(following),
         )
     )
     named = {name for pair in ended for name in pair if name}

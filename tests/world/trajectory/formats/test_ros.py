@@ -20,7 +20,9 @@ from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.formats.ros import along, rates
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-COLUMNS = arrays(float, st.tuples(st.integers(2, 8), st.integers(1, 3)), elements=st.floats(-10.0, 10.0))
+COLUMNS = arrays(
+    float, st.tuples(st.integers(2, 8), st.integers(1, 3)), elements=st.floats(-10.0, 10.0)
+)
 
 
 def some(rng: np.random.Generator, n: int = 9) -> tuple[np.ndarray, np.ndarray]:
@@ -30,7 +32,9 @@ def some(rng: np.random.Generator, n: int = 9) -> tuple[np.ndarray, np.ndarray]:
 def test_velocities_inside_are_those_of_scipys_monotone_cubic() -> None:
     times, positions = some(np.random.default_rng(0))
     velocities, _ = rates(times, positions)
-    np.testing.assert_allclose(velocities[1:-1], PchipInterpolator(times, positions).derivative()(times)[1:-1], atol=1e-12)
+    np.testing.assert_allclose(
+        velocities[1:-1], PchipInterpolator(times, positions).derivative()(times)[1:-1], atol=1e-12
+    )
     assert (velocities[[0, -1]] == 0.0).all()
 
 
@@ -47,7 +51,9 @@ def test_between_waypoints_the_derivatives_belong_to_the_positions() -> None:
     moments = np.linspace(times[0] + 0.01, times[-1] - 0.01, 57)
     moments = moments[np.abs(moments[:, None] - times).min(axis=1) > 1e-4]
     step = 1e-5
-    before, here, after = (along(times, positions, velocities, moments + d) for d in (-step, 0.0, step))
+    before, here, after = (
+        along(times, positions, velocities, moments + d) for d in (-step, 0.0, step)
+    )
     np.testing.assert_allclose((after[0] - before[0]) / (2 * step), here[1], atol=1e-6)
     np.testing.assert_allclose((after[1] - before[1]) / (2 * step), here[2], atol=1e-4)
 
@@ -61,7 +67,9 @@ def test_it_passes_the_waypoints_with_their_velocities() -> None:
 
 
 @given(COLUMNS, st.integers(0, 1000))
-def test_no_coordinate_leaves_the_range_between_two_waypoints(positions: np.ndarray, seed: int) -> None:
+def test_no_coordinate_leaves_the_range_between_two_waypoints(
+    positions: np.ndarray, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.01, 2.0, len(positions)))
     velocities, accelerations = rates(times, positions)
@@ -100,8 +108,12 @@ def plan() -> Plan:
 @FILES
 @given(trajectory=trajectories(largest=1e6))
 def test_ros_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None:
-    back = Trajectory.from_ros(json.loads(json.dumps(trajectory.to_ros(joints="all"))), like=trajectory)
-    np.testing.assert_allclose(back.times, trajectory.times - trajectory.times[0], rtol=0.0, atol=1e-9)
+    back = Trajectory.from_ros(
+        json.loads(json.dumps(trajectory.to_ros(joints="all"))), like=trajectory
+    )
+    np.testing.assert_allclose(
+        back.times, trajectory.times - trajectory.times[0], rtol=0.0, atol=1e-9
+    )
     assert {**back.to_dict(), "times": 0} == {**trajectory.to_dict(), "times": 0}
 
 
@@ -112,7 +124,13 @@ def test_a_message_has_the_fields_of_a_joint_trajectory(plan: Plan) -> None:
     assert message["header"] == {"stamp": {"sec": 1, "nanosec": 500_000_000}, "frame_id": "map"}
     assert message["joint_names"] == list(plan.trajectory.names[:9]), "what has a motor"
     for point, moment in zip(message["points"], plan.trajectory.times, strict=True):
-        assert set(point) == {"positions", "velocities", "accelerations", "effort", "time_from_start"}
+        assert set(point) == {
+            "positions",
+            "velocities",
+            "accelerations",
+            "effort",
+            "time_from_start",
+        }
         assert {len(point[key]) for key in ("positions", "velocities", "accelerations")} == {9}
         assert point["effort"] == []
         since = point["time_from_start"]
@@ -126,7 +144,10 @@ def test_a_message_has_the_fields_of_a_joint_trajectory(plan: Plan) -> None:
 def test_fewer_derivatives(plan: Plan) -> None:
     for count in (0, 1, 2):
         point = plan.to_ros(derivatives=count)["points"][1]
-        assert [len(point["velocities"]) > 0, len(point["accelerations"]) > 0] == [count > 0, count > 1]
+        assert [len(point["velocities"]) > 0, len(point["accelerations"]) > 0] == [
+            count > 0,
+            count > 1,
+        ]
 
 
 def test_a_rate_that_would_fill_the_memory(plan: Plan) -> None:
@@ -140,7 +161,12 @@ def test_a_rate_that_would_fill_the_memory(plan: Plan) -> None:
 @pytest.mark.parametrize("rate", [1.0, 7.0, 50])
 def test_points_at_a_rate(plan: Plan, rate: float) -> None:
     message = plan.to_ros(rate=rate, joints="all")
-    times = np.array([p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]])
+    times = np.array(
+        [
+            p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"]
+            for p in message["points"]
+        ]
+    )
     assert len(times) == np.ceil(6.0 * rate) + 1
     np.testing.assert_allclose(times[:-1], np.arange(len(times) - 1) / rate, atol=1e-9)
     assert times[-1] == pytest.approx(6.0)
@@ -157,7 +183,9 @@ def test_rests_last_as_long_at_any_rate(rate: float) -> None:
     knots = np.array([0.0, 1.1, 1.4, 2.0, 2.00002, 3.3])
     places = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0])[:, None] * np.ones(3)
     curve = Curve(knots, places, np.zeros((6, 3)))
-    motion = Trajectory(("base_x", "base_y", "base_yaw"), knots, places, (vkc.PhaseSpan("drive", 0, 5),), 3, curve)
+    motion = Trajectory(
+        ("base_x", "base_y", "base_yaw"), knots, places, (vkc.PhaseSpan("drive", 0, 5),), 3, curve
+    )
     sent = Trajectory.from_ros(motion.to_ros(rate=rate))
     even = np.append(np.arange(np.ceil(3.3 * rate - 1e-6)) / rate, 3.3)
     even = even[(np.abs(even[:, None] - knots[1:5]) > 1e-4).all(axis=1)]
@@ -216,13 +244,29 @@ def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
         ("points", {}, "points: wrong kind of value"),
         ("points", [], "Trajectory.times: times do not increase"),
         ("points/2", 3, r"points\[2\].positions: this is missing"),
-        ("points/2/positions", [1.0], r"points\[2\].positions: wrong number of values .expected 9, got 1"),
-        ("points/2/positions/4", "far", r"points\[2\].positions\[4\]: not a number .expected a number, got 'far'"),
+        (
+            "points/2/positions",
+            [1.0],
+            r"points\[2\].positions: wrong number of values .expected 9, got 1",
+        ),
+        (
+            "points/2/positions/4",
+            "far",
+            r"points\[2\].positions\[4\]: not a number .expected a number, got 'far'",
+        ),
         ("points/2/positions/4", True, r"points\[2\].positions\[4\]: not a number"),
         ("points/2/positions/4", float("nan"), r"Trajectory.positions\[2, 4\]: not finite"),
-        ("points/1/time_from_start/sec", 0.5, r"points\[1\].time_from_start.sec: wrong kind of value .expected a whole number"),
+        (
+            "points/1/time_from_start/sec",
+            0.5,
+            r"points\[1\].time_from_start.sec: wrong kind of value .expected a whole number",
+        ),
         ("points/1/time_from_start", None, r"points\[1\].time_from_start: this is missing"),
-        ("points/1/time_from_start/nanosec", None, r"points\[1\].time_from_start.nanosec: this is missing"),
+        (
+            "points/1/time_from_start/nanosec",
+            None,
+            r"points\[1\].time_from_start.nanosec: this is missing",
+        ),
         ("points/1/time_from_start/sec", 5, "Trajectory.times: times do not increase"),
     ],
 )
@@ -244,11 +288,21 @@ def test_the_arm_alone_is_no_trajectory(plan: Plan) -> None:
 @pytest.mark.parametrize("smooth", [True, False])
 def test_what_is_sent_can_be_validated(door_plan: Plan, smooth: bool, rate: float) -> None:
     """Between waypoints, on lines or cubics, the motion does what was asked for, and keeps its distances."""
-    sent = Trajectory.from_ros(door_plan.to_ros(joints="all", rate=rate, smooth=smooth), like=door_plan.trajectory)
-    assert [phase.name for phase in sent.phases] == [phase.name for phase in door_plan.trajectory.phases]
-    options = dataclasses.replace(door_plan.options, dist_safe=0.01)  # what is kept between waypoints
+    sent = Trajectory.from_ros(
+        door_plan.to_ros(joints="all", rate=rate, smooth=smooth), like=door_plan.trajectory
+    )
+    assert [phase.name for phase in sent.phases] == [
+        phase.name for phase in door_plan.trajectory.phases
+    ]
+    options = dataclasses.replace(
+        door_plan.options, dist_safe=0.01
+    )  # what is kept between waypoints
     report = vkc.validate(door_plan.scene, door_plan.steps, sent, options)
-    wrong = {"acceleration", "closure"} if smooth else {"acceleration"}  # it jumps between linear pieces
+    wrong = (
+        {"acceleration", "closure"} if smooth else {"acceleration"}
+    )  # it jumps between linear pieces
     assert {violation.constraint for violation in report.violations} <= wrong, report.lines()
     assert report.closure_error < (2e-3 if smooth else 1e-3)
-    assert np.abs(sent.positions - door_plan.trajectory.at(sent.times)).max() < (0.02 if smooth else 1e-9)
+    assert np.abs(sent.positions - door_plan.trajectory.at(sent.times)).max() < (
+        0.02 if smooth else 1e-9
+    )

@@ -32,7 +32,9 @@ def plan() -> Plan:
     rates = np.gradient(motion.positions, motion.times, axis=0)
     rates[[0, 6, -1]] = 0.0
     curve = Curve(motion.times, motion.positions, rates)
-    again = Trajectory(motion.names, motion.times, motion.positions, motion.phases, motion.robot_size, curve)
+    again = Trajectory(
+        motion.names, motion.times, motion.positions, motion.phases, motion.robot_size, curve
+    )
     object.__setattr__(made, "trajectory", again)
     object.__setattr__(made, "metrics", spent())
     return made
@@ -44,7 +46,9 @@ def read(folder: Path) -> Messages:
     found: Messages = {}
     with Reader(folder) as reader:
         for connection, when, data in reader.messages():
-            found.setdefault(connection.topic, []).append((when, store.deserialize_cdr(data, connection.msgtype)))
+            found.setdefault(connection.topic, []).append(
+                (when, store.deserialize_cdr(data, connection.msgtype))
+            )
     return found
 
 
@@ -60,7 +64,10 @@ def as_data(message: Any) -> dict[str, Any]:
         "points": [
             {
                 **{key: getattr(point, key).tolist() for key in keys},
-                "time_from_start": {"sec": point.time_from_start.sec, "nanosec": point.time_from_start.nanosec},
+                "time_from_start": {
+                    "sec": point.time_from_start.sec,
+                    "nanosec": point.time_from_start.nanosec,
+                },
             }
             for point in message.points
         ],
@@ -84,9 +91,14 @@ def test_a_motion_comes_back(plan: Plan, tmp_path: Path) -> None:
         {**one, **{key: one[key] + other[key] for key in ("positions", "velocities")}}
         for one, other in zip(data[0]["points"], data[1]["points"], strict=True)
     ]
-    back = Trajectory.from_ros({"joint_names": data[0]["joint_names"] + data[1]["joint_names"], "points": points})
+    back = Trajectory.from_ros(
+        {"joint_names": data[0]["joint_names"] + data[1]["joint_names"], "points": points}
+    )
     times = np.linspace(0.0, plan.trajectory.times[-1], 101)
-    assert np.abs(back.at(times) - plan.trajectory.at(times)[:, : plan.trajectory.robot_size]).max() < 1e-6
+    assert (
+        np.abs(back.at(times) - plan.trajectory.at(times)[:, : plan.trajectory.robot_size]).max()
+        < 1e-6
+    )
 
 
 def test_the_base_drives_along_its_path(plan: Plan, tmp_path: Path) -> None:
@@ -108,30 +120,51 @@ def test_the_base_drives_along_its_path(plan: Plan, tmp_path: Path) -> None:
     for step, (ahead, aside, turning) in zip(steps, (own[1:] + own[:-1]) / 2.0, strict=True):
         middle = place[2] + step * turning / 2.0
         place += step * np.array(
-            [np.cos(middle) * ahead - np.sin(middle) * aside, np.sin(middle) * ahead + np.cos(middle) * aside, turning]
+            [
+                np.cos(middle) * ahead - np.sin(middle) * aside,
+                np.sin(middle) * ahead + np.cos(middle) * aside,
+                turning,
+            ]
         )
     assert np.abs(place - motion.positions[-1, :3]).max() < 1e-3
     assert np.abs(own[-1]).max() < 1e-9  # it stands at the end
 
 
 def test_objects_and_phases(plan: Plan, tmp_path: Path) -> None:
-    found, motion = read(plan.to_rosbag(tmp_path / "bag", states=20.0, namespace="")), plan.trajectory
+    found, motion = (
+        read(plan.to_rosbag(tmp_path / "bag", states=20.0, namespace="")),
+        plan.trajectory,
+    )
     states = found["/objects/joint_states"]
-    times = np.array([message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec for _, message in states])
+    times = np.array(
+        [message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec for _, message in states]
+    )
     assert np.allclose(times, 1e-9 * np.array([when for when, _ in states]))
     assert np.allclose(np.diff(times)[:-1], 0.05)
     assert list(states[0][1].name) == ["door.hinge", "door.knob", "door.handle_free"]
-    assert np.allclose([message.position for _, message in states], motion.at(times)[:, motion.robot_size :], atol=1e-7)
-    assert np.allclose([message.velocity for _, message in states], motion.velocity(times)[:, motion.robot_size :], atol=1e-6)
+    assert np.allclose(
+        [message.position for _, message in states],
+        motion.at(times)[:, motion.robot_size :],
+        atol=1e-7,
+    )
+    assert np.allclose(
+        [message.velocity for _, message in states],
+        motion.velocity(times)[:, motion.robot_size :],
+        atol=1e-6,
+    )
     phases = [(when, json.loads(message.data)) for when, message in found["/phases"]]
-    assert [when for when, _ in phases] == [round(1e9 * motion.times[phase.first]) for phase in motion.phases]
+    assert [when for when, _ in phases] == [
+        round(1e9 * motion.times[phase.first]) for phase in motion.phases
+    ]
     assert [phase["held"] for _, phase in phases] == [{}, {"door": "handle"}]
 
 
 def test_what_a_motion_does_not_have_is_left_out(plan: Plan, tmp_path: Path) -> None:
     motion = plan.trajectory
     alone = Trajectory(motion.names[:3], motion.times, motion.positions[:, :3], motion.phases, 3)
-    assert set(read(alone.to_rosbag(tmp_path / "bag"))) == {f"/vkc/{end}" for end in TOPICS if end[:3] not in ("arm", "obj")}
+    assert set(read(alone.to_rosbag(tmp_path / "bag"))) == {
+        f"/vkc/{end}" for end in TOPICS if end[:3] not in ("arm", "obj")
+    }
 
 
 def test_a_folder_that_is_there_is_kept(plan: Plan, tmp_path: Path) -> None:
@@ -141,7 +174,9 @@ def test_a_folder_that_is_there_is_kept(plan: Plan, tmp_path: Path) -> None:
     with pytest.raises(vkc.InputError, match="there already"):
         plan.to_rosbag(folder, rate=10.0)
     assert sorted((file.name, file.read_bytes()) for file in folder.iterdir()) == before
-    assert len(read(plan.to_rosbag(folder, rate=10.0, force=True))["/vkc/base/path"][0][1].poses) == 61
+    assert (
+        len(read(plan.to_rosbag(folder, rate=10.0, force=True))["/vkc/base/path"][0][1].poses) == 61
+    )
     assert [file.name for file in folder.parent.iterdir()] == ["bag"]
 
 
@@ -166,7 +201,9 @@ def test_a_folder_of_another_kind_is_not_replaced(plan: Plan, tmp_path: Path) ->
         ({"frame": 1}, "frame"),
     ],
 )
-def test_wrong_arguments_are_named(plan: Plan, tmp_path: Path, options: dict[str, Any], field: str) -> None:
+def test_wrong_arguments_are_named(
+    plan: Plan, tmp_path: Path, options: dict[str, Any], field: str
+) -> None:
     with pytest.raises(vkc.InputError) as caught:
         plan.to_rosbag(tmp_path / "bag", **options)
     assert caught.value.field == field
@@ -181,7 +218,20 @@ def test_without_the_package_the_error_names_the_extra(
         plan.to_rosbag(tmp_path / "bag")
     assert caught.value.expected == 'pip install "vkc-pin[ros]"'
     # The command says so before it plans.
-    assert cli.main(["plan", "door", "--set", "door.hinge=1.2", "--quiet", "--rosbag", str(tmp_path / "bag")]) == 2
+    assert (
+        cli.main(
+            [
+                "plan",
+                "door",
+                "--set",
+                "door.hinge=1.2",
+                "--quiet",
+                "--rosbag",
+                str(tmp_path / "bag"),
+            ]
+        )
+        == 2
+    )
     assert "vkc-pin[ros]" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -193,6 +243,9 @@ def test_the_command_line(plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixt
     assert len(read(bag)["/vkc/base/path"][0][1].poses) == 61
     assert cli.main(["export", str(saved), "--rosbag", str(bag)]) == 2
     assert "--rosbag: this is there already" in capsys.readouterr().err
-    assert cli.main(["export", str(saved), "--rosbag", str(tmp_path / "other"), "--joints", "arm"]) == 2
+    assert (
+        cli.main(["export", str(saved), "--rosbag", str(tmp_path / "other"), "--joints", "arm"])
+        == 2
+    )
     assert "--joints" in capsys.readouterr().err
     assert sorted(file.name for file in tmp_path.iterdir()) == ["bag", "door.npz"]

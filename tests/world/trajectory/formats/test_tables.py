@@ -56,7 +56,10 @@ def test_a_plan_comes_back(plan: Plan, tmp_path: Path) -> None:
     assert same(Trajectory.from_json(plan.to_json(tmp_path / "door.json")), plan.trajectory)
     path = broken(tmp_path / "ros.json", json.dumps(plan.to_ros(joints="all")))
     back = Trajectory.from_ros(path, like=plan.trajectory)
-    assert (back.phases, back.positions.tolist()) == (plan.trajectory.phases, plan.trajectory.positions.tolist())
+    assert (back.phases, back.positions.tolist()) == (
+        plan.trajectory.phases,
+        plan.trajectory.positions.tolist(),
+    )
 
 
 # Tables
@@ -66,7 +69,14 @@ def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
     with plan.to_csv(tmp_path / "door.csv").open(encoding="utf-8", newline="") as file:
         lines = list(csv.reader(file))
     assert lines[0][:4] == ["time [s]", "base_x [m]", "base_y [m]", "base_yaw [rad]"]
-    assert lines[0][-6:] == ["door.hinge [rad]", "door.knob [rad]", "door.handle_free [rad]", "phase", "phase_name", "held"]
+    assert lines[0][-6:] == [
+        "door.hinge [rad]",
+        "door.knob [rad]",
+        "door.handle_free [rad]",
+        "phase",
+        "phase_name",
+        "held",
+    ]
     assert len(lines) == 1 + len(plan.trajectory.times)
     assert lines[1][-3:] == ["1", "reach door.handle", "{}"]
     assert lines[8][-3:] == ["2", "move door.hinge", '{"door": "handle"}']
@@ -74,10 +84,23 @@ def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("joints", "count"), [("robot", 9), ("base", 3), ("arm", 6), ("objects", 3), (["door.hinge", "base_x"], 2), ("all", 12)]
+    ("joints", "count"),
+    [
+        ("robot", 9),
+        ("base", 3),
+        ("arm", 6),
+        ("objects", 3),
+        (["door.hinge", "base_x"], 2),
+        ("all", 12),
+    ],
 )
 def test_some_of_the_joints(plan: Plan, tmp_path: Path, joints: Any, count: int) -> None:
-    header = plan.to_csv(tmp_path / "some.csv", joints=joints).read_text(encoding="utf-8").splitlines()[0].split(",")
+    header = (
+        plan.to_csv(tmp_path / "some.csv", joints=joints)
+        .read_text(encoding="utf-8")
+        .splitlines()[0]
+        .split(",")
+    )
     assert len(header) == 1 + count + 3
     names = plan.to_ros(joints=joints)["joint_names"]
     assert [re.sub(r" \[.*", "", name) for name in header[1:-3]] == names
@@ -113,9 +136,15 @@ GOOD = "0.0,0,0,0,1,go,{}\n"
         ("", "bad.csv: an empty file"),
         ("x,y\n", "bad.csv:1: first column: not a table of waypoints .expected time, got 'x'"),
         (HEAD + "0.0,0,0\n", "bad.csv:2: wrong number of columns .expected 7, got 3"),
-        (HEAD + GOOD + "1.0,0,zero,0,1,go,{}\n", "bad.csv:3: base_y: not a number .expected a finite number, got 'zero'"),
+        (
+            HEAD + GOOD + "1.0,0,zero,0,1,go,{}\n",
+            "bad.csv:3: base_y: not a number .expected a finite number, got 'zero'",
+        ),
         (HEAD + GOOD + "1.0,nan,0,0,1,go,{}\n", "bad.csv:3: base_x: not a number"),
-        (HEAD + GOOD + "1.0,0,0,0,3,go,{}\n", "bad.csv:3: phase: not the next phase .expected 1 or 2, got '3'"),
+        (
+            HEAD + GOOD + "1.0,0,0,0,3,go,{}\n",
+            "bad.csv:3: phase: not the next phase .expected 1 or 2, got '3'",
+        ),
         (HEAD + "0.0,0,0,0,2,go,{}\n", "bad.csv:2: phase: not the next phase .expected 1, got '2'"),
         (HEAD + "0.0,0,0,0,1,go,door\n", "bad.csv:2: held: not what is held"),
         (HEAD + '0.0,0,0,0,1,go,"{""door"": 3}"\n', "bad.csv:2: held: not what is held"),
@@ -133,10 +162,14 @@ def test_bad_tables(tmp_path: Path, text: str, message: str) -> None:
 
 def test_files_that_are_not_there_or_no_text(tmp_path: Path) -> None:
     for read in (Trajectory.from_csv, Trajectory.from_json, Trajectory.from_ros):
-        with pytest.raises(vkc.InputError, match=r"none.csv: cannot read the (CSV|JSON) .*No such file"):
+        with pytest.raises(
+            vkc.InputError, match=r"none.csv: cannot read the (CSV|JSON) .*No such file"
+        ):
             read(tmp_path / "none.csv")
         (tmp_path / "picture").write_bytes(b"\xff\xfe\x00")
-        with pytest.raises(vkc.InputError, match=r"picture: cannot read the (CSV|JSON) .*no text: byte 0"):
+        with pytest.raises(
+            vkc.InputError, match=r"picture: cannot read the (CSV|JSON) .*no text: byte 0"
+        ):
             read(tmp_path / "picture")
 
 
@@ -146,31 +179,53 @@ HELD = "0,0,0,0,1,a,"
 @pytest.mark.parametrize(
     ("read", "text", "message"),
     [
-        (Trajectory.from_csv, "time," + ",".join(map(str, range(1_000_000))), ":1: too many columns"),
+        (
+            Trajectory.from_csv,
+            "time," + ",".join(map(str, range(1_000_000))),
+            ":1: too many columns",
+        ),
         (Trajectory.from_csv, "time,x,y,yaw\n" + "0,0,0,0\n" * 300_000, "too many lines"),
         (Trajectory.from_csv, "time," + "x" * 200_000, ":1: not a table .got field larger"),
         (Trajectory.from_csv, "time,x,y,yaw\n0,0,0," + "9" * 100_000, ":2: yaw: not a number"),
-        (Trajectory.from_csv, "time,x,y,yaw,phase,phase_name,held\n" + HELD + "[" * 100_000, ":2: held: not what is held"),
+        (
+            Trajectory.from_csv,
+            "time,x,y,yaw,phase,phase_name,held\n" + HELD + "[" * 100_000,
+            ":2: held: not what is held",
+        ),
         (Trajectory.from_json, "[" * 1_000_000, "too many lists|not JSON"),
         (Trajectory.from_json, '{"names": [' + "1," * 5_000_000 + "1]}", "phases: this is missing"),
         (
             Trajectory.from_json,
-            '{"names": [' + ",".join(f'"{k}"' for k in range(500_000)) + ',"7"], "times": [0, 1], "positions": [[0]],'
+            '{"names": ['
+            + ",".join(f'"{k}"' for k in range(500_000))
+            + ',"7"], "times": [0, 1], "positions": [[0]],'
             ' "robot_size": 3, "phases": []}',
             "Trajectory.names: too many entries",
         ),
         (
             Trajectory.from_json,
-            '{"names": ["x"], "times": [0, 1], "positions": ["' + "x" * 5_000_000 + '"], "robot_size": 3, "phases": []}',
+            '{"names": ["x"], "times": [0, 1], "positions": ["'
+            + "x" * 5_000_000
+            + '"], "robot_size": 3, "phases": []}',
             "Trajectory.positions: not numbers",
         ),
-        (Trajectory.from_ros, '{"joint_names": ["x"], "points": [' + "[]," * 400_000 + "[]]}", "too many lists and objects"),
-        (Trajectory.from_ros, '{"joint_names": "' + "x" * 19_000_000 + '"}', "joint_names: wrong kind of value"),
+        (
+            Trajectory.from_ros,
+            '{"joint_names": ["x"], "points": [' + "[]," * 400_000 + "[]]}",
+            "too many lists and objects",
+        ),
+        (
+            Trajectory.from_ros,
+            '{"joint_names": "' + "x" * 19_000_000 + '"}',
+            "joint_names: wrong kind of value",
+        ),
         (Trajectory.from_json, " " * 20_000_001, "the JSON is too large"),
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 60 else "",
 )
-def test_files_of_any_size_and_depth_are_refused_in_time(read: Any, text: str, message: str, tmp_path: Path) -> None:
+def test_files_of_any_size_and_depth_are_refused_in_time(
+    read: Any, text: str, message: str, tmp_path: Path
+) -> None:
     began = time.process_time()
     with pytest.raises(vkc.InputError, match=message) as caught:
         read(broken(tmp_path / "bad", text))
@@ -214,18 +269,36 @@ def test_bad_json(tmp_path: Path, text: str, message: str) -> None:
 # The command line
 
 
-def test_export_of_a_saved_plan(plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_of_a_saved_plan(
+    plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     saved, out = plan.save(tmp_path / "door.npz"), tmp_path / "new"
     files = [part for kind in ("csv", "json", "ros") for part in (f"--{kind}", str(out / kind))]
     assert cli.main(["export", str(saved), *files]) == 0
-    assert capsys.readouterr().out.splitlines() == [f"wrote {out / kind}" for kind in ("csv", "json", "ros")]
+    assert capsys.readouterr().out.splitlines() == [
+        f"wrote {out / kind}" for kind in ("csv", "json", "ros")
+    ]
     assert same(Trajectory.from_csv(out / "csv"), plan.trajectory)
     assert same(Trajectory.from_json(out / "json"), plan.trajectory)
     assert json.loads((out / "ros").read_text(encoding="utf-8")) == plan.to_ros()
-    assert cli.main(["export", str(saved), "--ros", str(out / "arm"), "--joints", "arm", "--rate", "10"]) == 0
-    assert json.loads((out / "arm").read_text(encoding="utf-8")) == plan.to_ros(joints="arm", rate=10)
-    assert cli.main(["export", str(saved), "--csv", str(out / "two"), "--joints", "base_x,door.hinge"]) == 0
-    assert (out / "two").read_text(encoding="utf-8").startswith("time [s],base_x [m],door.hinge [rad],phase")
+    assert (
+        cli.main(
+            ["export", str(saved), "--ros", str(out / "arm"), "--joints", "arm", "--rate", "10"]
+        )
+        == 0
+    )
+    assert json.loads((out / "arm").read_text(encoding="utf-8")) == plan.to_ros(
+        joints="arm", rate=10
+    )
+    assert (
+        cli.main(["export", str(saved), "--csv", str(out / "two"), "--joints", "base_x,door.hinge"])
+        == 0
+    )
+    assert (
+        (out / "two")
+        .read_text(encoding="utf-8")
+        .startswith("time [s],base_x [m],door.hinge [rad],phase")
+    )
 
 
 @pytest.mark.parametrize(

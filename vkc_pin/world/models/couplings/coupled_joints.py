@@ -37,12 +37,17 @@ class Following:
 def followers(root: ElementTree.Element) -> dict[str, Following]:
     """Return the joints of a URDF that follow another one, and how.
 
-    A joint that follows one that follows a third follows the third. If a joint hangs on one that follows it, then the first of
-    these, from the root on, leads instead. What a file says of joints that do not turn or slide, of such as do not exist, and of
-    joints that follow each other in a circle, counts for nothing: see `check_followers`.
+    A joint that follows one that follows a third follows the third. If a joint hangs on one that
+    follows it, then the first of these, from the root on, leads instead. What a file says of joints
+    that do not turn or slide, of such as do not exist, and of joints that follow each other in a
+    circle, counts for nothing: see `check_followers`.
     """
     said, moving = _said(root), _moving(root)
-    found = {joint: led for joint in said if joint in moving and (led := _followed(joint, said, moving)) is not None}
+    found = {
+        joint: led
+        for joint in said
+        if joint in moving and (led := _followed(joint, said, moving)) is not None
+    }
     for leader in dict.fromkeys(led.leader for led in found.values()):
         group = {joint for joint, led in found.items() if led.leader == leader and led.factor}
         above = [joint for joint in _above(root, leader) if joint in group]
@@ -59,7 +64,8 @@ def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
     """Check that what joints on the way to the tool follow can move, and is there.
 
     Raises:
-        InputError: A joint follows one that does not exist, that does not turn or slide, or in a circle.
+        InputError: A joint follows one that does not exist, that does not turn or slide, or in a
+            circle.
     """
     said, moving, found = _said(file.root), _moving(file.root), followers(file.root)
     leaders = {led.leader for led in found.values()}
@@ -72,13 +78,33 @@ def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
             if chain[-1] in chain[:-1]:
                 problem, got = "joints that follow each other in a circle", " → ".join(chain)
             else:
-                kind = next((other.get("type") for other in file.root.findall("joint") if other.get("name") == chain[-1]), None)
+                kind = next(
+                    (
+                        other.get("type")
+                        for other in file.root.findall("joint")
+                        if other.get("name") == chain[-1]
+                    ),
+                    None,
+                )
                 problem = "a joint on the way to the tool follows one that cannot lead"
-                got = f"'{chain[-1]}', which does not exist" if kind is None else f"'{chain[-1]}', which is {kind}"
-            raise InputError(problem, file=file.path, line=line_of(element), field=joint, expected=expected, got=got)
+                got = (
+                    f"'{chain[-1]}', which does not exist"
+                    if kind is None
+                    else f"'{chain[-1]}', which is {kind}"
+                )
+            raise InputError(
+                problem,
+                file=file.path,
+                line=line_of(element),
+                field=joint,
+                expected=expected,
+                got=got,
+            )
 
 
-def coupled_groups(full: pin.Model, file: UrdfFile, tool_frame: str) -> dict[str, dict[str, Following]]:
+def coupled_groups(
+    full: pin.Model, file: UrdfFile, tool_frame: str
+) -> dict[str, dict[str, Following]]:
     """Return leader → the joints that follow it, wherever they are, of joints of which one is on the way to the tool."""
     follows, path = followers(file.root), {str(full.names[j]) for j in path_to(full, tool_frame)}
     groups: dict[str, dict[str, Following]] = {}
@@ -99,22 +125,30 @@ def couple(file: UrdfFile, couplings: Mapping[str, CouplingSchema], document: Do
     for joint, coupling in couplings.items():
         for name in (joint, coupling.joint):
             if name not in moving:
-                raise document.unknown(("couplings", joint), "joint that turns or slides", name, moving)
+                raise document.unknown(
+                    ("couplings", joint), "joint that turns or slides", name, moving
+                )
         for mimic in moving[joint].findall("mimic"):
             moving[joint].remove(mimic)
         multiplier, offset = repr(coupling.multiplier), repr(coupling.offset)
-        ElementTree.SubElement(moving[joint], "mimic", joint=coupling.joint, multiplier=multiplier, offset=offset)
+        ElementTree.SubElement(
+            moving[joint], "mimic", joint=coupling.joint, multiplier=multiplier, offset=offset
+        )
     said = _said(file.root)
     for joint, coupling in couplings.items():
         if _followed(joint, said, moving, anyone=True) is None:
             problem, expected = "joints that follow each other in a circle", "one joint that leads"
-            raise document.error(("couplings", joint), problem, expected=expected, got=coupling.joint)
+            raise document.error(
+                ("couplings", joint), problem, expected=expected, got=coupling.joint
+            )
 
 
 def path_to(full: pin.Model, frame: str) -> list[int]:
     """Return the joints from the world to a frame of a robot."""
     named = [other for other in full.frames if other.name == frame]
-    link = next((other for other in named if other.type == pin.FrameType.BODY), named[0])  # a link before a joint
+    link = next(
+        (other for other in named if other.type == pin.FrameType.BODY), named[0]
+    )  # a link before a joint
     return list(full.supports[link.parentJoint])
 
 
@@ -130,7 +164,11 @@ def _said(root: ElementTree.Element) -> dict[str, tuple[str, float, float, Eleme
 
 
 def _moving(root: ElementTree.Element) -> dict[str, ElementTree.Element]:
-    return {joint.get("name", ""): joint for joint in root.findall("joint") if joint.get("type") in _MOVING}
+    return {
+        joint.get("name", ""): joint
+        for joint in root.findall("joint")
+        if joint.get("type") in _MOVING
+    }
 
 
 def _followed(
@@ -155,7 +193,9 @@ def _above(root: ElementTree.Element, joint: str) -> list[str]:
     """Return the joints that a joint hangs on, from the root on."""
     ends = {
         key: {
-            other.get("name", ""): end.get("link", "") for other in root.findall("joint") if (end := other.find(key)) is not None
+            other.get("name", ""): end.get("link", "")
+            for other in root.findall("joint")
+            if (end := other.find(key)) is not None
         }
         for key in ("parent", "child")
     }

@@ -26,7 +26,8 @@ _ACCELERATION = 1.4  # the same [rad/s²] or [m/s²]
 def limited_together(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Model:
     """Return a robot whose joints that lead others on the way to the tool can go as far as these can follow.
 
-    Such joints turn within limits, which may be infinite: a turn is not nothing to those that follow.
+    Such joints turn within limits, which may be infinite: a turn is not nothing to those that
+    follow.
 
     Args:
         full: The robot with all its joints.
@@ -34,7 +35,8 @@ def limited_together(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Mo
         tool_frame: A frame of it.
 
     Raises:
-        InputError: What a joint on the way to the tool follows cannot move, or is not there; or limits leave nothing.
+        InputError: What a joint on the way to the tool follows cannot move, or is not there; or
+            limits leave nothing.
     """
     check_followers(full, file, tool_frame)
     groups = coupled_groups(full, file, tool_frame)
@@ -48,10 +50,16 @@ def limited_together(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Mo
             i = model.joints[model.getJointId(joint)].idx_q
             low, high = sorted((bound - led.offset) / led.factor for bound in (lower[i], upper[i]))
             if max(low, lower[at]) > min(high, upper[at]) + LIMIT_SLACK:
-                problem, expected = f"'{joint}', which follows it, has nowhere to go", f"limits that meet {low:g} to {high:g}"
+                problem, expected = (
+                    f"'{joint}', which follows it, has nowhere to go",
+                    f"limits that meet {low:g} to {high:g}",
+                )
                 got = f"{lower[at]:g} to {upper[at]:g}"
                 raise InputError(problem, file=file.path, field=leader, expected=expected, got=got)
-            lower[at], upper[at] = max(low, lower[at]), max(min(high, upper[at]), max(low, lower[at]))
+            lower[at], upper[at] = (
+                max(low, lower[at]),
+                max(min(high, upper[at]), max(low, lower[at])),
+            )
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     return model
 
@@ -67,17 +75,24 @@ def robot_limits(
         settings: Its robot.yaml.
         base: How it moves.
     """
-    low, high = np.array(settings.base.position).T if base != "fixed" else (np.zeros(2), np.zeros(2))
+    low, high = (
+        np.array(settings.base.position).T if base != "fixed" else (np.zeros(2), np.zeros(2))
+    )
     position_low, position_high = model.lowerPositionLimit, model.upperPositionLimit
     position_low[:2], position_high[:2] = low, high
     model.lowerPositionLimit, model.upperPositionLimit = position_low, position_high
     velocity, acceleration = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
     velocity[:3], acceleration[:3] = settings.base.velocity, settings.base.acceleration
     coordinates = Coordinates(model)
-    unsaid = coordinates.strides(1.0, 1.0)  # at which rate of a coordinate its fastest joint has one of 1
+    unsaid = coordinates.strides(
+        1.0, 1.0
+    )  # at which rate of a coordinate its fastest joint has one of 1
     for move in coordinates.moves[3:]:
         name, k, share = model.names[move.joint], move.coordinate, abs(move.factor)
-        named, own = settings.joints.get(name), float(full.velocityLimit[full.joints[full.getJointId(name)].idx_v])
+        named, own = (
+            settings.joints.get(name),
+            float(full.velocityLimit[full.joints[full.getJointId(name)].idx_v]),
+        )
         if named is not None and named.velocity is not None:
             velocity[k] = min(velocity[k], named.velocity / share)
         elif 0.0 < own < 1e3:  # Pinocchio's value for a joint without limit is the largest number
@@ -109,13 +124,28 @@ def _within_limits(full: pin.Model, joints: Set[str]) -> pin.Model:
     model.name = full.name
     pin.forwardKinematics(full, data, pin.neutral(full))
     for j in range(1, full.njoints):
-        joint, name, limits = full.joints[j], str(full.names[j]), (full.lowerPositionLimit, full.upperPositionLimit)
+        joint, name, limits = (
+            full.joints[j],
+            str(full.names[j]),
+            (full.lowerPositionLimit, full.upperPositionLimit),
+        )
         parts = [bound[joint.idx_q : joint.idx_q + joint.nq] for bound in limits]
         if name in joints and joint.nq == 2:
             axis = np.asarray(data.joints[j].S, float).ravel()[3:]
-            joint, parts = pin.JointModelRevoluteUnaligned(axis), [np.array([-np.inf]), np.array([np.inf])]
+            joint, parts = (
+                pin.JointModelRevoluteUnaligned(axis),
+                [np.array([-np.inf]), np.array([np.inf])],
+            )
         v = slice(full.joints[j].idx_v, full.joints[j].idx_v + full.joints[j].nv)
-        model.addJoint(full.parents[j], joint, full.jointPlacements[j], name, full.effortLimit[v], full.velocityLimit[v], *parts)
+        model.addJoint(
+            full.parents[j],
+            joint,
+            full.jointPlacements[j],
+            name,
+            full.effortLimit[v],
+            full.velocityLimit[v],
+            *parts,
+        )
         model.appendBodyToJoint(j, full.inertias[j], pin.SE3.Identity())
     for frame in full.frames[1:]:
         model.addFrame(frame, False)

@@ -12,7 +12,9 @@ from vkc_pin.world.models.couplings.coupled_joints import Following
 __all__ = ["in_order", "with_mimics"]
 
 
-def with_mimics(model: pin.Model, couplings: Sequence[Following], joints: Sequence[int]) -> pin.Model:
+def with_mimics(
+    model: pin.Model, couplings: Sequence[Following], joints: Sequence[int]
+) -> pin.Model:
     """Return a model in which some joints follow others.
 
     Args:
@@ -21,7 +23,9 @@ def with_mimics(model: pin.Model, couplings: Sequence[Following], joints: Sequen
         joints: Their numbers, larger than those of the joints that they follow.
     """
     for led, joint in zip(couplings, joints, strict=True):
-        model = pin.transformJointIntoMimic(model, model.getJointId(led.leader), joint, led.factor, led.offset)
+        model = pin.transformJointIntoMimic(
+            model, model.getJointId(led.leader), joint, led.factor, led.offset
+        )
     return model
 
 
@@ -47,6 +51,10 @@ def in_order(full: pin.Model, before: Mapping[int, Collection[int]]) -> list[int
                 later.append(j)
         if len(later) == len(waiting):
             names = ", ".join(str(full.names[j]) for j in later if j in before)
-            raise InputError("joints hang on each other's followers", field=names, expected="leaders nearer to the base")
+            raise InputError(
+                "joints hang on each other's followers",
+                field=names,
+                expected="leaders nearer to the base",
+            )
         waiting = later
     return order

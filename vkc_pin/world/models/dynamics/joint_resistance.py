@@ -23,10 +23,12 @@ class Resistance:
     """What a joint of an object resists with, in the terms of URDF and MuJoCo; nothing, where nobody says anything.
 
     Attributes:
-        friction: Coulomb's, against any motion, however slow [N·m] or [N]; URDF's `friction`, MuJoCo's `frictionloss`.
+        friction: Coulomb's, against any motion, however slow [N·m] or [N]; URDF's `friction`,
+            MuJoCo's `frictionloss`.
         damping: Against the velocity [N·m·s/rad] or [N·s/m].
         stiffness: Of a spring that pulls the joint to `springref` [N·m/rad] or [N/m].
-        springref: Where the spring is relaxed [rad] or [m]; far outside the joint's limits for one that is wound up.
+        springref: Where the spring is relaxed [rad] or [m]; far outside the joint's limits for one
+            that is wound up.
     """
 
     friction: float = 0.0
@@ -43,7 +45,11 @@ class Resistance:
             position: [rad] or [m], a number or an array.
             velocity: [rad/s] or [m/s], of the same shape.
         """
-        return self.stiffness * (position - self.springref) + self.damping * velocity + self.friction * np.sign(velocity)
+        return (
+            self.stiffness * (position - self.springref)
+            + self.damping * velocity
+            + self.friction * np.sign(velocity)
+        )
 
 
 class ObjectJointSchema(JointSchema):
@@ -56,7 +62,11 @@ class ObjectJointSchema(JointSchema):
 
 
 def resistances(
-    document: Document, joints: Mapping[str, ObjectJointSchema], urdf: Path, text: str | None, names: Sequence[str]
+    document: Document,
+    joints: Mapping[str, ObjectJointSchema],
+    urdf: Path,
+    text: str | None,
+    names: Sequence[str],
 ) -> dict[str, Resistance]:
     """Return what each joint of an object resists with: as its description says, else as its URDF's `<dynamics>` does, else 0.
 
@@ -68,7 +78,8 @@ def resistances(
         names: Of the joints that move.
 
     Raises:
-        InputError: A number of the URDF is none, or negative, or a spring has a place but no stiffness.
+        InputError: A number of the URDF is none, or negative, or a spring has a place but no
+            stiffness.
     """
     _, root = read_xml(urdf, "URDF", text)
     found = dict[str, Resistance]()
@@ -80,12 +91,27 @@ def resistances(
             for key in ("friction", "damping"):
                 (stated[key],) = numbers_of(urdf, dynamics, key, 1, default="0", where=name)
                 if stated[key] < 0.0:
-                    problem, field, line = "a joint cannot drive itself", f"{name}: dynamics {key}", line_of(dynamics)
-                    raise InputError(problem, file=urdf, line=line, field=field, expected="0 or more", got=stated[key])
+                    problem, field, line = (
+                        "a joint cannot drive itself",
+                        f"{name}: dynamics {key}",
+                        line_of(dynamics),
+                    )
+                    raise InputError(
+                        problem,
+                        file=urdf,
+                        line=line,
+                        field=field,
+                        expected="0 or more",
+                        got=stated[key],
+                    )
         given = joints.get(name, ObjectJointSchema())
         if given.springref is not None and given.stiffness is None:
             problem, expected = "a spring without stiffness", "stiffness beside it"
-            raise document.error(("joints", name, "springref"), problem, expected=expected, got=given.springref)
-        own = given.model_dump(include={"friction", "damping", "stiffness", "springref"}, exclude_none=True)
+            raise document.error(
+                ("joints", name, "springref"), problem, expected=expected, got=given.springref
+            )
+        own = given.model_dump(
+            include={"friction", "damping", "stiffness", "springref"}, exclude_none=True
+        )
         found[name] = Resistance(**{**stated, **own})
     return found

@@ -19,7 +19,8 @@ def mass_of(model: pin.Model) -> float:
 def weigh(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
     """Let all links of a model weigh so much together, in the shares and with the shapes that they had.
 
-    Where they weighed nothing, collision shapes are solids of one density; without these, all is at the origin of the base link.
+    Where they weighed nothing, collision shapes are solids of one density; without these, all is at
+    the origin of the base link.
 
     Args:
         model: Changed in place.
@@ -33,11 +34,15 @@ def weigh(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
             model.inertias[0] = pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3)))
     factor = mass / mass_of(model)
     for joint, inertia in enumerate(model.inertias):
-        model.inertias[joint] = pin.Inertia(factor * inertia.mass, inertia.lever, factor * np.asarray(inertia.inertia))
+        model.inertias[joint] = pin.Inertia(
+            factor * inertia.mass, inertia.lever, factor * np.asarray(inertia.inertia)
+        )
 
 
 def solid_inertia(shape: pin.GeometryObject, density: float = 1.0) -> pin.Inertia:
     """Return the inertia of a convex shape in its own frame, all of one density [kg/m³]."""
     solid = compute_hull(triangles(shape.geometry)[0])
     solid.density = density
-    return pin.Inertia(float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia))
+    return pin.Inertia(
+        float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)
+    )

@@ -22,7 +22,8 @@ class Efforts:
     """What the motors of a robot have.
 
     Attributes:
-        limits: Of torque or force of each coordinate, shape (n,) [N·m], [N]; infinite for the base, and where nothing is known.
+        limits: Of torque or force of each coordinate, shape (n,) [N·m], [N]; infinite for the base,
+            and where nothing is known.
         notes: Why nothing is known of some, one line each.
     """
 
@@ -38,8 +39,9 @@ class Efforts:
 def efforts(model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Floats) -> Efforts:
     """Return what the motors of a robot have.
 
-    Nothing is known without masses, or where no effort is stated. Where the stated effort does not hold the arm itself in all
-    postures, with an empty hand and at rest, it is not what the motor has: a placeholder, or a spring is left out.
+    Nothing is known without masses, or where no effort is stated. Where the stated effort does not
+    hold the arm itself in all postures, with an empty hand and at rest, it is not what the motor
+    has: a placeholder, or a spring is left out.
 
     Args:
         model: The robot; joint 1 is the base.
@@ -59,9 +61,13 @@ def efforts(model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Fl
     rng, data, weight = np.random.default_rng(0), model.createData(), np.zeros_like(limits)
     low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
     for z in rng.uniform(low, np.maximum(low, high), (_POSTURES, len(low))):
-        weight = np.maximum(weight, np.abs(pin.computeGeneralizedGravity(model, data, coordinates.q(z))))
+        weight = np.maximum(
+            weight, np.abs(pin.computeGeneralizedGravity(model, data, coordinates.q(z)))
+        )
     for k in np.flatnonzero((weight > limits) & stated):
         unit = {"m": "N", "rad": "N·m"}[coordinates.units[k]]
-        notes.append(f"{names[k]}: {limits[k]:g} {unit} do not carry the arm, which weighs up to {weight[k]:.3g} {unit} there")
+        notes.append(
+            f"{names[k]}: {limits[k]:g} {unit} do not carry the arm, which weighs up to {weight[k]:.3g} {unit} there"
+        )
         limits[k] = np.inf
     return Efforts(limits, tuple(notes))

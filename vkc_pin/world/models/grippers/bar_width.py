@@ -26,7 +26,14 @@ def bar_fits(width: float, shapes: Sequence[Placed]) -> bool:
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     for geometry, placement in shapes:
         result.clear()
-        if coal.collide(bar, where, geometry, coal.Transform3s(placement.rotation, placement.translation), request, result):
+        if coal.collide(
+            bar,
+            where,
+            geometry,
+            coal.Transform3s(placement.rotation, placement.translation),
+            request,
+            result,
+        ):
             return False
     return True
 

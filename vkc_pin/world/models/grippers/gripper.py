@@ -1,7 +1,8 @@
 """Grippers: the joints of the fingers, and where these stand when they are so far open.
 
-A hand is as far open as the widest bar is that fits between its fingers, see `bars`. All joints go from where they are
-closed to where they are open by the same share of their ways, as with one motor; joints that mimic others follow them.
+A hand is as far open as the widest bar is that fits between its fingers, see `bars`. All joints go
+from where they are closed to where they are open by the same share of their ways, as with one
+motor; joints that mimic others follow them.
 """
 
 from __future__ import annotations
@@ -35,9 +36,11 @@ class Gripper:
     """The fingers of a robot's hand.
 
     Attributes:
-        model: The robot's model with the joints of the fingers, k of them, which come last, instead of locked ones.
+        model: The robot's model with the joints of the fingers, k of them, which come last, instead
+            of locked ones.
         names: Of these joints; those that mimic others are among them.
-        closed, open: Where they are when the gripper is closed and fully open, shape (k,), [m] or [rad].
+        closed, open: Where they are when the gripper is closed and fully open, shape (k,), [m] or
+            [rad].
         rest: Where they are if nobody asks for an opening, shape (k,).
         tool_frame: The robot's.
         collision: The robot's collision shapes on `model`.
@@ -82,7 +85,12 @@ class Gripper:
         opening = arguments.number(opening, "opening", "between the fingers [m]")
         if not self.narrowest - EXACT <= opening <= self.widest + EXACT:
             expected = f"{self.narrowest:.4g} to {self.widest:.4g} m"
-            raise InputError("the gripper cannot be so far open", field="opening", expected=expected, got=f"{opening:g} m")
+            raise InputError(
+                "the gripper cannot be so far open",
+                field="opening",
+                expected=expected,
+                got=f"{opening:g} m",
+            )
         if opening not in self._shares:
             self._shares[opening] = self._share(opening)
         share = self._shares[opening]
@@ -99,7 +107,9 @@ class Gripper:
                 found[str(frame.name)] = data.oMi[carrier].actInv(data.oMi[joint]) * frame.placement
         return found
 
-    def carried(self, shapes: Sequence[pin.GeometryObject], model: pin.Model) -> list[pin.GeometryObject]:
+    def carried(
+        self, shapes: Sequence[pin.GeometryObject], model: pin.Model
+    ) -> list[pin.GeometryObject]:
         """Return shapes on the joints of `model`, the robot's, as shapes on those of this gripper's model."""
         return _carried(shapes, model, self.model)
 
@@ -120,9 +130,14 @@ class Gripper:
         data, frame = self._data(fingers), self.model.getFrameId(self.tool_frame)
         back, palm = data.oMf[frame].inverse(), self.model.frames[frame].parentJoint
         shapes = [
-            shape for shape in self.collision.geometryObjects if shape.parentJoint == palm or shape.parentJoint >= self._first
+            shape
+            for shape in self.collision.geometryObjects
+            if shape.parentJoint == palm or shape.parentJoint >= self._first
         ]
-        return [(shape.geometry, back * data.oMi[shape.parentJoint] * shape.placement) for shape in shapes]
+        return [
+            (shape.geometry, back * data.oMi[shape.parentJoint] * shape.placement)
+            for shape in shapes
+        ]
 
     def _share(self, opening: float) -> float:
         """Return the least share of the way from closed to open at which a bar so wide fits."""
@@ -136,7 +151,9 @@ class Gripper:
         return high
 
 
-def _carried(shapes: Sequence[pin.GeometryObject], model: pin.Model, unlocked: pin.Model) -> list[pin.GeometryObject]:
+def _carried(
+    shapes: Sequence[pin.GeometryObject], model: pin.Model, unlocked: pin.Model
+) -> list[pin.GeometryObject]:
     """Return shapes on the joints of `model` as shapes on those of `unlocked`, which begins with the same joints."""
     found = []
     for shape in shapes:
@@ -176,22 +193,30 @@ def described_gripper(
         height: Of the root link above the floor [m].
 
     Raises:
-        InputError: A joint is none of a finger: it is part of the arm, mimics another, cannot be where it is said to be, or does
-            not move; or there is no more room between the fingers where they are open than where they are closed.
+        InputError: A joint is none of a finger: it is part of the arm, mimics another, cannot be
+            where it is said to be, or does not move; or there is no more room between the fingers
+            where they are open than where they are closed.
     """
     if not stated:
         return None
-    follows, palm = followers(file.root), list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint])
+    follows, palm = (
+        followers(file.root),
+        list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint]),
+    )
     arm = max(j for j in palm if full.names[j] in list(model.names))
     for joint, finger in stated.items():
         where = ("gripper", joint)
         if joint in follows:
             problem, leader = "this joint follows another one", follows[joint].leader
-            raise document.error(where, problem, expected=f"'{leader}', which it follows", got=joint)
+            raise document.error(
+                where, problem, expected=f"'{leader}', which it follows", got=joint
+            )
         number = full.getJointId(joint)
         if number in palm or arm not in list(full.supports[number]):
             expected = f"a joint of the hand, beyond '{full.names[arm]}'"
-            raise document.error(where, "this joint is none of a finger", expected=expected, got=joint)
+            raise document.error(
+                where, "this joint is none of a finger", expected=expected, got=joint
+            )
         moving = full.joints[number]
         low, high = (-np.inf, np.inf)
         if moving.nq == 1:
@@ -199,10 +224,21 @@ def described_gripper(
         for key, value in (("closed", finger.closed), ("open", finger.open)):
             if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK:
                 problem = "a finger outside its limits"
-                raise document.error((*where, key), problem, expected=f"between {low:g} and {high:g}", got=value)
+                raise document.error(
+                    (*where, key), problem, expected=f"between {low:g} and {high:g}", got=value
+                )
         if finger.closed == finger.open:
-            raise document.error(where, "a finger that does not move", expected="two positions, closed and open", got=finger.open)
-    moved = [name for name in rest if name in stated or (name in follows and follows[name].leader in stated)]
+            raise document.error(
+                where,
+                "a finger that does not move",
+                expected="two positions, closed and open",
+                got=finger.open,
+            )
+    moved = [
+        name
+        for name in rest
+        if name in stated or (name in follows and follows[name].leader in stated)
+    ]
     names = tuple(sorted(moved, key=full.getJointId))
     unlocked, shapes = unlocked_model(full, file, model, names, rest, height), pin.GeometryModel()
     for shape in _carried(list(collision.geometryObjects), model, unlocked):
@@ -210,7 +246,11 @@ def described_gripper(
 
     def at(position: str) -> Floats:
         own = {joint: float(getattr(finger, position)) for joint, finger in stated.items()}
-        own |= {name: led.factor * own[led.leader] + led.offset for name, led in follows.items() if led.leader in own}
+        own |= {
+            name: led.factor * own[led.leader] + led.offset
+            for name, led in follows.items()
+            if led.leader in own
+        }
         return np.array([own[name] for name in names])
 
     gripper = Gripper(

@@ -19,7 +19,8 @@ Riders = Sequence[tuple[int, pin.Inertia]]
 """What rides on an object: the joint of its model that carries it, and its inertia in the frame of that."""
 _GRIP = 0.1  # [m] about the size of a hand: it turns what it holds by forces so far apart
 _SINGULAR = 1e-9  # of a joint that the hand cannot move, relative
-_STILL = 1e-6  # [m/s] or [rad/s]: of a joint that rests, and [m] or [rad]: of one that is where it is held
+# [m/s] or [rad/s]: of a joint that rests, and [m] or [rad]: of one that is where it is held
+_STILL = 1e-6
 
 
 class Motion(NamedTuple):
@@ -47,7 +48,9 @@ class Handle:
         own, loaded = pin.Model(thing.model), pin.Model(thing.model)
         for joint, inertia in riders:
             loaded.inertias[joint] += inertia
-        own.gravity.linear = loaded.gravity.linear = self.placed.placement.rotation.T @ thing.model.gravity.linear
+        own.gravity.linear = loaded.gravity.linear = (
+            self.placed.placement.rotation.T @ thing.model.gravity.linear
+        )
         self._own, self._loaded = own, loaded
         self._frame = thing.link_frame(self.attachment.link)
         path = list(own.supports[own.frames[self._frame].parentJoint])
@@ -56,15 +59,29 @@ class Handle:
     def wrenches(self, motion: Motion) -> Floats:
         """Return the force and torque that the hand exerts at `point`, in the world's axes, shape (K, 6) [N], [N·m]."""
         thing, turn = self.placed.object, self.placed.placement.rotation
-        forces, z = self.forces(motion)[:, self._moved], self._rows(motion.positions, self.placed.state)
+        forces, z = (
+            self.forces(motion)[:, self._moved],
+            self._rows(motion.positions, self.placed.state),
+        )
         columns = [f"{self.name}.{name}" for name in self.attachment.coordinates]
-        values = np.column_stack([np.zeros((len(z), 0)), *(motion.positions[name] for name in columns)])
-        data, jacobians, links = self._own.createData(), np.empty((len(z), 6, self._own.nv)), list[pin.SE3]()
+        values = np.column_stack(
+            [np.zeros((len(z), 0)), *(motion.positions[name] for name in columns)]
+        )
+        data, jacobians, links = (
+            self._own.createData(),
+            np.empty((len(z), 6, self._own.nv)),
+            list[pin.SE3](),
+        )
         for k, q in enumerate(thing.coordinates.q(z)):
             pin.computeJointJacobians(self._own, data, q)
             links.append(pin.updateFramePlacement(self._own, data, self._frame).copy())
-            jacobians[k] = pin.getFrameJacobian(self._own, data, self._frame, pin.LOCAL_WORLD_ALIGNED).reshape(6, -1)
-        turns, origins = np.array([link.rotation for link in links]), np.array([link.translation for link in links])
+            jacobians[k] = pin.getFrameJacobian(
+                self._own, data, self._frame, pin.LOCAL_WORLD_ALIGNED
+            ).reshape(6, -1)
+        turns, origins = (
+            np.array([link.rotation for link in links]),
+            np.array([link.translation for link in links]),
+        )
         points, free = self._grasp(turns, origins, values)
         ways = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
         ways[..., :3] += np.cross(ways[..., 3:], (points - origins)[:, None])
@@ -90,7 +107,9 @@ class Handle:
             axis = rotation @ freedom.axis
             if freedom.kind == "revolute":
                 through = origin + rotation @ freedom.through
-                rotation = rotation @ np.array([pin.exp3(turn) for turn in np.outer(value, freedom.axis)])
+                rotation = rotation @ np.array(
+                    [pin.exp3(turn) for turn in np.outer(value, freedom.axis)]
+                )
                 origin = through - rotation @ freedom.through
                 axes.append((axis, through))
             else:
@@ -107,7 +126,10 @@ class Handle:
         """Return what must be applied to the object's joints, shape (K, joints) [N], [N·m]; springs carry its own weight."""
         thing = self.placed.object
         z = self._rows(motion.positions, self.placed.state)
-        v, a = (self._rows(part, np.zeros(len(self.placed.state))) for part in (motion.velocities, motion.accelerations))
+        v, a = (
+            self._rows(part, np.zeros(len(self.placed.state)))
+            for part in (motion.velocities, motion.accelerations)
+        )
         data, found = self._own.createData(), np.empty(z.shape)
         for k, q in enumerate(thing.coordinates.q(z)):
             carried = pin.computeGeneralizedGravity(self._own, data, q)
@@ -118,7 +140,9 @@ class Handle:
             if resistance is not None:
                 found[:, k] += resistance.force(z[:, k], np.where(rests, 0.0, v[:, k]))
             shut = np.abs(z[:, k] - held.get(name, np.inf)) <= _STILL
-            shut |= (z[:, k] <= thing.lower[k] + _STILL) & (found[:, k] > 0.0)  # its stop carries that, or its bolt
+            shut |= (z[:, k] <= thing.lower[k] + _STILL) & (
+                found[:, k] > 0.0
+            )  # its stop carries that, or its bolt
             shut |= (z[:, k] >= thing.upper[k] - _STILL) & (found[:, k] < 0.0)
             found[rests & shut & (np.abs(a[:, k]) <= _STILL), k] = 0.0
         return found
@@ -127,7 +151,10 @@ class Handle:
         """Return the coordinates of the object, shape (K, joints)."""
         size = len(next(iter(part.values())))
         names = self.placed.object.coordinates.names
-        columns = (part.get(f"{self.name}.{name}", np.full(size, value)) for name, value in zip(names, otherwise, strict=True))
+        columns = (
+            part.get(f"{self.name}.{name}", np.full(size, value))
+            for name, value in zip(names, otherwise, strict=True)
+        )
         return np.column_stack([np.zeros((size, 0)), *columns])
 
     def _bases(self, turns: Floats) -> Floats:
@@ -137,5 +164,7 @@ class Handle:
             turns: Of the link, shape (K, 3, 3).
         """
         if self.attachment.contact == "push":
-            return np.pad(turns @ self.attachment.placement.rotation[:, 2], ((0, 0), (0, 3)))[..., None]
+            return np.pad(turns @ self.attachment.placement.rotation[:, 2], ((0, 0), (0, 3)))[
+                ..., None
+            ]
         return np.tile(np.diag([1.0] * 3 + [_GRIP] * 3), (len(turns), 1, 1))

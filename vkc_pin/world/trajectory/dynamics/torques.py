@@ -20,7 +20,9 @@ from vkc_pin.world.trajectory.wheels import seen
 
 __all__ = ["Moments", "Torques", "in_base_axes", "moments_of"]
 
-_SHARES = np.array([0.0, 0.5, 1.0])  # of each cubic at which it is looked at: accelerations jump at both ends
+_SHARES = np.array(
+    [0.0, 0.5, 1.0]
+)  # of each cubic at which it is looked at: accelerations jump at both ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +31,8 @@ class Moments:
 
     Attributes:
         times: Shape (K,) [s].
-        pieces: Which cubic of the curve each belongs to, shape (K,); without a curve, which segment.
+        pieces: Which cubic of the curve each belongs to, shape (K,); without a curve, which
+            segment.
         positions, velocities, accelerations: Shape (K, n) each.
     """
 
@@ -44,7 +47,10 @@ def moments_of(curve: Curve) -> Moments:
     """Return the ends and the middle of every cubic of a curve, with its own accelerations at its ends."""
     spans, count = np.diff(curve.times), len(curve.times) - 1
     times = moments_at(curve.times, _SHARES)
-    begin, middle = curve.acceleration(curve.times[:-1]), curve.acceleration(curve.times[:-1] + 0.5 * spans)
+    begin, middle = (
+        curve.acceleration(curve.times[:-1]),
+        curve.acceleration(curve.times[:-1] + 0.5 * spans),
+    )
     accelerations = begin[:, None] + 2.0 * _SHARES[None, :, None] * (middle - begin)[:, None]
     return Moments(
         times,
@@ -66,9 +72,10 @@ class _Load:
 class Torques:
     """The torques of an arm in the phases of a motion, by recursive Newton-Euler on the robot's model.
 
-    What is in the hand, and what rides on that, is part of the hand. Where the hand moves joints of what stands fixed, it exerts
-    the least wrench that does so; see `Handle`. Friction and rotors of the arm's own joints are left out, as descriptions hardly
-    know them, and where a grasp leaves freedoms to what is carried, it is where it is in the middle of the phase.
+    What is in the hand, and what rides on that, is part of the hand. Where the hand moves joints of
+    what stands fixed, it exerts the least wrench that does so; see `Handle`. Friction and rotors of
+    the arm's own joints are left out, as descriptions hardly know them, and where a grasp leaves
+    freedoms to what is carried, it is where it is in the middle of the phase.
 
     Args:
         scene: Robot and objects.
@@ -76,13 +83,17 @@ class Torques:
         free: Its free objects, if somebody has them already.
     """
 
-    def __init__(self, scene: Scene, trajectory: Trajectory, free: FreeObjects | None = None) -> None:
+    def __init__(
+        self, scene: Scene, trajectory: Trajectory, free: FreeObjects | None = None
+    ) -> None:
         self.scene, self.trajectory = scene, trajectory
         self._free = FreeObjects(scene, trajectory) if free is None else free
         self.efforts: Efforts = scene.robot.efforts
         self._loads: dict[int, _Load] = {}
 
-    def at(self, phases: Ints, positions: Floats, velocities: Floats, accelerations: Floats) -> Floats:
+    def at(
+        self, phases: Ints, positions: Floats, velocities: Floats, accelerations: Floats
+    ) -> Floats:
         """Return the torques of the robot's coordinates, shape (K, robot's) [N·m], [N]; those of the base are 0.
 
         Args:
@@ -94,19 +105,27 @@ class Torques:
         found = np.zeros((len(positions), self.trajectory.robot_size))
         for number in np.unique(phases).tolist():
             rows = np.flatnonzero(phases == number)
-            found[rows] = self._in_phase(self._load(number), *(part[rows] for part in (positions, velocities, accelerations)))
+            found[rows] = self._in_phase(
+                self._load(number), *(part[rows] for part in (positions, velocities, accelerations))
+            )
         return found
 
     def along(self, times: Floats) -> Floats:
         """Return the torques of the robot's coordinates at times [s], shape (K,), within the motion: shape (K, robot's)."""
         trajectory = self.trajectory
-        steps = np.clip(np.searchsorted(trajectory.times, times, side="right") - 1, 0, len(trajectory.times) - 2)
-        motion = (read(times) for read in (trajectory.at, trajectory.velocity, trajectory.acceleration))
+        steps = np.clip(
+            np.searchsorted(trajectory.times, times, side="right") - 1, 0, len(trajectory.times) - 2
+        )
+        motion = (
+            read(times) for read in (trajectory.at, trajectory.velocity, trajectory.acceleration)
+        )
         return self.at(self.phases_of(steps), *motion)
 
     def phases_of(self, waypoints: Ints) -> Ints:
         """Return the phases of the steps after some waypoints."""
-        return np.searchsorted([phase.last for phase in self.trajectory.phases[:-1]], waypoints, side="right")
+        return np.searchsorted(
+            [phase.last for phase in self.trajectory.phases[:-1]], waypoints, side="right"
+        )
 
     @cached_property
     def weightless(self) -> tuple[str, ...]:
@@ -116,19 +135,29 @@ class Torques:
         things = {name: self.scene.objects[name].object for name in carried}
         return tuple(name for name, thing in things.items() if thing.free and not thing.mass > 0.0)
 
-    def _in_phase(self, load: _Load, positions: Floats, velocities: Floats, accelerations: Floats) -> Floats:
+    def _in_phase(
+        self, load: _Load, positions: Floats, velocities: Floats, accelerations: Floats
+    ) -> Floats:
         robot, size = self.scene.robot, self.trajectory.robot_size
         v, a = in_base_axes(positions[:, 2], velocities[:, :size], accelerations[:, :size])
         data, found = load.model.createData(), np.empty((len(positions), size))
         configurations = robot.coordinates.q(positions[:, :size])
         for k, q in enumerate(configurations):
             found[k] = pin.rnea(load.model, data, q, v[k], a[k])
-        parts = (dict(zip(self.trajectory.names, part.T, strict=True)) for part in (positions, velocities, accelerations))
+        parts = (
+            dict(zip(self.trajectory.names, part.T, strict=True))
+            for part in (positions, velocities, accelerations)
+        )
         motion, frame = Motion(*parts), load.model.getFrameId(robot.tool_frame)
         for handle in load.handles:
-            jacobians, turns = np.empty((len(positions), 6, load.model.nv)), np.empty((len(positions), 3, 3))
+            jacobians, turns = (
+                np.empty((len(positions), 6, load.model.nv)),
+                np.empty((len(positions), 3, 3)),
+            )
             for k, q in enumerate(configurations):
-                jacobians[k] = pin.computeFrameJacobian(load.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+                jacobians[k] = pin.computeFrameJacobian(
+                    load.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED
+                )
                 turns[k] = data.oMf[frame].rotation
             wrenches = handle.wrenches(motion)
             wrenches[:, 3:] += np.cross(turns @ handle.point.translation, wrenches[:, :3])
@@ -146,22 +175,37 @@ class Torques:
             if self._free.names:
                 self._carry(number, model, riders)
             moved = [hold for hold in fixed if objects[hold.object].object.coordinates.size]
-            self._loads[number] = _Load(model, tuple(Handle(self.scene, hold, riders[hold.object]) for hold in moved))
+            self._loads[number] = _Load(
+                model, tuple(Handle(self.scene, hold, riders[hold.object]) for hold in moved)
+            )
         return self._loads[number]
 
-    def _carry(self, number: int, model: pin.Model, riders: dict[str, list[tuple[int, pin.Inertia]]]) -> None:
+    def _carry(
+        self, number: int, model: pin.Model, riders: dict[str, list[tuple[int, pin.Inertia]]]
+    ) -> None:
         """Add what is carried in a phase to the hand, and what rides on objects that stand fixed to those."""
-        phase, rides, objects = self.trajectory.phases[number], self._free.rides[number], self.scene.objects
+        phase, rides, objects = (
+            self.trajectory.phases[number],
+            self._free.rides[number],
+            self.scene.objects,
+        )
         middle = self.trajectory.times[[phase.first, phase.last]].mean(keepdims=True)
         carried = [hold.object for hold in phase.holds if objects[hold.object].object.free]
         if not (carried or rides):
             return
         where, (row,) = self._free.at(middle), self.trajectory.at(middle)
-        data, values = model.createData(), dict(zip(self.trajectory.names, row.tolist(), strict=True))
-        pin.forwardKinematics(model, data, self.scene.robot.coordinates.q(row[: self.trajectory.robot_size]))
+        data, values = (
+            model.createData(),
+            dict(zip(self.trajectory.names, row.tolist(), strict=True)),
+        )
+        pin.forwardKinematics(
+            model, data, self.scene.robot.coordinates.q(row[: self.trajectory.robot_size])
+        )
         hand = model.frames[model.getFrameId(self.scene.robot.tool_frame)].parentJoint
         for name in (*carried, *rides):
-            body = pin.XYZQUATToSE3(where[name][0]).act(_whole(objects[name].object, objects[name].state))
+            body = pin.XYZQUATToSE3(where[name][0]).act(
+                _whole(objects[name].object, objects[name].state)
+            )
             owner, _, link = rides.get(name, "").partition(".")
             if name in carried or owner in carried:
                 model.inertias[hand] += data.oMi[hand].actInv(body)
@@ -179,13 +223,17 @@ def _whole(thing: ArticulatedObject, state: Floats) -> pin.Inertia:
     """Return the inertia of all links of an object in its base link's frame, its joints at `state`, shape (n,)."""
     data = thing.model.createData()
     pin.forwardKinematics(thing.model, data, thing.coordinates.q(state))
-    return sum((data.oMi[j].act(inertia) for j, inertia in enumerate(thing.model.inertias)), pin.Inertia.Zero())
+    return sum(
+        (data.oMi[j].act(inertia) for j, inertia in enumerate(thing.model.inertias)),
+        pin.Inertia.Zero(),
+    )
 
 
 def in_base_axes(yaws: Floats, velocities: Floats, accelerations: Floats) -> tuple[Floats, Floats]:
     """Return velocities and accelerations of the base in the world, shape (K, n), as those of Pinocchio's planar joint.
 
-    Its velocity is that in its own axes, which turn; its acceleration is the derivative of these numbers.
+    Its velocity is that in its own axes, which turn; its acceleration is the derivative of these
+    numbers.
     """
     v, a = velocities.copy(), accelerations.copy()
     for rows in (v, a):

@@ -23,7 +23,15 @@ from vkc_pin.world.files.fields import Schema, fail
 from vkc_pin.world.files.resources import folder
 from vkc_pin.world.files.writing import write_atomically
 
-__all__ = ["FORMAT", "METRICS", "STATUSES", "folder_from_data", "folder_to_data", "read_archive", "write_archive"]
+__all__ = [
+    "FORMAT",
+    "METRICS",
+    "STATUSES",
+    "folder_from_data",
+    "folder_to_data",
+    "read_archive",
+    "write_archive",
+]
 
 FORMAT = 1
 LARGEST_ARCHIVE, LARGEST_MEMBER = 20_000_000, 40_000_000
@@ -34,20 +42,67 @@ CURVE = {"knot_times": ("f", 1), "knot_positions": ("f", 2), "knot_rates": ("f",
 """Parts that it has as well if the motion has a curve."""
 _PARTS = ARRAYS | CURVE
 STATUSES = (
-    *("success", "infeasible", "not converged", "time limit", "effort spent", "interrupted", "rejected"),
-    *("no base pose", "no base path", "arm does not reach", "no inverse kinematics", "collision", "too fast", "closure"),
+    *(
+        "success",
+        "infeasible",
+        "not converged",
+        "time limit",
+        "effort spent",
+        "interrupted",
+        "rejected",
+    ),
+    *(
+        "no base pose",
+        "no base path",
+        "arm does not reach",
+        "no inverse kinematics",
+        "collision",
+        "too fast",
+        "closure",
+    ),
 )
 """What plans end with; those in the second line are the baselines'."""
 METRICS = (
-    *("planning_time", "build_time", "base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "duration"),
-    *("iterations", "rounds", "effort", "time_initialization", "time_coal", "time_casadi", "time_ipopt", "time_validation"),
+    *(
+        "planning_time",
+        "build_time",
+        "base_effort",
+        "base_effort_l1",
+        "arm_effort",
+        "clearance",
+        "closure_error",
+        "duration",
+    ),
+    *(
+        "iterations",
+        "rounds",
+        "effort",
+        "time_initialization",
+        "time_coal",
+        "time_casadi",
+        "time_ipopt",
+        "time_validation",
+    ),
     *("time_retiming", "torque"),
 )
 """What every plan is measured by; baselines have more."""
 
 _DAMAGED = (
-    *(zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError),  # a zip archive that is none, or encrypted
-    *(ValueError, SyntaxError, TypeError, LookupError, OverflowError, MemoryError),  # an array that is none
+    *(
+        zipfile.BadZipFile,
+        zlib.error,
+        OSError,
+        EOFError,
+        RuntimeError,
+    ),  # a zip archive that is none, or encrypted
+    *(
+        ValueError,
+        SyntaxError,
+        TypeError,
+        LookupError,
+        OverflowError,
+        MemoryError,
+    ),  # an array that is none
 )
 
 Text = Annotated[str, Field(strict=True)]
@@ -117,7 +172,8 @@ class _Others(BaseModel):
 
 _LATER = ("effort", "time_retiming", "torque")  # older files do not have it
 _kinds: dict[str, Any] = {
-    name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...) for name in METRICS
+    name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...)
+    for name in METRICS
 }
 _Metrics = create_model("_Metrics", __base__=_Others, **_kinds)
 
@@ -175,7 +231,9 @@ def write_archive(file: str | Path, about: Mapping[str, Any]) -> Path:
     """
     motion = dict(about["trajectory"])
     arrays = {name: np.array(motion.pop(name), float) for name in ("times", "positions")}
-    arrays |= {f"knot_{name}": np.array(values, float) for name, values in motion.pop("curve", {}).items()}
+    arrays |= {
+        f"knot_{name}": np.array(values, float) for name, values in motion.pop("curve", {}).items()
+    }
     buffer, text = io.BytesIO(), json.dumps({"format": FORMAT, **about, "trajectory": motion})
     np.savez_compressed(buffer, allow_pickle=False, about=np.array(text), **arrays)
     return write_atomically(file, buffer.getvalue())
@@ -187,7 +245,8 @@ def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Nothing is unpacked before its size is known, and there are no pickles in it.
 
     Raises:
-        InputError: The file cannot be read, is no saved plan, is larger than one can be, or something in it does not fit.
+        InputError: The file cannot be read, is no saved plan, is larger than one can be, or
+            something in it does not fit.
     """
     data = read_bytes(file, "plan", LARGEST_ARCHIVE)
     try:
@@ -196,19 +255,32 @@ def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             names = sorted(name.removesuffix(".npy") for name in archive.namelist())
             if names not in (sorted(ARRAYS), sorted(_PARTS)):
-                raise ValueError(f"its parts are {', '.join(names) or 'none'}, not {', '.join(sorted(ARRAYS))}")
-            arrays = {info.filename.removesuffix(".npy"): _array(archive, info) for info in archive.infolist()}
+                raise ValueError(
+                    f"its parts are {', '.join(names) or 'none'}, not {', '.join(sorted(ARRAYS))}"
+                )
+            arrays = {
+                info.filename.removesuffix(".npy"): _array(archive, info)
+                for info in archive.infolist()
+            }
     except _DAMAGED as error:
-        raise InputError("not a saved plan", file=file, expected="a file written by Plan.save", got=error) from error
+        raise InputError(
+            "not a saved plan", file=file, expected="a file written by Plan.save", got=error
+        ) from error
     text = str(arrays.pop("about"))
     if text.count(",") > MOST_FIELDS:
-        raise InputError("the description has too many fields", file=file, expected=f"at most {MOST_FIELDS}")
+        raise InputError(
+            "the description has too many fields", file=file, expected=f"at most {MOST_FIELDS}"
+        )
     about = parse_json(text, file)
     if isinstance(about, dict) and about.get("format") != FORMAT:
-        raise InputError("unknown format", file=file, field="format", expected=FORMAT, got=about.get("format"))
+        raise InputError(
+            "unknown format", file=file, field="format", expected=FORMAT, got=about.get("format")
+        )
     found: dict[str, Any] = {name: finite(array, name, file) for name, array in arrays.items()}
     knots = {name.removeprefix("knot_"): found.pop(name) for name in CURVE if name in found}
-    return check(Document(about, file), _About).model_dump(), found | ({"curve": knots} if knots else {})
+    return check(Document(about, file), _About).model_dump(), found | (
+        {"curve": knots} if knots else {}
+    )
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
@@ -222,13 +294,24 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
     if (size := stream.getbuffer().nbytes) > LARGEST_MEMBER:
         raise ValueError(f"{name} is larger than {LARGEST_MEMBER:g} bytes")
     major, _ = np.lib.format.read_magic(stream)
-    header = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    header = (
+        np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    )
     shape, columns, dtype = header(stream)
     begin = stream.tell()
-    if dtype.kind != kind or len(shape) != axes or math.prod(shape) * dtype.itemsize != size - begin or size == begin:
+    if (
+        dtype.kind != kind
+        or len(shape) != axes
+        or math.prod(shape) * dtype.itemsize != size - begin
+        or size == begin
+    ):
         raise ValueError(f"{name} is an array of {dtype} and shape {shape} in {size - begin} bytes")
     values = np.frombuffer(stream.getbuffer(), dtype, offset=begin)
-    return values[0] if kind == "U" else values.reshape(shape, order="F" if columns else "C").astype(float)
+    return (
+        values[0]
+        if kind == "U"
+        else values.reshape(shape, order="F" if columns else "C").astype(float)
+    )
 
 
 def folder_to_data(scene_folder: Path, plan: Path) -> dict[str, str]:

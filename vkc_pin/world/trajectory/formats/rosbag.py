@@ -1,6 +1,7 @@
 """Motions as recordings of ROS 2 (rosbag2): trajectories of arm and base, the path of the base, and what objects do.
 
-A motion is plain data here, of the shape that `Trajectory.to_dict` returns; messages are made of what `ros.to_ros` returns.
+A motion is plain data here, of the shape that `Trajectory.to_dict` returns; messages are made of
+what `ros.to_ros` returns.
 """
 
 from __future__ import annotations
@@ -48,25 +49,27 @@ def write_rosbag(
 ) -> Path:
     """Write a motion as a recording of ROS 2: a folder with metadata.yaml and a database; return its path.
 
-    Trajectories and the path are one message each, at the recording's begin. Velocities of the base, in its own frame, and joint
-    states of objects follow one another at a rate; "phases" says as JSON, where each begins, what is held from then on, and how
-    far the gripper is open. Topics about what the motion does not have (an arm, objects) are left out.
+    Trajectories and the path are one message each, at the recording's begin. Velocities of the
+    base, in its own frame, and joint states of objects follow one another at a rate; "phases" says
+    as JSON, where each begins, what is held from then on, and how far the gripper is open. Topics
+    about what the motion does not have (an arm, objects) are left out.
 
     Args:
         motion: What to write.
         path: The folder to make.
-        rate: Points a second of the trajectories and of the path [Hz]; see `to_ros`. None: the knots of the curve, or else the
-            waypoints.
+        rate: Points a second of the trajectories and of the path [Hz]; see `to_ros`. None: the
+            knots of the curve, or else the waypoints.
         states: Velocities of the base and states of objects a second [Hz]; see `to_ros`, too.
         namespace: What the topics' names begin with.
         frame: `header.frame_id`, the frame of the base's coordinates.
         base_frame: The same of the base's velocities.
-        stamp: `header.stamp` of the trajectories [s]; in ROS, zero means at once. The recording begins then.
+        stamp: `header.stamp` of the trajectories [s]; in ROS, zero means at once. The recording
+            begins then.
         force: Replace a folder that is there.
 
     Raises:
-        InputError: The package `rosbags` is not installed, the folder cannot be made or is there already, `namespace` is no
-            name of topics, or a rate or `stamp` is out of range.
+        InputError: The package `rosbags` is not installed, the folder cannot be made or is there
+            already, `namespace` is no name of topics, or a rate or `stamp` is out of range.
     """
     bag_library()
     from rosbags.rosbag2 import Writer
@@ -76,13 +79,18 @@ def write_rosbag(
     begin = _namespace(namespace)
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
     own = text(base_frame, "base_frame")
-    messages = _messages(motion, store.types, rate, states, frame=frame, base_frame=own, stamp=stamp)
+    messages = _messages(
+        motion, store.types, rate, states, frame=frame, base_frame=own, stamp=stamp
+    )
     found = sorted(messages, key=lambda item: item[1])
     with folder_at_once(path, force=force) as staging:
         inside = staging / Path(path).absolute().name  # which the database is named after
         with Writer(inside, version=_FORMAT) as writer:
             ends = [end for end in TOPICS if any(end == own for own, _, _ in found)]
-            topics = {end: writer.add_connection(f"{begin}/{end}", TOPICS[end], typestore=store) for end in ends}
+            topics = {
+                end: writer.add_connection(f"{begin}/{end}", TOPICS[end], typestore=store)
+                for end in ends
+            }
             for end, when, message in found:
                 writer.write(topics[end], when, bytes(store.serialize_cdr(message, TOPICS[end])))
         for file in inside.iterdir():
@@ -103,12 +111,24 @@ def bag_library() -> Any:
 def _namespace(name: str) -> str:
     parts = text(name, "namespace").strip("/").split("/") if name != "" else [""]
     if parts != [""] and not all(part.isascii() and part.isidentifier() for part in parts):
-        raise InputError("no name of topics", field="namespace", expected="words with slashes between, e.g. /vkc", got=name)
+        raise InputError(
+            "no name of topics",
+            field="namespace",
+            expected="words with slashes between, e.g. /vkc",
+            got=name,
+        )
     return "".join(f"/{part}" for part in parts if part)
 
 
 def _messages(
-    motion: Mapping[str, Any], types: Any, rate: float | None, states: float, *, frame: str, base_frame: str, stamp: float
+    motion: Mapping[str, Any],
+    types: Any,
+    rate: float | None,
+    states: float,
+    *,
+    frame: str,
+    base_frame: str,
+    stamp: float,
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield every message, with the end of its topic's name and when it is recorded [ns]."""
     base = to_ros(motion, joints="base", rate=rate, frame=frame, stamp=stamp)
@@ -119,7 +139,10 @@ def _messages(
             yield end, begin, _trajectory(types, found)
     header, stamped = types["std_msgs/msg/Header"], types["geometry_msgs/msg/PoseStamped"]
     poses = [
-        stamped(header(_time(types, begin + _nanoseconds(p["time_from_start"])), frame), _pose(types, p)) for p in base["points"]
+        stamped(
+            header(_time(types, begin + _nanoseconds(p["time_from_start"])), frame), _pose(types, p)
+        )
+        for p in base["points"]
     ]
     yield "base/path", begin, types["nav_msgs/msg/Path"](header(_time(types, begin), frame), poses)
     for point in to_ros(motion, joints="base", rate=states, derivatives=1)["points"]:
@@ -129,7 +152,9 @@ def _messages(
     for point in objects["points"] if objects["joint_names"] else ():
         when = begin + _nanoseconds(point["time_from_start"])
         values = (np.array(point[key], float) for key in ("positions", "velocities", "effort"))
-        state = types["sensor_msgs/msg/JointState"](header(_time(types, when), frame), objects["joint_names"], *values)
+        state = types["sensor_msgs/msg/JointState"](
+            header(_time(types, when), frame), objects["joint_names"], *values
+        )
         yield "objects/joint_states", when, state
     for phase in motion["phases"]:
         when = begin + round((motion["times"][phase["first"]] - motion["times"][0]) * _NANO)
@@ -141,9 +166,12 @@ def _trajectory(types: Any, found: Mapping[str, Any]) -> Any:
     kind = types["trajectory_msgs/msg/JointTrajectoryPoint"]
     keys = ("positions", "velocities", "accelerations", "effort")
     points = [
-        kind(*(np.array(point[key], float) for key in keys), duration(**point["time_from_start"])) for point in found["points"]
+        kind(*(np.array(point[key], float) for key in keys), duration(**point["time_from_start"]))
+        for point in found["points"]
     ]
-    named = types["std_msgs/msg/Header"](_time(types, _nanoseconds(header["stamp"])), header["frame_id"])
+    named = types["std_msgs/msg/Header"](
+        _time(types, _nanoseconds(header["stamp"])), header["frame_id"]
+    )
     return types["trajectory_msgs/msg/JointTrajectory"](named, found["joint_names"], points)
 
 
@@ -155,7 +183,11 @@ def _pose(types: Any, point: Mapping[str, Any]) -> Any:
 
 def _twist(types: Any, point: Mapping[str, Any], header: Any) -> Any:
     """Return a velocity of the base in its own frame."""
-    (vx, vy, turning), yaw, vector = point["velocities"], point["positions"][2], types["geometry_msgs/msg/Vector3"]
+    (vx, vy, turning), yaw, vector = (
+        point["velocities"],
+        point["positions"][2],
+        types["geometry_msgs/msg/Vector3"],
+    )
     ahead, aside = math.cos(yaw) * vx + math.sin(yaw) * vy, math.cos(yaw) * vy - math.sin(yaw) * vx
     twist = types["geometry_msgs/msg/Twist"](vector(ahead, aside, 0.0), vector(0.0, 0.0, turning))
     return types["geometry_msgs/msg/TwistStamped"](header, twist)

@@ -1,7 +1,7 @@
 """Motions as tables (CSV) and as JSON, for other programs, and back.
 
-A motion is plain data here, of the shape that `Trajectory.to_dict` returns. Times are seconds, positions metres and radians; the
-base is three coordinates, x, y and yaw in the world frame.
+A motion is plain data here, of the shape that `Trajectory.to_dict` returns. Times are seconds,
+positions metres and radians; the base is three coordinates, x, y and yaw in the world frame.
 """
 
 from __future__ import annotations
@@ -42,23 +42,32 @@ LARGEST_MOTION = 20_000_000
 """Largest file that a motion is read from [bytes]: some 30 000 waypoints of 25 coordinates."""
 MOST_LINES, MOST_COLUMNS = 200_000, 1000
 """Most lines and columns of a table."""
-_TIME, _PHASES = "time", ("phase", "phase_name", "held")  # the first column of a table, and the last ones
+_TIME, _PHASES = (
+    "time",
+    ("phase", "phase_name", "held"),
+)  # the first column of a table, and the last ones
 _RATE, _WAYPOINT = " velocity", "waypoint"  # of the columns of a curve
 _OPENING = "opening"  # after these, where a gripper opens
 
 
 def write_csv(
-    motion: Mapping[str, Any], path: str | Path, *, joints: str | Sequence[str] = "all", units: Mapping[str, str] | None = None
+    motion: Mapping[str, Any],
+    path: str | Path,
+    *,
+    joints: str | Sequence[str] = "all",
+    units: Mapping[str, str] | None = None,
 ) -> Path:
     """Write a table, a line a waypoint, whole or not at all; return the path.
 
-    The first line names the columns, with units in brackets where they are known: `time [s]`, `base_x [m]`, `base_y [m]`,
-    `base_yaw [rad]`, the arm's joints, the objects' joints, then `phase` (counted from 1), `phase_name` and `held`, as JSON, and
-    `opening [m]` of the gripper if a phase says what it is, empty where it rests. A waypoint between two phases is in the earlier
+    The first line names the columns, with units in brackets where they are known: `time [s]`,
+    `base_x [m]`, `base_y [m]`, `base_yaw [rad]`, the arm's joints, the objects' joints, then
+    `phase` (counted from 1), `phase_name` and `held`, as JSON, and `opening [m]` of the gripper if
+    a phase says what it is, empty where it rests. A waypoint between two phases is in the earlier
     one. Numbers have as many digits as it takes to read back the very same.
 
-    A motion that has a curve has a line a knot, with the same coordinates' velocities, `base_x velocity [m/s]` and so on, after
-    their positions, and then `waypoint`, 1 for a knot that is one and 0 for the others.
+    A motion that has a curve has a line a knot, with the same coordinates' velocities, `base_x
+    velocity [m/s]` and so on, after their positions, and then `waypoint`, 1 for a knot that is one
+    and 0 for the others.
 
     Args:
         motion: What to write.
@@ -72,29 +81,51 @@ def write_csv(
     columns, phases = chosen_columns(motion, joints), motion["phases"]
     x, y, yaw = motion["names"][:3]
     known = {x: "m", y: "m", yaw: "rad"}
-    for name, unit in mapping({} if units is None else units, "units", "names of coordinates, each with its unit").items():
+    for name, unit in mapping(
+        {} if units is None else units, "units", "names of coordinates, each with its unit"
+    ).items():
         known[name] = text(unit, f"units[{name!r}]")
     lines: list[str] = []
-    table = csv.writer(SimpleNamespace(write=lines.append))  # its lines end with "\r\n", so it puts either of them in quotes
+    table = csv.writer(
+        SimpleNamespace(write=lines.append)
+    )  # its lines end with "\r\n", so it puts either of them in quotes
     names = [motion["names"][k] for k in columns]
     opens = [f"{_OPENING} [m]"] if any(phase.get(_OPENING) is not None for phase in phases) else []
     named = [f"{name} [{known[name]}]" if name in known else name for name in names]
     curve = motion.get("curve")
     if curve is not None:
-        named += [f"{name}{_RATE} [{known[name]}/s]" if name in known else name + _RATE for name in names] + [_WAYPOINT]
+        named += [
+            f"{name}{_RATE} [{known[name]}/s]" if name in known else name + _RATE for name in names
+        ] + [_WAYPOINT]
     table.writerow([f"{_TIME} [s]", *named, *_PHASES, *opens])
     number = 0
     for moment, waypoint, row, told in _written(motion, columns):
         number += waypoint > phases[number]["last"]
         phase = phases[number]
-        held = {name: [at, phase["by"][name]] if name in phase["by"] else at for name, at in phase["held"].items()}
+        held = {
+            name: [at, phase["by"][name]] if name in phase["by"] else at
+            for name, at in phase["held"].items()
+        }
         values = [*(repr(float(value)) for value in row), *told]
         opening = "" if phase.get(_OPENING) is None else repr(float(phase[_OPENING]))
-        table.writerow([repr(float(moment)), *values, number + 1, phase["name"], json.dumps(held), *([opening] if opens else [])])
-    return write_atomically(path, "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode("utf-8"))
+        table.writerow(
+            [
+                repr(float(moment)),
+                *values,
+                number + 1,
+                phase["name"],
+                json.dumps(held),
+                *([opening] if opens else []),
+            ]
+        )
+    return write_atomically(
+        path, "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode("utf-8")
+    )
 
 
-def _written(motion: Mapping[str, Any], columns: Sequence[int]) -> Iterator[tuple[float, int, list[float], list[str]]]:
+def _written(
+    motion: Mapping[str, Any], columns: Sequence[int]
+) -> Iterator[tuple[float, int, list[float], list[str]]]:
     """Yield the time of every line, its waypoint or the next, its numbers, and whether it is a waypoint, if that is told."""
     curve = motion.get("curve")
     if curve is None:
@@ -104,7 +135,12 @@ def _written(motion: Mapping[str, Any], columns: Sequence[int]) -> Iterator[tupl
     next_one = 0
     for moment, row, rates in zip(curve["times"], curve["positions"], curve["rates"], strict=True):
         is_one = moment == motion["times"][next_one]
-        yield moment, next_one, [values[column] for values in (row, rates) for column in columns], [str(int(is_one))]
+        yield (
+            moment,
+            next_one,
+            [values[column] for values in (row, rates) for column in columns],
+            [str(int(is_one))],
+        )
         next_one = min(next_one + is_one, len(motion["times"]) - 1)
 
 
@@ -112,11 +148,14 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
     """Return the motion in a table: what `write_csv` wrote with all of the robot's coordinates in it, or one like it.
 
     Args:
-        path: The file. Without the columns `phase`, `phase_name` and `held`, all of it is one phase in which nothing is held.
-        robot_size: How many of the coordinates are the robot's; None: those before the first with a dot in its name.
+        path: The file. Without the columns `phase`, `phase_name` and `held`, all of it is one phase
+            in which nothing is held.
+        robot_size: How many of the coordinates are the robot's; None: those before the first with a
+            dot in its name.
 
     Raises:
-        InputError: The file is missing, or something in it does not fit; the error names line and column.
+        InputError: The file is missing, or something in it does not fit; the error names line and
+            column.
     """
     path = file_path(path, "path")
     table = read_text(path, "CSV", LARGEST_MOTION)
@@ -125,13 +164,24 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
     lines = _lines(table, path)
     header = next(lines, (0, []))[1]
     if len(header) > MOST_COLUMNS:
-        raise InputError("too many columns", file=path, line=1, expected=f"at most {MOST_COLUMNS}", got=len(header))
+        raise InputError(
+            "too many columns",
+            file=path,
+            line=1,
+            expected=f"at most {MOST_COLUMNS}",
+            got=len(header),
+        )
     header = [re.sub(r" \[(s|m|rad|m/s|rad/s)\]$", "", name) for name in header]
     if not header:
         raise InputError("an empty file", file=path, expected="a table with a line of names")
     if header[0] != _TIME:
         raise InputError(
-            "not a table of waypoints", file=path, line=1, field="first column", expected=_TIME, got=shown(header[0])
+            "not a table of waypoints",
+            file=path,
+            line=1,
+            field="first column",
+            expected=_TIME,
+            got=shown(header[0]),
         )
     opens = tuple(header[-4:]) == (*_PHASES, _OPENING)
     told = opens or tuple(header[-3:]) == _PHASES
@@ -142,7 +192,13 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         names, rates = names[:half], names[half:-1]
         if rates != [name + _RATE for name in names]:
             expected = ", ".join(name + _RATE for name in names)
-            raise InputError("not the velocities of its coordinates", file=path, line=1, expected=expected, got=", ".join(rates))
+            raise InputError(
+                "not the velocities of its coordinates",
+                file=path,
+                line=1,
+                expected=expected,
+                got=", ".join(rates),
+            )
     rows: list[list[float]] = []
     knots: list[list[float]] = []
     phases: list[dict[str, Any]] = []
@@ -150,8 +206,17 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         if not cells:
             continue
         if len(cells) != len(header):
-            raise InputError("wrong number of columns", file=path, line=number, expected=len(header), got=len(cells))
-        row = [_number(cell, path, number, name) for cell, name in zip(cells[:last], header, strict=False)]
+            raise InputError(
+                "wrong number of columns",
+                file=path,
+                line=number,
+                expected=len(header),
+                got=len(cells),
+            )
+        row = [
+            _number(cell, path, number, name)
+            for cell, name in zip(cells[:last], header, strict=False)
+        ]
         if curved:
             knots.append(row)
             if not row[-1]:
@@ -173,7 +238,9 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         "names": names,
         "times": [row[0] for row in rows],
         "positions": [row[1:] for row in rows],
-        "robot_size": size_of_robot(names) if robot_size is None else whole(robot_size, "robot_size", low=3),
+        "robot_size": size_of_robot(names)
+        if robot_size is None
+        else whole(robot_size, "robot_size", low=3),
         "phases": phases,
     }
 
@@ -187,7 +254,8 @@ def read_json(path: str | Path) -> Any:
     """Return what a JSON file holds.
 
     Raises:
-        InputError: The file is missing, is no JSON, or is larger than a motion can be; the error names the line.
+        InputError: The file is missing, is no JSON, or is larger than a motion can be; the error
+            names the line.
     """
     path = file_path(path, "path")
     return parse_json(read_text(path, "JSON", LARGEST_MOTION), path)
@@ -201,14 +269,25 @@ def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> li
         InputError: There is no name, or one occurs twice.
     """
     known, robot, size = motion["names"], motion["robot_size"], len(motion["names"])
-    groups = {"all": (0, size), "robot": (0, robot), "base": (0, 3), "arm": (3, robot), "objects": (robot, size)}
+    groups = {
+        "all": (0, size),
+        "robot": (0, robot),
+        "base": (0, 3),
+        "arm": (3, robot),
+        "objects": (robot, size),
+    }
     if isinstance(joints, str):
         if joints not in groups:
             raise UnknownNameError("group of joints", joints, GROUPS, field="joints")
         return list(range(*groups[joints]))
     names = items(joints, "joints", f"one of {', '.join(GROUPS)}, or a list of names", str)
     if not names:
-        raise InputError("no joints", field="joints", expected=f"one of {', '.join(GROUPS)}, or at least one name", got="none")
+        raise InputError(
+            "no joints",
+            field="joints",
+            expected=f"one of {', '.join(GROUPS)}, or at least one name",
+            got="none",
+        )
     for k, name in enumerate(names):
         if name not in known:
             raise UnknownNameError("coordinate", name, known, field=f"joints[{k}]")
@@ -243,27 +322,52 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError("not a number", file=path, line=line, field=column, expected="a finite number", got=shown(cell))
+        raise InputError(
+            "not a number",
+            file=path,
+            line=line,
+            field=column,
+            expected="a finite number",
+            got=shown(cell),
+        )
     return value
 
 
 def _add_phase(
-    phases: list[dict[str, Any]], cells: Sequence[str], opening: float | None, row: int, path: Path, line: int
+    phases: list[dict[str, Any]],
+    cells: Sequence[str],
+    opening: float | None,
+    row: int,
+    path: Path,
+    line: int,
 ) -> None:
     """Take the last cells of a line: the phase's number, its name, what is held in it, and the gripper's opening [m]."""
     number, name, held = cells
     expected = f"{len(phases)} or {len(phases) + 1}" if phases else "1"
     if number not in expected.split(" or "):
-        raise InputError("not the next phase", file=path, line=line, field="phase", expected=expected, got=shown(number))
+        raise InputError(
+            "not the next phase",
+            file=path,
+            line=line,
+            field="phase",
+            expected=expected,
+            got=shown(number),
+        )
     if int(number) == len(phases):
         phases[-1]["last"] = row
         return
     try:
         found = json.loads(held)
-        at = {thing: where if isinstance(where, str) else where[0] for thing, where in found.items()}
+        at = {
+            thing: where if isinstance(where, str) else where[0] for thing, where in found.items()
+        }
         by = {thing: where[1] for thing, where in found.items() if not isinstance(where, str)}
     except (ValueError, AttributeError, TypeError, LookupError, RecursionError):
         wanted = 'JSON such as {"door": "handle"}'
-        raise InputError("not what is held", file=path, line=line, field="held", expected=wanted, got=shown(held)) from None
+        raise InputError(
+            "not what is held", file=path, line=line, field="held", expected=wanted, got=shown(held)
+        ) from None
     stands = {} if opening is None else {_OPENING: opening}
-    phases.append({"name": name, "first": max(row - 1, 0), "last": row, "held": at, "by": by, **stands})
+    phases.append(
+        {"name": name, "first": max(row - 1, 0), "last": row, "held": at, "by": by, **stands}
+    )

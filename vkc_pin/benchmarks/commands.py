@@ -34,7 +34,7 @@ def add_bench(commands: Any) -> None:
     door.add_argument("--quiet", action="store_true", help="no progress bar")
     door.set_defaults(run=_bench_door)
 
-    about = "Compare initialisations of the trajectory in three scenes, from the same random starts, and plan step after step too."
+    about = "Compare initialization methods in three scenes from the same random starts, and planning step by step."
     shown = "methods of initialising, at a task with a tool"
     initialization = _add_experiment(benches, "initialization", shown, about, "--starts")
     about = "trials per start and method (default 1)"
@@ -142,7 +142,7 @@ def add_bench(commands: Any) -> None:
     choices = "names of example-robot-data, paths of URDF, xacro and MJCF files (default: all arms and mobile manipulators there)"
     _add_choice(robots, "robots", choices)
 
-    about = "Plan the experiments' tasks from random starts, execute the plans in MuJoCo, and say how often they do what they say."
+    about = "Plan the tasks of the experiments from random starts and execute the plans in MuJoCo."
     shown = "plans executed in physics (needs the extra `sim`)"
     execution = _add_experiment(benches, "execution", shown, about, default=10, jobs=1)
     execution.set_defaults(benchmark="executing.execution")

@@ -1,4 +1,4 @@
-"""What the hand does by the rules of `world.scene.contact_rules`, and which pairs may be close, and when: found in the motion itself."""
+"""Finds in a trajectory which pairs may be close and when, by the rules of `world.scene.contact_rules`."""
 
 from __future__ import annotations
 

@@ -181,7 +181,10 @@ def test_a_robot_without_a_hand_opens_nothing() -> None:
 
 
 def test_what_the_arm_does_not_get_to_is_out_of_reach(husky: vkc.Robot, tmp_path: Path) -> None:
-    foot = '<link name="frame"><collision><origin xyz="0 0 0.1"/><geometry><box size="0.2 0.2 0.2"/></geometry></collision></link>'
+    foot = (
+        '<link name="frame"><collision><origin xyz="0 0 0.1"/>'
+        '<geometry><box size="0.2 0.2 0.2"/></geometry></collision></link>'
+    )
     bar = '<link name="bar"><collision><geometry><box size="0.02 0.2 0.02"/></geometry></collision></link>'
     fixed = '<joint name="on" type="fixed"><parent link="block"/><child link="bar"/><origin xyz="-0.26 0 0"/></joint>'
     high = SMOOTH.replace("0 0 0.5", "0 0 3.5").replace('<link name="frame"/>', foot)

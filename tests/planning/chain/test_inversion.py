@@ -26,13 +26,15 @@ def trees(draw: st.DrawFn) -> tuple[str, int]:
     length = st.floats(-1.0, 1.0).map(lambda x: round(x, 4))
     parts = []
     for i in range(number):
-        origin = f'<origin xyz="{draw(length)} {draw(length)} {draw(length)}" rpy="{draw(length)} {draw(length)} {draw(length)}"/>'
+        xyz, rpy = (f"{draw(length)} {draw(length)} {draw(length)}" for _ in range(2))
+        origin = f'<origin xyz="{xyz}" rpy="{rpy}"/>'
         shape = f"{origin}<geometry>{draw(st.sampled_from(SHAPES))}</geometry>"
         inertia = '<mass value="1.5"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
         bodies = f"<inertial>{origin}{inertia}</inertial><collision>{shape}</collision><visual>{shape}</visual>"
         parts.append(f'<link name="l{i}">{bodies}</link>')
     for i in range(1, number):
-        origin = f'<origin xyz="{draw(length)} {draw(length)} {draw(length)}" rpy="{draw(length)} {draw(length)} {draw(length)}"/>'
+        xyz, rpy = (f"{draw(length)} {draw(length)} {draw(length)}" for _ in range(2))
+        origin = f'<origin xyz="{xyz}" rpy="{rpy}"/>'
         parent, kind, axis = (
             draw(st.integers(0, i - 1)),
             draw(st.sampled_from(KINDS)),

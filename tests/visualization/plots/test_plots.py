@@ -183,7 +183,8 @@ def test_what_cannot_be_plotted(plan: Plan, tmp_path: Path) -> None:
 
 def test_importing_it_loads_neither_matplotlib_nor_meshcat() -> None:
     heavy = ("matplotlib", "meshcat", "trimesh")
-    code = f"import sys, vkc_pin.visualization.plots.plots, vkc_pin.visualization.viewer; print([m for m in {heavy} if m in sys.modules])"
+    modules = "vkc_pin.visualization.plots.plots, vkc_pin.visualization.viewer"
+    code = f"import sys, {modules}; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

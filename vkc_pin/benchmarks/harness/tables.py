@@ -234,7 +234,8 @@ def foot(about: Mapping[str, Any]) -> str:
         )
         minutes = sum(session["seconds"] for session in sessions) / 60.0
         number = sum(session["trials"] for session in sessions)
-        text += f" {number} trials, {jobs} at a time, took {minutes:.1f} min and up to {about['peak_memory_mb']:.0f} MB a process."
+        memory = f"{about['peak_memory_mb']:.0f} MB"
+        text += f" {number} trials, {jobs} at a time, took {minutes:.1f} min and up to {memory} a process."
     return text
 
 

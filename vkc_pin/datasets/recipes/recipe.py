@@ -147,8 +147,9 @@ class RecipeSchema(Schema):
     license: str = "CC-BY-4.0"
     robots: Robots = (RobotEntry(name="husky_ur5e"),)
     tasks: Annotated[
-        tuple[Literal[TASKS], ...], require(lambda v: v, "there is nothing", "at least one")
-    ] = TASKS  # type: ignore[valid-type]
+        tuple[Literal[TASKS], ...],  # type: ignore[valid-type]
+        require(lambda v: v, "there is nothing", "at least one"),
+    ] = TASKS
     objects: Names = (
         "random_cabinet",
         "random_drawers",

@@ -34,7 +34,9 @@ def eased_pairs(
     part: PhaseGeometry,
     options: Options,
 ) -> Eased:
-    """Return pair → (first waypoint, last waypoint, margin [m]) for what may be close for a while; see `world.scene.contact_rules`.
+    """Return pair → (first waypoint, last waypoint, margin [m]) of pairs with a temporarily smaller margin.
+
+    See `world.scene.contact_rules`.
 
     A hand keeps the attachment's clearance from the object that it takes or lets go of. A free
     object rests on something where it is lifted from and where it is put down, and may still do so

@@ -1,4 +1,4 @@
-"""What builds the functions of `vkc_pin.planning.kinematics`: its own compiled module, or upstream's `pinocchio.casadi` (conda-forge)."""
+"""Builds CasADi functions of Pinocchio's algorithms, with the compiled module or upstream's `pinocchio.casadi`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["check_versions", "compiled", "upstream"]
 
 
 def compiled(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
-    """Return the function of `vkc_pin.planning.kinematics` that is called so; frames and references among its arguments are numbers."""
+    """Return the kinematics function of this name; frames and references among its arguments are numbers."""
     return casadi.Function.deserialize(
         getattr(_extension(), name)(model.saveToString(), *arguments)
     )

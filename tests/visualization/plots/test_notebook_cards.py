@@ -16,7 +16,7 @@ import vkc_pin as vkc
 from vkc_pin.planning.plan import Plan
 from vkc_pin.validation.report import Report
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(scope="module")

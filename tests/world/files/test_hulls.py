@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.hulls import compute_hull, outer_hull
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 ROBOT = ROOT / "robots" / "husky_ur5e"
 
 

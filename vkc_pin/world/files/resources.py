@@ -32,7 +32,7 @@ _DEVICES = {"con", "prn", "aux", "nul", *_PORTS}  # reserved on Windows
 
 def package_folder() -> Path:
     """Return the folder of the package's sources."""
-    return Path(__file__).resolve().parents[1]
+    return Path(__file__).resolve().parents[2]
 
 
 def folder(kind: str) -> Path:

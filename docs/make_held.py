@@ -16,7 +16,7 @@ from vkc_pin.planning.initialization import interpolation as joining
 from vkc_pin.planning.initialization.keyframes import depth
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.obstacles import FLOOR
 
 EVERY = 6  # of the waypoints that are drawn
@@ -79,7 +79,7 @@ def draw_held(axes: Any, problem: TrajectoryProblem, way: np.ndarray, worst: int
     rotations, translations = problem.chain.joint_placements(way)
     shown = [*range(0, len(way), EVERY), *([] if worst is None else [worst])]
     for shape, label in zip(part.shapes, part.labels, strict=True):
-        points = triangles(shape.geometry)[0]
+        points = triangulate(shape.geometry)[0]
         for k in shown if shape.parentJoint else [0]:
             placed = (
                 pin.SE3(rotations[k, shape.parentJoint], translations[k, shape.parentJoint])

@@ -19,7 +19,7 @@ from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.visualization.plots.top_view import draw_top_view
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.trajectory.dynamics.torques import Torques
 from vkc_pin.world.trajectory.world_model import World
@@ -146,7 +146,7 @@ def furniture_picture() -> None:
             )
             faces, colours = list[np.ndarray](), list[np.ndarray]()
             for shape in shapes:
-                points, corners = triangles(shape.geometry)
+                points, corners = triangulate(shape.geometry)
                 points = points @ shape.placement.rotation.T + shape.placement.translation
                 for face in points[corners]:
                     normal = np.cross(face[1] - face[0], face[2] - face[0])
@@ -290,7 +290,7 @@ def opening_picture() -> None:
             for shape, label in zip(world.shapes, world.collision_labels, strict=True):
                 if label == "floor" or label.startswith(("body", "arm_1", "arm_2", "arm_3")):
                     continue
-                points = triangles(shape.geometry)[0]
+                points = triangulate(shape.geometry)[0]
                 placed = data.oMi[shape.parentJoint] * shape.placement
                 outline = (points @ placed.rotation.T + placed.translation)[:, :2]
                 outline = outline[ConvexHull(outline).vertices]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from vkc_pin.world.files.hulls import outer_hull
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.world.models.robot_schema import python_packages, read_robot
+from vkc_pin.world.models.robot_schema import find_python_packages, read_robot
 
 CORNERS = 40  # of a piece, at most
 
@@ -75,7 +75,7 @@ def main() -> None:
     if unknown := [link for link in given.links if link not in links]:
         parser.error(f"there are no settings for link '{unknown[0]}'")
     settings, document = read_robot(folder / "robot.yaml")
-    file = read_urdf(folder / settings.urdf, python_packages(settings.packages, document))
+    file = read_urdf(folder / settings.urdf, find_python_packages(settings.packages, document))
     print(
         "| link | pieces | corners | solid [l] | pieces' volume [l] | overhead |\n| --- | --- | --- | --- | --- | --- |"
     )

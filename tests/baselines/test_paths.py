@@ -17,7 +17,7 @@ from helpers.small_problems import door_scene, program_of
 import vkc_pin as vkc
 from vkc_pin.baselines.paths import BasePaths, headings
 from vkc_pin.planning.base_paths.base_path import shortest_path
-from vkc_pin.world.models.shapes import placed_shapes
+from vkc_pin.world.models.shapes import list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 
@@ -49,7 +49,7 @@ def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("d
     for name, placed in scene.objects.items():
         still += standing_geometry(placed) if name not in without else []
     rows = np.vstack([between(a, b, length=0.05, angle=0.1) for a, b in itertools.pairwise(poses)])
-    return min(distance(base, placed_shapes(still), row.tolist()) for row in rows)
+    return min(distance(base, list_placed_shapes(still), row.tolist()) for row in rows)
 
 
 def test_straight_where_that_is_free() -> None:

@@ -16,7 +16,7 @@ from vkc_pin.benchmarks import chores
 from vkc_pin.benchmarks.harness import step_by_step as stepwise
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.models.shapes import clearance
+from vkc_pin.world.models.shapes import compute_clearance
 from vkc_pin.world.scene.clearance_exemptions import close_pairs
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.task.actions import actions_of, foresee
@@ -71,7 +71,7 @@ def test_what_is_carried_has_a_neighbour(carried: str, other: str) -> None:
         (shape.geometry, shape.placement) for shape in standing_geometry(full.objects[carried])
     ]
     (index,) = [i for i, label in enumerate(full.obstacle_labels) if label == other]
-    assert clearance(
+    assert compute_clearance(
         shapes, [(full.obstacles[index].geometry, full.obstacles[index].placement)]
     ) == pytest.approx(0.01, abs=1e-4)
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from helpers.carrying import reaching
 from vkc_pin.options import Options
-from vkc_pin.world.models.shapes import link_name, shape_distance
+from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -101,7 +101,7 @@ def spare(scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = Fal
     for i, link in enumerate(links):
         for label, shape in things:
             wheels = label == FLOOR and link.parentJoint == 1
-            touching = label == "drawer.tray" and link_name(link.name) in robot.touch_links
+            touching = label == "drawer.tray" and get_link_name(link.name) in robot.touch_links
             if not wheels and not (touching and held):
                 gap = _gap(link, shapes.oMg[i], shape, shape.placement)
                 found.append(gap - (BESIDE_HANDLE if touching else MARGIN))
@@ -124,7 +124,7 @@ def _things(
     things = list(zip(scene.obstacle_labels, scene.obstacles, strict=True))
     for name, placed in scene.objects.items():
         things += [
-            (f"{name}.{link_name(s.name)}", s)
+            (f"{name}.{get_link_name(s.name)}", s)
             for s in standing_geometry(placed.with_state(state.get(name, {})))
         ]
     return things
@@ -133,4 +133,4 @@ def _things(
 def _gap(
     first: pin.GeometryObject, where: pin.SE3, second: pin.GeometryObject, there: pin.SE3
 ) -> float:
-    return shape_distance(first.geometry, where, second.geometry, there)
+    return compute_shape_distance(first.geometry, where, second.geometry, there)

@@ -30,10 +30,10 @@ from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import _Sweep, sweep
 from vkc_pin.visualization.plots.clearance import clearance_curves
-from vkc_pin.world.collision.clearances import Clearances, Nearest
-from vkc_pin.world.collision.shapes import asked
+from vkc_pin.world.collision.clearances import Clearances, ClosePairs
+from vkc_pin.world.collision.shapes import count_distance_queries
 from vkc_pin.world.models import shapes as geometry
-from vkc_pin.world.models.shapes import clearance, shape_distance
+from vkc_pin.world.models.shapes import compute_clearance, compute_shape_distance
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
@@ -54,7 +54,7 @@ class Counter:
 
     @contextmanager
     def counting(self, patch: pytest.MonkeyPatch) -> Iterator[None]:
-        real, counter, before = coal.distance, self, asked()
+        real, counter, before = coal.distance, self, count_distance_queries()
 
         def distance(*arguments: Any) -> float:
             counter.asked += 1
@@ -63,7 +63,7 @@ class Counter:
         with patch.context() as context:
             context.setattr(coal, "distance", distance)
             yield
-        self.asked += asked() - before
+        self.asked += count_distance_queries() - before
 
 
 # --- what it costs
@@ -328,7 +328,7 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
         reach: float,
         most: Any = None,
         standing: bool = True,
-    ) -> Nearest:
+    ) -> ClosePairs:
         where, every = near.placements.at(q), near.boxes.pairs
         w, k = np.indices((len(q), len(every))).reshape(2, -1)
         margins = near.margins.at(k, at[w], z, w)
@@ -344,7 +344,7 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
         chosen, found = near.shapes.shortest(
             where, edges, every[k], reach=reach, most=most, **known
         )
-        return Nearest(w[chosen], k[chosen], found.distance, margins[chosen], *found[1:])
+        return ClosePairs(w[chosen], k[chosen], found.distance, margins[chosen], *found[1:])
 
     def one_by_one(
         near: Clearances,
@@ -382,7 +382,7 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(PairTable, "near", all_of)
     patch.setattr(Body, "_close", lambda body, along: np.arange(len(body.moving)))
     for module in (geometry, easing):
-        patch.setattr(module, "world_box", everywhere)
+        patch.setattr(module, "compute_world_box", everywhere)
 
 
 @pytest.mark.parametrize("task", ["door", pytest.param("stick", marks=pytest.mark.long)])
@@ -442,13 +442,13 @@ def test_the_clearance_at_the_start_is_that_of_all_pairs(
     ]
     standing += standing_geometry(scene.objects["door"])
     expected = min(
-        shape_distance(shape, where, other.geometry, other.placement)
+        compute_shape_distance(shape, where, other.geometry, other.placement)
         for shape, where in moving
         for other in standing
     )
     found = scene.start_clearance(reach=reach)
     assert found == (pytest.approx(expected, abs=1e-9) if expected < reach else reach)
-    assert clearance(moving, []) == np.inf
+    assert compute_clearance(moving, []) == np.inf
 
 
 def test_what_a_scene_does_not_change_it_shares() -> None:

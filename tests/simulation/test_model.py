@@ -20,7 +20,7 @@ from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.simulation.servos import servos
 from vkc_pin.simulation.welds import latched
 from vkc_pin.world.models.dynamics.joint_resistance import Resistance
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.world_model import World
 
@@ -77,7 +77,7 @@ def test_bodies_and_shapes_are_where_pinocchio_has_them(name: str, tmp_path: Pat
             mesh = int(model.geom_dataid[geom])  # MuJoCo turns meshes into their principal axes
             first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
             seen = model.mesh_vert[first : first + count] @ turn.T + place
-            points = triangles(shape.geometry)[0] @ where.rotation.T + where.translation
+            points = triangulate(shape.geometry)[0] @ where.rotation.T + where.translation
             np.testing.assert_allclose(seen.min(axis=0), points.min(axis=0), atol=1e-5)
             np.testing.assert_allclose(seen.max(axis=0), points.max(axis=0), atol=1e-5)
 

@@ -12,7 +12,7 @@ import pytest
 from helpers.small_problems import door_scene, full_scene, random_configurations
 
 from vkc_pin.validation.distances import POINT, Solids
-from vkc_pin.world.models.shapes import shape_distance
+from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
 COAL = 1e-5  # [m]
@@ -48,7 +48,7 @@ def test_bounds_hold_and_the_nearest_is_the_nearest(seed: int) -> None:
     first = np.zeros(len(pairs), int)
     expected = np.array(
         [
-            shape_distance(shapes[a].geometry, at[a], shapes[b].geometry, at[b])
+            compute_shape_distance(shapes[a].geometry, at[a], shapes[b].geometry, at[b])
             for a, b in pairs.tolist()
         ]
     )
@@ -69,7 +69,7 @@ def test_what_is_around_a_point(seed: int) -> None:
     for point in [at[0].translation + rng.normal(scale=0.3, size=3) for _ in range(5)]:
         ball, here = coal.Sphere(POINT), pin.SE3(np.eye(3), point)
         distances = [
-            shape_distance(ball, here, shape.geometry, at[k])
+            compute_shape_distance(ball, here, shape.geometry, at[k])
             for k, shape in enumerate(solids().world.shapes)
         ]
         near = [k for k, distance in enumerate(distances) if distance < 0.2]

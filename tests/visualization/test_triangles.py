@@ -18,7 +18,7 @@ from vkc_pin.visualization.triangles import (
     tube,
 )
 from vkc_pin.world.files.meshes import MeshPart, to_bvh
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 
 
 def as_mesh(solid: Solid) -> trimesh.Trimesh:
@@ -47,7 +47,7 @@ def ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
 def test_surface_of_every_shape(
     shape: coal.CollisionGeometry, volume: float, size: tuple[float, ...]
 ) -> None:
-    vertices, faces = triangles(shape)
+    vertices, faces = triangulate(shape)
     mesh = trimesh.Trimesh(vertices, faces)
     assert mesh.volume == pytest.approx(volume, rel=0.05), "wound outwards, and nearly round"
     assert np.allclose(np.ptp(vertices, axis=0), size, rtol=0.03)
@@ -60,12 +60,12 @@ def test_convex_shapes() -> None:
     from vkc_pin.world.files.meshes import convex_hull
 
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
-    assert trimesh.Trimesh(*triangles(convex_hull(corners))).volume == pytest.approx(6.0)
+    assert trimesh.Trimesh(*triangulate(convex_hull(corners))).volume == pytest.approx(6.0)
 
 
 def test_a_half_space_has_no_surface() -> None:
     with pytest.raises(InputError, match="cannot be drawn"):
-        triangles(coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0))
+        triangulate(coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0))
 
 
 def test_boxes_have_edges_and_balls_have_none() -> None:

@@ -15,7 +15,7 @@ from vkc_pin.planning.initialization.initial_guess import Seed
 from vkc_pin.planning.initialization.keyframes import smooth
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.coordinates import wrapped
+from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.task.steps import GoTo
 
 __all__ = ["BasePaths", "headings"]
@@ -112,6 +112,6 @@ def headings(step: GoTo, yaw: float) -> Floats:
         if step.yaw is None
         else np.array([step.yaw - yaw])
     )
-    turns = wrapped(turns)
+    turns = wrap_angle(turns)
     turns = turns[np.argsort(np.abs(turns), kind="stable")]
     return np.column_stack([np.tile([step.x, step.y], (len(turns), 1)), yaw + turns])

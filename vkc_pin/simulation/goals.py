@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.coordinates import wrapped
+from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -109,7 +109,7 @@ def _misses(
     elif isinstance(step, GoTo):
         yield "base", float(np.hypot(row[0] - step.x, row[1] - step.y)), "m"
         if step.yaw is not None:
-            yield "base heading", float(abs(wrapped(row[2] - step.yaw))), "rad"
+            yield "base heading", float(abs(wrap_angle(row[2] - step.yaw))), "rad"
     elif isinstance(step, Grasp):
         scene = world.scene
         link = f"{step.object}.{scene.objects[step.object].object.attachment(step.attachment).link}"

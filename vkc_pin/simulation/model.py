@@ -21,9 +21,9 @@ from vkc_pin.simulation.contacts import Pairs
 from vkc_pin.simulation.physics import Physics, engine
 from vkc_pin.simulation.servos import Servo
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.models.coordinates import Moved
+from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.dynamics.joint_resistance import Resistance
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.contact_rules import moves_as_one
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.world_model import World
@@ -288,7 +288,7 @@ class Builder:
             return body.add_geom(type=kind, size=[shape.radius, shape.halfLength, 0.0], **where)
         if isinstance(shape, coal.Ellipsoid):
             return body.add_geom(type=kinds.mjGEOM_ELLIPSOID, size=shape.radii, **where)
-        points, faces = triangles(shape)
+        points, faces = triangulate(shape)
         mesh = self.spec.add_mesh(name=name, uservert=points.ravel(), userface=faces.ravel())
         inertias = self.mj.mjtMeshInertia
         mesh.inertia = inertias.mjMESH_INERTIA_SHELL if thin else inertias.mjMESH_INERTIA_CONVEX
@@ -343,7 +343,7 @@ class Builder:
         equality.data[0] = value
         return equality
 
-    def _follow(self, move: Moved) -> None:
+    def _follow(self, move: MovedJoint) -> None:
         """Add an equality that holds a joint where the one that it follows has it."""
         equality = self._fixed(str(self.world.model.names[move.joint]), move.offset, active=True)
         equality.name2, equality.data[1] = (

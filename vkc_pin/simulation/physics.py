@@ -11,7 +11,7 @@ import pinocchio as pin
 from vkc_pin.utils.arguments import flag, number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import optional_package
-from vkc_pin.world.models.dynamics.mass import solid_inertia
+from vkc_pin.world.models.dynamics.mass import compute_solid_inertia
 from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Physics", "engine", "weigh"]
@@ -126,7 +126,7 @@ def weigh(world: World, physics: Physics) -> list[str]:
                 _LEAST_MASS, np.zeros(3), 1e3 * _LEAST_INERTIA * _LEAST_MASS * np.eye(3)
             )
             for solid in solids:
-                inertia += solid.placement.act(solid_inertia(solid, physics.density))
+                inertia += solid.placement.act(compute_solid_inertia(solid, physics.density))
         tensor, added = _possible(inertia)
         if added > _ROUNDED:
             notes.append(

@@ -14,7 +14,7 @@ from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.models.grippers.bar_width import EXACT
+from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
 from vkc_pin.world.scene.clearance_exemptions import Allowance, allowances
 from vkc_pin.world.scene.contact_rules import (
     CONTACT,
@@ -120,7 +120,7 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
                 gripper.resting if opening is None else opening
                 for opening in (phase.opening, asked)
             )
-            if not abs(wide - right) <= EXACT:
+            if not abs(wide - right) <= WIDTH_TOLERANCE:
                 detail = (
                     f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are asked for"
                 )

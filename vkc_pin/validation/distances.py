@@ -13,11 +13,11 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.collision.placements import ShapePlacements, columns_of
+from vkc_pin.world.collision.placements import ShapePlacements, flatten_placements
 from vkc_pin.world.collision.shapes import Shapes
 from vkc_pin.world.collision.world_boxes import WorldBoxes
-from vkc_pin.world.models.coordinates import Moved
-from vkc_pin.world.models.shapes import bounding_box, shape_distance
+from vkc_pin.world.models.coordinates import MovedJoint
+from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Placed", "Solids", "travelled"]
@@ -40,13 +40,13 @@ class Solids:
 
     def __init__(self, world: World) -> None:
         self.world, self.bodies = world, len(world.bodies.geometryObjects)
-        boxes = [bounding_box(shape) for shape in world.shapes]
+        boxes = [compute_bounding_box(shape) for shape in world.shapes]
         self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
         obstacles = slice(self.bodies, None)
         where = [shape.placement for shape in world.shapes[obstacles]]
         self.asked = Shapes([shape.geometry for shape in world.shapes], where)
-        self.obstacle_corners = self.corners(columns_of(where), obstacles)
+        self.obstacle_corners = self.corners(flatten_placements(where), obstacles)
         self._placements = ShapePlacements(world.model, world.bodies)
 
     def at(self, q: Floats) -> Placed:
@@ -161,7 +161,7 @@ class Placed:
         return [
             i
             for i in near
-            if shape_distance(ball, here, shapes[i].geometry, self._placement(i)) < reach
+            if compute_shape_distance(ball, here, shapes[i].geometry, self._placement(i)) < reach
         ]
 
     def _placement(self, shape: int) -> pin.SE3:
@@ -186,7 +186,7 @@ def travelled(solids: Solids, samples: Floats) -> Floats:
     model, steps = world.model, np.abs(np.diff(samples, axis=0))
     spans = np.linalg.norm(steps[:, :2], axis=1)
     offsets = [float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements]
-    of_joint: dict[int, list[Moved]] = {}
+    of_joint: dict[int, list[MovedJoint]] = {}
     for move in world.coordinates.moves:
         of_joint.setdefault(move.joint, []).append(move)
     found = np.zeros((len(samples), len(world.shapes)))

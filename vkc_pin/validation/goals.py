@@ -12,7 +12,7 @@ from vkc_pin.errors import UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.models.coordinates import wrapped
+from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 __all__ = ["check_goals", "check_steps"]
@@ -276,7 +276,7 @@ def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Mi
         distance = float(np.hypot(x - step.x, y - step.y))
         expect("base", distance, "m", f"{distance:.4f} m from the place to go to")
         if step.yaw is not None:
-            turn = float(abs(wrapped(yaw - step.yaw)))
+            turn = float(abs(wrap_angle(yaw - step.yaw)))
             expect("base heading", turn, "rad", f"turned {turn:.4f} rad from the heading asked for")
     return misses
 

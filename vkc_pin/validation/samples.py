@@ -11,7 +11,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.articulated_object import Freedom
-from vkc_pin.world.models.grippers.bar_width import EXACT
+from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
 from vkc_pin.world.scene.contact_rules import hand_frame
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -124,7 +124,7 @@ class Samples:
             raise InputError(
                 "the robot's gripper does not open", field=field, expected=expected, got=opening
             )
-        if abs(gripper.nearest(opening) - opening) > EXACT:
+        if abs(gripper.nearest(opening) - opening) > WIDTH_TOLERANCE:
             expected = f"{gripper.narrowest:.4g} to {gripper.widest:.4g} m"
             raise InputError(
                 "the gripper cannot be so far open", field=field, expected=expected, got=opening

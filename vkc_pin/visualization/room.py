@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.triangles import Solid, box_solid, shade, to_solid
 from vkc_pin.world.files.meshes import load_parts
-from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["Part", "Room", "drawn_parts", "is_wall"]
@@ -106,7 +106,8 @@ class Room:
             *((one, 1.0) for one in self._furniture),
         ]
         return [
-            (*world_box(shape.geometry, shape.placement), opacity) for shape, opacity in opacities
+            (*compute_world_box(shape.geometry, shape.placement), opacity)
+            for shape, opacity in opacities
         ]
 
     def _inside(self, shape: pin.GeometryObject) -> tuple[int, float]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import MeshPart, coarser
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 
 __all__ = ["Solid", "box_solid", "coarse", "merge_solids", "shade", "to_solid", "tube"]
 
@@ -46,7 +46,7 @@ class Solid:
 
 def to_solid(shape: coal.CollisionGeometry) -> Solid:
     """Return a coal shape with normals: round where it is round, sharp where it has an edge."""
-    return shade(*triangles(shape))
+    return shade(*triangulate(shape))
 
 
 def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:

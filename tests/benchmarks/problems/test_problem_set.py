@@ -12,7 +12,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.problems import poses
 from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, TASKS, kind_of, problem, started
 from vkc_pin.procedural.rooms.random_room import random_layout
-from vkc_pin.world.models.shapes import shape_distance
+from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.scene.scene import START_CLEARANCE
 from vkc_pin.world.task.compiler import compile_task
 
@@ -72,7 +72,9 @@ def free(scene: vkc.Scene, at: pin.SE3, z: np.ndarray) -> None:
     for pair in robot.collision.collisionPairs:
         a, b = pair.first, pair.second
         assert (
-            shape_distance(geometry[a].geometry, shapes.oMg[a], geometry[b].geometry, shapes.oMg[b])
+            compute_shape_distance(
+                geometry[a].geometry, shapes.oMg[a], geometry[b].geometry, shapes.oMg[b]
+            )
             >= poses.CLEAR
         )
 

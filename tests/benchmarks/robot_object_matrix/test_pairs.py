@@ -23,7 +23,7 @@ from vkc_pin.planning.diagnosis.diagnosis import Blocked
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.furniture.catalogue import KINDS
 from vkc_pin.world.files.resources import folder
-from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
@@ -71,7 +71,7 @@ def test_everything_stands_where_it_belongs(name: str) -> None:
     scene = hall("husky_ur5e", name, description_of(name))
     boxes = np.array(
         [
-            world_box(shape.geometry, shape.placement)
+            compute_world_box(shape.geometry, shape.placement)
             for shape in standing_geometry(scene.objects["it"])
         ]
     )
@@ -144,7 +144,7 @@ def test_what_is_low_stands_on_a_counter(tmp_path: Path, height: float, raised: 
     scene = hall("husky_ur5e", file, description_of(file))
     boxes = np.array(
         [
-            world_box(shape.geometry, shape.placement)
+            compute_world_box(shape.geometry, shape.placement)
             for shape in standing_geometry(scene.objects["it"])
         ]
     )

@@ -12,7 +12,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.robot_object_matrix.robots import ROBOTS, report, run
 from vkc_pin.cli import main
-from vkc_pin.world.models.robot_file import known_robots
+from vkc_pin.world.models.robot_file import list_robots
 
 
 @pytest.fixture(autouse=True)
@@ -108,4 +108,4 @@ def test_what_cannot_be_asked_for(tmp_path: Path) -> None:
 
 
 def test_robots_that_there_are() -> None:
-    assert set(ROBOTS) <= set(known_robots())
+    assert set(ROBOTS) <= set(list_robots())

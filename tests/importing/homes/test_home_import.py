@@ -8,7 +8,7 @@ from helpers.downloads import SDF
 from helpers.homes import HOME_MJCF, PLACES, WALLS, home_urdf
 
 import vkc_pin as vkc
-from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
@@ -67,7 +67,10 @@ def test_everything_stands_where_the_file_has_it(home: vkc.ImportedHome) -> None
         there = vkc.Scene.from_document(document)
         boxes = [
             np.array(
-                [world_box(shape.geometry, shape.placement) for shape in standing_geometry(one)]
+                [
+                    compute_world_box(shape.geometry, shape.placement)
+                    for shape in standing_geometry(one)
+                ]
             )
             for one in (scene.objects[name], there.objects["it"])
         ]
@@ -148,7 +151,7 @@ def test_a_floor_that_is_higher_in_the_file(tmp_path: Path) -> None:
     assert done.shapes["floor"] == 1
     assert "cupboard" in done.scene.objects
     low = min(
-        world_box(shape.geometry, shape.placement)[0][2]
+        compute_world_box(shape.geometry, shape.placement)[0][2]
         for shape in standing_geometry(done.scene.objects["cupboard"])
     )
     assert low == pytest.approx(0.0, abs=1e-6)
@@ -258,7 +261,10 @@ def test_objects_whose_names_look_alike_stay_what_they_are(
     ):
         item = done.scene.objects[name]
         boxes = np.array(
-            [world_box(shape.geometry, shape.placement) for shape in standing_geometry(item)]
+            [
+                compute_world_box(shape.geometry, shape.placement)
+                for shape in standing_geometry(item)
+            ]
         )
         assert boxes[:, 0].min(axis=0) == pytest.approx(low, abs=1e-5), name
         assert boxes[:, 1].max(axis=0) == pytest.approx(high, abs=1e-5), name

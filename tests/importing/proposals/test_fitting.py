@@ -11,7 +11,7 @@ from helpers.furniture import BAR, flap
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.fitting import Blocked, Fitting
 from vkc_pin.importing.proposals.hand import hand_of
-from vkc_pin.world.models.shapes import clearance
+from vkc_pin.world.models.shapes import compute_clearance
 
 FRONT = np.column_stack(
     [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
@@ -73,9 +73,9 @@ def test_clearance_is_that_of_coal(fitting: Fitting) -> None:
             [(shape, tool * where) for shape, where in group] for group in (hand.touch, hand.others)
         )
         found = (
-            clearance(touch, groups["flap"]) >= 0.005
-            and clearance([*touch, *others], groups["case"]) >= 0.02
-            and clearance(others, groups["flap"]) >= 0.02
+            compute_clearance(touch, groups["flap"]) >= 0.005
+            and compute_clearance([*touch, *others], groups["case"]) >= 0.02
+            and compute_clearance(others, groups["flap"]) >= 0.02
         )
         assert (fitting.blocked(tool, "flap") is None) == found
         return found

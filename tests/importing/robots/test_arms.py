@@ -18,7 +18,7 @@ from vkc_pin.importing.robots.arms import (
 )
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
-from vkc_pin.world.models.robot_model import full_model
+from vkc_pin.world.models.robot_model import build_full_model
 
 
 def arms_of(file: UrdfFile) -> list[Arm]:
@@ -131,4 +131,4 @@ def test_segments_of_a_telescope(
         text = text.replace(old, new, 1)
     urdf = read_urdf(file, text=text)
     names = ("lift", "out_1", "out_2", "out_3", "out_4", "yaw_joint", "pitch_joint", "roll_joint")
-    assert telescopes(full_model(urdf), names) == groups
+    assert telescopes(build_full_model(urdf), names) == groups

@@ -12,7 +12,7 @@ import vkc_pin as vkc
 from vkc_pin.importing.robots.mjcf import convert
 from vkc_pin.world.files.kinematic_tree import check_tree
 from vkc_pin.world.files.meshes import load_mesh
-from vkc_pin.world.models.robot_model import configuration
+from vkc_pin.world.models.robot_model import make_configuration
 
 ARM = """
 <mujoco model="arm"><compiler angle="degree"/>
@@ -61,7 +61,7 @@ def test_links_are_where_mujoco_has_the_bodies(file: Path, tmp_path: Path) -> No
         mujoco.mj_kinematics(theirs, state)
         moved = state.qpos - theirs.qpos0
         positions = {theirs.joint(j).name: moved[theirs.jnt_qposadr[j]] for j in range(theirs.njnt)}
-        pin.framesForwardKinematics(model, data, configuration(model, positions))
+        pin.framesForwardKinematics(model, data, make_configuration(model, positions))
         for name in ("foot", "upper", "fore", "tip"):
             place = data.oMf[model.getFrameId(name, pin.FrameType.BODY)]
             np.testing.assert_allclose(place.translation, state.body(name).xpos, atol=1e-7)

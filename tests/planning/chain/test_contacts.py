@@ -28,7 +28,7 @@ from vkc_pin.planning.chain.collision_pairs import phase_geometries
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.budget import Budget, SpentError
-from vkc_pin.world.models.shapes import link_name
+from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.clearance_exemptions import allowances
 from vkc_pin.world.scene.contact_rules import EASED_TIME
 from vkc_pin.world.scene.hold import Hold
@@ -145,7 +145,9 @@ def test_only_what_does_not_stand_on_the_floor_can_hit_it(phase: int) -> None:
     robot = problem.scene.robot
     meets_floor = {first for first, second in pairs(problem, phase) if second == FLOOR}
     driving = {
-        link_name(shape.name) for shape in robot.collision.geometryObjects if shape.parentJoint == 1
+        get_link_name(shape.name)
+        for shape in robot.collision.geometryObjects
+        if shape.parentJoint == 1
     }
     assert meets_floor == set(robot.links) - driving
     assert driving

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
-from vkc_pin.world.models.shapes import bounding_box, shape_distance
+from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 
 JOINTS = 3
 COAL = 1e-5  # [m]
@@ -40,7 +40,7 @@ def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9
         if shapes[a].parentJoint != shapes[b].parentJoint
     ]
     pairs = np.array([pair for pair in every if rng.random() < 0.66]).reshape(-1, 2)
-    boxes = [bounding_box(shape) for shape in shapes]
+    boxes = [compute_bounding_box(shape) for shape in shapes]
     return PhaseGeometry(
         shapes=shapes,
         labels=tuple(shape.name for shape in shapes),
@@ -75,7 +75,7 @@ def all_distances(
             for s in part.shapes
         ]
         for k, (a, b) in enumerate(part.pairs.tolist()):
-            out[w, k] = shape_distance(
+            out[w, k] = compute_shape_distance(
                 part.shapes[a].geometry, at[a], part.shapes[b].geometry, at[b]
             )
     return out
@@ -136,7 +136,7 @@ def test_what_stands_around_a_box(seed: int) -> None:
     near = part.within(0.1, lower, lower + size).tolist()
     for k in range(7, 16):
         shape = part.shapes[k]
-        if shape_distance(box, here, shape.geometry, shape.placement) < 0.1 - COAL:
+        if compute_shape_distance(box, here, shape.geometry, shape.placement) < 0.1 - COAL:
             assert k in near
     assert min(near, default=7) >= 7, "what moves does not stand"
     listed = part.pairs.tolist()

@@ -13,7 +13,7 @@ from helpers.small_problems import door_scene
 from vkc_pin.options import Options
 from vkc_pin.planning.diagnosis.swept_volumes import swept
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.models.shapes import link_name, world_box
+from vkc_pin.world.models.shapes import compute_world_box, get_link_name
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
@@ -123,9 +123,9 @@ def test_an_overlap_that_validation_might_overlook_proves_nothing(
     """A slab above the floor, which the leaf's lower edge grazes from where it begins to where it is to go."""
     placed = door_scene().objects["door"].with_state({"hinge": 0.6})
     boxes = [
-        world_box(shape.geometry, shape.placement)
+        compute_world_box(shape.geometry, shape.placement)
         for shape in standing_geometry(placed)
-        if link_name(shape.name) == "panel"
+        if get_link_name(shape.name) == "panel"
     ]
     low = min(lower[2] for lower, _ in boxes)
     middle = around_the_hinge(

@@ -22,7 +22,7 @@ from vkc_pin.planning.initialization.beam_search import Beam, Found
 from vkc_pin.planning.initialization.initial_guess import Seed
 from vkc_pin.planning.initialization.keyframes import scatter
 from vkc_pin.planning.initialization.methods import _POOR, INITIALIZATIONS, _in_turn, initialize
-from vkc_pin.world.models.coordinates import wrapped
+from vkc_pin.world.models.coordinates import wrap_angle
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
@@ -505,7 +505,7 @@ def test_trees_search_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [seed.name for seed in [*others, first]] == ["interpolated", "astar", "rrt"]
     assert watched.kinds == ["interpolated", "astar", "rrt"]
     apart = grasps(watched.found[-1][1]) - first.z[int(problem().ends[0]) - 1, :9]
-    apart[:, 2] = wrapped(apart[:, 2])  # on the way there the base may turn the other way round
+    apart[:, 2] = wrap_angle(apart[:, 2])  # on the way there the base may turn the other way round
     assert np.abs(apart).max(axis=1).min() < 1e-3
 
 

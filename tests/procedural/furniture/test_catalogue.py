@@ -15,7 +15,11 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.procedural.furniture.catalogue import KINDS
-from vkc_pin.world.models.shapes import clearance, placed_shapes, shape_distance
+from vkc_pin.world.models.shapes import (
+    compute_clearance,
+    compute_shape_distance,
+    list_placed_shapes,
+)
 from vkc_pin.world.scene.placed_object import standing_geometry
 
 ROBOT = vkc.load_robot("husky_ur5e")
@@ -61,7 +65,7 @@ def test_the_hand_fits_around_every_handle(kind: str, seed: int) -> None:
         for shape in standing_geometry(own):
             link = shape.name.rpartition("_")[0]
             least = min(
-                shape_distance(solid, tool * where, shape.geometry, shape.placement)
+                compute_shape_distance(solid, tool * where, shape.geometry, shape.placement)
                 for solid, where in HAND
             )
             assert least >= (0.005 if link == attachment.link else 0.02), (
@@ -92,7 +96,10 @@ def test_links_pass_each_other(kind: str, seed: int) -> None:
             ]
             least = 0.0 if kind in ("faucet", "valve") else 5e-4  # levers sit on their spindles
             assert (
-                clearance(placed_shapes(moving), placed_shapes(others), reach=0.01) >= least - 1e-6
+                compute_clearance(
+                    list_placed_shapes(moving), list_placed_shapes(others), reach=0.01
+                )
+                >= least - 1e-6
             ), (joint, value, parents)
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.procedural.rooms.clutter import cluttered
-from vkc_pin.world.models.shapes import clearance, shape_distance
+from vkc_pin.world.models.shapes import compute_clearance, compute_shape_distance
 from vkc_pin.world.scene.placed_object import standing_geometry
 
 PLACE = ((-3.0, 1.3, 1.051), 0.2)
@@ -42,7 +42,7 @@ def test_everything_stands_or_hangs_and_hits_nothing(seed: int, things: int) -> 
     for shape in new:
         picture = isinstance(shape.geometry, coal.Box) and 2 * min(shape.geometry.halfSide) == 0.025
         gaps = sorted(
-            shape_distance(shape.geometry, shape.placement, other.geometry, other.placement)
+            compute_shape_distance(shape.geometry, shape.placement, other.geometry, other.placement)
             for other in old
         )
         if picture:  # let into one wall, away from all else
@@ -51,7 +51,10 @@ def test_everything_stands_or_hangs_and_hits_nothing(seed: int, things: int) -> 
             assert abs(gaps[0]) < 1e-4
         assert gaps[1] > -1e-4  # two boards side by side may carry it
     for one, other in itertools.combinations(new, 2):
-        assert shape_distance(one.geometry, one.placement, other.geometry, other.placement) > 0.0
+        assert (
+            compute_shape_distance(one.geometry, one.placement, other.geometry, other.placement)
+            > 0.0
+        )
 
 
 def test_hands_have_room_and_so_have_places_that_stay_clear() -> None:
@@ -63,7 +66,7 @@ def test_hands_have_room_and_so_have_places_that_stay_clear() -> None:
         *((p.placement.translation, 0.15) for p in home().objects.values() if p.object.free),
     ]:
         ball.translation = np.array(middle)
-        assert clearance(shapes, [(coal.Sphere(radius), ball)]) > -1e-6
+        assert compute_clearance(shapes, [(coal.Sphere(radius), ball)]) > -1e-6
 
 
 def test_the_same_seed_gives_the_same_and_another_another() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.procedural.rooms.footprints import Floor, Frame, Rectangle
-from vkc_pin.world.models.shapes import shape_distance
+from vkc_pin.world.models.shapes import compute_shape_distance
 
 LENGTHS = st.floats(0.1, 2.0)
 RECTANGLES = st.builds(
@@ -28,7 +28,7 @@ def as_box(one: Rectangle) -> tuple[coal.Box, pin.SE3]:
 def test_the_gap_is_no_more_than_the_distance_and_positive_where_that_is(
     one: Rectangle, other: Rectangle
 ) -> None:
-    distance = shape_distance(*as_box(one), *as_box(other))
+    distance = compute_shape_distance(*as_box(one), *as_box(other))
     gap = one.gap(other)
     assert gap == pytest.approx(other.gap(one))
     if distance > 1e-6:
@@ -40,7 +40,7 @@ def test_the_gap_is_no_more_than_the_distance_and_positive_where_that_is(
 @given(RECTANGLES, st.floats(-3, 3), st.floats(-3, 3))
 def test_the_distance_of_a_point(one: Rectangle, x: float, y: float) -> None:
     point = coal.Sphere(1e-3), pin.SE3(np.eye(3), np.array([x, y, 0.0]))
-    expected = max(shape_distance(*as_box(one), *point) + 1e-3, 0.0)
+    expected = max(compute_shape_distance(*as_box(one), *point) + 1e-3, 0.0)
     (found,) = one.distance([[x, y]])
     assert found == pytest.approx(expected, abs=2e-3)
 

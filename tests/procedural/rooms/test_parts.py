@@ -9,7 +9,7 @@ import vkc_pin as vkc
 from vkc_pin.procedural.rooms import parts
 from vkc_pin.procedural.rooms.fixtures import OPENED, fixture
 from vkc_pin.procedural.rooms.footprints import Floor, Frame
-from vkc_pin.world.models.shapes import clearance, placed_shapes, world_box
+from vkc_pin.world.models.shapes import compute_clearance, compute_world_box, list_placed_shapes
 from vkc_pin.world.scene.placed_object import standing_geometry
 
 FLOOR = Floor(6.0, 5.0)
@@ -27,7 +27,9 @@ def scene(*standing: parts.Part, walls: bool = False) -> vkc.Scene:
 
 
 def extent(found: vkc.Scene) -> np.ndarray:
-    boxes = np.array([world_box(shape.geometry, shape.placement) for shape in found.obstacles])
+    boxes = np.array(
+        [compute_world_box(shape.geometry, shape.placement) for shape in found.obstacles]
+    )
     return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
@@ -70,9 +72,9 @@ def test_what_opens_stands_at_its_wall_and_has_room_to(kind: str, side: int) -> 
     part = parts.opened(kind, fixture(kind, side), FLOOR, side, 0.5, 1.8)
     room = scene(part, walls=True)
     placed = room.objects[kind]
-    walls = placed_shapes(room.obstacles)
+    walls = list_placed_shapes(room.obstacles)
     assert (
-        clearance(placed_shapes(standing_geometry(placed)), walls) > -2e-3
+        compute_clearance(list_placed_shapes(standing_geometry(placed)), walls) > -2e-3
     )  # frames of doors touch their wall
     joint = placed.object.coordinates.names[0]
     for share in np.linspace(0.0, 1.0, 6):  # moving parts keep the clearance that plans do
@@ -82,7 +84,7 @@ def test_what_opens_stands_at_its_wall_and_has_room_to(kind: str, side: int) -> 
         moving = [
             shape for shape, parent in zip(standing_geometry(moved), parents, strict=True) if parent
         ]
-        assert clearance(placed_shapes(moving), walls) > 0.02
+        assert compute_clearance(list_placed_shapes(moving), walls) > 0.02
     tool = (
         placed.link_placement(placed.object.attachment().link)
         * placed.object.attachment().placement
@@ -102,7 +104,7 @@ def test_small_things_stand_on_a_counter(kind: str, seed: int) -> None:
     room = scene(part)
     boxes = np.array(
         [
-            world_box(shape.geometry, shape.placement)
+            compute_world_box(shape.geometry, shape.placement)
             for shape in standing_geometry(room.objects["it"])
         ]
     )
@@ -141,6 +143,8 @@ def test_what_is_carried_stands_on_its_table(kind: str) -> None:
     table = parts.table("table", Frame(1.0, -0.5, np.pi), (0.8, 1.4, 0.74))
     room = scene(table, parts.carried(kind, kind, table, -0.2, 0.3))
     placed = room.objects[kind]
-    gap = clearance(placed_shapes(standing_geometry(placed)), placed_shapes(room.obstacles))
+    gap = compute_clearance(
+        list_placed_shapes(standing_geometry(placed)), list_placed_shapes(room.obstacles)
+    )
     assert gap == pytest.approx(1e-3, abs=1e-4)
     assert placed.placement.translation[:2] == pytest.approx([1.2, -0.8])

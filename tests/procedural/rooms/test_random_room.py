@@ -18,7 +18,12 @@ import vkc_pin as vkc
 from vkc_pin.procedural.furniture.catalogue import KINDS
 from vkc_pin.procedural.rooms.fixtures import OPENED, fixture
 from vkc_pin.procedural.rooms.random_room import Layout, random_layout
-from vkc_pin.world.models.shapes import clearance, placed_shapes, shape_distance, world_box
+from vkc_pin.world.models.shapes import (
+    compute_clearance,
+    compute_shape_distance,
+    compute_world_box,
+    list_placed_shapes,
+)
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE
@@ -61,7 +66,9 @@ def test_a_room_is_sound(
 
     shapes = groups(layout, scene)
     for one, other in itertools.combinations(shapes, 2):
-        distance = clearance(placed_shapes(shapes[one]), placed_shapes(shapes[other]), reach=0.05)
+        distance = compute_clearance(
+            list_placed_shapes(shapes[one]), list_placed_shapes(shapes[other]), reach=0.05
+        )
         carried = "cup" in (one, other) or (
             "counters" in (one, other) and "walls" not in (one, other)
         )
@@ -129,7 +136,10 @@ def test_a_room_can_be_saved(tmp_path: Path) -> None:
     assert again.document == room.document
     for one, other in zip(room.obstacles, again.obstacles, strict=True):
         assert one.placement.isApprox(other.placement)
-        assert shape_distance(one.geometry, one.placement, other.geometry, other.placement) < 0.0
+        assert (
+            compute_shape_distance(one.geometry, one.placement, other.geometry, other.placement)
+            < 0.0
+        )
 
 
 def test_objects_made_at_random_differ_from_room_to_room_and_are_kept_with_it(
@@ -170,7 +180,7 @@ def test_objects_by_path_and_by_description(
     assert again.document == room.document
     for name in room.objects:
         low = min(
-            world_box(shape.geometry, shape.placement)[0][2]
+            compute_world_box(shape.geometry, shape.placement)[0][2]
             for shape in standing_geometry(room.objects[name])
         )
         assert low == pytest.approx(0.0, abs=1e-4)

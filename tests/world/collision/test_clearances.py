@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from vkc_pin.world.collision import clearances as looking
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.clearances import Clearances
-from vkc_pin.world.collision.margins import Margins, Place
+from vkc_pin.world.collision.margins import MarginRegion, Margins
 from vkc_pin.world.collision.placements import ShapePlacements
 from vkc_pin.world.collision.shapes import Shapes
 
@@ -57,7 +57,7 @@ class Room:
         )
         self.z, self.waypoints = rng.normal(size=(STATES, 2)), rng.integers(0, WAYPOINTS, STATES)
         eased = {int(pair): [(1, 3, -0.05)] for pair in rng.permutation(len(self.pairs))[:8]}
-        away = Place(
+        away = MarginRegion(
             rng.permutation(len(self.pairs))[:20],
             -np.inf,
             np.array([1]),

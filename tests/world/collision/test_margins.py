@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.collision.margins import Margins, Place
+from vkc_pin.world.collision.margins import MarginRegion, Margins
 
 PAIRS, COORDINATES = 12, 4
 
@@ -29,7 +29,7 @@ def test_the_least_that_holds_there(seed: int) -> None:
         columns, low = rng.permutation(COORDINATES)[: rng.integers(1, 3)], rng.normal(size=4)
         lower = low[: len(columns)]
         margin = float(rng.choice([-np.inf, -0.01, 0.01]))
-        places.append(Place(rng.permutation(PAIRS)[:5], margin, columns, lower, lower + 1.5))
+        places.append(MarginRegion(rng.permutation(PAIRS)[:5], margin, columns, lower, lower + 1.5))
     pairs, waypoints = (grid.ravel() for grid in np.meshgrid(np.arange(PAIRS), np.arange(10)))
     z, rows = rng.normal(size=(6, COORDINATES)), rng.integers(0, 6, len(pairs))
     expected = []
@@ -54,14 +54,14 @@ def test_wrong_numbers_are_refused() -> None:
     with pytest.raises(IndexError, match="pair"):
         Margins(usual, {3: [(0, 1, 0.0)]})
     for place in (
-        Place(one + 3, 0.0, one, z[0, :1], z[0, :1]),
-        Place(one, 0.0, one - 1, z[0, :1], z[0, :1]),
+        MarginRegion(one + 3, 0.0, one, z[0, :1], z[0, :1]),
+        MarginRegion(one, 0.0, one - 1, z[0, :1], z[0, :1]),
     ):
         with pytest.raises(IndexError):
             Margins(usual, {}, [place])
     with pytest.raises(ValueError, match="limits"):
-        Margins(usual, {}, [Place(one, 0.0, one, z[0], z[0, :1])])
-    table = Margins(usual, {}, [Place(one, 0.0, one + 1, z[0, :1], z[0, :1])])
+        Margins(usual, {}, [MarginRegion(one, 0.0, one, z[0], z[0, :1])])
+    table = Margins(usual, {}, [MarginRegion(one, 0.0, one + 1, z[0, :1], z[0, :1])])
     for pairs, rows in ((one + 3, one), (one - 1, one), (one, one + 1), (one, one - 1)):
         with pytest.raises(IndexError):
             table.at(pairs, one, z, rows)

@@ -9,17 +9,17 @@ import pytest
 from helpers.memory import growth
 from helpers.small_problems import door_scene, random_configurations
 
-from vkc_pin.world.collision.placements import ShapePlacements, columns_of
+from vkc_pin.world.collision.placements import ShapePlacements, flatten_placements
 from vkc_pin.world.trajectory.world_model import World
 
 
 def test_numbers_of_a_placement() -> None:
     rotation = pin.exp3(np.array([0.1, 0.2, 0.3]))
-    (numbers,) = columns_of([pin.SE3(rotation, np.array([4.0, 5.0, 6.0]))])
+    (numbers,) = flatten_placements([pin.SE3(rotation, np.array([4.0, 5.0, 6.0]))])
     np.testing.assert_array_equal(
         numbers, [*rotation[:, 0], *rotation[:, 1], *rotation[:, 2], 4.0, 5.0, 6.0]
     )
-    assert columns_of([]).shape == (0, 12)
+    assert flatten_placements([]).shape == (0, 12)
 
 
 def test_models_leave_nothing_behind() -> None:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.collision import shapes as asking
-from vkc_pin.world.collision.placements import columns_of
-from vkc_pin.world.collision.shapes import Shapes, Witnesses, asked
+from vkc_pin.world.collision.placements import flatten_placements
+from vkc_pin.world.collision.shapes import Shapes, Witnesses, count_distance_queries
 from vkc_pin.world.files.meshes import convex_hull
 
 MOVING = 4
@@ -118,7 +118,7 @@ def test_distances_are_those_of_the_bindings(
     if one != "TriangleP":
         first.setSweptSphereRadius(swept)
     here, there = anywhere(rng), anywhere(rng)
-    where, pair = columns_of([here, there])[None], (np.zeros(1, int), np.array([[0, 1]]))
+    where, pair = flatten_placements([here, there])[None], (np.zeros(1, int), np.array([[0, 1]]))
     both = Shapes([first, second], tolerance=tolerance)
     try:
         expected = by_coal(first, here, second, there, tolerance)
@@ -140,7 +140,7 @@ def test_meshes() -> None:
     for _ in range(20):
         first, second, here, there = mesh(rng), mesh(rng), anywhere(rng), anywhere(rng)
         both = Shapes([first, second]).witnesses(
-            columns_of([here, there])[None], np.zeros(1, int), np.array([[0, 1]])
+            flatten_placements([here, there])[None], np.zeros(1, int), np.array([[0, 1]])
         )
         told = [0, *range(4, 10)]  # coal writes no normal for two meshes
         np.testing.assert_array_equal(
@@ -159,7 +159,7 @@ class Room:
         ]
         self.standing = [anywhere(rng) for _ in self.solids[MOVING:]]
         self.places = [[anywhere(rng) for _ in range(MOVING)] for _ in range(states)]
-        self.where = np.array([columns_of(row) for row in self.places])
+        self.where = np.array([flatten_placements(row) for row in self.places])
         pairs = [
             pair for pair in itertools.combinations(range(len(self.solids)), 2) if pair[0] < MOVING
         ]
@@ -235,7 +235,7 @@ def test_those_that_fall_shortest_of_their_margins(
 
 def test_of_equal_ones_the_lower_number_comes_first() -> None:
     balls = [coal.Sphere(0.1)] * 4
-    where = columns_of(
+    where = flatten_placements(
         [pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0, -1.0, 1.0)]
     )[None]
     pairs = np.array([[0, 1], [0, 2], [0, 3]])
@@ -256,7 +256,9 @@ def test_of_equal_ones_the_lower_number_comes_first() -> None:
 def test_only_what_may_be_among_the_shortest_is_asked_for() -> None:
     """A pair whose bound says that it is further is left out, even where the bound is wrong."""
     balls = [coal.Sphere(0.1)] * 3
-    where = columns_of([pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0, 0.5)])[None]
+    where = flatten_placements(
+        [pin.SE3(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0, 0.5)]
+    )[None]
     pairs, bounds = np.array([[0, 1], [0, 2]]), np.array([0.5, 5.0])
     known = {
         "numbers": np.arange(2),
@@ -293,7 +295,7 @@ def test_what_stands_elsewhere() -> None:
 def test_who_is_first_makes_no_difference_but_of_sign(one: str, other: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     both = Shapes([solid(one, rng), solid(other, rng)], tolerance=1e-8)
-    where = columns_of([anywhere(rng, 1.5), anywhere(rng, 1.5)])[None]
+    where = flatten_placements([anywhere(rng, 1.5), anywhere(rng, 1.5)])[None]
     there, back = table(both.witnesses(where, np.zeros(2, int), np.array([[0, 1], [1, 0]])))
     if min(there[0], back[0]) > 1e-3:
         assert there[0] == pytest.approx(back[0], abs=1e-5)
@@ -304,7 +306,7 @@ def test_a_million_pairs() -> None:
     balls = Shapes(
         [coal.Sphere(0.1), coal.Sphere(0.2)], [pin.SE3(np.eye(3), np.array([0.0, 0.0, 3.0]))]
     )
-    where = np.tile(columns_of([pin.SE3.Identity()]), (1000, 1, 1))
+    where = np.tile(flatten_placements([pin.SE3.Identity()]), (1000, 1, 1))
     where[:, 0, 11] = np.linspace(-1.0, 1.0, 1000)
     states = np.random.default_rng(0).integers(0, 1000, 1_000_000)
     found = balls.distances(where, states, np.tile([[0, 1]], (1_000_000, 1)))
@@ -365,13 +367,13 @@ def test_wrong_numbers_are_refused() -> None:
 def test_what_coal_cannot_do_is_an_error_in_threads_too() -> None:
     rng = np.random.default_rng(0)
     both = Shapes([solid("Box", rng), solid("TriangleP", rng)], threads=2)
-    where = columns_of([anywhere(rng), anywhere(rng)])[None]
+    where = flatten_placements([anywhere(rng), anywhere(rng)])[None]
     with pytest.raises(ValueError, match="not yet supported"):
         both.distances(where, np.zeros(1000, int), np.tile([[0, 1]], (1000, 1)))
 
 
 def test_how_many_were_asked_for() -> None:
     room = Room(0)
-    before = asked()
+    before = count_distance_queries()
     room.shapes().distances(room.where, room.states, room.pairs)
-    assert asked() - before == len(room.pairs)
+    assert count_distance_queries() - before == len(room.pairs)

@@ -16,7 +16,7 @@ from vkc_pin.errors import BuildError, InputError
 from vkc_pin.utils import optional_imports as needed
 from vkc_pin.world.collision import solids
 from vkc_pin.world.collision.shapes import Shapes
-from vkc_pin.world.collision.solids import solid_of
+from vkc_pin.world.collision.solids import convert_solid
 from vkc_pin.world.files.meshes import convex_hull, indices
 
 NOWHERE = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
@@ -34,19 +34,19 @@ def distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> f
 
 def test_what_is_not_known_is_refused_by_name() -> None:
     with pytest.raises(InputError, match="HeightFieldAABB"):
-        solid_of(coal.HeightFieldAABB(1.0, 1.0, np.zeros((3, 3)), 0.0))
+        convert_solid(coal.HeightFieldAABB(1.0, 1.0, np.zeros((3, 3)), 0.0))
     with pytest.raises(InputError, match="object"):
-        solid_of(object())
+        convert_solid(object())
 
 
 def test_hulls_are_rebuilt_once_while_they_live_and_stay_the_same() -> None:
     shape = hull(0)
-    first = solid_of(shape)
-    assert solid_of(shape) is first
+    first = convert_solid(shape)
+    assert convert_solid(shape) is first
     shape.setSweptSphereRadius(0.1)
-    assert solid_of(shape) is not first
+    assert convert_solid(shape) is not first
     other = hull(1)
-    assert solid_of(other) is not solid_of(shape)
+    assert convert_solid(other) is not convert_solid(shape)
     key = id(shape)
     assert key in solids._known
     del shape
@@ -84,12 +84,12 @@ def test_corners_of_triangles() -> None:
 @pytest.mark.parametrize("wrong", [np.array([[0, 1, 3]]), np.array([[0, -1, 2]])])
 def test_faces_of_no_points_are_refused(wrong: np.ndarray) -> None:
     with pytest.raises(IndexError, match="corner"):
-        solids.compiled().convex(np.eye(3), wrong, 0.0)
+        solids.load_compiled().convex(np.eye(3), wrong, 0.0)
 
 
 def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was compiled against another coal or Pinocchio, or is not there."""
-    solids.compiled.cache_clear()
+    solids.load_compiled.cache_clear()
     for theirs, mine, said in (
         ("2.9.1", pin.__version__, r"against coal 2\.9\.1"),
         (coal.__version__, "3.9.0", r"pin 3\.9\.0"),
@@ -98,7 +98,7 @@ def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> 
             built = types.SimpleNamespace(COAL_VERSION=theirs, PINOCCHIO_VERSION=mine)
             patch.setattr(solids, "compiled_module", lambda _, built=built: built)
             with pytest.raises(BuildError, match=said):
-                solids.compiled()
+                solids.load_compiled()
 
     def missing(name: str) -> types.ModuleType:
         raise ImportError(f"no {name}")
@@ -106,9 +106,9 @@ def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> 
     with monkeypatch.context() as patch:
         patch.setattr(needed, "import_module", missing)
         with pytest.raises(BuildError, match="compiler"):
-            solids.compiled()
-    solids.compiled.cache_clear()
-    assert coal.__version__ == solids.compiled().COAL_VERSION
+            solids.load_compiled()
+    solids.load_compiled.cache_clear()
+    assert coal.__version__ == solids.load_compiled().COAL_VERSION
 
 
 _FIRST = """

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.object_file import load_object
-from vkc_pin.world.models.shapes import clearance, placed_shapes
+from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 
 
@@ -123,7 +123,9 @@ def test_moving_parts_keep_away_from_the_base_over_the_whole_range(
             for s, original in zip(placed, thing.collision.geometryObjects, strict=True)
             if original.parentJoint != 0
         ]
-        nearest = min(nearest, clearance(placed_shapes(moving), placed_shapes(still)))
+        nearest = min(
+            nearest, compute_clearance(list_placed_shapes(moving), list_placed_shapes(still))
+        )
     assert 0.02 < nearest < 0.05
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.models.coordinates import Coordinates, wrapped
+from vkc_pin.world.models.coordinates import Coordinates, wrap_angle
 
 FREE = ("thing_x", "thing_y", "thing_z", "thing_qx", "thing_qy", "thing_qz", "thing_qw")
 
@@ -158,5 +158,5 @@ def test_what_does_not_fit() -> None:
 
 @given(st.floats(-50.0, 50.0))
 def test_wrapped_angles(angle: float) -> None:
-    assert -np.pi <= wrapped(angle) <= np.pi
-    assert np.exp(1j * wrapped(angle)) == pytest.approx(np.exp(1j * angle), abs=1e-9)
+    assert -np.pi <= wrap_angle(angle) <= np.pi
+    assert np.exp(1j * wrap_angle(angle)) == pytest.approx(np.exp(1j * angle), abs=1e-9)

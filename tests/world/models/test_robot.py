@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from helpers.robots import at_rest, placement, small_urdf
 
-from vkc_pin.world.models.robot import _LEAST_LEVER, Robot
+from vkc_pin.world.models.robot import _MIN_LEVER, Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.scene import Scene
 
@@ -226,4 +226,4 @@ def test_the_front_is_as_far_ahead_as_the_hand_reaches(husky: Robot) -> None:
 def test_an_arm_that_does_not_turn_has_the_least_lever(husky: Robot) -> None:
     units = tuple("m" for _ in husky.coordinates.units)
     straight = dataclasses.replace(husky, coordinates=SimpleNamespace(units=units))  # type: ignore[arg-type]
-    assert straight.lever == _LEAST_LEVER
+    assert straight.lever == _MIN_LEVER

@@ -13,7 +13,11 @@ from vkc_pin.world.files.srdf import read_srdf
 from vkc_pin.world.models import self_collisions
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.models.self_collisions import sample_allowed_pairs, survey, write_srdf
+from vkc_pin.world.models.self_collisions import (
+    analyze_self_collisions,
+    sample_allowed_pairs,
+    write_srdf,
+)
 
 SRDF = resources.folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"
 
@@ -255,9 +259,9 @@ def test_a_survey_is_kept_by_all_it_depends_on(
 ) -> None:
     """The second time nothing is sampled; other shapes, limits, homes and lists are other robots."""
     monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
-    sampled, real = [], self_collisions._survey
+    sampled, real = [], self_collisions._compute_analysis
     monkeypatch.setattr(
-        self_collisions, "_survey", lambda *rest: (sampled.append(rest), real(*rest))[1]
+        self_collisions, "_compute_analysis", lambda *rest: (sampled.append(rest), real(*rest))[1]
     )
     file = slider(tmp_path, room=0.012, at=0.004)
     first, again = load_robot(file), load_robot(file)
@@ -278,7 +282,7 @@ def test_a_survey_is_kept_by_all_it_depends_on(
     file.write_text(text)
     load_robot(file, home={"carriage_joint": 0.001})
     assert len(sampled) == 5
-    assert survey(first, {("finger", "wall"): "Never"}, samples=10).allowed == {
+    assert analyze_self_collisions(first, {("finger", "wall"): "Never"}, samples=10).allowed == {
         ("finger", "wall"): "Never"
     }
     assert len(sampled) == 6

@@ -21,16 +21,16 @@ from vkc_pin.world.models.shapes import (
     LIMIT_SLACK,
     LinkDistances,
     ShapeDistances,
-    bounding_box,
-    clearance,
+    clamp_to_limits,
+    compute_bounding_box,
+    compute_clearance,
+    compute_shape_distance,
+    compute_world_box,
     copy_shape,
-    link_name,
-    own_name,
-    placed_shapes,
-    shape_distance,
-    triangles,
-    within_limits,
-    world_box,
+    get_link_name,
+    get_local_name,
+    list_placed_shapes,
+    triangulate,
 )
 
 Solid = tuple[coal.CollisionGeometry, pin.SE3]
@@ -58,9 +58,9 @@ def random_solids(rng: np.random.Generator, count: int, size: float) -> list[Sol
 def test_clearance_is_the_smallest_distance(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     first, second = random_solids(rng, 4, size), random_solids(rng, 6, size)
-    least = min(shape_distance(*one, *other) for one in first for other in second)
-    assert clearance(first, second) == pytest.approx(least, abs=1e-6)
-    near = clearance(first, second, reach=0.2)
+    least = min(compute_shape_distance(*one, *other) for one in first for other in second)
+    assert compute_clearance(first, second) == pytest.approx(least, abs=1e-6)
+    near = compute_clearance(first, second, reach=0.2)
     assert near == (
         pytest.approx(least, abs=1e-6) if least < 0.2 - 1e-6 else pytest.approx(max(0.2, near))
     )
@@ -68,17 +68,17 @@ def test_clearance_is_the_smallest_distance(seed: int, size: float) -> None:
 
 def test_clearance_of_nothing() -> None:
     some = random_solids(np.random.default_rng(0), 2, 1.0)
-    assert clearance(some, []) == clearance([], some) == np.inf
+    assert compute_clearance(some, []) == compute_clearance([], some) == np.inf
 
 
 @pytest.mark.parametrize("number", range(len(SOLIDS)))
 def test_surfaces_are_closed_and_enclose_the_volume(number: int) -> None:
     make, volume = SOLIDS[number]
-    mesh = trimesh.Trimesh(*triangles(make()))
+    mesh = trimesh.Trimesh(*triangulate(make()))
     assert mesh.is_watertight
     assert 0.94 * volume <= mesh.volume <= volume * (1 + 1e-9)
     shape = pin.GeometryObject("s", 0, 0, pin.SE3.Identity(), make())
-    center, half = bounding_box(shape)
+    center, half = compute_bounding_box(shape)
     np.testing.assert_allclose(mesh.bounds, [center - half, center + half], atol=0.02)
     assert (mesh.bounds[0] >= center - half - 1e-9).all()
     assert (mesh.bounds[1] <= center + half + 1e-9).all()
@@ -89,24 +89,26 @@ def test_meshes_give_back_their_triangles() -> None:
     mesh = to_bvh(MeshPart(np.asarray(box.vertices), np.asarray(box.faces)))
     mesh.buildConvexRepresentation(False)
     for shape in (mesh, mesh.convex):
-        vertices, faces = triangles(shape)
+        vertices, faces = triangulate(shape)
         assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(0.006)
 
 
 def test_what_has_no_end_cannot_be_drawn() -> None:
     with pytest.raises(InputError, match="cannot be drawn"):
-        triangles(coal.Halfspace(0.0, 0.0, 1.0, 0.0))
+        triangulate(coal.Halfspace(0.0, 0.0, 1.0, 0.0))
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_boxes_along_the_worlds_axes_hold_the_surface(seed: int) -> None:
     ((shape, placement),) = random_solids(np.random.default_rng(seed), 1, 1.0)
-    low, high = world_box(shape, placement)
-    points = triangles(shape)[0] @ placement.rotation.T + placement.translation
+    low, high = compute_world_box(shape, placement)
+    points = triangulate(shape)[0] @ placement.rotation.T + placement.translation
     assert (points >= low - 1e-9).all()
     assert (points <= high + 1e-9).all()
-    diagonal = 2 * np.linalg.norm(bounding_box(pin.GeometryObject("s", 0, 0, placement, shape))[1])
+    diagonal = 2 * np.linalg.norm(
+        compute_bounding_box(pin.GeometryObject("s", 0, 0, placement, shape))[1]
+    )
     assert (high - low <= diagonal + 1e-9).all()
 
 
@@ -114,13 +116,13 @@ def test_boxes_along_the_worlds_axes_hold_the_surface(seed: int) -> None:
     ("value", "expected"), [(0.5, 0.5), (1.0 + LIMIT_SLACK / 2, 1.0), (-LIMIT_SLACK / 2, 0.0)]
 )
 def test_values_outside_by_rounding_are_moved_to_the_limit(value: float, expected: float) -> None:
-    assert within_limits(value, 0.0, 1.0, "joint") == expected
+    assert clamp_to_limits(value, 0.0, 1.0, "joint") == expected
 
 
 @pytest.mark.parametrize("value", [1.0 + 2 * LIMIT_SLACK, -1.0, np.nan, np.inf])
 def test_values_further_outside_are_refused(value: float) -> None:
     with pytest.raises(InputError) as caught:
-        within_limits(value, 0.0, 1.0, "joint")
+        clamp_to_limits(value, 0.0, 1.0, "joint")
     assert caught.value.field == "joint"
 
 
@@ -136,18 +138,18 @@ def test_copies_stand_in_the_world() -> None:
     )
     assert copy.placement.isApprox(place)
     assert (
-        own_name(copy.name),
-        link_name(own_name(copy.name)),
-        link_name("upper_arm_link_12"),
+        get_local_name(copy.name),
+        get_link_name(get_local_name(copy.name)),
+        get_link_name("upper_arm_link_12"),
     ) == (
         "arm_3",
         "arm",
         "upper_arm_link",
     )
-    ((geometry, at),) = placed_shapes([copy])
-    assert shape_distance(geometry, at, coal.Sphere(0.1), pin.SE3.Identity()) == pytest.approx(
-        np.sqrt(14) - 0.2
-    )
+    ((geometry, at),) = list_placed_shapes([copy])
+    assert compute_shape_distance(
+        geometry, at, coal.Sphere(0.1), pin.SE3.Identity()
+    ) == pytest.approx(np.sqrt(14) - 0.2)
 
 
 FIRST = """
@@ -194,11 +196,13 @@ def test_distances_of_links_are_those_of_their_shapes(worth: float) -> None:
             (shape.geometry, data.oMi[shape.parentJoint] * shape.placement) for shape in shapes
         ]
         np.testing.assert_allclose(
-            distances.lowest(), [world_box(*one)[0][2] for one in placed], atol=1e-12
+            distances.lowest(), [compute_world_box(*one)[0][2] for one in placed], atol=1e-12
         )
         bounds = links.bounds()
         for k, name in enumerate(links.links):
-            exact = min(shape_distance(*placed[one], *placed[other]) for one, other in groups[name])
+            exact = min(
+                compute_shape_distance(*placed[one], *placed[other]) for one, other in groups[name]
+            )
             assert bounds[k] <= exact + 1e-6
             found = links.between(k, worth)
             assert found == pytest.approx(exact, abs=1e-6) if exact <= worth else found > worth

@@ -13,7 +13,7 @@ import pytest
 from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
 from vkc_pin.planning.chain.pose import PoseRow
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import clearance, link_name, placed_shapes
+from vkc_pin.world.models.shapes import compute_clearance, get_link_name, list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
@@ -45,14 +45,14 @@ def standing(name: str, *names: str) -> Shapes:
     """Shapes of some obstacles."""
     found = [shape for shape in scene(name).obstacles if shape.name in names]
     assert len(found) == len(names)
-    return placed_shapes(found)
+    return list_placed_shapes(found)
 
 
 def parts(placed: PlacedObject, *links: str) -> Shapes:
     """Shapes of some of an object's links."""
-    found = [shape for shape in standing_geometry(placed) if link_name(shape.name) in links]
+    found = [shape for shape in standing_geometry(placed) if get_link_name(shape.name) in links]
     assert found
-    return placed_shapes(found)
+    return list_placed_shapes(found)
 
 
 def bounds(shapes: Iterable[tuple[coal.CollisionGeometry, pin.SE3]]) -> np.ndarray:
@@ -136,9 +136,9 @@ def test_starts_lie_in_the_papers_region_and_are_free(name: str) -> None:
 
 def test_a_corridor_leads_to_the_door() -> None:
     name = "corridor_door"
-    assert clearance(standing(name, "block_left"), standing(name, "block_right")) == pytest.approx(
-        2.0, abs=1e-6
-    )
+    assert compute_clearance(
+        standing(name, "block_left"), standing(name, "block_right")
+    ) == pytest.approx(2.0, abs=1e-6)
     np.testing.assert_allclose(
         bounds(standing(name, "block_left")), [[0.0, 1.0, 0.0], [5.0, 5.0, 2.06]], atol=1e-9
     )
@@ -164,9 +164,9 @@ def test_the_panel_is_as_wide_as_the_papers_opening_and_hangs_at_its_edge() -> N
         (placed.placement * model.jointPlacements[1]).translation, [5.0, 0.55, 0.0], atol=1e-12
     )
     left, right = ([shape] for shape in parts(placed, "frame"))
-    assert clearance(left, right) == pytest.approx(1.1 + 0.03 + 0.005, abs=1e-6)
+    assert compute_clearance(left, right) == pytest.approx(1.1 + 0.03 + 0.005, abs=1e-6)
     for post, wall in ((left, WALLS[0]), (right, WALLS[1])):
-        assert abs(clearance(post, standing("corridor_door", wall))) < 1e-6, (
+        assert abs(compute_clearance(post, standing("corridor_door", wall))) < 1e-6, (
             "no gap beside the frame"
         )
         np.testing.assert_allclose(
@@ -198,8 +198,8 @@ def test_the_door_swings_free_of_walls_and_frame() -> None:
         placed = thing("corridor_door", hinge=float(angle))
         moving = parts(placed, "panel", "lever")
         world = standing("corridor_door", *scene("corridor_door").obstacle_names)
-        assert clearance(moving, world) > DIST_SAFE + 0.01
-        assert clearance(moving, parts(placed, "frame")) > 0.004
+        assert compute_clearance(moving, world) > DIST_SAFE + 0.01
+        assert compute_clearance(moving, parts(placed, "frame")) > 0.004
     open_ = bounds(parts(thing("corridor_door", hinge=np.pi / 2), "panel"))
     assert open_[1, 0] == pytest.approx(5.0 + 1.1, abs=1e-6), (
         "hinge > 0 pushes it away from the corridor"
@@ -233,9 +233,9 @@ def test_counters_leave_an_aisle() -> None:
         np.testing.assert_allclose(
             [body[0, :2] - top[0, :2], top[1, :2] - body[1, :2]], 0.02, atol=1e-9
         )
-    assert clearance(standing(name, "worktop_1"), standing(name, "worktop_2")) == pytest.approx(
-        1.25, abs=1e-6
-    )
+    assert compute_clearance(
+        standing(name, "worktop_1"), standing(name, "worktop_2")
+    ) == pytest.approx(1.25, abs=1e-6)
     rest = {*scene(name).obstacle_names} - {
         f"{part}_{number}" for part in ("worktop", "counter") for number in figures
     }
@@ -258,10 +258,10 @@ def test_drawer_is_as_large_as_the_papers() -> None:
     assert around[0, 0] == pytest.approx(bounds(standing("aisle_drawer", "worktop_2"))[0, 0]), (
         "flush with its edge"
     )
-    assert clearance([left, right, back, bottom], case) == pytest.approx(0.01, abs=1e-6)
+    assert compute_clearance([left, right, back, bottom], case) == pytest.approx(0.01, abs=1e-6)
     tool = placed.link_placement("tray") * placed.object.attachment().placement
     np.testing.assert_allclose(tool.translation, handle[0][1].translation, atol=1e-9)
-    assert clearance([handle[0]], [front]) == pytest.approx(0.07 - 0.01, abs=1e-6)
+    assert compute_clearance([handle[0]], [front]) == pytest.approx(0.07 - 0.01, abs=1e-6)
 
 
 def test_pulled_out_it_leaves_no_room_for_the_robot_before_it() -> None:
@@ -269,10 +269,10 @@ def test_pulled_out_it_leaves_no_room_for_the_robot_before_it() -> None:
     for slide in np.linspace(0.0, 0.65, 14):
         placed = thing(name, slide=float(slide))
         assert (
-            clearance(parts(placed, "tray"), standing(name, *scene(name).obstacle_names))
+            compute_clearance(parts(placed, "tray"), standing(name, *scene(name).obstacle_names))
             > DIST_SAFE
         )
-        assert clearance(parts(placed, "tray"), parts(placed, "case")) > 0.004
+        assert compute_clearance(parts(placed, "tray"), parts(placed, "case")) > 0.004
     out = bounds(parts(thing(name, slide=0.6), "tray")[:1])
     shut = bounds(parts(thing(name), "tray")[:1])
     np.testing.assert_allclose(out - shut, [[-0.6, 0, 0]] * 2, atol=1e-9)
@@ -307,16 +307,19 @@ def room(
     """Smallest distance [m] between the robot and the world, without that of the fingers to what they hold."""
     here = scene(name)
     labels = zip(here.obstacles, here.obstacle_labels, strict=True)
-    world = placed_shapes([shape for shape, label in labels if label != FLOOR])
+    world = list_placed_shapes([shape for shape, label in labels if label != FLOOR])
     others = [
         link
-        for link in {link_name(shape.name) for shape in standing_geometry(placed)}
+        for link in {get_link_name(shape.name) for shape in standing_geometry(placed)}
         if link != HELD[name]
     ]
     held, touch = parts(placed, HELD[name]), here.robot.touch_links
     everything = [(shape, placement) for _, shape, placement in robot]
     without_hand = [(shape, placement) for link, shape, placement in robot if link not in touch]
-    return min(clearance(everything, world + parts(placed, *others)), clearance(without_hand, held))
+    return min(
+        compute_clearance(everything, world + parts(placed, *others)),
+        compute_clearance(without_hand, held),
+    )
 
 
 def solutions(name: str, placed: PlacedObject, *, count: int = 60) -> np.ndarray:
@@ -374,7 +377,7 @@ def test_the_hand_has_room_all_the_way(name: str) -> None:
         tool = placed.link_placement(HELD[name]) * placed.object.attachment().placement
         there = [(link, shape, tool * back * placement) for link, shape, placement in hand]
         assert room(name, placed, there) > 0.06, "the rest of the arm, behind it, needs some too"
-        assert clearance([each[1:] for each in there], parts(placed, HELD[name])) > 0.005
+        assert compute_clearance([each[1:] for each in there], parts(placed, HELD[name])) > 0.005
 
 
 def test_the_robot_fits_through_door_and_aisle() -> None:
@@ -400,7 +403,7 @@ def test_the_robot_fits_through_door_and_aisle() -> None:
             "wrist_2_link",
             "wrist_3_link",
         }
-        around = placed_shapes(world) + placed_shapes(standing_geometry(placed))
+        around = list_placed_shapes(world) + list_placed_shapes(standing_geometry(placed))
         for heading in headings:
             for x, y in path:
                 z = np.concatenate([[x, y, heading], here.robot.home])
@@ -409,4 +412,4 @@ def test_the_robot_fits_through_door_and_aisle() -> None:
                     for each in robot_shapes(here.robot, z)
                     if each[0] not in {*arm, *here.robot.touch_links}
                 ]
-                assert clearance(base, around) > DIST_SAFE, (name, x, y)
+                assert compute_clearance(base, around) > DIST_SAFE, (name, x, y)

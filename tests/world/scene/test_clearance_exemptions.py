@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.models.shapes import link_name, shape_distance
+from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
 from vkc_pin.world.scene import clearance_exemptions as neighbours
 from vkc_pin.world.scene.clearance_exemptions import Allowance, allowances, close_pairs
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -83,14 +83,14 @@ def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(
 def test_the_distance_of_two_links_is_that_of_their_closest_shapes() -> None:
     scene = beside(0.012).with_state("drawer", {"slide": 0.2})
     shapes = [
-        (f"drawer.{link_name(shape.name)}", shape)
+        (f"drawer.{get_link_name(shape.name)}", shape)
         for shape in standing_geometry(scene.objects["drawer"])
     ]
     moving = [shape for label, shape in shapes if label == "drawer.tray"]
     least: dict[str, float] = {}
     for label, other in zip(scene.obstacle_labels, scene.obstacles, strict=True):
         for shape in moving if label != FLOOR else ():
-            distance = shape_distance(
+            distance = compute_shape_distance(
                 shape.geometry, shape.placement, other.geometry, other.placement
             )
             least[label] = min(least.get(label, np.inf), distance)
@@ -370,9 +370,9 @@ def test_of_ten_thousand_obstacles_only_those_nearby_are_measured(
     ]
     document = in_wall(-0.004).document
     asked = []
-    measured = neighbours.shape_distance
+    measured = neighbours.compute_shape_distance
     monkeypatch.setattr(
-        neighbours, "shape_distance", lambda *given: asked.append(given) or measured(*given)
+        neighbours, "compute_shape_distance", lambda *given: asked.append(given) or measured(*given)
     )
     scene = Scene.from_document({**document, "obstacles": [*document["obstacles"], *boxes]})
     assert [pair[:2] for pair in close_pairs(scene, SAFE)] == [("door.panel", "wall")]

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 GAP = 0.85  # [m]
@@ -61,7 +61,7 @@ def test_the_robot_has_less_than_ten_centimetres_a_side() -> None:
         robot.model, data, robot.collision, shapes, robot.coordinates.q(home)
     )
     boxes = [
-        world_box(shape.geometry, at)
+        compute_world_box(shape.geometry, at)
         for shape, at in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
     ]
     body = [

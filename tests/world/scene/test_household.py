@@ -18,7 +18,7 @@ from vkc_pin.world.files.resources import folder
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Freedom
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import clearance, link_name, placed_shapes
+from vkc_pin.world.models.shapes import compute_clearance, get_link_name, list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
@@ -73,14 +73,16 @@ def at_origin(name: str, **state: float) -> PlacedObject:
 
 def parts(placed: PlacedObject, *links: str) -> Shapes:
     """Shapes of some of an object's links, or of all."""
-    return placed_shapes(
-        shape for shape in standing_geometry(placed) if not links or link_name(shape.name) in links
+    return list_placed_shapes(
+        shape
+        for shape in standing_geometry(placed)
+        if not links or get_link_name(shape.name) in links
     )
 
 
 def obstacles(here: Scene, *, without: Iterable[str] = (FLOOR,)) -> Shapes:
     labels = zip(here.obstacles, here.obstacle_labels, strict=True)
-    return placed_shapes(shape for shape, label in labels if label not in without)
+    return list_placed_shapes(shape for shape, label in labels if label not in without)
 
 
 def world(here: Scene, *, without: Iterable[str] = ()) -> Shapes:
@@ -140,12 +142,14 @@ def test_attachments_are_where_hands_can_be(name: str) -> None:
         )
         pushes = attachment.contact == "push"
         hand = moved_hand(tool * scene().robot.front.inverse() if pushes else tool)
-        gap = clearance(hand, parts(placed, attachment.link))
+        gap = compute_clearance(hand, parts(placed, attachment.link))
         assert gap > GRASP_CLEARANCE or (
             pushes and gap == pytest.approx(attachment.standoff, abs=1e-5)
         ), attachment.name
         others = [link for link in obj.links if link != attachment.link]
-        assert not others or clearance(hand, parts(placed, *others)) > DIST_SAFE, attachment.name
+        assert not others or compute_clearance(hand, parts(placed, *others)) > DIST_SAFE, (
+            attachment.name
+        )
 
 
 def test_hand_on_the_dishwashers_door_can_stay_level_until_it_is_open() -> None:
@@ -193,7 +197,7 @@ def test_parts_do_not_overlap_while_they_move(name: str) -> None:
                 name, **dict(zip(obj.coordinates.names, state.tolist(), strict=True))
             )
             for first, second in pairs:
-                assert clearance(parts(placed, first), parts(placed, second)) > 0.005, (
+                assert compute_clearance(parts(placed, first), parts(placed, second)) > 0.005, (
                     first,
                     second,
                     state,
@@ -220,21 +224,21 @@ def test_refrigerator_and_cabinet_have_room_for_cup_and_ball() -> None:
         body = parts(at_origin(name), thing(name).base_link)
         shelf = {"refrigerator": 0.98, "cabinet": 0.81}[name]
         height = shelf + {"cup": 0.001, "ball": 0.036}[item]
-        inside = placed_shapes(
+        inside = list_placed_shapes(
             standing_geometry(
                 PlacedObject(
                     item, thing(item), pin.SE3(np.eye(3), np.array([x, 0, height])), np.zeros(0)
                 )
             )
         )
-        assert clearance(inside, body) == pytest.approx(1e-3, abs=1e-6), (
+        assert compute_clearance(inside, body) == pytest.approx(1e-3, abs=1e-6), (
             "it stands on the shelf, and on nothing else"
         )
         lifted = [
             (shape, pin.SE3(where.rotation, where.translation + np.array([0.0, 0.0, 0.1])))
             for shape, where in inside
         ]
-        assert clearance(lifted, body) > 0.1, "there is air above it"
+        assert compute_clearance(lifted, body) > 0.1, "there is air above it"
 
 
 # --- the home
@@ -251,7 +255,7 @@ def test_home_is_as_large_and_full_as_the_papers() -> None:
     inner = {"wall_west": (0, 1), "wall_east": (0, 0), "wall_south": (1, 1), "wall_north": (1, 0)}
     for wall, (axis, side) in inner.items():
         (standing,) = [shape for shape in here.obstacles if shape.name == wall]
-        assert abs(bounds(placed_shapes([standing]))[side, axis]) == pytest.approx(4.0)
+        assert abs(bounds(list_placed_shapes([standing]))[side, axis]) == pytest.approx(4.0)
     shapes = len(obstacles(here)) + sum(
         len(placed.object.collision.geometryObjects) for placed in here.objects.values()
     )
@@ -276,7 +280,9 @@ def test_nothing_stands_in_anything_else() -> None:
         links = (
             ("panel", "lever") if name == "door" else ()
         )  # its frame fills an opening in the wall
-        assert clearance(parts(placed, *links), world(here, without={name}), reach=0.1) > 9e-4, name
+        assert (
+            compute_clearance(parts(placed, *links), world(here, without={name}), reach=0.1) > 9e-4
+        ), name
     movable = {
         "chair",
         "desk_chair",
@@ -295,7 +301,9 @@ def test_nothing_stands_in_anything_else() -> None:
             if label == name
         ]
         assert (
-            clearance(placed_shapes(standing), obstacles(here, without={FLOOR, name}), reach=0.1)
+            compute_clearance(
+                list_placed_shapes(standing), obstacles(here, without={FLOOR, name}), reach=0.1
+            )
             > 0.01
         ), name
 
@@ -311,7 +319,7 @@ def test_moving_parts_keep_clear_of_the_home(name: str) -> None:
     for value in np.linspace(0.0, upper, 12):
         moved = placed.with_state({joint: float(value)})
         assert (
-            clearance(parts(moved, *moving_links(placed.object)), rest, reach=0.1)
+            compute_clearance(parts(moved, *moving_links(placed.object)), rest, reach=0.1)
             > DIST_SAFE + 0.005
         ), value
 
@@ -322,7 +330,9 @@ def test_dishwasher_door_shuts_and_the_rack_comes_out_over_it() -> None:
     rest = world(scene(), without={"dishwasher"})
     for angle in np.linspace(0.0, np.pi / 2, 12):
         assert (
-            clearance(parts(placed.with_state({"door": float(angle)}), "door"), rest, reach=0.1)
+            compute_clearance(
+                parts(placed.with_state({"door": float(angle)}), "door"), rest, reach=0.1
+            )
             > DIST_SAFE + 0.005
         )
     out = placed.with_state({"rack": 0.5})
@@ -368,8 +378,10 @@ def test_robot_fits_through_the_open_door_and_nowhere_else_into_the_bedroom() ->
     along = np.array([np.cos(1.52), np.sin(1.52)])  # as the open door points
     for way in np.linspace(-1.4, 1.0, 25):
         x, y = np.array([1.584, 1.25]) + way * along
-        assert clearance(body_at(here.robot, x, y, 1.52), around, reach=0.1) > DIST_SAFE, way
-    assert clearance(body_at(here.robot, 1.58, 1.25), world(scene()), reach=0.1) < 0.0, (
+        assert compute_clearance(body_at(here.robot, x, y, 1.52), around, reach=0.1) > DIST_SAFE, (
+            way
+        )
+    assert compute_clearance(body_at(here.robot, 1.58, 1.25), world(scene()), reach=0.1) < 0.0, (
         "the door is shut"
     )
     left, right = (bounds([part]) for part in parts(here.objects["door"], "frame")[:2])
@@ -392,13 +404,15 @@ def test_aisles_are_wide_enough_for_the_robot() -> None:
     for name, (begin, end) in ways.items():
         heading = float(np.arctan2(*np.subtract(end, begin)[::-1]))
         for x, y in np.linspace(begin, end, 20):
-            assert clearance(body_at(here.robot, x, y, heading), around, reach=0.1) > DIST_SAFE, (
+            assert (
+                compute_clearance(body_at(here.robot, x, y, heading), around, reach=0.1) > DIST_SAFE
+            ), (
                 name,
                 x,
                 y,
             )
     for yaw in np.linspace(-np.pi, np.pi, 24):
-        assert clearance(body_at(here.robot, 1.3, -1.0, yaw), around, reach=0.1) > DIST_SAFE
+        assert compute_clearance(body_at(here.robot, 1.3, -1.0, yaw), around, reach=0.1) > DIST_SAFE
 
 
 REACHED = [
@@ -433,14 +447,14 @@ def test_the_arm_reaches_it_without_touching_anything(
     rest = [link for link in placed.object.links if link != grasp.link]
     others += parts(placed, *rest) if rest else []
     ball = [(coal.Sphere(1.8), pin.SE3(np.eye(3), placed.placement.translation))]
-    others = [part for part in others if clearance(ball, [part]) < 0.0]
+    others = [part for part in others if compute_clearance(ball, [part]) < 0.0]
     data, shapes = robot.model.createData(), robot.collision.createData()
     frame, rng = tool_frame(robot), np.random.default_rng(0)
     for turn in turns(grasp.freedoms):
         target = placed.link_placement(grasp.link) * grasp.placement * grasp.motion(turn)
         for z in solutions(robot, target, rng):
             links = robot_shapes(robot, z)
-            near = clearance(
+            near = compute_clearance(
                 [part[1:] for part in links if part[0] == "base_link"], others, reach=DIST_SAFE
             )
             q = robot.coordinates.q(z)
@@ -449,9 +463,9 @@ def test_the_arm_reaches_it_without_touching_anything(
             ):
                 continue
             away = [part[1:] for part in links if part[0] not in robot.touch_links]
-            if clearance([part[1:] for part in links], others, reach=DIST_SAFE) < DIST_SAFE:
+            if compute_clearance([part[1:] for part in links], others, reach=DIST_SAFE) < DIST_SAFE:
                 continue
-            if clearance(away, held, reach=DIST_SAFE) >= DIST_SAFE:
+            if compute_clearance(away, held, reach=DIST_SAFE) >= DIST_SAFE:
                 tool = data.oMi[frame.parentJoint] * frame.placement
                 np.testing.assert_allclose(tool.homogeneous, target.homogeneous, atol=1e-5)
                 return
@@ -481,7 +495,7 @@ def bounds(shapes: Iterable[tuple[coal.CollisionGeometry, pin.SE3]]) -> np.ndarr
 def lowest(shapes: Shapes) -> float:
     """How far shapes are above the floor [m]."""
     plate = (coal.Box(20.0, 20.0, 0.1), pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.05])))
-    return clearance(shapes, [plate])
+    return compute_clearance(shapes, [plate])
 
 
 def robot_shapes(robot: Robot, z: np.ndarray) -> list[tuple[str, coal.CollisionGeometry, pin.SE3]]:

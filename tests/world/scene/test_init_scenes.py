@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import clearance, placed_shapes
+from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
@@ -155,11 +155,11 @@ def test_two_things_are_in_the_way_of_most_starts_of_the_second_scene() -> None:
 def test_the_stick_lies_on_its_table_without_touching_it() -> None:
     for name in SCENES:
         here = scene(name)
-        stick = placed_shapes(standing_geometry(here.objects["stick"]))
+        stick = list_placed_shapes(standing_geometry(here.objects["stick"]))
         top = [shape for shape in here.obstacles if shape.name == "table_top"]
-        assert 0.0005 <= clearance(stick, placed_shapes(top)) < 0.002
+        assert 0.0005 <= compute_clearance(stick, list_placed_shapes(top)) < 0.002
         others = [shape for shape in here.obstacles if shape.name != "table_top"]
-        assert clearance(stick, placed_shapes(others)) > 0.02
+        assert compute_clearance(stick, list_placed_shapes(others)) > 0.02
 
 
 def test_the_stick_is_a_tenth_by_half_a_metre_and_its_tip_points_east() -> None:
@@ -241,15 +241,15 @@ def test_the_hand_fits_round_the_stick_along_the_whole_range(turn: float, table:
         (-0.095, 0.095),
         (-1.2, 1.2),
     ]
-    dowel, butt, front, *tip = placed_shapes(standing_geometry(placed))
+    dowel, butt, front, *tip = list_placed_shapes(standing_geometry(placed))
     world = [shape for shape in here.obstacles if shape.name in (*TABLES, "floor")]
     for slide in SLIDES:
         tool = placed.link_placement("stick") * grip.placement * grip.motion([slide, turn])
         shapes = hand(here.robot, tool)
-        assert clearance(shapes, placed_shapes(world)) > table
-        assert clearance(shapes, [dowel]) > 0.005
-        assert clearance(shapes, [butt]) > 0.005
-        assert clearance(shapes, [front, *tip]) > 0.05
+        assert compute_clearance(shapes, list_placed_shapes(world)) > table
+        assert compute_clearance(shapes, [dowel]) > 0.005
+        assert compute_clearance(shapes, [butt]) > 0.005
+        assert compute_clearance(shapes, [front, *tip]) > 0.05
         # The dowel's axis runs between the pads, 0.01 in front of the tool frame and across the
         # closing direction.
         inside = tool.actInv(dowel[1])
@@ -277,10 +277,10 @@ def test_sliding_goes_towards_the_tip_and_stays_in_the_half_away_from_it() -> No
 @pytest.mark.parametrize("turn", [1.2, -1.2])
 def test_in_the_air_the_hand_fits_at_the_ends_of_its_turn_too(turn: float) -> None:
     placed = scene("init_1").objects["stick"]
-    grip, shapes = placed.object.attachments["grip"], placed_shapes(standing_geometry(placed))
+    grip, shapes = placed.object.attachments["grip"], list_placed_shapes(standing_geometry(placed))
     for slide in SLIDES:
         tool = placed.link_placement("stick") * grip.placement * grip.motion([slide, turn])
-        assert clearance(hand(scene("init_1").robot, tool), shapes) > 0.005
+        assert compute_clearance(hand(scene("init_1").robot, tool), shapes) > 0.005
 
 
 LYING = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.036]))  # the ball, 1 mm above the floor
@@ -298,8 +298,13 @@ def test_the_hand_fits_round_a_ball_on_the_floor(turn: tuple[float, float, float
     (round_,) = ball.collision.geometryObjects
     tool = LYING * grip.placement * grip.motion(turn)
     shapes = hand(here.robot, tool)
-    assert clearance(shapes, [(round_.geometry, LYING)]) > 0.005
-    assert clearance(shapes, placed_shapes([s for s in here.obstacles if s.name == "floor"])) > 0.02
+    assert compute_clearance(shapes, [(round_.geometry, LYING)]) > 0.005
+    assert (
+        compute_clearance(
+            shapes, list_placed_shapes([s for s in here.obstacles if s.name == "floor"])
+        )
+        > 0.02
+    )
     np.testing.assert_allclose(tool.actInv(LYING).translation, [0.0, 0.0, 0.01], atol=1e-12)
 
 
@@ -328,5 +333,5 @@ def test_a_sticks_tip_touches_the_ball_and_points_at_its_centre(
         (shape.geometry, at * shape.placement) for shape in stick.collision.geometryObjects
     ]
     around = [(round_.geometry, pin.SE3.Identity())]
-    assert clearance([pole], around) == pytest.approx(0.0, abs=1e-6)
-    assert clearance([dowel, butt, front, shaft], around) > 0.005
+    assert compute_clearance([pole], around) == pytest.approx(0.0, abs=1e-6)
+    assert compute_clearance([dowel, butt, front, shaft], around) > 0.005

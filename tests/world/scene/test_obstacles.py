@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.shapes import triangles, world_box
+from vkc_pin.world.models.shapes import compute_world_box, triangulate
 from vkc_pin.world.scene.obstacles import FLOOR, floor_shape, obstacle_shapes
 from vkc_pin.world.scene.scene_schema import ObstacleSchema
 
@@ -33,7 +33,7 @@ def described(
 
 
 def volume(shape: pin.GeometryObject) -> float:
-    return float(trimesh.Trimesh(*triangles(shape.geometry)).volume)
+    return float(trimesh.Trimesh(*triangulate(shape.geometry)).volume)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_a_file_that_is_not_there(kind: str, tmp_path: Path) -> None:
 
 def test_the_floor_lies_under_the_whole_arena_and_a_border() -> None:
     floor = floor_shape((-1.0, 4.0, 0.0, 2.5))
-    low, high = world_box(floor.geometry, floor.placement)
+    low, high = compute_world_box(floor.geometry, floor.placement)
     np.testing.assert_allclose(low, [-3.0, -2.0, -0.1])
     np.testing.assert_allclose(high, [6.0, 4.5, 0.0], atol=1e-12)
     assert floor.name == FLOOR

@@ -9,7 +9,7 @@ import pytest
 from helpers.rooms import TINY, load
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.models.shapes import clearance, placed_shapes
+from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
@@ -48,7 +48,7 @@ def test_moving_parts_keep_clear_of_the_room_over_the_whole_range(name: str, joi
     scene = load_scene(name)
     placed = scene.objects[name]
     index = placed.object.coordinates.index(joint)
-    room = placed_shapes(
+    room = list_placed_shapes(
         s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR
     )
     nearest = np.inf
@@ -59,7 +59,7 @@ def test_moving_parts_keep_clear_of_the_room_over_the_whole_range(name: str, joi
             for s, original in zip(moved, placed.object.collision.geometryObjects, strict=True)
             if original.parentJoint
         ]
-        nearest = min(nearest, clearance(placed_shapes(moving), room))
+        nearest = min(nearest, compute_clearance(list_placed_shapes(moving), room))
     assert nearest >= 0.03
 
 
@@ -68,7 +68,7 @@ def test_the_frame_fills_the_opening_without_a_gap_wider_than_a_finger(door: Sce
     frame = [s for s in standing_geometry(door.objects["door"]) if s.name.startswith("frame_")]
     assert len(frame) == 3
     for part in frame:
-        assert abs(clearance(placed_shapes([part]), placed_shapes(walls))) < 1e-3
+        assert abs(compute_clearance(list_placed_shapes([part]), list_placed_shapes(walls))) < 1e-3
 
 
 def test_with_methods_refuse_what_does_not_fit(door: Scene) -> None:

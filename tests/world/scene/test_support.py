@@ -8,7 +8,7 @@ import pytest
 from helpers.carrying import lifted
 from helpers.riding import TOP, cup, folder, plates, scene_of
 
-from vkc_pin.world.models.shapes import link_name
+from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import RESTING, borne, supports, tilt
@@ -16,7 +16,7 @@ from vkc_pin.world.scene.support import RESTING, borne, supports, tilt
 
 def on(scene: Scene, name: str = "cup") -> set[str]:
     shapes = [
-        (f"{other}.{link_name(shape.name)}", shape)
+        (f"{other}.{get_link_name(shape.name)}", shape)
         for other, placed in scene.objects.items()
         if other != name
         for shape in standing_geometry(placed)

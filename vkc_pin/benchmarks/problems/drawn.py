@@ -20,7 +20,7 @@ from vkc_pin.procedural.rooms.fixtures import OPENED
 from vkc_pin.procedural.rooms.random_room import random_room
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.resources import available
-from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -164,11 +164,14 @@ def _place(scene: Scene, name: str, rng: np.random.Generator) -> Step:
     """Put an object on the floor, or on top of an obstacle."""
     placed = scene.objects[name]
     below = min(
-        world_box(shape.geometry, shape.placement)[0][2] for shape in standing_geometry(placed)
+        compute_world_box(shape.geometry, shape.placement)[0][2]
+        for shape in standing_geometry(placed)
     )
     shapes = zip(scene.obstacles, scene.obstacle_labels, strict=True)
     boxes = [
-        world_box(shape.geometry, shape.placement) for shape, label in shapes if label != FLOOR
+        compute_world_box(shape.geometry, shape.placement)
+        for shape, label in shapes
+        if label != FLOOR
     ]
     tops = [
         (low, high) for low, high in boxes if 0.3 < high[2] < 1.3 and min(high[:2] - low[:2]) > 0.2

@@ -14,7 +14,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.procedural.rooms.parts import Part
 from vkc_pin.procedural.rooms.random_room import Layout
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.shapes import shape_distance, world_box
+from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["pose_among", "pose_over", "random_start"]
@@ -144,11 +144,14 @@ def _free(scene: Scene, z: Floats, near: float = np.inf) -> bool:
     pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(z))
     geometry = robot.collision.geometryObjects
     for shape, where in zip(geometry, shapes.oMg, strict=True):
-        if shape.parentJoint > 1 and world_box(shape.geometry, where)[0][2] < CLEAR:
+        if shape.parentJoint > 1 and compute_world_box(shape.geometry, where)[0][2] < CLEAR:
             return False
     for pair in robot.collision.collisionPairs:
         one, two = (geometry[k].geometry for k in (pair.first, pair.second))
-        if shape_distance(one, shapes.oMg[pair.first], two, shapes.oMg[pair.second]) < CLEAR:
+        if (
+            compute_shape_distance(one, shapes.oMg[pair.first], two, shapes.oMg[pair.second])
+            < CLEAR
+        ):
             return False
     try:
         there = scene.with_start(base=z[:3], arm=z[3:])

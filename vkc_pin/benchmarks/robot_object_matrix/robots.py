@@ -22,8 +22,8 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.world.files.srdf import read_srdf
 from vkc_pin.world.files.writing import check_name
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_file import known_robots, load_robot
-from vkc_pin.world.models.self_collisions import with_collision_pairs
+from vkc_pin.world.models.robot_file import list_robots, load_robot
+from vkc_pin.world.models.self_collisions import set_collision_pairs
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Reach
 
@@ -189,7 +189,7 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
 
 def _files(robots: Sequence[str]) -> dict[str, Path]:
     """Return name → file of every robot; files of one name are called as their folders, too."""
-    known, found = known_robots(), list[tuple[str, Path]]()
+    known, found = list_robots(), list[tuple[str, Path]]()
     for robot in map(str, robots):
         path = Path(robot)
         if path.suffix.lower() in _FORMATS:
@@ -278,7 +278,7 @@ def _facts(robot: Robot, folder: Path) -> dict[str, Any]:
     )
     every = load_robot(folder, pairs="all")
     (srdf,) = folder.glob("*.srdf")
-    look = Clearances(with_collision_pairs(every, read_srdf(srdf, links=every.file.links).allowed))
+    look = Clearances(set_collision_pairs(every, read_srdf(srdf, links=every.file.links).allowed))
     look.place(robot.home)  # also of pairs that loading exempts since they overlap there
     links = {
         tuple(sorted((robot.link_of(pair.first), robot.link_of(pair.second))))

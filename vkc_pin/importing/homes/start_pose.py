@@ -9,7 +9,7 @@ import numpy as np
 from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.reachable_floor import Cells, Discs, taken
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.shapes import placed_shapes
+from vkc_pin.world.models.shapes import list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
@@ -51,7 +51,7 @@ def free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
         standing += standing_geometry(placed)
     cells = Cells.over(low, high, _CELL)
     free = np.ones(cells.shape, bool)
-    for wall in Discs(placed_shapes(base)).walls(placed_shapes(standing)):
+    for wall in Discs(list_placed_shapes(base)).walls(list_placed_shapes(standing)):
         window, own = taken(cells, wall, 0.0)
         free[window] &= ~own
     regions, count = ndimage.label(free)

@@ -10,7 +10,7 @@ import pinocchio as pin
 from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.world.models.shapes import bounding_box, link_name, shape_distance
+from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance, get_link_name
 
 __all__ = ["Blocked", "Fitting"]
 
@@ -45,13 +45,14 @@ class Fitting:
         self.item, self.hand = item, hand
         self._safe, self._close = dist_safe, grasp_clearance
         self._shapes = list(item.collision.geometryObjects)
-        self.links = np.array([link_name(shape.name) for shape in self._shapes])
+        self.links = np.array([get_link_name(shape.name) for shape in self._shapes])
         self._joints = [shape.parentJoint for shape in self._shapes]
-        self._boxes = [bounding_box(shape) for shape in self._shapes]
+        self._boxes = [compute_bounding_box(shape) for shape in self._shapes]
         self._touch = np.array([True] * len(hand.touch) + [False] * len(hand.others))
         self._hand = [*hand.touch, *hand.others]
         self._hand_boxes = [
-            bounding_box(pin.GeometryObject("", 0, where, shape)) for shape, where in self._hand
+            compute_bounding_box(pin.GeometryObject("", 0, where, shape))
+            for shape, where in self._hand
         ]
         self._data = item.model.createData()
         self.place(np.clip(np.zeros(len(item.lower)), item.lower, item.upper))
@@ -94,7 +95,7 @@ class Fitting:
             gaps = np.maximum(self._low - high, low - self._high).max(axis=1)
             for k in np.flatnonzero(gaps < margins).tolist():
                 if (
-                    shape_distance(shape, placed, self._shapes[k].geometry, self._at[k])
+                    compute_shape_distance(shape, placed, self._shapes[k].geometry, self._at[k])
                     < margins[k]
                 ):
                     return Blocked(

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.grippers.bar_width import THIN, widest_bar
+from vkc_pin.world.models.grippers.bar_width import BAR_THICKNESS, find_widest_bar
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import placed_shapes, world_box
+from vkc_pin.world.models.shapes import compute_world_box, list_placed_shapes
 
 __all__ = ["Hand", "hand_of"]
 
@@ -70,16 +70,18 @@ def hand_of(robot: Robot) -> Hand:
             touch.append(placed)
         elif frame.parentJoint in robot.model.supports[shape.parentJoint]:
             others.append(placed)
-    fingers, rest = tuple(placed_shapes(touch)), tuple(placed_shapes(others))
-    opening = widest_bar(fingers)
-    if opening < 2.0 * THIN:
+    fingers, rest = tuple(list_placed_shapes(touch)), tuple(list_placed_shapes(others))
+    opening = find_widest_bar(fingers)
+    if opening < 2.0 * BAR_THICKNESS:
         problem = f"there is no room between the fingers of '{robot.name}' at its tool frame '{robot.tool_frame}'"
         expected = "an open hand around its origin, x the direction of closing"
         raise InputError(problem, file=robot.urdf, field="tool_frame", expected=expected)
     beside = [
-        box for geometry, where in fingers if (box := world_box(geometry, where))[1][2] > 0.0
+        box
+        for geometry, where in fingers
+        if (box := compute_world_box(geometry, where))[1][2] > 0.0
     ]  # what reaches past the origin
-    ends = beside or [world_box(geometry, where) for geometry, where in fingers]
+    ends = beside or [compute_world_box(geometry, where) for geometry, where in fingers]
     width = max(high[1] for _, high in ends) - min(low[1] for low, _ in ends)
     return Hand(
         robot.name,

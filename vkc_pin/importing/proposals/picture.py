@@ -15,7 +15,7 @@ from vkc_pin.importing.proposals.proposal import Proposal, Proposals
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.world.models.shapes import link_name, triangles
+from vkc_pin.world.models.shapes import get_link_name, triangulate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,7 +89,7 @@ def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> No
     pin.forwardKinematics(item.model, data, item.coordinates.q(state))
     moving, faces, colours = item.links_moved_by({joint}), list[Floats](), list[Floats]()
     for shape in item.collision.geometryObjects:
-        base = _MOVING if link_name(shape.name) in moving else _STILL
+        base = _MOVING if get_link_name(shape.name) in moving else _STILL
         _add(faces, colours, shape.geometry, data.oMi[shape.parentJoint] * shape.placement, base)
     tool = item.link_placement(attachment.link, state) * attachment.tool(
         np.zeros(len(attachment.freedoms))
@@ -108,7 +108,7 @@ def _add(
 ) -> None:
     import trimesh
 
-    vertices, corners = triangles(geometry)
+    vertices, corners = triangulate(geometry)
     if (
         size := float(np.ptp(vertices, axis=0).max())
     ) > _FACET:  # large triangles are drawn in the wrong order

@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.shapes import link_name, triangles
+from vkc_pin.world.models.shapes import get_link_name, triangulate
 
 __all__ = ["Piece", "Section"]
 
@@ -92,9 +92,9 @@ class Piece:
     @classmethod
     def of(cls, shape: pin.GeometryObject) -> Piece:
         """Return the piece that a shape of an object is."""
-        vertices, faces = triangles(shape.geometry)
+        vertices, faces = triangulate(shape.geometry)
         placed = vertices @ shape.placement.rotation.T + shape.placement.translation
-        return cls(link_name(shape.name), str(shape.name), np.asarray(placed), faces)
+        return cls(get_link_name(shape.name), str(shape.name), np.asarray(placed), faces)
 
     @cached_property
     def axes(self) -> Floats:

@@ -17,7 +17,7 @@ from vkc_pin.importing.robots.rest_configuration import Clearances, never_apart
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import number, whole
 from vkc_pin.world.files.meshes import load_mesh
-from vkc_pin.world.models.couplings.limits import UNSAID_VELOCITY
+from vkc_pin.world.models.couplings.limits import DEFAULT_JOINT_VELOCITY
 from vkc_pin.world.models.dynamics.torque_limits import UNLIMITED
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
@@ -184,7 +184,7 @@ def _numbers(robot: Robot) -> list[Finding]:
         if name not in planned:
             continue
         velocity = float(limit.get("velocity", "0")) if limit is not None else 0.0
-        if not 0.0 < velocity < 1e3 and robot.velocity[planned[name]] == UNSAID_VELOCITY:
+        if not 0.0 < velocity < 1e3 and robot.velocity[planned[name]] == DEFAULT_JOINT_VELOCITY:
             speed.append(name)
         if not 0.0 < robot.model.effortLimit[planned[name]] < UNLIMITED:
             effort.append(name)

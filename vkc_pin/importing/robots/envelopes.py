@@ -9,7 +9,7 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 
 __all__ = ["envelopes", "leave_out"]
 
@@ -34,7 +34,7 @@ def envelopes(robot: Robot) -> dict[str, float]:
     surfaces: dict[str, list[tuple[Floats, Floats]]] = {}
     for k, shape in enumerate(robot.collision.geometryObjects):
         if shape.parentJoint == joint:
-            points, faces = triangles(shape.geometry)
+            points, faces = triangulate(shape.geometry)
             placed = np.asarray(
                 points @ shape.placement.rotation.T + shape.placement.translation, float
             )

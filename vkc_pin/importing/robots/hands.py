@@ -14,7 +14,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.importing.robots.arms import Arm, Body
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.models.robot_model import configuration, rest_positions
+from vkc_pin.world.models.robot_model import compute_rest_positions, make_configuration
 
 __all__ = ["Hand", "look_at"]
 
@@ -135,8 +135,8 @@ class _Looker:
         )
 
     def _place(self, positions: Mapping[str, float]) -> pin.SE3:
-        rest = rest_positions(self._full, self._file, positions)
-        pin.framesForwardKinematics(self._full, self._data, configuration(self._full, rest))
+        rest = compute_rest_positions(self._full, self._file, positions)
+        pin.framesForwardKinematics(self._full, self._data, make_configuration(self._full, rest))
         return self._data.oMf[self._palm]
 
     def _of(self, body: Body, positions: Mapping[str, float], *, alone: bool = False) -> Floats:
@@ -215,7 +215,7 @@ class _Looker:
         self, first: Sequence[Body], second: Sequence[Body], joints: Sequence[str]
     ) -> tuple[dict[str, float], dict[str, float], float, float]:
         """Return where the fingers' joints are open, where they are shut, and the gaps there [m]."""
-        rest = rest_positions(self._full, self._file, {})
+        rest = compute_rest_positions(self._full, self._file, {})
         chosen = {joint: rest[joint] for joint in joints if joint in rest}
         choices = {joint: self._choices(joint, rest[joint]) for joint in chosen}
         best = smallest = self._gap(first, second, chosen)

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_model import nearest_position
+from vkc_pin.world.models.robot_model import find_nearest_position
 from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances
 
 __all__ = ["HOME_ROOM", "Clearances", "Home", "arm_at", "find_home", "never_apart", "standing"]
@@ -99,7 +99,7 @@ def arm_at(robot: Robot, state: Mapping[str, float]) -> Floats:
     """Return where an arm is in a state of its joints, turned by 2π or else moved to the nearest limits, shape (n − 3,)."""
     return np.array(
         [
-            nearest_position(robot.model, joint, state[joint])
+            find_nearest_position(robot.model, joint, state[joint])
             for joint in robot.coordinates.names[3:]
         ]
     )

@@ -46,8 +46,8 @@ from vkc_pin.world.files.writing import folder_at_once
 from vkc_pin.world.files.xml import replace_forbidden
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.models.robot_model import full_model
-from vkc_pin.world.models.self_collisions import sample_allowed_pairs, with_collision_pairs
+from vkc_pin.world.models.robot_model import build_full_model
+from vkc_pin.world.models.self_collisions import sample_allowed_pairs, set_collision_pairs
 
 __all__ = ["ImportedRobot", "import_robot"]
 
@@ -186,7 +186,7 @@ class _Importer:
         text = ElementTree.tostring(root, encoding="unicode")
         self._file = UrdfFile(self._folder / self._settings["urdf"], text, root)
         if chosen is not None:
-            self._hand(look_at(self._file, full_model(self._file), chosen), tool_frame)
+            self._hand(look_at(self._file, build_full_model(self._file), chosen), tool_frame)
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
         robot = self._on_the_floor(self._without_envelopes(self._loaded()), seed)
@@ -236,7 +236,7 @@ class _Importer:
         sure = "likely" if kind != "omni" else "guess"
         self._guess(sure, f"base: {kind} ({why})", "scenes and `load_robot` choose it: `base: ...`")
         if chosen is not None:
-            for leader, *others in telescopes(full_model(self._file), chosen.joints):
+            for leader, *others in telescopes(build_full_model(self._file), chosen.joints):
                 self._settings.setdefault("couplings", {}).update(dict.fromkeys(others, leader))
                 told = (
                     f"{', '.join(others)} slide along with {leader}, as a telescope: one coordinate"
@@ -370,14 +370,14 @@ class _Importer:
             **self._source.srdf.allowed,
             **sample_allowed_pairs(robot, samples=samples, seed=seed),
         }
-        sampled = with_collision_pairs(robot, allowed)
+        sampled = set_collision_pairs(robot, allowed)
         for one, other in never_apart(
             sampled, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed
         ):
             text = f"{one} and {other} are hardly ever {1e3 * _NEIGHBOURS:.0f} mm apart: they are not kept apart"
             self._findings.append(Finding("note", "pairs", text))
             allowed[min(one, other), max(one, other)] = "Near"
-        apart, arm = with_collision_pairs(robot, allowed), robot.coordinates.names[3:]
+        apart, arm = set_collision_pairs(robot, allowed), robot.coordinates.names[3:]
         states = [
             (name, state)
             for name, state in self._source.srdf.states.items()

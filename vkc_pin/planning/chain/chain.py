@@ -17,7 +17,7 @@ from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.grafting import clean, graft, graft_geometry
+from vkc_pin.world.models.grafting import graft, graft_geometry, round_placement
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.contact_rules import hand_frame
 from vkc_pin.world.scene.hold import Hold, checked_holds, holds_of
@@ -296,7 +296,9 @@ def consolidate(
             )
             own = [np.array([value]) for value in (np.inf, VIRTUAL_VELOCITY, low, high)]
             through = pin.SE3(np.eye(3), freedom.through)
-            parent = model.addJoint(parent, joint, clean(placement * through), joint_name, *own)
+            parent = model.addJoint(
+                parent, joint, round_placement(placement * through), joint_name, *own
+            )
             placement = through.inverse()
             added.append(joint_name)
             for row, value in zip(
@@ -305,7 +307,7 @@ def consolidate(
                 row.append(value)
         virtual[hold] = tuple(added)
         tree = invert(placed.object, attachment.link, placed.state)
-        placement = clean(placement * attachment.placement.inverse())
+        placement = round_placement(placement * attachment.placement.inverse())
         joints = graft(model, tree.model, parent=parent, placement=placement, prefix=prefix)
         names += added
         for joint_name in tree.model.names[1:]:

@@ -16,8 +16,8 @@ from vkc_pin.planning.chain.easing import EASED_SHARE, eased_pairs
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import spend
-from vkc_pin.world.collision.margins import Place
-from vkc_pin.world.models.shapes import bounding_box, link_name, own_name
+from vkc_pin.world.collision.margins import MarginRegion
+from vkc_pin.world.models.shapes import compute_bounding_box, get_link_name, get_local_name
 from vkc_pin.world.scene.clearance_exemptions import allowances, shape_keys
 from vkc_pin.world.scene.contact_rules import (
     CONTACT,
@@ -68,7 +68,7 @@ class _Pairing:
         riding = [(ride.object, indices) for ride, indices in chain.ride_geometries.items()]
         for name, indices in (*held, *riding):
             self._labels += [
-                f"{name}.{link_name(own_name(chain.collision.geometryObjects[i].name))}"
+                f"{name}.{get_link_name(get_local_name(chain.collision.geometryObjects[i].name))}"
                 for i in indices
             ]
         self._allowances = allowances(scene, options.dist_safe)
@@ -131,12 +131,12 @@ class _Pairing:
                 )
             standing = standing_geometry(placed.with_state(state))
             if name in mine:  # its frame stands on, the rest is in the hand
-                held_shapes = {own_name(shapes[i].name) for i in mine[name]}
+                held_shapes = {get_local_name(shapes[i].name) for i in mine[name]}
                 standing = [shape for shape in standing if shape.name not in held_shapes]
             if name in phase.left:
                 left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
             for shape in standing:
-                label = f"{name}.{link_name(shape.name)}"
+                label = f"{name}.{get_link_name(shape.name)}"
                 others = [
                     i
                     for i in moving
@@ -202,7 +202,7 @@ class _Pairing:
 
     def _allowed(
         self, phase: Phase, table: Floats, labels: Sequence[str], keys: Sequence[str]
-    ) -> tuple[Floats, list[Place]]:
+    ) -> tuple[Floats, list[MarginRegion]]:
         """Return pairs with their margins, shape (P, 3), as the scene allows them, and those that are exempt for a while.
 
         Args:
@@ -229,7 +229,7 @@ class _Pairing:
             near_pairs, within = place[rows[one]][kept[rows[one]]], self._within(phase, one.ranges)
             if one.ranges and len(near_pairs) and within is not None:
                 margin = one.margin if one.margin < 0.0 else EASED_SHARE * max(one.distance, 0.0)
-                near.append(Place(near_pairs, margin, *within))
+                near.append(MarginRegion(near_pairs, margin, *within))
         return table[kept], near
 
     def _within(
@@ -276,7 +276,7 @@ class _Pairing:
 
 def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:
     """Return centres and half extents of bounding boxes, and placements as rotations and translations; see `PhaseGeometry`."""
-    boxes = [bounding_box(shape) for shape in shapes]
+    boxes = [compute_bounding_box(shape) for shape in shapes]
     return (
         np.array([center for center, _ in boxes]).reshape(-1, 3),
         np.array([half for _, half in boxes]).reshape(-1, 3),

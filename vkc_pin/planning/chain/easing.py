@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
-from vkc_pin.world.models.shapes import own_name, shape_distance, world_box
+from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_local_name
 from vkc_pin.world.scene.contact_rules import CONTACT, EASED_TIME, hand_clearance, touching
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 from vkc_pin.world.scene.scene import Scene
@@ -67,10 +67,10 @@ def eased_pairs(
         inside: bool = False,
     ) -> None:
         """Ease the pairs of a geometry that moves with what stands next to a shape, or in it."""
-        beside = part.within(float(part.margins.max()), *world_box(shape, where))
+        beside = part.within(float(part.margins.max()), *compute_world_box(shape, where))
         for k in part.pairs_of(moving, beside).tolist():
             other = shapes[int(part.pairs[k, 1])]
-            distance = shape_distance(shape, where, other.geometry, other.placement)
+            distance = compute_shape_distance(shape, where, other.geometry, other.placement)
             share = EASED_SHARE * max(distance, 0.0)
             if distance < part.margins[k]:
                 eased.setdefault(k, []).append(
@@ -94,7 +94,14 @@ def eased_pairs(
             new = begins and placed.name not in {
                 hold.object for earlier in task.phases[:number] for hold in earlier.held
             }
-            ease(i, shapes[i].geometry, stands[own_name(shapes[i].name)], begin, end, inside=new)
+            ease(
+                i,
+                shapes[i].geometry,
+                stands[get_local_name(shapes[i].name)],
+                begin,
+                end,
+                inside=new,
+            )
     touches = [(goal, last - steps, last) for goal in phase.frames]
     touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
     for goal, begin, end in touches:

@@ -14,7 +14,7 @@ from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.grafting import add_joint, clean
+from vkc_pin.world.models.grafting import add_joint, round_placement
 
 __all__ = ["InvertedTree", "invert"]
 
@@ -76,7 +76,9 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
         new_parent, body = carrier[child]
         joint, axis = _z_aligned(source, data, child)
         turn = pin.SE3(_z_to(-axis), np.zeros(3))
-        index = add_joint(model, new_parent, joint, clean(body * turn), like=(source, child))
+        index = add_joint(
+            model, new_parent, joint, round_placement(body * turn), like=(source, child)
+        )
         carrier[parent] = (index, turn.inverse() * source.jointPlacements[child].inverse())
 
     def place(joint: int, placement: pin.SE3) -> tuple[int, pin.SE3]:
@@ -85,7 +87,7 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
         while anchor not in carrier:
             anchor = source.parents[anchor]
         new, body = carrier[anchor]
-        return new, clean(body * data.oMi[anchor].actInv(data.oMi[joint]) * placement)
+        return new, round_placement(body * data.oMi[anchor].actInv(data.oMi[joint]) * placement)
 
     for joint in range(source.njoints):
         if source.inertias[joint].mass > 0.0:

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.collision.boxes import Boxes
-from vkc_pin.world.collision.margins import Margins, Place
+from vkc_pin.world.collision.margins import MarginRegion, Margins
 
 __all__ = ["PhaseGeometry"]
 
@@ -47,7 +47,7 @@ class PhaseGeometry:
     rotation: Floats
     translation: Floats
     eased: Mapping[int, Sequence[tuple[int, int, float]]] = field(default_factory=dict)
-    neighbours: Sequence[Place] = ()
+    neighbours: Sequence[MarginRegion] = ()
     left: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def margins_at(

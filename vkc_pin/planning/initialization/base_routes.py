@@ -15,7 +15,7 @@ from vkc_pin.planning.base_paths.grid import BaseGrid, fine_cells
 from vkc_pin.planning.initialization.keyframes import ALIKE, depth
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.world.collision.threads import available_threads
+from vkc_pin.world.collision.threads import count_threads
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 
@@ -122,7 +122,7 @@ class Routes:
             if key not in self._distances
         }
         if new:
-            found = grid.distances_from(np.array(list(new.values())), threads=available_threads())
+            found = grid.distances_from(np.array(list(new.values())), threads=count_threads())
             self._distances |= dict(zip(new, found, strict=True))
         return np.array([self._distances[key][i, j] for key, (i, j) in zip(keys, end, strict=True)])
 

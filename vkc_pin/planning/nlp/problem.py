@@ -21,7 +21,7 @@ from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.planning.nlp.waypoint import Structure
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
-from vkc_pin.world.models.coordinates import wrapped
+from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase, Task
@@ -187,7 +187,9 @@ class TrajectoryProblem:
             if phase.base is not None:
                 for column, goal in enumerate(phase.base):
                     if goal is not None:
-                        turn = wrapped(goal - self.start[2])  # to the nearest of the equal headings
+                        turn = wrap_angle(
+                            goal - self.start[2]
+                        )  # to the nearest of the equal headings
                         lower[end - 1, column] = upper[end - 1, column] = (
                             self.start[2] + turn if column == 2 else goal
                         )

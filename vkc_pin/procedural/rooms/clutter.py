@@ -14,7 +14,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import instance, whole
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
 
@@ -83,7 +83,7 @@ class _Faces:
             *scene.obstacles,
             *(shape for placed in objects for shape in standing_geometry(placed)),
         ]
-        self.boxes = [world_box(shape.geometry, shape.placement) for shape in shapes]
+        self.boxes = [compute_world_box(shape.geometry, shape.placement) for shape in shapes]
         self.clear = [(np.array(place, float), float(radius)) for place, radius in clear]
         self.clear += [
             (placed.placement.translation, _REACH) for placed in objects if placed.object.free

@@ -18,7 +18,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.resources import available
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.object_file import load_object
-from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 
 __all__ = ["OPENED", "RANDOM", "Counter", "Fixture", "fixture", "known_objects", "own_name"]
@@ -140,7 +140,7 @@ def _other(kind: str | dict[str, Any], own: ArticulatedObject) -> Fixture:
         )
     low, high = _extent(own, in_wall=False)
     fixed = [
-        world_box(shape.geometry, shape.placement)[0]
+        compute_world_box(shape.geometry, shape.placement)[0]
         for shape in own.collision.geometryObjects
         if shape.parentJoint == 0
     ]
@@ -181,7 +181,7 @@ def _extent(own: ArticulatedObject, *, in_wall: bool) -> tuple[Floats, Floats]:
     """Return lowest and highest corner, shape (3,) each [m]; see `Fixture`."""
     placed = PlacedObject("it", own, pin.SE3.Identity(), np.clip(0.0, own.lower, own.upper))
     boxes = np.array(
-        [world_box(shape.geometry, shape.placement) for shape in standing_geometry(placed)]
+        [compute_world_box(shape.geometry, shape.placement) for shape in standing_geometry(placed)]
     )
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     if in_wall:

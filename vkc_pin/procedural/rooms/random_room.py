@@ -21,7 +21,7 @@ from vkc_pin.utils.arguments import instance, whole
 from vkc_pin.world.files.resources import folder
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.models.shapes import world_box
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
 __all__ = ["Layout", "random_layout", "random_room"]
@@ -302,7 +302,7 @@ def _turning_radius(robot: Robot) -> float:
         robot.model, data, robot.collision, shapes, robot.coordinates.q(rest)
     )
     boxes = [
-        world_box(shape.geometry, where)
+        compute_world_box(shape.geometry, where)
         for shape, where in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
     ]
     reach = max(

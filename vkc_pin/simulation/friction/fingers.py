@@ -19,8 +19,8 @@ from vkc_pin.simulation.model import Builder, PhysicalWorld, quaternion
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.servos import Servo, position_servo
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.models.grippers.bar_width import bar_fits, widest_bar
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.grippers.bar_width import check_bar_fits, find_widest_bar
+from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Fingers", "Sides", "fingers_of", "limited"]
@@ -176,12 +176,12 @@ def _sides(world: World) -> Sides:
     for number, shape in hand:
         place = back * shape.placement
         x = _across(place, shape)
-        if (x.min() > 0.0 or x.max() < 0.0) and not bar_fits(
+        if (x.min() > 0.0 or x.max() < 0.0) and not check_bar_fits(
             2.0 * _FURTHEST, [(shape.geometry, place)]
         ):
             sides[0 if x.min() > 0.0 else 1].append(number)
     travel = (
-        widest_bar([(shape.geometry, back * shape.placement) for _, shape in hand]) / 2.0
+        find_widest_bar([(shape.geometry, back * shape.placement) for _, shape in hand]) / 2.0
         if all(sides)
         else 0.0
     )
@@ -200,5 +200,5 @@ def _sides(world: World) -> Sides:
 
 def _across(place: pin.SE3, shape: pin.GeometryObject) -> Floats:
     """Return where the corners of a shape are along the x axis of the tool frame."""
-    points = triangles(shape.geometry)[0]
+    points = triangulate(shape.geometry)[0]
     return np.asarray(points @ place.rotation[0] + place.translation[0])

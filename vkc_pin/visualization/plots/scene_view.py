@@ -15,7 +15,7 @@ from vkc_pin.visualization.plots.plots import PICTURES
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.visualization.plots.top_view import draw_top_view, outline
 from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.world_model import World
@@ -83,7 +83,7 @@ def plot_scene(
         for label, shape in zip(world.collision_labels, world.shapes, strict=True):
             if label in stuck and label != FLOOR:
                 where = data.oMi[shape.parentJoint] * shape.placement
-                corners = triangles(shape.geometry)[0] @ where.rotation.T + where.translation
+                corners = triangulate(shape.geometry)[0] @ where.rotation.T + where.translation
                 axes.add_patch(
                     Polygon(outline(corners), fill=False, edgecolor=red, linewidth=2.0, zorder=6)
                 )

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.trajectory.placements import sample_motion
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -156,7 +156,7 @@ def _corners(world: World, index: int, joint: Floats, known: dict[int, Floats]) 
     """Return a collision shape's vertices, shape (n, 3) [m], with its joint at `joint`, shape (4, 4); `known` keeps its own."""
     shape = world.shapes[index]
     if index not in known:
-        known[index] = triangles(shape.geometry)[0]
+        known[index] = triangulate(shape.geometry)[0]
     placed = pin.SE3(joint) * shape.placement
     return np.asarray(known[index] @ np.asarray(placed.rotation).T + placed.translation)
 

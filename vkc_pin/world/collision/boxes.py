@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.collision.solids import compiled
-from vkc_pin.world.collision.threads import available_threads
+from vkc_pin.world.collision.solids import load_compiled
+from vkc_pin.world.collision.threads import count_threads
 
 __all__ = ["Boxes"]
 
@@ -27,7 +27,7 @@ class Boxes:
         centers: Of the boxes, in the same frame, shape (G, 3) [m].
         halves: Half extents along the boxes' own axes, shape (G, 3) [m].
         pairs: Which of them to look at, shape (P, 2); of every pair at least the first moves.
-        threads: How many look at most; None: see `available_threads`.
+        threads: How many look at most; None: see `count_threads`.
 
     Attributes:
         pairs: Which pairs it looks at, shape (P, 2).
@@ -35,7 +35,7 @@ class Boxes:
     Raises:
         ValueError: Those that move are not the first, or arrays do not fit together.
         IndexError: There is no such box.
-        BuildError: See `solids.compiled`.
+        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
@@ -48,9 +48,9 @@ class Boxes:
         *,
         threads: int | None = None,
     ) -> None:
-        self.threads = available_threads() if threads is None else threads
+        self.threads = count_threads() if threads is None else threads
         self.pairs = pairs
-        self.compiled: Any = compiled().Boxes(joints, rotations, centers, halves, pairs)
+        self.compiled: Any = load_compiled().Boxes(joints, rotations, centers, halves, pairs)
 
     def placed(self, which: Ints, rotations: Floats, centers: Floats) -> Boxes:
         """Return the same with some that stand, shape (n,), placed elsewhere: shapes (n, 3, 3) and (n, 3) [m]."""

@@ -13,15 +13,15 @@ from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.margins import Margins
 from vkc_pin.world.collision.placements import ShapePlacements
 from vkc_pin.world.collision.shapes import Shapes
-from vkc_pin.world.collision.solids import compiled
+from vkc_pin.world.collision.solids import load_compiled
 
-__all__ = ["Clearances", "Nearest"]
+__all__ = ["Clearances", "ClosePairs"]
 
 _ROUNDING = 1e-6  # [m] of coal
 _WORTH = 16  # configurations, some 0.3 ms, for which another thread is worth starting
 
 
-class Nearest(NamedTuple):
+class ClosePairs(NamedTuple):
     """Pairs that are close, C in all, by configuration and then by distance − margin.
 
     Attributes:
@@ -60,7 +60,7 @@ class Clearances:
     ) -> None:
         self.placements, self.boxes, self.shapes, self.margins = placements, boxes, shapes, margins
         self._parts = placements.compiled, boxes.compiled, shapes.compiled, margins.compiled
-        self._nearest, self._first_blocked = compiled().nearest, compiled().first_blocked
+        self._nearest, self._first_blocked = load_compiled().nearest, load_compiled().first_blocked
 
     def placed(self, boxes: Boxes, where: Mapping[int, pin.SE3]) -> Clearances:
         """Return the same with some shapes that stand placed elsewhere in the world, where `boxes` has them already."""
@@ -75,7 +75,7 @@ class Clearances:
         reach: float,
         most: int | None = None,
         standing: bool = True,
-    ) -> Nearest:
+    ) -> ClosePairs:
         """Return, for each configuration, the pairs closer than `reach` that fall shortest of their margins.
 
         Args:
@@ -91,7 +91,7 @@ class Clearances:
         """
         threads = max(1, min(self.shapes.threads, len(q) // _WORTH))
         limit = -1 if most is None else most
-        return Nearest(
+        return ClosePairs(
             *self._nearest(
                 *self._parts, q, z, waypoints, reach, limit, standing, _ROUNDING, threads
             )
@@ -149,6 +149,6 @@ class Clearances:
         """
         where = [np.ascontiguousarray(part, np.int64) for part in places]
         moved = np.ascontiguousarray(z, float), np.ascontiguousarray(weights, float)
-        return compiled().Lines(
+        return load_compiled().Lines(
             *self._parts, *where, *moved, step, waypoint, reach, allowed, _ROUNDING
         )

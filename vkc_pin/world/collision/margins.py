@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.collision.solids import compiled
+from vkc_pin.world.collision.solids import load_compiled
 
-__all__ = ["Margins", "Place"]
+__all__ = ["MarginRegion", "Margins"]
 
 
-class Place(NamedTuple):
+class MarginRegion(NamedTuple):
     """Pairs that may be closer than others as long as some coordinates are within limits.
 
     Attributes:
@@ -41,16 +41,16 @@ class Margins:
 
     Raises:
         IndexError: There is no such pair.
-        BuildError: See `solids.compiled`.
+        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
         self,
         usual: Floats,
         eased: Mapping[int, Sequence[tuple[int, int, float]]],
-        places: Iterable[Place] = (),
+        places: Iterable[MarginRegion] = (),
     ) -> None:
-        self.compiled: Any = compiled().Margins(usual)
+        self.compiled: Any = load_compiled().Margins(usual)
         for pair, spans in eased.items():
             for first, last, margin in spans:
                 self.compiled.ease(pair, first, last, margin)

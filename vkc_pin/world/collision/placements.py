@@ -9,14 +9,14 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.collision.solids import compiled
+from vkc_pin.world.collision.solids import load_compiled
 
-__all__ = ["ShapePlacements", "columns_of"]
+__all__ = ["ShapePlacements", "flatten_placements"]
 
 _NUMBERS = 12
 
 
-def columns_of(placements: Sequence[pin.SE3]) -> Floats:
+def flatten_placements(placements: Sequence[pin.SE3]) -> Floats:
     """Return placements as numbers, shape (n, 12): the columns of each rotation, then the translation [m]."""
     columns = np.empty((len(placements), _NUMBERS))
     for row, placement in zip(columns, placements, strict=True):
@@ -32,7 +32,7 @@ class ShapePlacements:
         geometry: The shapes on its joints, M of them.
 
     Raises:
-        BuildError: See `solids.compiled`.
+        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
@@ -40,10 +40,17 @@ class ShapePlacements:
         model.saveToBinary(described)
         content = bytes(described.view())  # as tobytes() does, which leaks a view at every call
         joints = np.array([shape.parentJoint for shape in shapes], np.int64)
-        self.compiled: Any = compiled().Bodies(
-            content, joints, columns_of([shape.placement for shape in shapes])
+        self.compiled: Any = load_compiled().Bodies(
+            content, joints, flatten_placements([shape.placement for shape in shapes])
         )
 
     def at(self, q: Floats) -> Floats:
-        """Return the placements in the world at Pinocchio's configurations, shape (W, nq): shape (W, M, 12), see `columns_of`."""
+        """Return the placements of the shapes in the world frame, shape (W, M, 12).
+
+        Args:
+            q: Configurations, shape (W, nq).
+
+        Returns:
+            Placements in the format of `flatten_placements`.
+        """
         return np.asarray(self.compiled.placements(q), float)

@@ -10,11 +10,11 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.collision.placements import columns_of
-from vkc_pin.world.collision.solids import compiled, solid_of
-from vkc_pin.world.collision.threads import available_threads
+from vkc_pin.world.collision.placements import flatten_placements
+from vkc_pin.world.collision.solids import convert_solid, load_compiled
+from vkc_pin.world.collision.threads import count_threads
 
-__all__ = ["TOLERANCE", "Shapes", "Witnesses", "asked"]
+__all__ = ["TOLERANCE", "Shapes", "Witnesses", "count_distance_queries"]
 
 TOLERANCE = 1e-6  # coal's own, of GJK
 _WORTH = 128  # distances, some 0.2 ms, for which another thread is worth starting
@@ -41,7 +41,7 @@ class Shapes:
 
     They are coal's to the last bit (`coal.distance` with a result of its own), however many threads
     look for them. States say where what moves is: placements in the world, shape (W, M, 12), see
-    `placements.columns_of`.
+    `placements.flatten_placements`.
 
     Args:
         geometries: coal's shapes, first those that move.
@@ -53,8 +53,8 @@ class Shapes:
             process, 8 at most, or `OMP_NUM_THREADS`.
 
     Raises:
-        InputError: A shape is of a kind that is not known; see `solids.solid_of`.
-        BuildError: See `solids.compiled`.
+        InputError: A shape is of a kind that is not known; see `solids.convert_solid`.
+        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
@@ -65,16 +65,16 @@ class Shapes:
         tolerance: float = TOLERANCE,
         threads: int | None = None,
     ) -> None:
-        self.threads = available_threads() if threads is None else threads
-        solids = [solid_of(geometry) for geometry in geometries]
-        self.compiled: Any = compiled().Shapes(solids, columns_of(standing), tolerance)
+        self.threads = count_threads() if threads is None else threads
+        solids = [convert_solid(geometry) for geometry in geometries]
+        self.compiled: Any = load_compiled().Shapes(solids, flatten_placements(standing), tolerance)
 
     def placed(self, where: Mapping[int, pin.SE3]) -> Shapes:
         """Return the same with some that stand placed elsewhere in the world; `where` goes by their numbers among the G."""
         other = object.__new__(Shapes)
         other.threads = self.threads
         other.compiled = self.compiled.placed(
-            np.array(list(where), np.int64), columns_of(list(where.values()))
+            np.array(list(where), np.int64), flatten_placements(list(where.values()))
         )
         return other
 
@@ -146,6 +146,6 @@ def _witnesses(table: Floats) -> Witnesses:
     return Witnesses(table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7:10])
 
 
-def asked() -> int:
+def count_distance_queries() -> int:
     """Return how many distances were asked of coal so far here, by this process: what bounds have not saved."""
-    return int(compiled().asked())
+    return int(load_compiled().asked())

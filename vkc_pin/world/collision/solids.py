@@ -15,11 +15,11 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import REBUILD, compiled_module
 from vkc_pin.world.files.meshes import indices
 
-__all__ = ["compiled", "solid_of"]
+__all__ = ["convert_solid", "load_compiled"]
 
 
 @cache
-def compiled() -> Any:
+def load_compiled() -> Any:
     """Return the compiled module, imported once and after coal and Pinocchio, whose libraries it uses.
 
     Raises:
@@ -40,7 +40,7 @@ def compiled() -> Any:
     return module
 
 
-def solid_of(shape: coal.CollisionGeometry) -> Any:
+def convert_solid(shape: coal.CollisionGeometry) -> Any:
     """Return a coal shape as the compiled module has it, with the same numbers and the radius that is swept around it.
 
     What is made of points and faces is kept as long as the shape lives and its points stay the
@@ -48,14 +48,14 @@ def solid_of(shape: coal.CollisionGeometry) -> Any:
 
     Raises:
         InputError: It is of a kind that is not known here.
-        BuildError: See `compiled`.
+        BuildError: See `load_compiled`.
     """
     if isinstance(shape, coal.Convex):
-        return _kept(
+        return _convert_cached(
             shape, np.asarray(shape.points(), np.float64), float(shape.getSweptSphereRadius())
         )
     if isinstance(shape, coal.BVHModelOBBRSS):
-        return _kept(shape, np.asarray(shape.vertices(), np.float64), 0.0)
+        return _convert_cached(shape, np.asarray(shape.vertices(), np.float64), 0.0)
     if isinstance(shape, coal.Box):
         numbers = shape.halfSide
     elif isinstance(shape, coal.Sphere):
@@ -75,7 +75,7 @@ def solid_of(shape: coal.CollisionGeometry) -> Any:
             expected=known,
             got=type(shape).__name__,
         )
-    return compiled().primitive(
+    return load_compiled().primitive(
         type(shape).__name__,
         np.asarray(numbers, float).tolist(),
         float(shape.getSweptSphereRadius()),
@@ -85,7 +85,7 @@ def solid_of(shape: coal.CollisionGeometry) -> Any:
 _known: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of a shape
 
 
-def _kept(shape: Any, points: Floats, radius: float) -> Any:
+def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
     """Return a shape of points and faces, rebuilt if it is not known with these points: faces are slow to read."""
     key, content = id(shape), points.tobytes()
     if key in _known:
@@ -94,9 +94,9 @@ def _kept(shape: Any, points: Floats, radius: float) -> Any:
             return solid
     faces = indices(shape)
     solid = (
-        compiled().convex(points, faces, radius)
+        load_compiled().convex(points, faces, radius)
         if isinstance(shape, coal.Convex)
-        else compiled().mesh(points, faces)
+        else load_compiled().mesh(points, faces)
     )
     _known[key] = (weakref.ref(shape, lambda _: _known.pop(key, None)), content, radius, solid)
     return solid

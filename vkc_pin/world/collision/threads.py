@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 
-__all__ = ["available_threads"]
+__all__ = ["count_threads"]
 
 _MOST = 8
 
 
-def available_threads() -> int:
+def count_threads() -> int:
     """Return how many to use: one for each core that this process may use, 8 at most, or as `OMP_NUM_THREADS` says."""
     said = os.environ.get("OMP_NUM_THREADS", "")
     cores = (

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.world.collision.solids import compiled
+from vkc_pin.world.collision.solids import load_compiled
 
 __all__ = ["WorldBoxes"]
 
@@ -22,7 +22,7 @@ class WorldBoxes:
         standing_upper: Shape (S, 3) [m].
 
     Raises:
-        BuildError: See `solids.compiled`.
+        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class WorldBoxes:
             np.ascontiguousarray(part, float)
             for part in (lower, upper, standing_lower, standing_upper)
         )
-        self.compiled: Any = compiled().WorldBoxes(*corners)
+        self.compiled: Any = load_compiled().WorldBoxes(*corners)
 
     def near(
         self,

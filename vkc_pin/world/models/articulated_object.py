@@ -19,7 +19,7 @@ from vkc_pin.utils.arguments import known, number, numbers
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.dynamics.joint_resistance import Resistance
-from vkc_pin.world.models.dynamics.mass import mass_of
+from vkc_pin.world.models.dynamics.mass import compute_mass
 
 __all__ = [
     "DEFAULT_ACCELERATION",
@@ -216,7 +216,7 @@ class ArticulatedObject:
     @property
     def mass(self) -> float:
         """What all its links weigh together [kg]; 0 if nobody says so."""
-        return mass_of(self.model)
+        return compute_mass(self.model)
 
     @property
     def links(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import known, numbers
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = ["Coordinates", "Moved", "wrapped"]
+__all__ = ["Coordinates", "MovedJoint", "wrap_angle"]
 
 _SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismaticUnaligned")
 _UNBOUNDED = (
@@ -28,7 +28,7 @@ _UNBOUNDED = (
 )
 
 
-class Moved(NamedTuple):
+class MovedJoint(NamedTuple):
     """A joint that a coordinate moves: to factor · coordinate + offset, [m] or [rad].
 
     Attributes:
@@ -142,7 +142,7 @@ class Coordinates:
         self.upper: Floats = np.array(upper, float)
         self.velocity: Floats = np.array(model.velocityLimit, float)
         self.nq = int(model.nq)
-        self.moves: tuple[Moved, ...] = self._moves(model, followers)
+        self.moves: tuple[MovedJoint, ...] = self._moves(model, followers)
         self.lengths, self.turns = np.zeros(self.size), np.zeros(self.size)
         for move in self.moves:
             (self.lengths if move.slides else self.turns)[move.coordinate] += abs(move.factor)
@@ -151,7 +151,7 @@ class Coordinates:
             plain,
             angles,
             quaternions,
-            _runs(plain),
+            _merge_into_slices(plain),
         )
 
     @property
@@ -163,14 +163,15 @@ class Coordinates:
         return plain, angles, quaternions
 
     @property
-    def followers(self) -> tuple[Moved, ...]:
+    def followers(self) -> tuple[MovedJoint, ...]:
         """Those of `moves` whose joint follows another one."""
         return tuple(move for move in self.moves if move.joint != self.joints[move.coordinate])
 
-    def _moves(self, model: pin.Model, followers: list[int]) -> tuple[Moved, ...]:
+    def _moves(self, model: pin.Model, followers: list[int]) -> tuple[MovedJoint, ...]:
         """Return `moves`."""
         moves = [
-            Moved(k, joint, 1.0, 0.0, self.units[k] == "m") for k, joint in enumerate(self.joints)
+            MovedJoint(k, joint, 1.0, 0.0, self.units[k] == "m")
+            for k, joint in enumerate(self.joints)
         ]
         if followers:
             data = model.createData()
@@ -184,7 +185,9 @@ class Coordinates:
                 )
                 factor, offset = float(following.scaling), float(following.offset)
                 moves.append(
-                    Moved(at[model.joints[joint].idx_q], joint, factor, offset, not axis[3:].any())
+                    MovedJoint(
+                        at[model.joints[joint].idx_q], joint, factor, offset, not axis[3:].any()
+                    )
                 )
         return tuple(sorted(moves))
 
@@ -265,12 +268,12 @@ class Coordinates:
         return self.names.index(known(name, self.names, "coordinate"))
 
 
-def wrapped(angle: Any) -> Any:
+def wrap_angle(angle: Any) -> Any:
     """Return an angle, or an array of them, between -π and π [rad]."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _runs(pairs: list[tuple[int, int]]) -> list[tuple[slice, slice]]:
+def _merge_into_slices(pairs: list[tuple[int, int]]) -> list[tuple[slice, slice]]:
     """Return pairs that follow each other as slices, which arrays are indexed with in a fraction of the time."""
     found: list[tuple[slice, slice]] = []
     for i, j in pairs:

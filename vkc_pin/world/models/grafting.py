@@ -12,10 +12,10 @@ from collections.abc import Iterable
 import numpy as np
 import pinocchio as pin
 
-__all__ = ["add_joint", "clean", "graft", "graft_geometry"]
+__all__ = ["add_joint", "graft", "graft_geometry", "round_placement"]
 
 
-def clean(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
+def round_placement(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
     """Return `placement` with entries within `tolerance` of 0 and ±1 rounded: keeps symbolic kinematics sparse."""
     rotation, translation = np.array(placement.rotation), np.array(placement.translation)
     for array in (rotation, translation):
@@ -81,7 +81,7 @@ def graft(
         joint, above = tree.joints[index], tree.parents[index]
         local = tree.jointPlacements[index] if above else placement * tree.jointPlacements[index]
         added = add_joint(
-            model, joints[above], joint, clean(local), like=(tree, index), prefix=prefix
+            model, joints[above], joint, round_placement(local), like=(tree, index), prefix=prefix
         )
         model.appendBodyToJoint(added, tree.inertias[index], pin.SE3.Identity())
         joints.append(added)
@@ -93,7 +93,13 @@ def graft(
             continue
         local = frame.placement if frame.parentJoint else placement * frame.placement
         model.addFrame(
-            pin.Frame(prefix + frame.name, joints[frame.parentJoint], 0, clean(local), frame.type)
+            pin.Frame(
+                prefix + frame.name,
+                joints[frame.parentJoint],
+                0,
+                round_placement(local),
+                frame.type,
+            )
         )
     return joints
 

@@ -37,32 +37,32 @@ from vkc_pin.world.models.articulated_object import (
     Latch,
 )
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema, resistances
-from vkc_pin.world.models.dynamics.mass import weigh
-from vkc_pin.world.models.grafting import clean
+from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema, read_resistances
+from vkc_pin.world.models.dynamics.mass import set_mass
+from vkc_pin.world.models.grafting import round_placement
 
 __all__ = [
     "AttachmentSchema",
     "FreedomSchema",
     "LatchSchema",
     "ObjectSchema",
-    "described_object",
+    "build_object",
     "load_object",
 ]
 
 
-_around_zero = require(
+_contains_zero = require(
     lambda value: value[0] <= 0.0 <= value[1],
     "the limits do not contain 0",
     "limits [lower <= 0, upper >= 0]",
 )
-_some_length = require(
+_is_nonzero = require(
     lambda value: np.linalg.norm(value) >= 1e-6,
     "a direction cannot be zero",
     "a vector of some length",
 )
-Limits = Annotated[tuple[Number, Number], count(2), _around_zero]
-Direction = Annotated[Vector3, _some_length]
+Limits = Annotated[tuple[Number, Number], count(2), _contains_zero]
+Direction = Annotated[Vector3, _is_nonzero]
 
 
 class FreedomSchema(Schema):
@@ -204,16 +204,14 @@ def load_object(
         InputError: The description or its URDF is wrong.
     """
     if isinstance(name_or_path, Mapping):
-        return described_object(
+        return build_object(
             Document(mapping(name_or_path, "description")), file_path(folder, "folder")
         )
     file = located(name_or_path, "scenes", "objects/*.yaml", what="object")
-    return described_object(read_yaml(file), file.parent, file.stem)
+    return build_object(read_yaml(file), file.parent, file.stem)
 
 
-def described_object(
-    document: Document, folder: Path, name: str | None = None
-) -> ArticulatedObject:
+def build_object(document: Document, folder: Path, name: str | None = None) -> ArticulatedObject:
     """Return the object of a description.
 
     Args:
@@ -261,7 +259,7 @@ def described_object(
                 "masses of links in its URDF, or free: true",
             )
             raise document.error(("mass",), problem, expected=expected, got=schema.mass)
-        weigh(model, collision, schema.mass)
+        set_mass(model, collision, schema.mass)
     attachments: dict[str, Attachment] = {}
     for index, item in enumerate(schema.attachments):
         if item.link not in links:
@@ -278,7 +276,7 @@ def described_object(
             raise document.error(
                 ("attachments", index, "contact"), problem, expected="grasp", got=item.contact
             )
-        attachment = _attachment(item, firm=schema.free)
+        attachment = _build_attachment(item, firm=schema.free)
         taken = {name for other in attachments.values() for name in other.coordinates}.intersection(
             attachment.coordinates
         )
@@ -300,15 +298,15 @@ def described_object(
         velocity=velocity,
         acceleration=acceleration,
         attachments=MappingProxyType(attachments),
-        latches=_latches(document, schema, coordinates),
+        latches=_build_latches(document, schema, coordinates),
         base_link=links[0],
         free=schema.free,
-        own_pairs=_own_pairs(document, schema, links),
-        resistance=MappingProxyType(resistances(document, schema.joints, urdf, text, names)),
+        own_pairs=_read_own_pairs(document, schema, links),
+        resistance=MappingProxyType(read_resistances(document, schema.joints, urdf, text, names)),
     )
 
 
-def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
+def _build_attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
     """Return the attachment; `firm` holds where its description does not say."""
     if item.approach is not None and item.closing is not None:
         z, x = (np.array(v) / np.linalg.norm(v) for v in (item.approach, item.closing))
@@ -320,9 +318,9 @@ def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
     return Attachment(
         name=item.name,
         link=item.link,
-        placement=clean(pin.SE3(rotation, np.array(item.position))),
+        placement=round_placement(pin.SE3(rotation, np.array(item.position))),
         joint="listed" if item.freedoms else item.joint,
-        freedoms=_freedoms(item),
+        freedoms=_build_freedoms(item),
         standoff=item.standoff,
         firm=firm if item.firm is None else item.firm,
         clearance=item.clearance,
@@ -331,9 +329,9 @@ def _attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
     )
 
 
-def _freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
+def _build_freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
     if item.freedoms:
-        return tuple(_freedom(own) for own in item.freedoms)
+        return tuple(_build_freedom(own) for own in item.freedoms)
     if item.joint == "spherical":
         limits = item.limits or (-np.pi, np.pi)
         return tuple(
@@ -350,7 +348,7 @@ def _freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
     return (Freedom("", item.joint, axis, *item.limits),)
 
 
-def _freedom(item: FreedomSchema) -> Freedom:
+def _build_freedom(item: FreedomSchema) -> Freedom:
     kind, given = ("revolute", item.turn) if item.slide is None else ("prismatic", item.slide)
     axis = np.array(given, float)
     return Freedom(
@@ -362,7 +360,7 @@ def _freedom(item: FreedomSchema) -> Freedom:
     )
 
 
-def _own_pairs(
+def _read_own_pairs(
     document: Document, schema: ObjectSchema, links: Sequence[str]
 ) -> frozenset[frozenset[str]]:
     for number, pair in enumerate(schema.own_collisions):
@@ -379,7 +377,7 @@ def _own_pairs(
     return frozenset(map(frozenset, schema.own_collisions))
 
 
-def _latches(
+def _build_latches(
     document: Document, schema: ObjectSchema, coordinates: Coordinates
 ) -> tuple[Latch, ...]:
     latches = []

@@ -19,19 +19,19 @@ from vkc_pin.utils.arguments import whole
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.dynamics.torque_limits import Efforts, efforts
-from vkc_pin.world.models.grafting import clean
+from vkc_pin.world.models.dynamics.torque_limits import TorqueLimits, compute_torque_limits
+from vkc_pin.world.models.grafting import round_placement
 from vkc_pin.world.models.grippers.gripper import Gripper
-from vkc_pin.world.models.robot_model import visual_geometry
+from vkc_pin.world.models.robot_model import load_visual_geometry
 from vkc_pin.world.models.robot_schema import Wheels
-from vkc_pin.world.models.shapes import link_name, shape_distance, triangles
+from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name, triangulate
 
 __all__ = ["Base", "Robot"]
 
-_LEAST_LEVER = 0.1  # [m/rad] about the size of a hand
-_AHEAD = 10.0  # [m] further than any hand reaches
-_POSTURES = 200  # random ones over which the lever is averaged
-_TIGHT_SHARE = 0.5  # margin of links that are always close, as a share of what they can have
+_MIN_LEVER = 0.1  # [m/rad] about the size of a hand
+_FRONT_DISTANCE = 10.0  # [m] further than any hand reaches
+_LEVER_SAMPLES = 200  # random ones over which the lever is averaged
+_TIGHT_FACTOR = 0.5  # margin of links that are always close, as a share of what they can have
 
 Base = Literal["omni", "differential", "ackermann", "fixed"]
 
@@ -96,7 +96,7 @@ class Robot:
         Raises:
             InputError: A mesh cannot be read.
         """
-        return visual_geometry(self.model, self.file)
+        return load_visual_geometry(self.model, self.file)
 
     @cached_property
     def lever(self) -> float:
@@ -112,38 +112,41 @@ class Robot:
         )
         turns = [k for k, unit in enumerate(self.coordinates.units) if k > 2 and unit == "rad"]
         if not turns:
-            return _LEAST_LEVER
+            return _MIN_LEVER
         low, high = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
         squares = np.zeros(len(turns))
-        for z in rng.uniform(low, np.maximum(low, high), (_POSTURES, len(low))):
+        for z in rng.uniform(low, np.maximum(low, high), (_LEVER_SAMPLES, len(low))):
             jacobian = pin.computeFrameJacobian(
                 self.model, data, self.coordinates.q(z), frame, pin.LOCAL_WORLD_ALIGNED
             )
             squares += (jacobian[:3, turns] ** 2).sum(axis=0)
-        return max(float(np.sqrt(squares / _POSTURES).mean()), _LEAST_LEVER)
+        return max(float(np.sqrt(squares / _LEVER_SAMPLES).mean()), _MIN_LEVER)
 
     @cached_property
-    def efforts(self) -> Efforts:
+    def efforts(self) -> TorqueLimits:
         """The torques that its motors have, as far as its description can be relied upon."""
-        return efforts(self.model, self.coordinates, self.lower, self.upper)
+        return compute_torque_limits(self.model, self.coordinates, self.lower, self.upper)
 
     @cached_property
     def front(self) -> pin.SE3:
         """The foremost point of the hand in the tool frame, with its axes: as far along the approach as a touch link reaches."""
         frame = self.model.frames[self.model.getFrameId(self.tool_frame)]
         ahead = coal.Halfspace(
-            np.array([0.0, 0.0, -1.0]), -_AHEAD
+            np.array([0.0, 0.0, -1.0]), -_FRONT_DISTANCE
         )  # all that is so far before the tool
         carried = [s for s in self.collision.geometryObjects if s.parentJoint == frame.parentJoint]
         hand = [
             (s.geometry, frame.placement.actInv(s.placement))
             for s in carried
-            if link_name(s.name) in self.touch_links
+            if get_link_name(s.name) in self.touch_links
         ]
         gaps = [
-            shape_distance(geometry, where, ahead, pin.SE3.Identity()) for geometry, where in hand
+            compute_shape_distance(geometry, where, ahead, pin.SE3.Identity())
+            for geometry, where in hand
         ]
-        return pin.SE3(np.eye(3), np.array([0.0, 0.0, _AHEAD - min(gaps, default=_AHEAD)]))
+        return pin.SE3(
+            np.eye(3), np.array([0.0, 0.0, _FRONT_DISTANCE - min(gaps, default=_FRONT_DISTANCE)])
+        )
 
     @cached_property
     def fingerprint(self) -> str:
@@ -165,7 +168,7 @@ class Robot:
             pin.forwardKinematics(self.model, data, self.coordinates.q(z))
             digest.update(np.array([place.homogeneous for place in data.oMi]).tobytes())
         for shape in self.collision.geometryObjects:
-            points, faces = triangles(shape.geometry)
+            points, faces = triangulate(shape.geometry)
             digest.update(repr((shape.name, shape.parentJoint, points.shape, faces.shape)).encode())
             digest.update(points.tobytes() + shape.placement.homogeneous.tobytes())
         return digest.hexdigest()
@@ -201,7 +204,7 @@ class Robot:
                     there.frames[shape.parentFrame].placement for there in (self.model, model)
                 )
                 if old != new:
-                    shape.placement = clean(new * old.actInv(shape.placement))
+                    shape.placement = round_placement(new * old.actInv(shape.placement))
             self._opened[opening] = dataclasses.replace(
                 self, model=model, collision=collision, _opened={}
             )
@@ -225,11 +228,11 @@ class Robot:
             InputError: There is no such shape.
         """
         geometry = whole(geometry, "geometry", low=0, high=len(self.collision.geometryObjects) - 1)
-        return link_name(self.collision.geometryObjects[geometry].name)
+        return get_link_name(self.collision.geometryObjects[geometry].name)
 
     def own_margin(self, links: tuple[str, str], margin: float) -> float:
         """Return the clearance [m] that two of its links, sorted, can keep: `margin`, or half of what they have at most."""
-        return min(margin, _TIGHT_SHARE * self.tight.get(links, np.inf))
+        return min(margin, _TIGHT_FACTOR * self.tight.get(links, np.inf))
 
     def own_margins(self, margin: float) -> dict[tuple[int, int], float]:
         """Return for each of its collision pairs, by the numbers of its shapes, the clearance to keep [m].
@@ -239,7 +242,7 @@ class Robot:
         Args:
             margin: What pairs keep that can: `Options.self_distance` [m].
         """
-        found, links = {}, [link_name(shape.name) for shape in self.collision.geometryObjects]
+        found, links = {}, [get_link_name(shape.name) for shape in self.collision.geometryObjects]
         for pair in self.collision.collisionPairs:
             one, other = sorted((links[pair.first], links[pair.second]))
             found[pair.first, pair.second] = self.own_margin((one, other), margin)
@@ -249,5 +252,5 @@ class Robot:
     def links(self) -> tuple[str, ...]:
         """The links that have collision geometry, each once."""
         return tuple(
-            dict.fromkeys(link_name(shape.name) for shape in self.collision.geometryObjects)
+            dict.fromkeys(get_link_name(shape.name) for shape in self.collision.geometryObjects)
         )

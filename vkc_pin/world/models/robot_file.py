@@ -19,24 +19,29 @@ from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.srdf import Srdf, group_tip, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.coupled_joints import couple
-from vkc_pin.world.models.couplings.limits import limited_together, robot_limits
-from vkc_pin.world.models.grippers.gripper import described_gripper
+from vkc_pin.world.models.couplings.coupled_joints import apply_couplings
+from vkc_pin.world.models.couplings.limits import apply_robot_limits, tighten_coupled_limits
+from vkc_pin.world.models.grippers.gripper import build_gripper
 from vkc_pin.world.models.robot import Base, Robot
 from vkc_pin.world.models.robot_model import (
-    collision_geometry,
-    default_tool_frame,
-    full_model,
-    nearest_position,
-    own_base,
-    planned_model,
-    rest_positions,
+    build_full_model,
+    build_planned_model,
+    compute_rest_positions,
+    find_base_joints,
+    find_default_tool_frame,
+    find_nearest_position,
+    load_collision_geometry,
 )
-from vkc_pin.world.models.robot_schema import RobotSchema, python_packages, read_robot, wheels_of
-from vkc_pin.world.models.self_collisions import surveyed, with_collision_pairs
+from vkc_pin.world.models.robot_schema import (
+    RobotSchema,
+    find_python_packages,
+    read_robot,
+    read_wheels,
+)
+from vkc_pin.world.models.self_collisions import apply_self_collision_analysis, set_collision_pairs
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
-__all__ = ["find_robot", "known_robots", "load_robot"]
+__all__ = ["find_robot", "list_robots", "load_robot"]
 
 _BASES = get_args(Base)
 _PAIRS = ("srdf", "sampled", "all")
@@ -51,7 +56,7 @@ _ALIASES = {
 }
 
 
-def known_robots() -> dict[str, Path]:
+def list_robots() -> dict[str, Path]:
     """Return the names `load_robot` knows and their files: those in robots/, then those of example-robot-data."""
     known = {
         path.parent.name: path for path in sorted(resources.folder("robots").glob("*/robot.yaml"))
@@ -73,7 +78,7 @@ def find_robot(name: str | Path) -> Path:
     """Return the robot.yaml or URDF file of a robot.
 
     Args:
-        name: A name of `known_robots`, or the path of a URDF file, of a robot.yaml, or of a folder
+        name: A name of `list_robots`, or the path of a URDF file, of a robot.yaml, or of a folder
             that holds one. Text is a path if it has the ending of such a file or a slash in it.
 
     Raises:
@@ -90,7 +95,7 @@ def find_robot(name: str | Path) -> Path:
                 expected="a URDF file, a robot.yaml, or a robot's name",
             )
         return file
-    known = known_robots()
+    known = list_robots()
     if name not in known:
         raise UnknownNameError("robot", str(name), known)
     return known[str(name)]
@@ -187,7 +192,7 @@ def load_robot(
             joint: quantity(value, f"{field}.{joint}") for joint, value in named.items()
         }
     home, locked_joints = positions["home"], positions["locked_joints"]
-    files = _read(
+    files = _read_files(
         name,
         mapping({} if packages is None else packages, "packages", "packages, each with its folder"),
     )
@@ -196,21 +201,21 @@ def load_robot(
     semantics = (
         read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
     )
-    full = full_model(urdf)
+    full = build_full_model(urdf)
     tool = (
         tool_frame
         if tool_frame is not None
-        else files.tool_frame(arm, beside) or default_tool_frame(full, urdf)
+        else files.tool_frame(arm, beside) or find_default_tool_frame(full, urdf)
     )
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
-    full = limited_together(full, urdf, tool)
-    replaced = own_base(full, urdf) if base != "fixed" else ()
+    full = tighten_coupled_limits(full, urdf, tool)
+    replaced = find_base_joints(full, urdf) if base != "fixed" else ()
     fingers = {joint: finger.open for joint, finger in settings.gripper.items()}
     said = {**settings.locked_joints, **locked_joints}
     locked = {**fingers, **dict.fromkeys(replaced, 0.0), **said}
     given = {**settings.home, **home, **locked}
-    rest = rest_positions(full, urdf, given)
+    rest = compute_rest_positions(full, urdf, given)
     files.check_names(rest)
     for joint in given:
         field = "home" if joint in home else "locked_joints"
@@ -225,11 +230,13 @@ def load_robot(
         settings.base.height if height is None else quantity(height, "height"),
         {**rest, **locked},
     )
-    model = planned_model(full, urdf, tool, rest, locked, height=raised)
-    coordinates, lower, upper, velocity, acceleration = robot_limits(full, model, settings, base)
+    model = build_planned_model(full, urdf, tool, rest, locked, height=raised)
+    coordinates, lower, upper, velocity, acceleration = apply_robot_limits(
+        full, model, settings, base
+    )
     files.check_followers(model, rest, given)
-    state = _state(model, coordinates.names[3:], semantics, given)
-    collision = collision_geometry(model, urdf)
+    state = _read_rest_state(model, coordinates.names[3:], semantics, given)
+    collision = load_collision_geometry(model, urdf)
     robot = Robot(
         name=files.name,
         urdf=urdf.path,
@@ -247,8 +254,8 @@ def load_robot(
         base=base,
         touch_links=settings.touch_links,
         height=raised,
-        **wheels_of(base, turning_radius, settings, files.source),
-        gripper=described_gripper(
+        **read_wheels(base, turning_radius, settings, files.source),
+        gripper=build_gripper(
             full,
             urdf,
             model,
@@ -262,12 +269,12 @@ def load_robot(
         file=urdf,
     )
     if pairs == "all":
-        robot = with_collision_pairs(robot, ())
+        robot = set_collision_pairs(robot, ())
     else:
         loose = [
             joint for joint in coordinates.names[3:] if joint not in given and joint not in state
         ]
-        robot = surveyed(robot, semantics, loose, samples=_SAMPLES)
+        robot = apply_self_collision_analysis(robot, semantics, loose, samples=_SAMPLES)
     if len(robot.collision.collisionPairs) == 0 and (pairs == "all" or semantics is not None):
         expected = "<collision> elements, and an SRDF that fits"
         raise InputError(
@@ -277,7 +284,7 @@ def load_robot(
 
 
 @dataclass(frozen=True, eq=False)
-class _Files:
+class _RobotFiles:
     """A robot's files: `source`, its robot.yaml or else its URDF; what the first says; and the URDF."""
 
     source: Path
@@ -370,7 +377,7 @@ class _Files:
                     )
 
 
-def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
+def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotFiles:
     """Find and read a robot's URDF, and the robot.yaml that belongs to it if there is one."""
     file_path(name, "name", "a robot's name, or a path")
     source = find_robot(name)
@@ -385,21 +392,21 @@ def _read(name: str | Path, packages: Mapping[str, str | Path]) -> _Files:
         key: file_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()
     }
     folders = {
-        **python_packages(tuple(p for p in settings.packages if p not in folders), document),
+        **find_python_packages(tuple(p for p in settings.packages if p not in folders), document),
         **folders,
     }
     urdf = read_urdf(source.parent / settings.urdf, folders)
-    couple(urdf, settings.couplings, document)
-    return _Files(source, settings, document, urdf)
+    apply_couplings(urdf, settings.couplings, document)
+    return _RobotFiles(source, settings, document, urdf)
 
 
-def _state(
+def _read_rest_state(
     model: pin.Model, arm: Sequence[str], semantics: Srdf | None, given: Collection[str]
 ) -> dict[str, float]:
     """Return where an SRDF says that the joints of an arm rest, those `given` otherwise left out."""
     state = {} if semantics is None else semantics.state(arm)
     return {
-        joint: nearest_position(model, joint, state[joint])
+        joint: find_nearest_position(model, joint, state[joint])
         for joint in arm
         if joint in state and joint not in given
     }

@@ -13,48 +13,48 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import load_parts, to_bvh
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape, tree_model
 from vkc_pin.world.models.couplings.coupled_joints import (
-    Following,
-    coupled_groups,
-    followers,
-    path_to,
+    JointCoupling,
+    find_coupled_groups,
+    find_followers,
+    find_joint_path,
 )
-from vkc_pin.world.models.couplings.mimic_joints import in_order, with_mimics
-from vkc_pin.world.models.grafting import add_joint, clean
+from vkc_pin.world.models.couplings.mimic_joints import add_mimics, sort_joints
+from vkc_pin.world.models.grafting import add_joint, round_placement
 
 __all__ = [
-    "collision_geometry",
-    "default_tool_frame",
-    "full_model",
-    "nearest_position",
-    "neighbours",
-    "own_base",
-    "planned_model",
-    "rest_positions",
-    "unlocked_model",
-    "visual_geometry",
+    "build_full_model",
+    "build_planned_model",
+    "build_unlocked_model",
+    "compute_rest_positions",
+    "find_base_joints",
+    "find_default_tool_frame",
+    "find_nearest_position",
+    "find_neighbours",
+    "load_collision_geometry",
+    "load_visual_geometry",
 ]
 
-ROOT = "base"  # the name of the planar joint
+BASE_JOINT = "base"  # the name of the planar joint
 # [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean
 # expressions
 _ROUNDING = 1e-9
-_LEVEL = 1e-3  # sine of the angle up to which axes count as level or upright
-_FINGER = 7  # joints in the longest finger of a hand
-_ARM = 4  # joints, at least, that carry a hand
-_DETAIL = 0.0015  # of displayed meshes, [m]
+_AXIS_TOLERANCE = 1e-3  # sine of the angle up to which axes count as level or upright
+_MAX_FINGER_JOINTS = 7  # joints in the longest finger of a hand
+_MIN_ARM_JOINTS = 4  # joints, at least, that carry a hand
+_MESH_DETAIL = 0.0015  # of displayed meshes, [m]
 _GREY = (0.6, 0.6, 0.62, 1.0)
 
 
-def full_model(file: UrdfFile) -> pin.Model:
+def build_full_model(file: UrdfFile) -> pin.Model:
     """Return the model of all joints of `file` on a planar joint.
 
     Raises:
         InputError: It is no valid URDF.
     """
-    return tree_model(file, pin.JointModelPlanar(), ROOT)
+    return tree_model(file, pin.JointModelPlanar(), BASE_JOINT)
 
 
-def planned_model(
+def build_planned_model(
     full: pin.Model,
     file: UrdfFile,
     tool_frame: str,
@@ -69,17 +69,17 @@ def planned_model(
     theirs.
 
     Args:
-        full: See `full_model`.
+        full: See `build_full_model`.
         file: Its file.
         tool_frame: A frame of it.
-        rest: Where each joint is locked, [m] or [rad]; see `rest_positions`.
+        rest: Where each joint is locked, [m] or [rad]; see `compute_rest_positions`.
         locked: Joints to lock though they are among these, and where.
         height: Of the root link above the base's joint, which moves on the floor [m].
 
     Raises:
         InputError: No joint is left, or one is locked that follows one that is not.
     """
-    follows, groups = followers(file.root), coupled_groups(full, file, tool_frame)
+    follows, groups = find_followers(file.root), find_coupled_groups(full, file, tool_frame)
     groups = {leader: group for leader, group in groups.items() if leader not in locked}
     if stuck := [
         (joint, led.leader)
@@ -99,7 +99,10 @@ def planned_model(
             expected=expected,
             got=f"'{leader}' moves",
         )
-    alone = {str(full.names[j]) for j in path_to(full, tool_frame) if j > 1} - {*locked, *follows}
+    alone = {str(full.names[j]) for j in find_joint_path(full, tool_frame) if j > 1} - {
+        *locked,
+        *follows,
+    }
     moving = alone.union(groups, *groups.values())
     planned = [
         j for j in range(2, full.njoints) if full.names[j] in moving and full.names[j] in rest
@@ -113,10 +116,12 @@ def planned_model(
             expected=expected,
             got=tool_frame,
         )
-    return _reduced(full, {1, *planned}, configuration(full, {**rest, **locked}), height, follows)
+    return _lock_joints(
+        full, {1, *planned}, make_configuration(full, {**rest, **locked}), height, follows
+    )
 
 
-def unlocked_model(
+def build_unlocked_model(
     full: pin.Model,
     file: UrdfFile,
     model: pin.Model,
@@ -124,24 +129,28 @@ def unlocked_model(
     rest: Mapping[str, float],
     height: float,
 ) -> pin.Model:
-    """Return `model`, which `planned_model` made of `full`, with more `joints` that are not locked, all of them after its own.
+    """Return a model with the joints of `model` followed by additional unlocked `joints`.
 
     Args:
-        full: See `full_model`.
+        full: See `build_full_model`.
         file: Its file.
         model: The planned joints.
         joints: The others, each of which moves on its own.
         rest: Where the rest is locked, [m] or [rad].
-        height: As for `planned_model` [m].
+        height: As for `build_planned_model` [m].
     """
     own, last = (
         [full.getJointId(str(name)) for name in names] for names in (list(model.names)[1:], joints)
     )
-    follows = {joint: led for joint, led in followers(file.root).items() if joint not in joints}
-    return _reduced(full, {*own, *last}, configuration(full, rest), height, follows, last)
+    follows = {
+        joint: led for joint, led in find_followers(file.root).items() if joint not in joints
+    }
+    return _lock_joints(full, {*own, *last}, make_configuration(full, rest), height, follows, last)
 
 
-def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) -> dict[str, float]:
+def compute_rest_positions(
+    full: pin.Model, file: UrdfFile, given: Mapping[str, float]
+) -> dict[str, float]:
     """Return for each joint of 1 degree of freedom where it rests, [m] or [rad].
 
     That is what `given` says, else where the joint that it follows has it, else 0, or the middle of
@@ -159,13 +168,13 @@ def rest_positions(full: pin.Model, file: UrdfFile, given: Mapping[str, float]) 
             rest[full.names[j]] = float(
                 given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high))
             )
-    for name, led in followers(file.root).items():
+    for name, led in find_followers(file.root).items():
         if name in rest and led.leader in rest and name not in given:
             rest[name] = led.factor * rest[led.leader] + led.offset
     return rest
 
 
-def nearest_position(model: pin.Model, joint: str, position: float) -> float:
+def find_nearest_position(model: pin.Model, joint: str, position: float) -> float:
     """Return `position` [m] or [rad] of a joint, turned by 2π or else moved to the nearest limit if it lies outside."""
     moving = model.joints[model.getJointId(joint)]
     if moving.nq == 2:
@@ -178,7 +187,7 @@ def nearest_position(model: pin.Model, joint: str, position: float) -> float:
     return float(np.clip(position, low, high))
 
 
-def neighbours(
+def find_neighbours(
     file: UrdfFile, links: Collection[str]
 ) -> tuple[Set[tuple[str, str]], Set[tuple[str, str]]]:
     """Return two sets of pairs of `links`, each sorted.
@@ -198,19 +207,21 @@ def neighbours(
             up, _ = parents.get(up, ("", ""))
         if up:
             joined.add((min(link, up), max(link, up)))
-        body[link] = _rigid(link, parents)
-        above[link] = _rigid(parents[body[link]][0], parents) if body[link] in parents else ""
+        body[link] = _find_rigid_root(link, parents)
+        above[link] = (
+            _find_rigid_root(parents[body[link]][0], parents) if body[link] in parents else ""
+        )
     return joined, {(min(a, b), max(a, b)) for a in links for b in links if above[a] == body[b]}
 
 
-def _rigid(link: str, parents: Mapping[str, tuple[str, str]]) -> str:
+def _find_rigid_root(link: str, parents: Mapping[str, tuple[str, str]]) -> str:
     """Return the uppermost of the links that a link is fixed to."""
     while link in parents and parents[link][1] == "fixed":
         link, _ = parents[link]
     return link
 
 
-def own_base(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
+def find_base_joints(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
     """Return the joints that move a robot in the plane on their own, or none: then its URDF has a base that drives, too.
 
     They are the first three, one after the other: two that slide along the floor, in different
@@ -233,18 +244,19 @@ def own_base(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
         twist = pin.getJointJacobian(full, data, joint, pin.LOCAL_WORLD_ALIGNED)[
             :, full.joints[joint].idx_v
         ]
-        if np.abs(twist[3:]).max() < _LEVEL and abs(twist[2]) < _LEVEL:
+        if np.abs(twist[3:]).max() < _AXIS_TOLERANCE and abs(twist[2]) < _AXIS_TOLERANCE:
             slides.append(twist[:2])
-        elif abs(twist[5]) < 1.0 - _LEVEL:
+        elif abs(twist[5]) < 1.0 - _AXIS_TOLERANCE:
             return ()
         found.append(full.names[joint])
     crossing = (
-        len(slides) == 2 and abs(slides[0][0] * slides[1][1] - slides[0][1] * slides[1][0]) > _LEVEL
+        len(slides) == 2
+        and abs(slides[0][0] * slides[1][1] - slides[0][1] * slides[1][0]) > _AXIS_TOLERANCE
     )
     return tuple(found) if crossing else ()
 
 
-def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
+def make_configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
     """Return the configuration, shape (nq,), with joints at `positions`; those not named are neutral."""
     q: Floats = pin.neutral(model)
     for j in range(1, model.njoints):
@@ -256,9 +268,9 @@ def configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
     return q
 
 
-def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
+def find_default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
     """Return the last frame of the longest chain of joints, before it branches into fingers."""
-    follows = followers(file.root)
+    follows = find_followers(file.root)
     children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
     depth = np.zeros(full.njoints, int)
     for j in range(full.njoints - 1, 1, -1):
@@ -267,8 +279,8 @@ def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
         depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
     joint, above = 1, 0
     while children[joint]:
-        hand = len(children[joint]) > 1 and depth[joint] <= _FINGER
-        if hand and above >= _ARM:
+        hand = len(children[joint]) > 1 and depth[joint] <= _MAX_FINGER_JOINTS
+        if hand and above >= _MIN_ARM_JOINTS:
             break
         joint, above = (
             max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)),
@@ -283,7 +295,7 @@ def default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
     )
 
 
-def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
+def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """Return the collision shapes of `file` on the joints of `model`, named `<link>_<k>`, meshes as their convex hulls.
 
     Raises:
@@ -292,7 +304,9 @@ def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """
     geometry = pin.GeometryModel()
     for shape in file.few_shapes("collision"):
-        geometry.addGeometryObject(_geometry_object(model, shape, shape.name, shape.solid(), _GREY))
+        geometry.addGeometryObject(
+            _make_geometry_object(model, shape, shape.name, shape.solid(), _GREY)
+        )
     if len(geometry.geometryObjects) == 0:
         raise InputError(
             "nothing of this robot can collide",
@@ -303,7 +317,7 @@ def collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     return geometry
 
 
-def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
+def load_visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """Return what `file` looks like on the joints of `model`: one shape per colour, light enough for a web page.
 
     The shapes hold triangles (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that
@@ -316,23 +330,27 @@ def visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     for shape in file.few_shapes("visual"):
         if shape.file is None:
             geometry.addGeometryObject(
-                _geometry_object(model, shape, shape.name, shape.solid(), shape.colour or _GREY)
+                _make_geometry_object(
+                    model, shape, shape.name, shape.solid(), shape.colour or _GREY
+                )
             )
             continue
-        parts = load_parts(shape.file, shape.size, detail=_DETAIL)
+        parts = load_parts(shape.file, shape.size, detail=_MESH_DETAIL)
         for k, part in enumerate(parts):
             name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
             colour = shape.colour or part.colour or _GREY
-            geometry.addGeometryObject(_geometry_object(model, shape, name, to_bvh(part), colour))
+            geometry.addGeometryObject(
+                _make_geometry_object(model, shape, name, to_bvh(part), colour)
+            )
     return geometry
 
 
-def _reduced(
+def _lock_joints(
     full: pin.Model,
     planned: Collection[int],
     q: Floats,
     height: float,
-    follows: Mapping[str, Following],
+    follows: Mapping[str, JointCoupling],
     last: Collection[int] = (),
 ) -> pin.Model:
     """Return `full` with the joints that are not `planned` locked at `q`, and all on joint 1 higher by `height`.
@@ -354,14 +372,14 @@ def _reduced(
     before = {j: {full.getJointId(led.leader)} for j, led in coupled.items()} | {
         j: {*planned} - {*last} for j in last
     }
-    for j in in_order(full, before):
+    for j in sort_joints(full, before):
         joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
         if j in planned:
             index = add_joint(
                 model,
                 parent,
                 joint,
-                clean(placement * full.jointPlacements[j], _ROUNDING),
+                round_placement(placement * full.jointPlacements[j], _ROUNDING),
                 like=(full, j),
             )
             placed[j] = (index, pin.SE3(np.eye(3), np.array([0.0, 0.0, height if j == 1 else 0.0])))
@@ -373,12 +391,14 @@ def _reduced(
         if frame.type == pin.FrameType.BODY or frame.name not in links:
             parent, placement = placed[frame.parentJoint]
             model.addFrame(
-                pin.Frame(frame.name, parent, 0, clean(placement * frame.placement), frame.type)
+                pin.Frame(
+                    frame.name, parent, 0, round_placement(placement * frame.placement), frame.type
+                )
             )
-    return with_mimics(model, [coupled[j] for j in coupled], [placed[j][0] for j in coupled])
+    return add_mimics(model, [coupled[j] for j in coupled], [placed[j][0] for j in coupled])
 
 
-def _geometry_object(
+def _make_geometry_object(
     model: pin.Model,
     shape: UrdfShape,
     name: str,
@@ -389,7 +409,7 @@ def _geometry_object(
     frame = model.getFrameId(shape.link, pin.FrameType.BODY)
     parent = model.frames[frame]
     added = pin.GeometryObject(
-        name, parent.parentJoint, frame, clean(parent.placement * shape.placement), solid
+        name, parent.parentJoint, frame, round_placement(parent.placement * shape.placement), solid
     )
     added.meshColor = np.array(colour)
     return added

@@ -28,9 +28,9 @@ __all__ = [
     "RobotJointSchema",
     "RobotSchema",
     "Wheels",
-    "python_packages",
+    "find_python_packages",
     "read_robot",
-    "wheels_of",
+    "read_wheels",
 ]
 
 
@@ -139,7 +139,7 @@ def read_robot(file: Path) -> tuple[RobotSchema, Document]:
     return settings, document
 
 
-def wheels_of(
+def read_wheels(
     base: str, least: float | None, settings: RobotSchema, source: Path
 ) -> dict[str, Any]:
     """Return the fields of a `Robot` that its wheels are about.
@@ -181,7 +181,7 @@ def wheels_of(
     return {"wheels": wheels, "turning_radius": radius}
 
 
-def python_packages(names: tuple[str, ...], document: Document) -> dict[str, Path]:
+def find_python_packages(names: tuple[str, ...], document: Document) -> dict[str, Path]:
     """Return the folders of installed Python packages, without importing them.
 
     Raises:

@@ -22,7 +22,7 @@ from vkc_pin.world.files.srdf import Srdf
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.files.xml import quote
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_model import neighbours
+from vkc_pin.world.models.robot_model import find_neighbours
 from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances
 
 Pair = tuple[str, str]
@@ -30,11 +30,11 @@ Parts = list[tuple[int, int]]
 
 __all__ = [
     "HOME_DISTANCE",
-    "Survey",
+    "SelfCollisionAnalysis",
+    "analyze_self_collisions",
+    "apply_self_collision_analysis",
     "sample_allowed_pairs",
-    "survey",
-    "surveyed",
-    "with_collision_pairs",
+    "set_collision_pairs",
     "write_srdf",
 ]
 
@@ -42,18 +42,18 @@ _VERSION = 1  # of what is kept on disk: another one whenever the same robot wou
 _SAMPLES = 20_000
 # [m]: links that come no closer in any sample are not driven together; neighbours that are always
 # closer are exempt
-_FAR = 0.05
+_MAX_DISTANCE = 0.05
 # [m] as `Options.self_distance`: links that are that far apart do not count against a home
 HOME_DISTANCE = 0.02
-_STARTS, _STEPS = 4, 200  # how often and in how many steps the others are
-_TOUCHING = 1e-3  # [m]: links that never get further apart touch; validation sees no less
-_SEARCH, _TRIES = (
+_DESCENT_STARTS, _DESCENT_STEPS = 4, 200  # how often and in how many steps the others are
+_CONTACT_DISTANCE = 1e-3  # [m]: links that never get further apart touch; validation sees no less
+_HOME_SEARCH_RADII, _HOME_SEARCH_SAMPLES = (
     (0.05, 0.1, 0.2, 0.4, 0.7, 1.0),
     100,
 )  # a free home: shares of the joints' ranges, and postures in each
 
 
-class Survey(NamedTuple):
+class SelfCollisionAnalysis(NamedTuple):
     """How a robot's links are to each other.
 
     Attributes:
@@ -68,7 +68,7 @@ class Survey(NamedTuple):
     home: tuple[float, ...]
 
 
-def with_collision_pairs(robot: Robot, allowed: Collection[Pair]) -> Robot:
+def set_collision_pairs(robot: Robot, allowed: Collection[Pair]) -> Robot:
     """Return `robot` with those of its links that move against each other as collision pairs, less the `allowed` ones.
 
     Args:
@@ -85,10 +85,12 @@ def with_collision_pairs(robot: Robot, allowed: Collection[Pair]) -> Robot:
     return dataclasses.replace(robot, collision=collision)
 
 
-def surveyed(
+def apply_self_collision_analysis(
     robot: Robot, semantics: Srdf | None, loose: Collection[str], *, samples: int
 ) -> Robot:
-    """Return a robot with its collision pairs and its home; see `survey`. There is a warning of what nobody would expect.
+    """Return a copy of `robot` with collision pairs and home from `analyze_self_collisions`.
+
+    Warns if the home was moved, or if links that are not neighbours are exempt from checks.
 
     Args:
         robot: The robot; its own collision pairs play no part.
@@ -97,7 +99,10 @@ def surveyed(
         samples: How many configurations to look at.
     """
     listed = None if semantics is None else semantics.allowed
-    found, names = survey(robot, listed, loose, samples=samples), robot.coordinates.names[3:]
+    found, names = (
+        analyze_self_collisions(robot, listed, loose, samples=samples),
+        robot.coordinates.names[3:],
+    )
     home, said = np.array(found.home), f"{robot.urdf}: "
     if moved := [
         f"{name}: {value:.3g}"
@@ -121,14 +126,14 @@ def surveyed(
                 f"{robot.urdf}: links that {what} are not kept apart: {', '.join(links)}",
                 stacklevel=3,
             )
-    return with_collision_pairs(
+    return set_collision_pairs(
         dataclasses.replace(robot, home=home, tight=found.tight), found.allowed
     )
 
 
-def survey(
+def analyze_self_collisions(
     robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[str] = (), *, samples: int
-) -> Survey:
+) -> SelfCollisionAnalysis:
     """Return which links need not be kept apart, how far others can be, and a home at which none overlap.
 
     To those `listed`, or else found by `sample_allowed_pairs`, come pairs that no motion keeps
@@ -152,8 +157,10 @@ def survey(
         robot.fingerprint,
     )
     key = json.dumps(about).encode()
-    allowed, tight, home = record(key, lambda: _plain(_survey(robot, listed, loose, samples)))
-    return Survey(
+    allowed, tight, home = record(
+        key, lambda: _to_plain_lists(_compute_analysis(robot, listed, loose, samples))
+    )
+    return SelfCollisionAnalysis(
         {(a, b): why for a, b, why in allowed}, {(a, b): gap for a, b, gap in tight}, tuple(home)
     )
 
@@ -174,10 +181,14 @@ def sample_allowed_pairs(
         samples: How many configurations to look at.
         seed: Of the random numbers; the same seed gives the same pairs.
     """
-    groups, (joined, welded) = _groups(robot), neighbours(robot.file, robot.links)
+    groups, (joined, welded) = _group_shape_pairs(robot), find_neighbours(robot.file, robot.links)
     allowed = {links: "Adjacent" for links in groups if links in joined}
     groups = {links: parts for links, parts in groups.items() if links not in joined}
-    rng, distances, (low, high) = np.random.default_rng(seed), _distances(robot), _ranges(robot)
+    rng, distances, (low, high) = (
+        np.random.default_rng(seed),
+        _make_shape_distances(robot),
+        _find_sampling_bounds(robot),
+    )
     look, undecided, (free, hit) = (
         LinkDistances(distances, groups),
         np.arange(len(groups)),
@@ -187,17 +198,20 @@ def sample_allowed_pairs(
     for z in rng.uniform(low, high, (samples, len(low))):
         distances.place(z)
         free[undecided[(bounds := look.bounds()) > 0.0]] = True
-        for k in np.flatnonzero(bounds <= _FAR).tolist():
+        for k in np.flatnonzero(bounds <= _MAX_DISTANCE).tolist():
             best = closest[pair := undecided[k]]
-            distance = look.between(k, min(_FAR, best[-1][0]) if len(best) == _STARTS else _FAR)
+            distance = look.between(
+                k,
+                min(_MAX_DISTANCE, best[-1][0]) if len(best) == _DESCENT_STARTS else _MAX_DISTANCE,
+            )
             free[pair] |= distance > 0.0
             hit[pair] |= distance <= 0.0
             if (
-                distance < _FAR
+                distance < _MAX_DISTANCE
                 and not hit[pair]
-                and (len(best) < _STARTS or distance < best[-1][0])
+                and (len(best) < _DESCENT_STARTS or distance < best[-1][0])
             ):
-                closest[pair] = sorted([*best, (distance, tuple(z))])[:_STARTS]
+                closest[pair] = sorted([*best, (distance, tuple(z))])[:_DESCENT_STARTS]
         look.keep(left := ~(free & hit)[undecided])
         undecided = undecided[left]
     for pair, (links, parts) in enumerate(groups.items()):
@@ -205,54 +219,68 @@ def sample_allowed_pairs(
             allowed[links] = "Always"
         elif not hit[pair]:
             starts = (np.array(z) for _, z in closest[pair])
-            if not any(_drive_together(distances, parts, z, (low, high), rng) for z in starts):
+            if not any(
+                _descend_to_collision(distances, parts, z, (low, high), rng) for z in starts
+            ):
                 allowed[links] = "Never"
     unsure = {
         links: groups[links] for links in welded & groups.keys() if allowed.get(links) != "Never"
     }
     allowed |= {
-        links: "Adjacent" for links, room in _rooms(robot, unsure, samples).items() if room < _FAR
+        links: "Adjacent"
+        for links, room in _compute_max_distances(robot, unsure, samples).items()
+        if room < _MAX_DISTANCE
     }
     return dict(sorted(allowed.items()))
 
 
-def _survey(
+def _compute_analysis(
     robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[str], samples: int
-) -> Survey:
+) -> SelfCollisionAnalysis:
     allowed = dict(sample_allowed_pairs(robot, samples=samples) if listed is None else listed)
-    groups = {links: parts for links, parts in _groups(robot).items() if links not in allowed}
-    rooms = {links: room for links, room in _rooms(robot, groups, samples).items() if room < _FAR}
-    joined = frozenset().union(*neighbours(robot.file, robot.links))
+    groups = {
+        links: parts for links, parts in _group_shape_pairs(robot).items() if links not in allowed
+    }
+    rooms = {
+        links: room
+        for links, room in _compute_max_distances(robot, groups, samples).items()
+        if room < _MAX_DISTANCE
+    }
+    joined = frozenset().union(*find_neighbours(robot.file, robot.links))
     for links, room in rooms.items():
-        if links in joined or room <= _TOUCHING:
+        if links in joined or room <= _CONTACT_DISTANCE:
             allowed[links] = "Adjacent" if links in joined else "Always"
     groups = {links: parts for links, parts in groups.items() if links not in allowed}
     tight = {links: room for links, room in rooms.items() if links in groups}
     robot = dataclasses.replace(robot, tight=tight)
-    home = _free_home(robot, groups, loose)
-    distances = _distances(robot)
+    home = _find_free_home(robot, groups, loose)
+    distances = _make_shape_distances(robot)
     distances.place(np.array([0.0, 0.0, 0.0, *home]))
     for links, parts in groups.items():
-        if (gap := distances.between(parts, _FAR)) <= 0.0:
+        if (gap := distances.between(parts, _MAX_DISTANCE)) <= 0.0:
             allowed[links] = "Home"
             tight.pop(links, None)
-        elif gap < _FAR:
+        elif gap < _MAX_DISTANCE:
             tight[links] = min(gap, tight.get(links, np.inf))
-    return Survey(dict(sorted(allowed.items())), dict(sorted(tight.items())), home)
+    return SelfCollisionAnalysis(dict(sorted(allowed.items())), dict(sorted(tight.items())), home)
 
 
-def _plain(
-    found: Survey,
+def _to_plain_lists(
+    found: SelfCollisionAnalysis,
 ) -> tuple[list[tuple[str, str, str]], list[tuple[str, str, float]], list[float]]:
     allowed = [(*links, reason) for links, reason in found.allowed.items()]
     return allowed, [(*links, gap) for links, gap in found.tight.items()], list(found.home)
 
 
-def _free_home(
+def _find_free_home(
     robot: Robot, groups: Mapping[Pair, Parts], loose: Collection[str]
 ) -> tuple[float, ...]:
     """Return the robot's home, or another in which the fewest of some pairs overlap, with only the `loose` joints elsewhere."""
-    distances, (low, high), rng = _distances(robot), _ranges(robot), np.random.default_rng(0)
+    distances, (low, high), rng = (
+        _make_shape_distances(robot),
+        _find_sampling_bounds(robot),
+        np.random.default_rng(0),
+    )
     moves = np.array([name in loose for name in robot.coordinates.names])
     rest = np.array([0.0, 0.0, 0.0, *robot.home])
 
@@ -274,9 +302,9 @@ def _free_home(
     best, fewest = rest, short(rest, 0.0, np.inf)
     if not fewest or not moves.any():
         return tuple(best[3:].tolist())
-    for share in _SEARCH:
+    for share in _HOME_SEARCH_RADII:
         tries = rest + np.where(
-            moves, share * (rng.uniform(low, high, (_TRIES, len(rest))) - rest), 0.0
+            moves, share * (rng.uniform(low, high, (_HOME_SEARCH_SAMPLES, len(rest))) - rest), 0.0
         )
         for z in tries[
             np.argsort(
@@ -290,7 +318,7 @@ def _free_home(
     return tuple(best[3:].tolist())
 
 
-def _groups(robot: Robot) -> dict[Pair, Parts]:
+def _group_shape_pairs(robot: Robot) -> dict[Pair, Parts]:
     """Return the pairs of links that move against each other, each sorted, with the pairs of their shapes."""
     shapes, groups = robot.collision.geometryObjects, dict[Pair, Parts]()
     for first, second in itertools.combinations(range(len(shapes)), 2):
@@ -300,9 +328,15 @@ def _groups(robot: Robot) -> dict[Pair, Parts]:
     return groups
 
 
-def _rooms(robot: Robot, groups: Mapping[Pair, Parts], samples: int) -> dict[Pair, float]:
+def _compute_max_distances(
+    robot: Robot, groups: Mapping[Pair, Parts], samples: int
+) -> dict[Pair, float]:
     """Return how far links are apart at most [m], at home or in random configurations; 50 mm or more where that is certain."""
-    distances, (low, high), rng = _distances(robot), _ranges(robot), np.random.default_rng(0)
+    distances, (low, high), rng = (
+        _make_shape_distances(robot),
+        _find_sampling_bounds(robot),
+        np.random.default_rng(0),
+    )
     look, rooms = LinkDistances(distances, groups), dict.fromkeys(groups, -np.inf)
     for z in (np.array([0.0, 0.0, 0.0, *robot.home]), *rng.uniform(low, high, (samples, len(low)))):
         if not look.links:
@@ -310,13 +344,14 @@ def _rooms(robot: Robot, groups: Mapping[Pair, Parts], samples: int) -> dict[Pai
         distances.place(z)
         for k, (links, bound) in enumerate(zip(look.links, look.bounds(), strict=True)):
             rooms[links] = max(
-                rooms[links], float(bound) if bound > _FAR else look.between(k, _FAR)
+                rooms[links],
+                float(bound) if bound > _MAX_DISTANCE else look.between(k, _MAX_DISTANCE),
             )
-        look.keep([rooms[links] < _FAR for links in look.links])
+        look.keep([rooms[links] < _MAX_DISTANCE for links in look.links])
     return rooms
 
 
-def _ranges(robot: Robot) -> tuple[Floats, Floats]:
+def _find_sampling_bounds(robot: Robot) -> tuple[Floats, Floats]:
     """Return within which bounds configurations are looked at, shape (n,)."""
     low, high = (
         np.where(np.isfinite(robot.lower), robot.lower, -np.pi),
@@ -326,7 +361,7 @@ def _ranges(robot: Robot) -> tuple[Floats, Floats]:
     return low, high
 
 
-def _distances(robot: Robot) -> ShapeDistances:
+def _make_shape_distances(robot: Robot) -> ShapeDistances:
     return ShapeDistances(robot.model, robot.coordinates.q, robot.collision.geometryObjects)
 
 
@@ -365,7 +400,7 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
     return write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
-def _drive_together(
+def _descend_to_collision(
     distances: ShapeDistances,
     parts: Parts,
     z: Floats,
@@ -376,7 +411,7 @@ def _drive_together(
     low, high = limits
     distances.place(z)
     nearest = distances.between(parts)
-    for width in np.geomspace(0.2, 0.002, _STEPS):
+    for width in np.geomspace(0.2, 0.002, _DESCENT_STEPS):
         trial = np.clip(z + width * (high - low) / 6.0 * rng.standard_normal(len(z)), low, high)
         distances.place(trial)
         distance = distances.between(parts)

@@ -12,30 +12,30 @@ from numpy.typing import NDArray
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.files.meshes import indices
-from vkc_pin.world.models.grafting import clean
+from vkc_pin.world.models.grafting import round_placement
 
 __all__ = [
     "LIMIT_SLACK",
     "LinkDistances",
     "ShapeDistances",
-    "bounding_box",
-    "clearance",
+    "clamp_to_limits",
+    "compute_bounding_box",
+    "compute_clearance",
+    "compute_shape_distance",
+    "compute_world_box",
     "copy_shape",
-    "link_name",
-    "own_name",
-    "placed_shapes",
-    "shape_distance",
-    "triangles",
-    "within_limits",
-    "world_box",
+    "get_link_name",
+    "get_local_name",
+    "list_placed_shapes",
+    "triangulate",
 ]
 
 LIMIT_SLACK = 1e-6
 """Joint values up to this far outside their limits, [rad] or [m], count as rounding and are moved to the limit."""
-_SEGMENTS = 28  # of a circle
+_CIRCLE_SEGMENTS = 28  # of a circle
 
 
-def within_limits(value: float, lower: float, upper: float, field: str | None) -> float:
+def clamp_to_limits(value: float, lower: float, upper: float, field: str | None) -> float:
     """Return `value`, moved to the limit if it is outside by rounding only. Raises `InputError` if it is further out."""
     if not np.isfinite(value):
         raise InputError("not a finite number", field=field, expected="a finite number", got=value)
@@ -52,28 +52,33 @@ def within_limits(value: float, lower: float, upper: float, field: str | None) -
 def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:
     """Return a copy of `shape` that stands still at `placement` in the world frame."""
     copy = pin.GeometryObject(shape)
-    copy.name, copy.parentJoint, copy.parentFrame, copy.placement = name, 0, 0, clean(placement)
+    copy.name, copy.parentJoint, copy.parentFrame, copy.placement = (
+        name,
+        0,
+        0,
+        round_placement(placement),
+    )
     return copy
 
 
-def link_name(shape_name: str) -> str:
+def get_link_name(shape_name: str) -> str:
     """Return the name of the link that a shape belongs to: Pinocchio calls its shapes `<link>_<number>`."""
     return shape_name.rpartition("_")[0]
 
 
-def own_name(shape_name: str) -> str:
+def get_local_name(shape_name: str) -> str:
     """Return the name in its object of a shape that is called `<object>.<own name>`."""
     return shape_name.partition(".")[2]
 
 
-def placed_shapes(
+def list_placed_shapes(
     shapes: Iterable[pin.GeometryObject],
 ) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
-    """Return (shape, placement) for shapes that stand in the world, for `clearance`."""
+    """Return (shape, placement) for shapes that stand in the world, for `compute_clearance`."""
     return [(shape.geometry, shape.placement) for shape in shapes]
 
 
-def clearance(
+def compute_clearance(
     first: Iterable[tuple[coal.CollisionGeometry, pin.SE3]],
     second: Iterable[tuple[coal.CollisionGeometry, pin.SE3]],
     *,
@@ -87,20 +92,22 @@ def clearance(
         reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
     """
     nearest, others = reach, list(second)
-    boxes = np.array([world_box(shape, placement) for shape, placement in others]).reshape(-1, 2, 3)
+    boxes = np.array([compute_world_box(shape, placement) for shape, placement in others]).reshape(
+        -1, 2, 3
+    )
     for shape, placement in first:
-        low, high = world_box(shape, placement)
+        low, high = compute_world_box(shape, placement)
         # Moved apart by as much as their boxes overlap, shapes are separate: a bound also where it
         # is negative.
         gaps = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
         for k in np.argsort(gaps, kind="stable").tolist():
             if gaps[k] >= nearest:
                 break
-            nearest = min(nearest, shape_distance(shape, placement, *others[k]))
+            nearest = min(nearest, compute_shape_distance(shape, placement, *others[k]))
     return nearest
 
 
-def shape_distance(
+def compute_shape_distance(
     first: coal.CollisionGeometry,
     first_placement: pin.SE3,
     second: coal.CollisionGeometry,
@@ -114,7 +121,7 @@ def shape_distance(
     return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
 
 
-def triangles(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]:
+def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]:
     """Return the surface of a coal shape in its own frame: vertices, shape (n, 3) [m], and faces, shape (m, 3).
 
     Raises:
@@ -125,18 +132,24 @@ def triangles(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]
     if isinstance(shape, coal.Box):
         mesh = make.box(extents=2.0 * np.asarray(shape.halfSide))
     elif isinstance(shape, coal.Sphere):
-        mesh = make.uv_sphere(radius=shape.radius, count=(_SEGMENTS // 2, _SEGMENTS))
+        mesh = make.uv_sphere(radius=shape.radius, count=(_CIRCLE_SEGMENTS // 2, _CIRCLE_SEGMENTS))
     elif isinstance(shape, coal.Ellipsoid):
-        mesh = make.uv_sphere(radius=1.0, count=(_SEGMENTS // 2, _SEGMENTS))
+        mesh = make.uv_sphere(radius=1.0, count=(_CIRCLE_SEGMENTS // 2, _CIRCLE_SEGMENTS))
         mesh.apply_transform(np.diag([*np.asarray(shape.radii), 1.0]))
     elif isinstance(shape, coal.Cylinder):
-        mesh = make.cylinder(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
+        mesh = make.cylinder(
+            radius=shape.radius, height=2.0 * shape.halfLength, sections=_CIRCLE_SEGMENTS
+        )
     elif isinstance(shape, coal.Cone):
-        mesh = make.cone(radius=shape.radius, height=2.0 * shape.halfLength, sections=_SEGMENTS)
+        mesh = make.cone(
+            radius=shape.radius, height=2.0 * shape.halfLength, sections=_CIRCLE_SEGMENTS
+        )
         mesh.apply_translation([0.0, 0.0, -shape.halfLength])
     elif isinstance(shape, coal.Capsule):
         length = 2.0 * shape.halfLength
-        mesh = make.capsule(height=length, radius=shape.radius, count=(_SEGMENTS, _SEGMENTS))
+        mesh = make.capsule(
+            height=length, radius=shape.radius, count=(_CIRCLE_SEGMENTS, _CIRCLE_SEGMENTS)
+        )
         mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
     elif isinstance(shape, coal.BVHModelBase | coal.Convex):
         points = shape.points() if isinstance(shape, coal.Convex) else shape.vertices()
@@ -148,17 +161,17 @@ def triangles(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]
     return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
 
 
-def bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
+def compute_bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
     """Return centre and half extents of a shape's bounding box in its own frame."""
     shape.geometry.computeLocalAABB()
-    return np.asarray(shape.geometry.aabb_local.center(), float), _half_extents(shape.geometry)
+    return np.asarray(shape.geometry.aabb_local.center(), float), _get_half_extents(shape.geometry)
 
 
-def world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
+def compute_world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
     """Return the lower and upper corner, shape (3,) each [m], of a box along the world's axes around a shape."""
     shape.computeLocalAABB()
     centre = placement.act(np.asarray(shape.aabb_local.center(), float))
-    extent = np.abs(placement.rotation) @ _half_extents(shape)
+    extent = np.abs(placement.rotation) @ _get_half_extents(shape)
     return centre - extent, centre + extent
 
 
@@ -191,7 +204,7 @@ class ShapeDistances:
             ]
         )
         self._turns = np.array([place.rotation for place in self._locals])
-        self._halves = np.array([_half_extents(solid) for solid in self._solids])
+        self._halves = np.array([_get_half_extents(solid) for solid in self._solids])
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
     def place(self, z: Floats) -> None:
@@ -294,6 +307,6 @@ class LinkDistances:
         self._pairs = np.vstack([np.zeros((0, 2), np.int64), *self._groups.values()])
 
 
-def _half_extents(solid: coal.CollisionGeometry) -> Floats:
+def _get_half_extents(solid: coal.CollisionGeometry) -> Floats:
     box = solid.aabb_local
     return np.array([box.width(), box.height(), box.depth()]) / 2

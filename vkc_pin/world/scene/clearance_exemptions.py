@@ -21,7 +21,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.collision.shapes import Shapes
-from vkc_pin.world.models.shapes import link_name, shape_distance, world_box
+from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_link_name
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import (
     PlacedObject,
@@ -272,7 +272,7 @@ class Standing:
         for name, placed in self.objects.items():
             shapes = standing_geometry(placed)
             self._shapes += shapes
-            self.labels += [f"{name}.{link_name(shape.name)}" for shape in shapes]
+            self.labels += [f"{name}.{get_link_name(shape.name)}" for shape in shapes]
         free = {name for name, placed in self.objects.items() if placed.object.free}
         self._moving = {
             label
@@ -288,7 +288,7 @@ class Standing:
         """Return pairs of shapes, the first of which can move, that are closer than so much: their distance [m]."""
         if not self._moving:
             return {}
-        boxes = [world_box(shape.geometry, shape.placement) for shape in self._shapes]
+        boxes = [compute_world_box(shape.geometry, shape.placement) for shape in self._shapes]
         lower, upper = (np.array(side).T for side in zip(*boxes, strict=True))
         owners = np.array([label.partition(".")[0] for label in self.labels])
         floor, found = owners == FLOOR, dict[tuple[int, int], float]()
@@ -304,7 +304,7 @@ class Standing:
                 if (j, i) in found:
                     continue
                 other = self._shapes[j]
-                distance = shape_distance(
+                distance = compute_shape_distance(
                     shape.geometry, shape.placement, other.geometry, other.placement
                 )
                 if distance < reach:
@@ -436,7 +436,9 @@ class Standing:
         where, lower, upper = moved_shapes(self.objects[owner], link, index, values)
         lows, highs = (
             np.array(side)
-            for side in zip(*(world_box(s.geometry, s.placement) for s in others), strict=True)
+            for side in zip(
+                *(compute_world_box(s.geometry, s.placement) for s in others), strict=True
+            )
         )
         near = (lows < upper[:, :, None] + reach) & (highs > lower[:, :, None] - reach)
         return where, np.asarray(near.all(axis=3))

@@ -16,7 +16,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.utils.arguments import instance, items, mapping, numbers, text
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import clearance, placed_shapes, within_limits
+from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 
 __all__ = [
@@ -177,7 +177,7 @@ def checked_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
                 got=len(values),
             )
         for value, freedom in zip(values, freedoms, strict=True):
-            within_limits(value, freedom.lower, freedom.upper, where)
+            clamp_to_limits(value, freedom.lower, freedom.upper, where)
         if hold.by is not None:
             objects[hold.by.object].link_placement(str(hold.link))
             if not (objects[hold.object].object.free and objects[hold.by.object].object.free):
@@ -234,9 +234,10 @@ def misdirected(
             holder = objects[hold.by.object]
             back = holder.link_placement(hold.link).inverse()
             hand = [
-                (shape, back * where) for shape, where in placed_shapes(standing_geometry(holder))
+                (shape, back * where)
+                for shape, where in list_placed_shapes(standing_geometry(holder))
             ]
-        solids = [*placed_shapes(standing_geometry(placed)), *floor]
+        solids = [*list_placed_shapes(standing_geometry(placed)), *floor]
         if hold.attachment in placed.reversed or _free(placed, hold.attachment, hand, solids):
             continue
         if _free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):
@@ -290,7 +291,7 @@ def _free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -
         tool = where * grasp.tool(values)
         way = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _WAY]
         if (
-            clearance(
+            compute_clearance(
                 [(shape, at * local) for at in way for shape, local in hand], solids, reach=-_DEEP
             )
             >= -_DEEP

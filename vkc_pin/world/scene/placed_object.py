@@ -13,9 +13,14 @@ import pinocchio as pin
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.utils.arguments import mapping, number
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.collision.placements import columns_of
+from vkc_pin.world.collision.placements import flatten_placements
 from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.world.models.shapes import bounding_box, copy_shape, link_name, within_limits
+from vkc_pin.world.models.shapes import (
+    clamp_to_limits,
+    compute_bounding_box,
+    copy_shape,
+    get_link_name,
+)
 
 __all__ = ["PlacedObject", "link_shapes", "moved_shapes", "standing_geometry"]
 
@@ -63,7 +68,7 @@ class PlacedObject:
                     f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}"
                 )
             index, value = coordinates.index(joint), number(given, f"{self.name}.{joint}")
-            state[index] = within_limits(
+            state[index] = clamp_to_limits(
                 value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}"
             )
         return dataclasses.replace(self, state=state)
@@ -120,7 +125,9 @@ def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin
 def link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
     """Return the convex shapes of a link of an object, in the frames of their joints."""
     return [
-        shape for shape in placed.object.collision.geometryObjects if link_name(shape.name) == link
+        shape
+        for shape in placed.object.collision.geometryObjects
+        if get_link_name(shape.name) == link
     ]
 
 
@@ -136,7 +143,7 @@ def moved_shapes(
         values: [rad] or [m].
 
     Returns:
-        Placements, shape (V, K, 12), see `placements.columns_of`, and the corners of boxes around
+        Placements, shape (V, K, 12), see `placements.flatten_placements`, and the corners of boxes around
         the shapes, both (V, K, 3) [m].
     """
     model, data, own, state = (
@@ -145,7 +152,7 @@ def moved_shapes(
         link_shapes(placed, link),
         placed.state.copy(),
     )
-    boxes = [bounding_box(shape) for shape in own]
+    boxes = [compute_bounding_box(shape) for shape in own]
     where, lower, upper = (
         np.empty((len(values), len(own), 12)),
         *np.empty((2, len(values), len(own), 3)),
@@ -156,7 +163,7 @@ def moved_shapes(
         placements = [
             placed.placement * data.oMi[shape.parentJoint] * shape.placement for shape in own
         ]
-        where[row] = columns_of(placements)
+        where[row] = flatten_placements(placements)
         for k, (placement, (center, half)) in enumerate(zip(placements, boxes, strict=True)):
             middle, extent = placement.act(center), np.abs(placement.rotation) @ half
             lower[row, k], upper[row, k] = middle - extent, middle + extent

@@ -20,7 +20,7 @@ from vkc_pin.utils.arguments import instance, is_number, known, mapping, numbers
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.notebook import show
 from vkc_pin.world.files.resources import file_path, located
-from vkc_pin.world.models.shapes import clearance, placed_shapes, within_limits
+from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
 from vkc_pin.world.scene.hold import (
     Hold,
@@ -159,7 +159,7 @@ class Scene:
                 )
             lower, upper = (limits[part] for limits in self.robot.start_limits)
             start[part] = [
-                within_limits(value, low, high, f"{part_name}.{name}")
+                clamp_to_limits(value, low, high, f"{part_name}.{name}")
                 for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
             ]
         for value, low, high, name in zip(
@@ -237,7 +237,7 @@ class Scene:
             if label == FLOOR
         ]
         objects = dict(self.objects)
-        for hold in misdirected(self.objects, holds, self.robot, placed_shapes(floor)):
+        for hold in misdirected(self.objects, holds, self.robot, list_placed_shapes(floor)):
             objects[hold.object] = objects[hold.object].with_reversed(hold.attachment)
             what = f"{hold.frame or 'the hand'} would come to {hold.object}.{hold.attachment}"
             text = f"{what} out of the object or from below the floor"
@@ -305,8 +305,8 @@ class Scene:
             if name not in self.held:
                 standing += standing_geometry(placed)
             elif placed.object.free:
-                moving += placed_shapes(standing_geometry(placed))
-        return clearance(moving, placed_shapes(standing), reach=reach)
+                moving += list_placed_shapes(standing_geometry(placed))
+        return compute_clearance(moving, list_placed_shapes(standing), reach=reach)
 
     def sample_start(self, rng: np.random.Generator) -> Scene:
         """Return the scene with the base at a random place of its start region, clear of everything.

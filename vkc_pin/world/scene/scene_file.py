@@ -18,11 +18,11 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.documents import Document, check
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.srdf import read_srdf
-from vkc_pin.world.models.grafting import clean
-from vkc_pin.world.models.object_file import described_object, load_object
+from vkc_pin.world.models.grafting import round_placement
+from vkc_pin.world.models.object_file import build_object, load_object
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.models.shapes import within_limits
+from vkc_pin.world.models.shapes import clamp_to_limits
 from vkc_pin.world.scene import scene_schema as schema
 from vkc_pin.world.scene.hold import Hold, checked_holds, holds_of
 from vkc_pin.world.scene.obstacles import FLOOR, floor_shape, obstacle_shapes
@@ -217,7 +217,7 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats
     for index, name in enumerate(robot.coordinates.names):
         path = ("start", "base", index) if index < 3 else ("start", "arm", index - 3)
         with document.at(path):
-            start[index] = within_limits(start[index], lower[index], upper[index], name)
+            start[index] = clamp_to_limits(start[index], lower[index], upper[index], name)
     return start
 
 
@@ -288,7 +288,7 @@ def _pose(item: schema.PoseSchema) -> pin.SE3:
     rotation = pin.rpy.rpyToMatrix(roll, pitch, yaw)
     if item.quaternion is not None:
         rotation = pin.Quaternion(np.array(item.quaternion)).matrix()
-    return clean(pin.SE3(rotation, np.array(item.position)))
+    return round_placement(pin.SE3(rotation, np.array(item.position)))
 
 
 def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: str) -> Path:
@@ -319,7 +319,7 @@ def _object(
     at, kind = (*path, "type"), item.type
     with document.at(at):
         if isinstance(kind, dict):
-            loaded = described_object(_part(document, at), folder)
+            loaded = build_object(_part(document, at), folder)
         else:
             by_path = kind.endswith((".yaml", ".yml")) or "/" in kind
             loaded = load_object(_file(document, at, folder, kind) if by_path else kind)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.world.models.shapes import link_name, shape_distance, world_box
+from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_link_name
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 
@@ -53,12 +53,12 @@ def supports(placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObjec
         shapes: Label and shape of all that stands there, placed in the world.
     """
     own = standing_geometry(placed)
-    boxes = [world_box(shape.geometry, shape.placement) for shape in own]
+    boxes = [compute_world_box(shape.geometry, shape.placement) for shape in own]
     found: set[str] = set()
     for label, shape in shapes:
         if label in found:
             continue
-        lower, upper = world_box(shape.geometry, shape.placement)
+        lower, upper = compute_world_box(shape.geometry, shape.placement)
         near = (
             (low < upper + RESTING).all() and (high > lower - RESTING).all() for low, high in boxes
         )
@@ -81,7 +81,7 @@ def borne(
         (f"{name}.{link}", shape)
         for name, links in moving.items()
         for shape in standing_geometry(objects[name])
-        if (link := link_name(shape.name)) in links
+        if (link := get_link_name(shape.name)) in links
     ]
     left, found = [name for name in free if name not in moving], dict[str, str]()
     while left and shapes:
@@ -103,7 +103,7 @@ def _bears(shape: pin.GeometryObject, one: pin.GeometryObject) -> bool:
 
     def distance(shift: float) -> float:
         moved = pin.SE3(one.placement.rotation, one.placement.translation + shift * _DOWN)
-        return shape_distance(one.geometry, moved, shape.geometry, shape.placement)
+        return compute_shape_distance(one.geometry, moved, shape.geometry, shape.placement)
 
     lowered = distance(1.0)
     return lowered < -RESTING / 2 and distance(-1.0) - lowered > RESTING

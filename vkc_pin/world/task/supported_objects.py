@@ -8,7 +8,7 @@ from dataclasses import replace
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.shapes import link_name
+from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
 from vkc_pin.world.scene.scene import Scene
@@ -121,11 +121,11 @@ def rides_of(
     if not riding:
         return ()
     still = [
-        (f"{name}.{link_name(shape.name)}", shape)
+        (f"{name}.{get_link_name(shape.name)}", shape)
         for name, placed in now.items()
         if name not in riding
         for shape in standing_geometry(placed)
-        if name != hold.object or link_name(shape.name) not in links
+        if name != hold.object or get_link_name(shape.name) not in links
     ]
     still += zip(scene.obstacle_labels, scene.obstacles, strict=True)
     found = []

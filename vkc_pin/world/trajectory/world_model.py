@@ -19,7 +19,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import graft, graft_geometry
 from vkc_pin.world.models.grippers.gripper import Gripper
-from vkc_pin.world.models.shapes import link_name
+from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.clearance_exemptions import shape_keys
 from vkc_pin.world.scene.contact_rules import opening_at_start
 from vkc_pin.world.scene.hold import Hold
@@ -77,7 +77,7 @@ class World:
         self.bodies = self._geometry(robot.collision, objects)
         self.shapes = (*self.bodies.geometryObjects, *scene.obstacles)
         self.collision_labels = [
-            *(link_name(shape.name) for shape in self.bodies.geometryObjects),
+            *(get_link_name(shape.name) for shape in self.bodies.geometryObjects),
             *scene.obstacle_labels,
         ]
         self.collision_keys = shape_keys(
@@ -122,7 +122,7 @@ class World:
         moving = len(shapes) - len(self.scene.obstacle_visual)
         labels = []
         for shape in shapes[:moving]:
-            label = link_name(shape.name)
+            label = get_link_name(shape.name)
             while (
                 label not in links and "_" in label
             ):  # a mesh of several parts is `<link>_<number>_<part>`

@@ -10,7 +10,7 @@ from helpers.telescopes import joint, link, write_telescope
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
-from vkc_pin.world.models.couplings.coupled_joints import Following, followers
+from vkc_pin.world.models.couplings.coupled_joints import JointCoupling, find_followers
 
 
 def file_of(tmp_path: Path, *inside: str, kinds: str = "prismatic") -> Path:
@@ -36,11 +36,11 @@ def read(path: Path) -> UrdfFile:
 
 def test_chains_end_at_the_one_that_leads(tmp_path: Path) -> None:
     """j3 = -0.5·j2 + 0.2 and j2 = 2·j1 + 0.1, whatever comes first in the file."""
-    found = followers(
+    found = find_followers(
         read(file_of(tmp_path, "", mimic("j1", 2.0, 0.1), mimic("j2", -0.5, 0.2))).root
     )
     assert found.keys() == {"j2", "j3"}
-    assert found["j2"] == Following("j1", 2.0, 0.1)
+    assert found["j2"] == JointCoupling("j1", 2.0, 0.1)
     assert (found["j3"].leader, found["j3"].factor, found["j3"].offset) == (
         "j1",
         -1.0,
@@ -50,13 +50,15 @@ def test_chains_end_at_the_one_that_leads(tmp_path: Path) -> None:
 
 def test_a_leader_that_hangs_on_its_follower_follows(tmp_path: Path) -> None:
     """j1 = 2·j3 + 0.1 makes j3 = 0.5·j1 - 0.05, and j2 = -4·j3 makes j2 = -2·j1 + 0.2."""
-    found = followers(read(file_of(tmp_path, mimic("j3", 2.0, 0.1), mimic("j3", -4.0), "")).root)
-    assert found == {"j3": Following("j1", 0.5, -0.05), "j2": Following("j1", -2.0, 0.2)}
+    found = find_followers(
+        read(file_of(tmp_path, mimic("j3", 2.0, 0.1), mimic("j3", -4.0), "")).root
+    )
+    assert found == {"j3": JointCoupling("j1", 0.5, -0.05), "j2": JointCoupling("j1", -2.0, 0.2)}
 
 
 def test_the_second_coupling_of_a_joint_in_a_urdf_is_not_read(tmp_path: Path) -> None:
-    found = followers(read(file_of(tmp_path, "", "", mimic("j1") + mimic("j2"))).root)
-    assert found == {"j3": Following("j1", 1.0, 0.0)}
+    found = find_followers(read(file_of(tmp_path, "", "", mimic("j1") + mimic("j2"))).root)
+    assert found == {"j3": JointCoupling("j1", 1.0, 0.0)}
 
 
 @pytest.mark.parametrize(
@@ -101,8 +103,8 @@ def test_a_robot_yaml_has_the_last_word(tmp_path: Path) -> None:
     file_of(tmp_path, "", mimic("j1", 3.0), "")
     text = "urdf: robot.urdf\ntool_frame: l3\ncouplings:\n  j2: j1\n  j3: {joint: j2, multiplier: -2.0, offset: 0.5}\n"
     (tmp_path / "robot.yaml").write_text(text)
-    found = followers(vkc.load_robot(tmp_path, pairs="all").file.root)
-    assert found == {"j2": Following("j1", 1.0, 0.0), "j3": Following("j1", -2.0, 0.5)}
+    found = find_followers(vkc.load_robot(tmp_path, pairs="all").file.root)
+    assert found == {"j2": JointCoupling("j1", 1.0, 0.0), "j3": JointCoupling("j1", -2.0, 0.5)}
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,12 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.limits import limited_together, robot_limits
-from vkc_pin.world.models.robot_model import full_model, planned_model, rest_positions
+from vkc_pin.world.models.couplings.limits import apply_robot_limits, tighten_coupled_limits
+from vkc_pin.world.models.robot_model import (
+    build_full_model,
+    build_planned_model,
+    compute_rest_positions,
+)
 from vkc_pin.world.models.robot_schema import RobotSchema
 
 
@@ -148,9 +152,9 @@ def test_within_the_limits_of_a_coordinate_all_joints_are_within_theirs(seed: in
         )
         parts += [link(f"l{k + 1}"), moved]
     file = read_urdf(Path("robot.urdf"), text=f'<robot name="robot">{"".join(parts)}</robot>')
-    full = limited_together(full_model(file), file, "l4")
-    model = planned_model(full, file, "l4", rest_positions(full, file, {}), {})
-    coordinates, lower, upper, velocity, _ = robot_limits(
+    full = tighten_coupled_limits(build_full_model(file), file, "l4")
+    model = build_planned_model(full, file, "l4", compute_rest_positions(full, file, {}), {})
+    coordinates, lower, upper, velocity, _ = apply_robot_limits(
         full, model, RobotSchema(urdf="robot.urdf"), "omni"
     )
     assert coordinates.names[3:] == ("j0",)

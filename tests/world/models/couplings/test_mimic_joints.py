@@ -16,14 +16,14 @@ import vkc_pin as vkc
 from vkc_pin.planning import kinematics as cpin
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.coupled_joints import Following, followers
-from vkc_pin.world.models.couplings.limits import limited_together
-from vkc_pin.world.models.couplings.mimic_joints import in_order
+from vkc_pin.world.models.couplings.coupled_joints import JointCoupling, find_followers
+from vkc_pin.world.models.couplings.limits import tighten_coupled_limits
+from vkc_pin.world.models.couplings.mimic_joints import sort_joints
 from vkc_pin.world.models.robot_model import (
-    configuration,
-    full_model,
-    planned_model,
-    rest_positions,
+    build_full_model,
+    build_planned_model,
+    compute_rest_positions,
+    make_configuration,
 )
 
 KINDS = ("revolute", "prismatic", "continuous")
@@ -63,10 +63,10 @@ def test_all_links_are_where_all_joints_have_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
     text, tool = random_robot(rng)
     file = read_urdf(Path("robot.urdf"), text=text)
-    single = full_model(file)
-    full = limited_together(single, file, tool)
-    rest = rest_positions(full, file, {})
-    model, follows = planned_model(full, file, tool, rest, {}), followers(file.root)
+    single = build_full_model(file)
+    full = tighten_coupled_limits(single, file, tool)
+    rest = compute_rest_positions(full, file, {})
+    model, follows = build_planned_model(full, file, tool, rest, {}), find_followers(file.root)
     coordinates = Coordinates(model)
     assert len({frame.name for frame in model.frames}) == model.nframes
     z = rng.uniform(-1.0, 1.0, coordinates.size)
@@ -75,7 +75,7 @@ def test_all_links_are_where_all_joints_have_them(seed: int) -> None:
     assert len(coordinates.moves) == len(planned) + 3
     for move in coordinates.moves[3:]:
         joint, leader = str(model.names[move.joint]), coordinates.names[move.coordinate]
-        led = follows.get(joint, Following(joint, 1.0, 0.0))
+        led = follows.get(joint, JointCoupling(joint, 1.0, 0.0))
         assert (leader, move.factor, move.offset) == (
             led.leader,
             pytest.approx(led.factor),
@@ -89,7 +89,7 @@ def test_all_links_are_where_all_joints_have_them(seed: int) -> None:
         values = dict(zip(coordinates.names, z, strict=True))
         at = {**rest, **{name: value for name, value in values.items() if name in rest}}
         at |= {name: led.factor * at[led.leader] + led.offset for name, led in follows.items()}
-        q = configuration(single, at)
+        q = make_configuration(single, at)
         q[:4] = z[0], z[1], np.cos(z[2]), np.sin(z[2])
         return q
 
@@ -176,10 +176,10 @@ def test_joints_wait_for_those_that_lead_them() -> None:
     first = model.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "first")
     model.addJoint(first, pin.JointModelRX(), pin.SE3.Identity(), "on it")
     second = model.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "second")
-    assert in_order(model, {}) == [1, 2, 3]
-    assert in_order(model, {first: {second}}) == [3, 1, 2]
+    assert sort_joints(model, {}) == [1, 2, 3]
+    assert sort_joints(model, {first: {second}}) == [3, 1, 2]
     with pytest.raises(vkc.InputError, match="on each other's followers"):
-        in_order(model, {first: {second}, second: {first}})
+        sort_joints(model, {first: {second}, second: {first}})
 
 
 def test_a_leader_may_be_on_another_branch_and_come_later(tmp_path: Path) -> None:

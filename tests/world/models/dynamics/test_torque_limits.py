@@ -11,7 +11,7 @@ import yaml
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.dynamics.torque_limits import Efforts, efforts
+from vkc_pin.world.models.dynamics.torque_limits import TorqueLimits, compute_torque_limits
 from vkc_pin.world.models.robot import Robot
 
 
@@ -20,8 +20,8 @@ def husky() -> Robot:
     return vkc.load_robot("husky_ur5e")
 
 
-def of(robot: Robot, model: pin.Model) -> Efforts:
-    return efforts(model, robot.coordinates, robot.lower, robot.upper)
+def of(robot: Robot, model: pin.Model) -> TorqueLimits:
+    return compute_torque_limits(model, robot.coordinates, robot.lower, robot.upper)
 
 
 def test_motors_have_what_the_urdf_says_and_the_base_has_no_limit(husky: Robot) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.world.models.grippers.bar_width import EXACT, bar_fits, widest_bar
+from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE, check_bar_fits, find_widest_bar
 
 
 def walls(left: float, right: float) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
@@ -19,13 +19,13 @@ def walls(left: float, right: float) -> list[tuple[coal.CollisionGeometry, pin.S
 @pytest.mark.parametrize(("left", "right"), [(0.04, 0.04), (0.01, 0.04), (0.1, 0.02)])
 def test_the_nearer_side_says_how_wide_a_bar_may_be(left: float, right: float) -> None:
     width = 2.0 * min(left, right)
-    assert widest_bar(walls(left, right)) == pytest.approx(width, abs=EXACT)
-    assert bar_fits(width - 1e-5, walls(left, right))
-    assert not bar_fits(width + 1e-5, walls(left, right))
+    assert find_widest_bar(walls(left, right)) == pytest.approx(width, abs=WIDTH_TOLERANCE)
+    assert check_bar_fits(width - 1e-5, walls(left, right))
+    assert not check_bar_fits(width + 1e-5, walls(left, right))
 
 
 def test_nothing_fits_where_there_is_no_room() -> None:
-    assert widest_bar(walls(-0.01, 0.04)) == 0.0
+    assert find_widest_bar(walls(-0.01, 0.04)) == 0.0
 
 
 def test_what_is_beside_the_bar_does_not_count() -> None:
@@ -33,4 +33,4 @@ def test_what_is_beside_the_bar_does_not_count() -> None:
         (shape, place * pin.SE3(np.eye(3), np.array([0.0, 0.6, 0.0])))
         for shape, place in walls(0.04, 0.04)
     ]
-    assert widest_bar(shapes) > 0.4
+    assert find_widest_bar(shapes) > 0.4

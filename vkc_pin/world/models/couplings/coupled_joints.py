@@ -14,13 +14,20 @@ from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import line_of
 from vkc_pin.world.models.robot_schema import CouplingSchema
 
-__all__ = ["Following", "check_followers", "couple", "coupled_groups", "followers", "path_to"]
+__all__ = [
+    "JointCoupling",
+    "apply_couplings",
+    "check_followers",
+    "find_coupled_groups",
+    "find_followers",
+    "find_joint_path",
+]
 
 _MOVING = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True)
-class Following:
+class JointCoupling:
     """How a joint follows another one: its position is factor · (the leader's) + offset, [m] or [rad].
 
     Attributes:
@@ -34,7 +41,7 @@ class Following:
     offset: float
 
 
-def followers(root: ElementTree.Element) -> dict[str, Following]:
+def find_followers(root: ElementTree.Element) -> dict[str, JointCoupling]:
     """Return the joints of a URDF that follow another one, and how.
 
     A joint that follows one that follows a third follows the third. If a joint hangs on one that
@@ -42,21 +49,21 @@ def followers(root: ElementTree.Element) -> dict[str, Following]:
     that do not turn or slide, of such as do not exist, and of joints that follow each other in a
     circle, counts for nothing: see `check_followers`.
     """
-    said, moving = _said(root), _moving(root)
+    said, moving = _read_mimics(root), _find_movable_joints(root)
     found = {
         joint: led
         for joint in said
-        if joint in moving and (led := _followed(joint, said, moving)) is not None
+        if joint in moving and (led := _resolve_coupling(joint, said, moving)) is not None
     }
     for leader in dict.fromkeys(led.leader for led in found.values()):
         group = {joint for joint, led in found.items() if led.leader == leader and led.factor}
-        above = [joint for joint in _above(root, leader) if joint in group]
+        above = [joint for joint in _find_ancestors(root, leader) if joint in group]
         if above:
             first, led = above[0], found.pop(above[0])
-            found[leader] = Following(leader, 1.0, 0.0)
+            found[leader] = JointCoupling(leader, 1.0, 0.0)
             for joint, other in [item for item in found.items() if item[1].leader == leader]:
                 factor = other.factor / led.factor
-                found[joint] = Following(first, factor, other.offset - factor * led.offset)
+                found[joint] = JointCoupling(first, factor, other.offset - factor * led.offset)
     return found
 
 
@@ -67,9 +74,13 @@ def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
         InputError: A joint follows one that does not exist, that does not turn or slide, or in a
             circle.
     """
-    said, moving, found = _said(file.root), _moving(file.root), followers(file.root)
+    said, moving, found = (
+        _read_mimics(file.root),
+        _find_movable_joints(file.root),
+        find_followers(file.root),
+    )
     leaders = {led.leader for led in found.values()}
-    for joint in (str(full.names[j]) for j in path_to(full, tool_frame)):
+    for joint in (str(full.names[j]) for j in find_joint_path(full, tool_frame)):
         if joint in said and joint in moving and joint not in found and joint not in leaders:
             element, expected = said[joint][3], "a joint that turns or slides"
             chain = [joint]
@@ -102,26 +113,31 @@ def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
             )
 
 
-def coupled_groups(
+def find_coupled_groups(
     full: pin.Model, file: UrdfFile, tool_frame: str
-) -> dict[str, dict[str, Following]]:
+) -> dict[str, dict[str, JointCoupling]]:
     """Return leader → the joints that follow it, wherever they are, of joints of which one is on the way to the tool."""
-    follows, path = followers(file.root), {str(full.names[j]) for j in path_to(full, tool_frame)}
-    groups: dict[str, dict[str, Following]] = {}
+    follows, path = (
+        find_followers(file.root),
+        {str(full.names[j]) for j in find_joint_path(full, tool_frame)},
+    )
+    groups: dict[str, dict[str, JointCoupling]] = {}
     for joint, led in follows.items():
         if led.factor:
             groups.setdefault(led.leader, {})[joint] = led
     return {leader: group for leader, group in groups.items() if path & {leader, *group}}
 
 
-def couple(file: UrdfFile, couplings: Mapping[str, CouplingSchema], document: Document) -> None:
+def apply_couplings(
+    file: UrdfFile, couplings: Mapping[str, CouplingSchema], document: Document
+) -> None:
     """Write the couplings of a robot.yaml into a URDF that was read, as <mimic>, in place of those that it has.
 
     Raises:
         UnknownNameError: There is no such joint.
         InputError: Joints follow each other in a circle.
     """
-    moving = _moving(file.root)
+    moving = _find_movable_joints(file.root)
     for joint, coupling in couplings.items():
         for name in (joint, coupling.joint):
             if name not in moving:
@@ -134,16 +150,16 @@ def couple(file: UrdfFile, couplings: Mapping[str, CouplingSchema], document: Do
         ElementTree.SubElement(
             moving[joint], "mimic", joint=coupling.joint, multiplier=multiplier, offset=offset
         )
-    said = _said(file.root)
+    said = _read_mimics(file.root)
     for joint, coupling in couplings.items():
-        if _followed(joint, said, moving, anyone=True) is None:
+        if _resolve_coupling(joint, said, moving, anyone=True) is None:
             problem, expected = "joints that follow each other in a circle", "one joint that leads"
             raise document.error(
                 ("couplings", joint), problem, expected=expected, got=coupling.joint
             )
 
 
-def path_to(full: pin.Model, frame: str) -> list[int]:
+def find_joint_path(full: pin.Model, frame: str) -> list[int]:
     """Return the joints from the world to a frame of a robot."""
     named = [other for other in full.frames if other.name == frame]
     link = next(
@@ -152,7 +168,9 @@ def path_to(full: pin.Model, frame: str) -> list[int]:
     return list(full.supports[link.parentJoint])
 
 
-def _said(root: ElementTree.Element) -> dict[str, tuple[str, float, float, ElementTree.Element]]:
+def _read_mimics(
+    root: ElementTree.Element,
+) -> dict[str, tuple[str, float, float, ElementTree.Element]]:
     """Return joint → (the joint it follows, factor, offset, where it says so)."""
     found = {}
     for joint in root.findall("joint"):
@@ -163,7 +181,7 @@ def _said(root: ElementTree.Element) -> dict[str, tuple[str, float, float, Eleme
     return found
 
 
-def _moving(root: ElementTree.Element) -> dict[str, ElementTree.Element]:
+def _find_movable_joints(root: ElementTree.Element) -> dict[str, ElementTree.Element]:
     return {
         joint.get("name", ""): joint
         for joint in root.findall("joint")
@@ -171,13 +189,13 @@ def _moving(root: ElementTree.Element) -> dict[str, ElementTree.Element]:
     }
 
 
-def _followed(
+def _resolve_coupling(
     joint: str,
     said: Mapping[str, tuple[str, float, float, ElementTree.Element]],
     moving: Mapping[str, ElementTree.Element],
     *,
     anyone: bool = False,
-) -> Following | None:
+) -> JointCoupling | None:
     """Return how a joint follows the one at the end of its chain, `anyone` or one that can lead; None: there is none."""
     leader, factor, offset, passed = joint, 1.0, 0.0, set[str]()
     while leader in said and leader in moving:
@@ -186,10 +204,10 @@ def _followed(
         passed.add(leader)
         above, multiplier, shift, _ = said[leader]
         leader, factor, offset = above, factor * multiplier, offset + factor * shift
-    return Following(leader, factor, offset) if anyone or leader in moving else None
+    return JointCoupling(leader, factor, offset) if anyone or leader in moving else None
 
 
-def _above(root: ElementTree.Element, joint: str) -> list[str]:
+def _find_ancestors(root: ElementTree.Element, joint: str) -> list[str]:
     """Return the joints that a joint hangs on, from the root on."""
     ends = {
         key: {

@@ -12,18 +12,18 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.coupled_joints import check_followers, coupled_groups
+from vkc_pin.world.models.couplings.coupled_joints import check_followers, find_coupled_groups
 from vkc_pin.world.models.robot_schema import RobotSchema
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
-__all__ = ["UNSAID_VELOCITY", "limited_together", "robot_limits"]
+__all__ = ["DEFAULT_JOINT_VELOCITY", "apply_robot_limits", "tighten_coupled_limits"]
 
-UNSAID_VELOCITY = np.pi
+DEFAULT_JOINT_VELOCITY = np.pi
 """Of joints for which no file names one [rad/s] or [m/s]."""
-_ACCELERATION = 1.4  # the same [rad/s²] or [m/s²]
+_DEFAULT_JOINT_ACCELERATION = 1.4  # the same [rad/s²] or [m/s²]
 
 
-def limited_together(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Model:
+def tighten_coupled_limits(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Model:
     """Return a robot whose joints that lead others on the way to the tool can go as far as these can follow.
 
     Such joints turn within limits, which may be infinite: a turn is not nothing to those that
@@ -39,10 +39,12 @@ def limited_together(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Mo
             limits leave nothing.
     """
     check_followers(full, file, tool_frame)
-    groups = coupled_groups(full, file, tool_frame)
+    groups = find_coupled_groups(full, file, tool_frame)
     if not groups:
         return full
-    model = _within_limits(full, {*groups, *itertools.chain.from_iterable(groups.values())})
+    model = _bound_continuous_joints(
+        full, {*groups, *itertools.chain.from_iterable(groups.values())}
+    )
     lower, upper = model.lowerPositionLimit, model.upperPositionLimit
     for leader, group in groups.items():
         at = model.joints[model.getJointId(leader)].idx_q
@@ -64,13 +66,13 @@ def limited_together(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Mo
     return model
 
 
-def robot_limits(
+def apply_robot_limits(
     full: pin.Model, model: pin.Model, settings: RobotSchema, base: str
 ) -> tuple[Coordinates, Floats, Floats, Floats, Floats]:
     """Write the limits into a robot's model; return its coordinates, and lower, upper, velocity, acceleration, shape (n,) each.
 
     Args:
-        full: The robot with all its joints, see `limited_together`.
+        full: The robot with all its joints, see `tighten_coupled_limits`.
         model: Those of them that are planned; changed in place.
         settings: Its robot.yaml.
         base: How it moves.
@@ -99,16 +101,23 @@ def robot_limits(
             velocity[k] = min(velocity[k], own / share)
         if named is not None and named.acceleration is not None:
             acceleration[k] = min(acceleration[k], named.acceleration / share)
-    velocity = np.where(np.isinf(velocity), UNSAID_VELOCITY * unsaid, velocity)
-    acceleration = np.where(np.isinf(acceleration), _ACCELERATION * unsaid, acceleration)
-    model.velocityLimit, model.effortLimit = velocity, _efforts(model, coordinates, settings)
+    velocity = np.where(np.isinf(velocity), DEFAULT_JOINT_VELOCITY * unsaid, velocity)
+    acceleration = np.where(
+        np.isinf(acceleration), _DEFAULT_JOINT_ACCELERATION * unsaid, acceleration
+    )
+    model.velocityLimit, model.effortLimit = (
+        velocity,
+        _read_torque_limits(model, coordinates, settings),
+    )
     lower, upper = coordinates.lower.copy(), coordinates.upper.copy()
     if base == "fixed":
         lower[:3] = upper[:3] = 0.0
     return Coordinates(model), lower, upper, velocity.copy(), acceleration
 
 
-def _efforts(model: pin.Model, coordinates: Coordinates, settings: RobotSchema) -> Floats:
+def _read_torque_limits(
+    model: pin.Model, coordinates: Coordinates, settings: RobotSchema
+) -> Floats:
     """Return the efforts of the motors, shape (n,): of joints that move together the leading one has it."""
     effort = model.effortLimit
     for k, joint in enumerate(coordinates.joints):
@@ -118,7 +127,7 @@ def _efforts(model: pin.Model, coordinates: Coordinates, settings: RobotSchema) 
     return np.asarray(effort)
 
 
-def _within_limits(full: pin.Model, joints: Set[str]) -> pin.Model:
+def _bound_continuous_joints(full: pin.Model, joints: Set[str]) -> pin.Model:
     """Return a copy of a model in which those of some joints that turn without end do so between infinite limits."""
     model, data = pin.Model(), full.createData()
     model.name = full.name

@@ -7,13 +7,13 @@ from collections.abc import Collection, Mapping, Sequence
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.couplings.coupled_joints import Following
+from vkc_pin.world.models.couplings.coupled_joints import JointCoupling
 
-__all__ = ["in_order", "with_mimics"]
+__all__ = ["add_mimics", "sort_joints"]
 
 
-def with_mimics(
-    model: pin.Model, couplings: Sequence[Following], joints: Sequence[int]
+def add_mimics(
+    model: pin.Model, couplings: Sequence[JointCoupling], joints: Sequence[int]
 ) -> pin.Model:
     """Return a model in which some joints follow others.
 
@@ -29,7 +29,7 @@ def with_mimics(
     return model
 
 
-def in_order(full: pin.Model, before: Mapping[int, Collection[int]]) -> list[int]:
+def sort_joints(full: pin.Model, before: Mapping[int, Collection[int]]) -> list[int]:
     """Return the joints of a model in their order, but for those that have to wait for others.
 
     Args:

@@ -15,7 +15,7 @@ from vkc_pin.world.files.fields import JointSchema, NotNegative, Number
 from vkc_pin.world.files.kinematic_tree import numbers_of
 from vkc_pin.world.files.xml import line_of, read_xml
 
-__all__ = ["ObjectJointSchema", "Resistance", "resistances"]
+__all__ = ["ObjectJointSchema", "Resistance", "read_resistances"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ class ObjectJointSchema(JointSchema):
     springref: Number | None = None
 
 
-def resistances(
+def read_resistances(
     document: Document,
     joints: Mapping[str, ObjectJointSchema],
     urdf: Path,

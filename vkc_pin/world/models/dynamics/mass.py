@@ -6,17 +6,17 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.world.files.hulls import compute_hull
-from vkc_pin.world.models.shapes import triangles
+from vkc_pin.world.models.shapes import triangulate
 
-__all__ = ["mass_of", "solid_inertia", "weigh"]
+__all__ = ["compute_mass", "compute_solid_inertia", "set_mass"]
 
 
-def mass_of(model: pin.Model) -> float:
+def compute_mass(model: pin.Model) -> float:
     """Return what all links of a model weigh together [kg]."""
     return float(sum(inertia.mass for inertia in model.inertias))
 
 
-def weigh(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
+def set_mass(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
     """Let all links of a model weigh so much together, in the shares and with the shapes that they had.
 
     Where they weighed nothing, collision shapes are solids of one density; without these, all is at
@@ -27,21 +27,21 @@ def weigh(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
         collision: Its shapes.
         mass: [kg], 0 or more.
     """
-    if not mass_of(model) > 0.0:
+    if not compute_mass(model) > 0.0:
         for shape in collision.geometryObjects:
-            model.inertias[shape.parentJoint] += shape.placement.act(solid_inertia(shape))
-        if not mass_of(model) > 0.0:
+            model.inertias[shape.parentJoint] += shape.placement.act(compute_solid_inertia(shape))
+        if not compute_mass(model) > 0.0:
             model.inertias[0] = pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3)))
-    factor = mass / mass_of(model)
+    factor = mass / compute_mass(model)
     for joint, inertia in enumerate(model.inertias):
         model.inertias[joint] = pin.Inertia(
             factor * inertia.mass, inertia.lever, factor * np.asarray(inertia.inertia)
         )
 
 
-def solid_inertia(shape: pin.GeometryObject, density: float = 1.0) -> pin.Inertia:
+def compute_solid_inertia(shape: pin.GeometryObject, density: float = 1.0) -> pin.Inertia:
     """Return the inertia of a convex shape in its own frame, all of one density [kg/m³]."""
-    solid = compute_hull(triangles(shape.geometry)[0])
+    solid = compute_hull(triangulate(shape.geometry)[0])
     solid.density = density
     return pin.Inertia(
         float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)

@@ -10,15 +10,15 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
 
-__all__ = ["UNLIMITED", "Efforts", "efforts"]
+__all__ = ["UNLIMITED", "TorqueLimits", "compute_torque_limits"]
 
 UNLIMITED = 1e300
 """Pinocchio's efforts above this are none."""
-_POSTURES = 200  # random ones in which a motor has to hold its own arm
+_SAMPLES = 200  # random ones in which a motor has to hold its own arm
 
 
 @dataclass(frozen=True, eq=False)
-class Efforts:
+class TorqueLimits:
     """What the motors of a robot have.
 
     Attributes:
@@ -36,7 +36,9 @@ class Efforts:
         return bool(np.isfinite(self.limits).any())
 
 
-def efforts(model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Floats) -> Efforts:
+def compute_torque_limits(
+    model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Floats
+) -> TorqueLimits:
     """Return what the motors of a robot have.
 
     Nothing is known without masses, or where no effort is stated. Where the stated effort does not
@@ -52,7 +54,7 @@ def efforts(model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Fl
     limits = np.asarray(model.effortLimit, float)[: coordinates.size].copy()
     limits[:3] = np.inf
     if not sum(inertia.mass for inertia in list(model.inertias)[2:]) > 0.0:
-        return Efforts(np.full_like(limits, np.inf), ("the URDF states no masses of the arm",))
+        return TorqueLimits(np.full_like(limits, np.inf), ("the URDF states no masses of the arm",))
     stated = (limits > 0.0) & (limits < UNLIMITED)
     limits[~stated] = np.inf
     names, notes = np.array(coordinates.names), list[str]()
@@ -60,7 +62,7 @@ def efforts(model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Fl
         notes.append(f"the URDF states no effort of {', '.join(silent)}")
     rng, data, weight = np.random.default_rng(0), model.createData(), np.zeros_like(limits)
     low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
-    for z in rng.uniform(low, np.maximum(low, high), (_POSTURES, len(low))):
+    for z in rng.uniform(low, np.maximum(low, high), (_SAMPLES, len(low))):
         weight = np.maximum(
             weight, np.abs(pin.computeGeneralizedGravity(model, data, coordinates.q(z)))
         )
@@ -70,4 +72,4 @@ def efforts(model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Fl
             f"{names[k]}: {limits[k]:g} {unit} do not carry the arm, which weighs up to {weight[k]:.3g} {unit} there"
         )
         limits[k] = np.inf
-    return Efforts(limits, tuple(notes))
+    return TorqueLimits(limits, tuple(notes))

@@ -8,21 +8,24 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-__all__ = ["EXACT", "THIN", "Placed", "bar_fits", "widest_bar"]
+__all__ = ["BAR_THICKNESS", "WIDTH_TOLERANCE", "PlacedShape", "check_bar_fits", "find_widest_bar"]
 
-THIN = 2e-3
+BAR_THICKNESS = 2e-3
 """How thick the bar is, across the direction that is measured [m]."""
-EXACT = 1e-4
+WIDTH_TOLERANCE = 1e-4
 """How exactly the widest bar is known [m]."""
-_WIDEST = 0.5  # [m]: no hand opens wider
+_MAX_WIDTH = 0.5  # [m]: no hand opens wider
 
-Placed = tuple[coal.CollisionGeometry, pin.SE3]
+PlacedShape = tuple[coal.CollisionGeometry, pin.SE3]
 """A shape, and where it is."""
 
 
-def bar_fits(width: float, shapes: Sequence[Placed]) -> bool:
+def check_bar_fits(width: float, shapes: Sequence[PlacedShape]) -> bool:
     """Return whether a bar at the tool's origin, so wide along its x axis [m], hits none of some shapes in the tool frame."""
-    bar, where = coal.Box(width, THIN, THIN), coal.Transform3s(np.eye(3), np.zeros(3))
+    bar, where = (
+        coal.Box(width, BAR_THICKNESS, BAR_THICKNESS),
+        coal.Transform3s(np.eye(3), np.zeros(3)),
+    )
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     for geometry, placement in shapes:
         result.clear()
@@ -38,10 +41,10 @@ def bar_fits(width: float, shapes: Sequence[Placed]) -> bool:
     return True
 
 
-def widest_bar(shapes: Sequence[Placed]) -> float:
+def find_widest_bar(shapes: Sequence[PlacedShape]) -> float:
     """Return how wide a bar at the tool's origin may be [m], 0 if none fits: all narrower ones fit."""
-    low, high = 0.0, _WIDEST
-    while high - low > EXACT:
+    low, high = 0.0, _MAX_WIDTH
+    while high - low > WIDTH_TOLERANCE:
         middle = (low + high) / 2.0
-        low, high = (middle, high) if bar_fits(middle, shapes) else (low, middle)
+        low, high = (middle, high) if check_bar_fits(middle, shapes) else (low, middle)
     return low

@@ -20,15 +20,20 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.coupled_joints import followers
-from vkc_pin.world.models.grippers.bar_width import EXACT, Placed, bar_fits, widest_bar
-from vkc_pin.world.models.robot_model import unlocked_model
+from vkc_pin.world.models.couplings.coupled_joints import find_followers
+from vkc_pin.world.models.grippers.bar_width import (
+    WIDTH_TOLERANCE,
+    PlacedShape,
+    check_bar_fits,
+    find_widest_bar,
+)
+from vkc_pin.world.models.robot_model import build_unlocked_model
 from vkc_pin.world.models.robot_schema import FingerSchema
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
-__all__ = ["Gripper", "described_gripper"]
+__all__ = ["Gripper", "build_gripper"]
 
-_HALVINGS = 30  # of the way between closed and open: 1e-9 of it
+_BISECTION_STEPS = 30  # of the way between closed and open: 1e-9 of it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,17 +63,17 @@ class Gripper:
     @cached_property
     def narrowest(self) -> float:
         """Its opening when it is closed [m]."""
-        return widest_bar(self._hand(self.closed))
+        return find_widest_bar(self._hand(self.closed))
 
     @cached_property
     def widest(self) -> float:
         """Its opening when it is fully open [m]."""
-        return widest_bar(self._hand(self.open))
+        return find_widest_bar(self._hand(self.open))
 
     @cached_property
     def resting(self) -> float:
         """Its opening if nobody asks for one [m]."""
-        return widest_bar(self._hand(self.rest))
+        return find_widest_bar(self._hand(self.rest))
 
     def nearest(self, opening: float) -> float:
         """Return the opening that it can stand at and is nearest to one that is asked for [m]."""
@@ -83,7 +88,7 @@ class Gripper:
         if opening is None:
             return self.rest
         opening = arguments.number(opening, "opening", "between the fingers [m]")
-        if not self.narrowest - EXACT <= opening <= self.widest + EXACT:
+        if not self.narrowest - WIDTH_TOLERANCE <= opening <= self.widest + WIDTH_TOLERANCE:
             expected = f"{self.narrowest:.4g} to {self.widest:.4g} m"
             raise InputError(
                 "the gripper cannot be so far open",
@@ -111,7 +116,7 @@ class Gripper:
         self, shapes: Sequence[pin.GeometryObject], model: pin.Model
     ) -> list[pin.GeometryObject]:
         """Return shapes on the joints of `model`, the robot's, as shapes on those of this gripper's model."""
-        return _carried(shapes, model, self.model)
+        return _attach_shapes(shapes, model, self.model)
 
     @property
     def _first(self) -> int:
@@ -125,7 +130,7 @@ class Gripper:
         pin.framesForwardKinematics(self.model, data, coordinates.q(z))
         return data
 
-    def _hand(self, fingers: Floats) -> list[Placed]:
+    def _hand(self, fingers: Floats) -> list[PlacedShape]:
         """Return the shapes of fingers and palm in the tool frame, with the fingers at some positions."""
         data, frame = self._data(fingers), self.model.getFrameId(self.tool_frame)
         back, palm = data.oMf[frame].inverse(), self.model.frames[frame].parentJoint
@@ -142,16 +147,18 @@ class Gripper:
     def _share(self, opening: float) -> float:
         """Return the least share of the way from closed to open at which a bar so wide fits."""
         low, high = 0.0, 1.0
-        if opening <= self.narrowest or bar_fits(opening, self._hand(self.closed)):
+        if opening <= self.narrowest or check_bar_fits(opening, self._hand(self.closed)):
             return low
-        for _ in range(_HALVINGS):
+        for _ in range(_BISECTION_STEPS):
             middle = (low + high) / 2.0
-            fits = bar_fits(opening, self._hand((1.0 - middle) * self.closed + middle * self.open))
+            fits = check_bar_fits(
+                opening, self._hand((1.0 - middle) * self.closed + middle * self.open)
+            )
             low, high = (low, middle) if fits else (middle, high)
         return high
 
 
-def _carried(
+def _attach_shapes(
     shapes: Sequence[pin.GeometryObject], model: pin.Model, unlocked: pin.Model
 ) -> list[pin.GeometryObject]:
     """Return shapes on the joints of `model` as shapes on those of `unlocked`, which begins with the same joints."""
@@ -167,7 +174,7 @@ def _carried(
     return found
 
 
-def described_gripper(
+def build_gripper(
     full: pin.Model,
     file: UrdfFile,
     model: pin.Model,
@@ -182,7 +189,7 @@ def described_gripper(
     """Return the gripper that a robot.yaml describes; None: it says nothing of one.
 
     Args:
-        full: The robot with all its joints, see `robot_model.full_model`.
+        full: The robot with all its joints, see `robot_model.build_full_model`.
         file: Its URDF.
         model: The same with all joints locked but those that are planned.
         collision: The robot's shapes on that.
@@ -200,7 +207,7 @@ def described_gripper(
     if not stated:
         return None
     follows, palm = (
-        followers(file.root),
+        find_followers(file.root),
         list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint]),
     )
     arm = max(j for j in palm if full.names[j] in list(model.names))
@@ -240,8 +247,11 @@ def described_gripper(
         if name in stated or (name in follows and follows[name].leader in stated)
     ]
     names = tuple(sorted(moved, key=full.getJointId))
-    unlocked, shapes = unlocked_model(full, file, model, names, rest, height), pin.GeometryModel()
-    for shape in _carried(list(collision.geometryObjects), model, unlocked):
+    unlocked, shapes = (
+        build_unlocked_model(full, file, model, names, rest, height),
+        pin.GeometryModel(),
+    )
+    for shape in _attach_shapes(list(collision.geometryObjects), model, unlocked):
         shapes.addGeometryObject(shape)
 
     def at(position: str) -> Floats:

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.world.models.dynamics.torque_limits import Efforts
+from vkc_pin.world.models.dynamics.torque_limits import TorqueLimits
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve, moments_at
 from vkc_pin.world.trajectory.dynamics.handles import Handle, Motion
@@ -88,7 +88,7 @@ class Torques:
     ) -> None:
         self.scene, self.trajectory = scene, trajectory
         self._free = FreeObjects(scene, trajectory) if free is None else free
-        self.efforts: Efforts = scene.robot.efforts
+        self.efforts: TorqueLimits = scene.robot.efforts
         self._loads: dict[int, _Load] = {}
 
     def at(

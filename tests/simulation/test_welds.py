@@ -1,4 +1,4 @@
-"""What a hand holds pulls with its weight; holds begin and end when the plan says so."""
+"""Welds carry the load of grasped objects for as long as the plan holds them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from helpers.executions import door_plan, holding, still, with_mass
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
-from vkc_pin.simulation.welds import spans
+from vkc_pin.simulation.welds import find_hold_spans
 from vkc_pin.world.trajectory.world_model import World
 
 
 @pytest.mark.parametrize("mass", [0.4, 3.0])
-def test_what_is_held_pulls_with_its_weight(mass: float) -> None:
+def test_load_of_a_grip_is_the_object_weight(mass: float) -> None:
     scene = with_mass(holding(), "stick", mass)
     result = simulate(scene, [vkc.Grasp("stick")], still(scene, 2.0))
     (grip,) = result.grips
@@ -35,19 +35,19 @@ def test_what_is_held_pulls_with_its_weight(mass: float) -> None:
     )
 
 
-def test_holds_last_as_long_as_the_plan_says() -> None:
+def test_hold_spans_follow_the_plan() -> None:
     plan = door_plan()
-    ((hold, begin, end),) = spans(plan.scene, plan.trajectory)
+    ((hold, begin, end),) = find_hold_spans(plan.scene, plan.trajectory)
     first = next(phase for phase in plan.trajectory.phases if phase.holds)
     assert str(hold) == "door.handle"
     assert begin == plan.trajectory.times[first.first]
     assert end == np.inf
     scene = holding()
-    ((hold, begin, _),) = spans(scene, still(scene))
+    ((hold, begin, _),) = find_hold_spans(scene, still(scene))
     assert hold.object == "stick"
     assert begin == -np.inf
 
 
-def test_a_push_is_no_grip() -> None:
+def test_pushes_are_not_held() -> None:
     scene = vkc.load_scene("door").with_held({"door": "push"})
-    assert spans(scene, still(scene)) == []
+    assert find_hold_spans(scene, still(scene)) == []

@@ -22,7 +22,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
-from vkc_pin.simulation.cameras.images import Images, taken
+from vkc_pin.simulation.cameras.images import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.utils.arrays import Floats
@@ -161,7 +161,7 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
                 executed = simulate(found.scene, found.steps, found.trajectory)
                 record |= _physics(executed)
                 if executed.ok and recipe.cameras:
-                    images = taken(
+                    images = render_images(
                         executed, recipe.cameras, moments(found.trajectory, recipe.fields.rate)
                     ).to_bytes()
             if record["success"]:

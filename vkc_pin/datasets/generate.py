@@ -25,7 +25,7 @@ from vkc_pin.datasets.recipes.recipe import CAMERAS, Recipe, load_recipe
 from vkc_pin.datasets.recipes.terms import as_entries
 from vkc_pin.datasets.robots import check_frames, ready_robots
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.simulation.physics import engine
+from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.utils.arguments import flag, whole
 from vkc_pin.utils.parallel.engine import Died, needs_dask, results
 from vkc_pin.utils.parallel.journal import Journal
@@ -106,7 +106,7 @@ def generate(
     if flag(lerobot, "lerobot"):
         lerobot_layout.needed(made.fields.rate)
     if made.fields.simulate:
-        engine()
+        import_mujoco()
     check_frames(made)
     if jobs > 1 or scheduler is not None:
         needs_dask(scheduler)

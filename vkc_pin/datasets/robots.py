@@ -11,8 +11,8 @@ from vkc_pin.datasets.recipes.recipe import Recipe, robot_name
 from vkc_pin.datasets.recipes.terms import check_robot
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.simulation.cameras.mount import check_frame
-from vkc_pin.simulation.physics import engine
-from vkc_pin.simulation.snapshots import drawing_context
+from vkc_pin.simulation.physics import import_mujoco
+from vkc_pin.simulation.snapshots import open_gl_context
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot_file import find_robot, load_robot
@@ -35,8 +35,8 @@ def check_frames(recipe: Recipe) -> None:
     if not recipe.cameras and not recipe.terms:
         return
     if recipe.cameras:
-        engine()
-        with drawing_context((8, 8)):
+        import_mujoco()
+        with open_gl_context((8, 8)):
             pass
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is said of robots is said when they are made ready

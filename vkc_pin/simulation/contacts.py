@@ -1,9 +1,9 @@
-"""What may touch what, by the planner's own rules, and which contacts of an executed motion the plan did not have.
+"""Selects the contact pairs of a simulation, and finds contacts that were not planned.
 
-The pairs are those that the planner keeps apart: the robot's own pairs that can collide, robot and
-objects with each other and with the world, and the floor below what is carried or on the arm. Pairs
-that overlap from the start, or need no clearance, do not push each other apart. Neither do a hand
-and the link that it is welded to, while it is.
+The pairs are those between which the planner keeps a clearance: the robot's own pairs that can
+collide, robot and objects with each other and with the world, and the floor below free objects and
+the arm. Excluded are pairs that overlap from the start or need no clearance, and a hand with the
+link to which it is welded, for the time of the weld.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Contact", "Pairs", "touching_pairs", "unwanted"]
+__all__ = ["Contact", "Pairs", "find_contact_pairs", "find_unplanned_contacts"]
 
-# [m] what is planned to be closer than this may as well touch: descriptions put cups a millimetre
-# above tables
+# [m] Links that are planned to be closer may touch: some descriptions put cups a millimetre above
+# tables.
 _TOUCHING = 2e-3
-_GROUPS = 31  # bits of MuJoCo's contact types
+_GROUPS = 31  # usable bits of MuJoCo's contact types
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Two links that touched where the plan has them apart.
+    """Two links that touched although the plan keeps them apart.
 
     Attributes:
-        first, second: Links "<link>" or "<object>.<link>", or an obstacle's name.
-        time: When they were deepest in each other [s], in the plan's time.
-        begin: When they touched first [s].
-        duration: For how long in all [s].
-        depth: How deep at most [m].
+        first, second: Links "<link>" or "<object>.<link>", or names of obstacles.
+        time: Time of the deepest penetration [s], on the plan's clock.
+        begin: Time of the first contact [s].
+        duration: Total duration of contact [s].
+        depth: Largest penetration depth [m].
     """
 
     first: str
@@ -53,25 +53,26 @@ class Contact:
     depth: float
 
     def __str__(self) -> str:
-        lasts = f"from {self.begin:.2f} s on for {self.duration:.2f} s"
-        return f"{self.first} – {self.second}: {1e3 * self.depth:.1f} mm deep at {self.time:.2f} s ({lasts})"
+        depth = f"{1e3 * self.depth:.1f} mm deep at {self.time:.2f} s"
+        span = f"from {self.begin:.2f} s on for {self.duration:.2f} s"
+        return f"{self.first} – {self.second}: {depth} ({span})"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data of it."""
+        """Return the contact as plain data."""
         return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Which shapes of a world meet.
+    """Shapes of a world that may touch.
 
     Attributes:
-        always: Pairs that do at any time, by the numbers of their shapes, shape (P, 2).
-        types, affinities: Of every shape, shape (G,): bits of `contype` and `conaffinity`, by which
-            the pairs of holds meet.
-        bits: Hold → the bit by which what holds meets the link that it holds, unless it does; 0 if
-            they never meet.
-        overlapping: Links with shapes that overlap at the start and so never meet.
+        always: Pairs of shape numbers that collide at any time, shape (P, 2).
+        types, affinities: Bits of `contype` and `conaffinity` of each shape, shape (G,), through
+            which holders and held links collide.
+        bits: Maps each hold to the bit through which holder and held link collide unless the hold
+            is active; 0 if they never collide.
+        overlapping: Links whose shapes overlap at the start and therefore never collide.
     """
 
     always: Ints
@@ -81,33 +82,33 @@ class Pairs:
     overlapping: tuple[tuple[str, str], ...]
 
 
-def touching_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
-    """Return which shapes of a world meet.
+def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
+    """Return the pairs of shapes that may touch.
 
     Args:
-        world: The world, as it is at the start.
-        holds: All that is ever held firmly enough to be welded.
+        world: The world in its start configuration.
+        holds: All holds that are ever welded.
     """
     labels, joints = world.collision_labels, [shape.parentJoint for shape in world.shapes]
     pairs = np.array(
-        [pair for pair in _candidates(world) if joints[pair[0]] or joints[pair[1]]], int
+        [pair for pair in _iterate_planner_pairs(world) if joints[pair[0]] or joints[pair[1]]], int
     ).reshape(-1, 2)
-    silent = {
+    exempt = {
         pair
         for one in allowances(world.scene, Options().dist_safe)
         for pair in one.shape_pairs(labels, world.collision_keys)
         if one.margin < 0.0
     }
-    quiet = np.array([(min(pair), max(pair)) in silent for pair in pairs.tolist()], bool)
+    excluded = np.array([(min(pair), max(pair)) in exempt for pair in pairs.tolist()], bool)
     named = [frozenset((labels[i], labels[j])) for i, j in pairs.tolist()]
     placed = Solids(world).at(world.coordinates.q(world.start[None]))
     near = np.flatnonzero(placed.bounds(np.zeros(len(pairs), int), pairs) < 0.0)
     deep = near[placed.distances(np.zeros(len(near), int), pairs[near]) < -CONTACT]
-    apart = {named[k] for k in deep.tolist() if not quiet[k]}
-    quiet[deep] = True
-    never = {named[k] for k in np.flatnonzero(quiet).tolist()}
+    overlapping = {named[k] for k in deep.tolist() if not excluded[k]}
+    excluded[deep] = True
+    never = {named[k] for k in np.flatnonzero(excluded).tolist()}
     types, affinities = np.zeros((2, len(labels)), int)
-    bits, groups, gripped = (
+    bits, groups, held_pairs = (
         dict[Hold, int](),
         dict[tuple[frozenset[str], str], int](),
         set[frozenset[str]](),
@@ -120,14 +121,14 @@ def touching_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
             bits[hold] = groups[hands, link] = 1 << len(groups)
             types[[label in hands for label in labels]] |= bits[hold]
             affinities[[label == link for label in labels]] |= bits[hold]
-        gripped |= own
-    keep = [k for k, name in enumerate(named) if not quiet[k] and name not in gripped]
-    links = tuple(sorted((min(name), max(name)) for name in apart))
+        held_pairs |= own
+    keep = [k for k, name in enumerate(named) if not excluded[k] and name not in held_pairs]
+    links = tuple(sorted((min(name), max(name)) for name in overlapping))
     return Pairs(pairs[keep], types, affinities, bits, links)
 
 
-def _candidates(world: World) -> Iterable[tuple[int, int]]:
-    """Yield the pairs of shapes that the planner looks at, whatever moves."""
+def _iterate_planner_pairs(world: World) -> Iterable[tuple[int, int]]:
+    """Yield the pairs of shapes that the planner checks, regardless of what moves."""
     scene, labels = world.scene, world.collision_labels
     robots, bodies = len(scene.robot.collision.geometryObjects), len(world.bodies.geometryObjects)
     owners = [label.partition(".")[0] for label in labels]
@@ -135,10 +136,9 @@ def _candidates(world: World) -> Iterable[tuple[int, int]]:
     yield from ((pair.first, pair.second) for pair in scene.robot.collision.collisionPairs)
     for i in range(bodies):
         for j in range(max(i + 1, robots), len(labels)):
-            stands = (
-                j >= bodies and labels[j] == FLOOR
-            )  # as wheels do; objects that do not move freely hang in their walls
-            if stands and not (
+            # Wheels stand on the floor, and fixed objects may reach into it.
+            is_floor = j >= bodies and labels[j] == FLOOR
+            if is_floor and not (
                 world.shapes[i].parentJoint > 1 if i < robots else owners[i] in free
             ):
                 continue
@@ -148,26 +148,29 @@ def _candidates(world: World) -> Iterable[tuple[int, int]]:
                 yield i, j
 
 
-def unwanted(
+def find_unplanned_contacts(
     scene: Scene,
     trajectory: Trajectory,
-    seen: dict[tuple[str, str], list[tuple[float, float]]],
+    samples_by_pair: dict[tuple[str, str], list[tuple[float, float]]],
     period: float,
 ) -> tuple[Contact, ...]:
-    """Return contacts that the plan does not have: the links are further apart in it for `EASED_TIME` before and after.
+    """Return the contacts that the plan does not have.
+
+    A contact is unplanned if the links stay apart in the plan for `EASED_TIME` before and after it.
 
     Args:
-        scene: The scene that was planned in.
+        scene: Scene of the plan.
         trajectory: The plan.
-        seen: Pair of labels → (time [s], depth [m]) at every time at which they touched.
-        period: Between two such times [s].
+        samples_by_pair: Maps pairs of labels to samples (time [s], depth [m]) at which they
+            touched.
+        period: Sampling period [s].
     """
-    if not seen:
+    if not samples_by_pair:
         return ()
     world = World(scene)
     placed = Solids(world).at(world.coordinates.q(world.positions(trajectory)))
     found = []
-    for (first, second), samples in seen.items():
+    for (first, second), samples in samples_by_pair.items():
         ones, others = (
             [k for k, label in enumerate(world.collision_labels) if label == one]
             for one in (first, second)

@@ -1,4 +1,4 @@
-"""What is held when: welds that begin and end with the holds of a plan, and break where they are pulled too hard; and latches."""
+"""Models grasps as welds that follow the plan's holds and break under load, and models latches."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ import numpy as np
 
 from vkc_pin.simulation.contacts import Pairs
 from vkc_pin.simulation.model import PhysicalWorld
-from vkc_pin.simulation.physics import Physics, engine
+from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Grip", "Grips", "Latches", "latched", "spans"]
+__all__ = ["Grip", "Grips", "Latches", "find_hold_spans", "find_latches"]
 
-_AVERAGED = 0.02  # [s] over which forces are averaged: rubber gives way, a weld does not
-_SHUT = 2e-3  # [rad] or [m] from where a latch holds its joint at which it snaps in
+_AVERAGING_TIME = 0.02  # [s] of the moving average of forces: rubber yields, a weld does not
+_LATCH_TOLERANCE = 2e-3  # [rad] or [m] from the latched position within which a latch engages
 
 
 @dataclass(frozen=True)
 class Grip:
-    """One hold of a plan, from its begin to its end.
+    """One hold of a plan, from begin to end.
 
     Attributes:
-        what: What is held, e.g. "door.handle".
-        begin, end: When, by the plan [s].
-        force, torque: The largest, averaged over 20 ms [N], [N·m]; at where the hand takes hold.
-        broken: When it was pulled off [s]; None: it was not.
-        slip: How far what holds moved at most against what it holds, of holds by friction [m].
+        what: Grasped attachment, e.g. "door.handle".
+        begin, end: Begin and end of the hold according to the plan [s].
+        force, torque: Largest 20 ms average at the grasping frame [N], [N·m].
+        broken: Time at which the hand lost its hold [s]; None if it did not.
+        slip: Largest displacement between holder and object, for grasps by friction [m].
     """
 
     what: str
@@ -44,42 +44,45 @@ class Grip:
     slip: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data of it."""
+        """Return the grip as plain data."""
         return asdict(self)
 
 
-def spans(scene: Scene, trajectory: Trajectory) -> list[tuple[Hold, float, float]]:
-    """Return every hold of a motion that is no push, from when to when it lasts [s], in the order in which they begin."""
-    found, since = list[tuple[Hold, float, float]](), dict[Hold, float]()
+def find_hold_spans(scene: Scene, trajectory: Trajectory) -> list[tuple[Hold, float, float]]:
+    """Return each hold that is not a push with its begin and end [s], ordered by begin."""
+    spans, active_since = list[tuple[Hold, float, float]](), dict[Hold, float]()
     times = trajectory.times
     held = [set(scene.holds), *(set(phase.holds) for phase in trajectory.phases)]
     begins = [-np.inf, *(float(times[phase.first]) for phase in trajectory.phases)]
     for now, at in zip(held, begins, strict=True):
-        for hold in [hold for hold in since if hold not in now]:
-            found.append((hold, since.pop(hold), at))
-        since |= {hold: at for hold in now if hold not in since and not _pushes(scene, hold)}
-    found += [(hold, at, np.inf) for hold, at in since.items()]
-    return sorted(found, key=lambda span: (span[1], str(span[0])))
+        for hold in [hold for hold in active_since if hold not in now]:
+            spans.append((hold, active_since.pop(hold), at))
+        active_since |= {
+            hold: at for hold in now if hold not in active_since and not _is_push(scene, hold)
+        }
+    spans += [(hold, at, np.inf) for hold, at in active_since.items()]
+    return sorted(spans, key=lambda span: (span[1], str(span[0])))
 
 
-def _pushes(scene: Scene, hold: Hold) -> bool:
+def _is_push(scene: Scene, hold: Hold) -> bool:
+    """Return whether a hold only pushes."""
     return scene.objects[hold.object].object.attachment(hold.attachment).contact == "push"
 
 
 class Grips:
-    """Welds that follow a schedule.
+    """Activates and releases welds according to a schedule.
 
     Args:
         physical: The model, whose first equalities are the welds of `holds`.
-        holds: What they hold.
-        schedule: See `spans`.
-        pairs: What may touch what.
-        trajectory: The plan, for where the freedoms of a grasp are when it begins.
-        physics: How hard a hand holds.
-        touching: Holds in which what holds and what it holds meet all the same.
+        holds: Holds in the order of their welds.
+        schedule: Holds with begin and end; see `find_hold_spans`.
+        pairs: Shapes that may touch.
+        trajectory: The plan, which gives the degrees of freedom of a grasp when it begins.
+        physics: Settings with the strength of grasps.
+        touching: Holds whose holder and link collide even while held.
 
     Attributes:
-        grips: What has been held so far.
+        grips: Grips so far.
     """
 
     def __init__(
@@ -100,45 +103,44 @@ class Grips:
             list(schedule),
             pairs,
         )
-        self.trajectory, self.physics, self._engine = trajectory, physics, engine()
+        self.trajectory, self.physics, self._engine = trajectory, physics, import_mujoco()
         self.grips: list[Grip] = []
-        self._active: dict[Hold, tuple[int, float]] = {}  # which of the grips, and when it ends
+        self._active: dict[Hold, tuple[int, float]] = {}  # index into grips, and end [s]
         self._forces: dict[Hold, deque[Floats]] = {}
         self._equality = int(self._engine.mjtConstraint.mjCNSTR_EQUALITY)
-        self._length = max(1, round(_AVERAGED / physics.timestep))
+        self._window = max(1, round(_AVERAGING_TIME / physics.timestep))
 
     def follow(self, data: Any, clock: float) -> None:
-        """Begin and end what begins and ends by a time [s] of the plan."""
+        """Begin and end the holds that are due at a time [s] of the plan."""
         for hold in [hold for hold, (_, end) in self._active.items() if end <= clock]:
-            self._let_go(data, hold)
+            self._release(data, hold)
         while self.schedule and self.schedule[0][1] <= clock:
             hold, begin, end = self.schedule.pop(0)
-            self._take(data, hold, clock)
+            self._engage(data, hold, clock)
             self._active[hold], self._forces[hold] = (
                 (len(self.grips), end),
-                deque(maxlen=self._length),
+                deque(maxlen=self._window),
             )
             times = self.trajectory.times
             self.grips.append(
                 Grip(str(hold), max(begin, float(times[0])), min(end, float(times[-1])))
             )
 
-    def holding(self, hold: Hold) -> bool:
-        """Return whether something is held now."""
+    def is_active(self, hold: Hold) -> bool:
+        """Return whether a hold is active."""
         return hold in self._active
 
     def measure(self, data: Any, clock: float) -> None:
-        """Note how hard the welds are pulled after a step; let go of what is pulled too hard."""
+        """Record the load on the welds after a step, and release those that are overloaded."""
         if not self._active:
             return
         kinds, owners = np.asarray(data.efc_type), np.asarray(data.efc_id)
         for hold, (number, _) in list(self._active.items()):
             rows = np.flatnonzero((kinds == self._equality) & (owners == self.holds.index(hold)))
             forces = self._forces[hold]
-            forces.append(
-                np.asarray(data.efc_force)[rows] * [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]
-            )  # of half angles, as quaternions are
-            if len(forces) < self._length:
+            # Rotational rows act on half angles, as quaternions do.
+            forces.append(np.asarray(data.efc_force)[rows] * [1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+            if len(forces) < self._window:
                 continue
             mean = np.mean(forces, axis=0)
             force, torque = float(np.linalg.norm(mean[:3])), float(np.linalg.norm(mean[3:]))
@@ -148,22 +150,21 @@ class Grips:
                 if force > self.physics.grasp_force or torque > self.physics.grasp_torque
                 else None
             )
-            if (
-                clock >= grip.begin or broken is not None
-            ):  # before, the servos take up what is in the hand at the start
+            # Before, the servos settle under the load that is in the hand at the start.
+            if clock >= grip.begin or broken is not None:
                 grip = replace(grip, force=max(force, grip.force), torque=max(torque, grip.torque))
             self.grips[number] = replace(grip, broken=broken)
             if broken is not None:
-                self._let_go(data, hold)
+                self._release(data, hold)
 
-    def _take(self, data: Any, hold: Hold, clock: float) -> None:
-        """Weld what holds to what it holds, as they are now."""
+    def _engage(self, data: Any, hold: Hold, clock: float) -> None:
+        """Weld the holder to the link at their current relative placement."""
         model, number = self.physical.model, self.holds.index(hold)
         if hold in self.physical.carriers:
-            data.qpos[self.physical.carriers[hold]] = self._freedoms(hold, clock)
+            data.qpos[self.physical.carriers[hold]] = self._planned_freedoms(hold, clock)
             self._engine.mj_kinematics(model, data)
         first, second = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
-        tool = self._tool(data, hold)
+        tool = self._grasp_point(data, hold)
         one, other = (np.asarray(data.xmat[body]).reshape(3, 3) for body in (first, second))
         quaternion = np.zeros(4)
         self._engine.mju_mat2Quat(quaternion, (one.T @ other).ravel())
@@ -171,15 +172,15 @@ class Grips:
         model.eq_data[number, 3:6] = one.T @ (tool - data.xpos[first])
         model.eq_data[number, 6:10] = quaternion
         data.eq_active[number] = 1
-        self._meet(hold, meets=False)
+        self._set_collision(hold, enabled=False)
 
-    def _let_go(self, data: Any, hold: Hold) -> None:
+    def _release(self, data: Any, hold: Hold) -> None:
         data.eq_active[self.holds.index(hold)] = 0
         del self._active[hold], self._forces[hold]
-        self._meet(hold, meets=True)
+        self._set_collision(hold, enabled=True)
 
-    def _meet(self, hold: Hold, *, meets: bool) -> None:
-        """Let what holds and the link that it holds meet, or not."""
+    def _set_collision(self, hold: Hold, *, enabled: bool) -> None:
+        """Enable or disable contacts between the holder and the held link."""
         if hold in self._touching:
             return
         bit = self.pairs.bits[hold]
@@ -187,10 +188,10 @@ class Grips:
             return
         own = self.physical.geoms[(self.pairs.types & bit) != 0]
         types = self.physical.model.geom_contype
-        types[own] = types[own] | bit if meets else types[own] & ~bit
+        types[own] = types[own] | bit if enabled else types[own] & ~bit
 
-    def _freedoms(self, hold: Hold, clock: float) -> Floats:
-        """Return where the plan has the freedoms of a grasp."""
+    def _planned_freedoms(self, hold: Hold, clock: float) -> Floats:
+        """Return the planned values of a grasp's degrees of freedom."""
         names = (
             self.physical.world.scene.objects[hold.object]
             .object.attachment(hold.attachment)
@@ -202,8 +203,8 @@ class Grips:
             [values.get(f"{hold.object}.{name}", start.get(name, 0.0)) for name in names]
         )
 
-    def _tool(self, data: Any, hold: Hold) -> Floats:
-        """Return where what holds takes hold, in the world [m]."""
+    def _grasp_point(self, data: Any, hold: Hold) -> Floats:
+        """Return the position of the holder's grasping frame in the world [m]."""
         tree = self.physical.world.model
         frame = tree.frames[
             tree.getFrameId(hold.frame or self.physical.world.scene.robot.tool_frame)
@@ -215,8 +216,8 @@ class Grips:
         )
 
 
-def latched(scene: Scene) -> list[tuple[str, float, str, float]]:
-    """Return all latches of a scene: coordinate, where it is held, and the coordinate that releases it from what value on."""
+def find_latches(scene: Scene) -> list[tuple[str, float, str, float]]:
+    """Return joint, latched position, releasing joint and release threshold of each latch."""
     return [
         (f"{name}.{latch.joint}", latch.held_at, f"{name}.{latch.released_by}", latch.threshold)
         for name, placed in scene.objects.items()
@@ -225,13 +226,13 @@ def latched(scene: Scene) -> list[tuple[str, float, str, float]]:
 
 
 class Latches:
-    """Latches that snap in where they hold their joint, and are released by another one.
+    """Latches that engage at their joint's latched position and are released by another joint.
 
     Args:
         physical: The model.
-        latches: See `latched`.
-        first: Which equality is that of the first.
-        physics: Their play.
+        latches: Latches as returned by `find_latches`.
+        first: Index of the first latch's equality.
+        physics: Settings with the play of latches.
     """
 
     def __init__(
@@ -251,7 +252,7 @@ class Latches:
         self._first = first
 
     def follow(self, data: Any) -> None:
-        """Engage and release."""
+        """Engage and release latches."""
         for number, (joint, at, by, threshold) in enumerate(self._latches, self._first):
-            shut = bool(data.eq_active[number]) or abs(data.qpos[joint] - at) <= _SHUT
-            data.eq_active[number] = shut and data.qpos[by] < threshold
+            engaged = bool(data.eq_active[number]) or abs(data.qpos[joint] - at) <= _LATCH_TOLERANCE
+            data.eq_active[number] = engaged and data.qpos[by] < threshold

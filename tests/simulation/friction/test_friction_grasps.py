@@ -1,4 +1,4 @@
-"""What is held by friction is carried as long as friction suffices, and lost where it does not."""
+"""Friction grasps carry objects within the friction cone and lose them beyond it."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ def cup_plan() -> Plan:
     return plan
 
 
-def test_a_drawer_is_pulled_by_friction() -> None:
+def test_drawer_is_pulled_by_friction() -> None:
     plan = drawer_plan()
     result = plan.simulate(grasp="friction")
     assert result.ok, result.report()
     assert result.contacts == ()
     (grip,) = result.grips
     assert grip.slip < 0.005
-    # The hand pulls with what the drawer's mass takes, as a weld does; the robot waits while the
-    # fingers close.
+    # The pulling force is about that of a weld; the robot waits while the fingers close.
     welded = plan.simulate().grips[0]
     assert 0.2 * welded.force < grip.force < 3.0 * welded.force
     assert result.planned.times[-1] == pytest.approx(
@@ -40,7 +39,7 @@ def test_a_drawer_is_pulled_by_friction() -> None:
 
 
 @pytest.mark.parametrize("physics", [vkc.Physics(friction=1e-3), vkc.Physics(closing_force=0.2)])
-def test_what_slips_is_lost(physics: vkc.Physics) -> None:
+def test_slipping_object_is_lost(physics: vkc.Physics) -> None:
     result = drawer_plan().simulate(grasp="friction", physics=physics)
     assert not result.ok
     assert result.grips[0].broken is not None
@@ -48,31 +47,29 @@ def test_what_slips_is_lost(physics: vkc.Physics) -> None:
     assert any("drawer.slide" in line for line in result.problems())
 
 
-def test_a_cup_is_carried_and_put_down() -> None:
+def test_cup_is_carried_and_placed() -> None:
     result = cup_plan().simulate(grasp="friction")
     assert result.ok, result.report()
     (grip,) = result.grips
     assert grip.force > 0.25 * 9.81 * 0.9  # its weight at least
-    assert (
-        grip.slip < 0.005
-    )  # round bends as well, where MuJoCo's usual contacts let it creep; see `Builder.gripping`
+    # MuJoCo's default contacts creep on curves; see `Builder.has_friction_grasps`.
+    assert grip.slip < 0.005
     assert max(miss.amount for miss in result.misses if miss.unit == "m") < 0.01
 
 
-def test_a_gripper_that_is_described_closes_its_own_fingers(tmp_path: Path) -> None:
+def test_described_gripper_closes_its_own_fingers(tmp_path: Path) -> None:
     scene = between_cheeks(write_gripper(tmp_path), opening=0.03)
     plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})])
     assert plan.success, plan.report()
     result = plan.simulate(grasp="friction")
     assert result.ok, result.report()
     assert not any("slide towards" in note for note in result.notes)
-    # Fingers close as far as the handle lets them: 20 mm apart, and deeper by what contacts give
-    # way.
+    # Fingers close on the handle, 20 mm apart, and slightly further as contacts are compliant.
     world = result.rows[:, len(scene.start) : len(scene.start) + 2]
     assert world.min() == pytest.approx(0.01, abs=0.004)
 
 
-def test_what_is_in_the_hand_at_the_start_stays_there() -> None:
+def test_object_in_hand_at_start_stays_there() -> None:
     scene = holding()
     result = simulate(scene, [vkc.Grasp("stick")], still(scene, 1.5), grasp="friction")
     (grip,) = result.grips

@@ -20,7 +20,7 @@ from vkc_pin.benchmarks.problems.problem_set import started
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
 from vkc_pin.simulation.execution import GRASPS, simulate
-from vkc_pin.simulation.physics import Physics, engine
+from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.utils.arguments import known
 
@@ -85,7 +85,7 @@ def run(
             settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
-    engine()
+    import_mujoco()
     if trials < 1:
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     names = runner.chosen("task", tasks, TASKS)

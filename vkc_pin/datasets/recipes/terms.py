@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from vkc_pin.simulation.cameras.mount import BASE, HAND, frame_of
+from vkc_pin.simulation.cameras.mount import BASE, HAND, resolve_frame
 from vkc_pin.utils.arguments import known
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.fields import Positive, Schema, Vector3, count, require
@@ -205,7 +205,7 @@ def meant(terms: Sequence[Term], scene: Scene, name: str, attachment: str) -> tu
         attachment: Where the hand takes hold of it.
     """
     link = scene.objects[name].object.attachments[attachment].link
-    frames = {word: frame_of(scene.robot, word) for word in (BASE, HAND)} | {
+    frames = {word: resolve_frame(scene.robot, word) for word in (BASE, HAND)} | {
         OBJECT: f"{name}.{link}"
     }
     return tuple(renamed(term, frames, {OBJECT: name}) for term in terms)

@@ -1,8 +1,8 @@
-"""Fingers that close on what is to be held: those of a gripper that is described, or else the two sides of a hand.
+"""Models fingers that close on an object: those of a described gripper, or the two sides of a hand.
 
-A hand whose robot.yaml says nothing of a `gripper` has fingers that do not move. For holding by
-friction its pads slide towards each other: the shapes of the touch links that the x axis of the
-tool frame meets, on either side. Fingers of one hand are coupled, as by one motor.
+A hand whose robot.yaml describes no `gripper` has rigid fingers. For grasps by friction its pads
+slide towards each other: the shapes of the touch links that the x axis of the tool frame
+intersects, on either side. Fingers of one hand are coupled as if by one motor.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.simulation.model import Builder, PhysicalWorld, quaternion
+from vkc_pin.simulation.model import Builder, PhysicalWorld, to_mujoco_quaternion
 from vkc_pin.simulation.physics import Physics
-from vkc_pin.simulation.servos import Servo, position_servo
+from vkc_pin.simulation.servos import Servo, make_servo
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.grippers.bar_width import check_bar_fits, find_widest_bar
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Fingers", "Sides", "fingers_of", "limited"]
+__all__ = ["Fingers", "Sides", "find_fingers", "limit_finger_servos"]
 
-_MASS = 0.1  # [kg] of a finger that slides
-_FURTHEST = 0.2  # [m]: what is further from the tool frame is none of a finger
-_COUPLING = (0.004, 1.0)  # time constant [s] and damping ratio of what couples fingers
+_MASS = 0.1  # [kg] of a sliding finger
+_REACH = 0.2  # [m] largest distance of a finger's shapes from the tool frame
+_COUPLING = (0.004, 1.0)  # time constant [s] and damping ratio of the coupling of fingers
 
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """The sides of a hand that slide towards each other.
+    """Sides of a hand that slide towards each other.
 
     Attributes:
-        shapes: The world's shapes on either side, by number.
-        tool: The tool frame on the joint that carries it.
-        joint: That joint.
-        travel: How far each side goes until they meet [m].
+        shapes: Numbers of the world's shapes on either side.
+        tool: Placement of the tool frame on its parent joint.
+        joint: Parent joint of the tool frame.
+        travel: Distance that each side moves until they meet [m].
     """
 
     shapes: tuple[tuple[int, ...], tuple[int, ...]]
@@ -49,15 +49,15 @@ class Sides:
 
 @dataclass(frozen=True, eq=False)
 class Fingers:
-    """Fingers and what drives them.
+    """Fingers and their drives.
 
     Attributes:
-        names: MuJoCo's joints, k of them.
-        closed: Where they are when nothing is between them and they are closed, shape (k,), [m] or
+        names: Names of the k joints in MuJoCo.
+        closed: Joint positions of closed fingers with nothing between them, shape (k,), [m] or
             [rad].
-        open: The same when they are fully open.
-        sides: What slides, if they are the sides of a hand; None: they are joints of the robot.
-        servos: Of the sides.
+        open: Joint positions of fully open fingers, shape (k,).
+        sides: Sliding sides of the hand; None if the fingers are joints of the robot.
+        servos: Servos of the sides.
     """
 
     names: tuple[str, ...]
@@ -67,7 +67,7 @@ class Fingers:
     servos: tuple[Servo, ...] = ()
 
     def add_bodies(self, builder: Builder) -> None:
-        """Add the bodies of sides that slide, which take their shapes along."""
+        """Add the bodies of sliding sides, to which their shapes move."""
         if self.sides is None:
             return
         hand, kinds = builder.bodies[self.sides.joint], builder.mj.mjtJoint
@@ -76,20 +76,23 @@ class Fingers:
         ):
             tool = self.sides.tool
             body = hand.add_body(
-                name=name, pos=tool.translation, quat=quaternion(tool), gravcomp=1.0
+                name=name, pos=tool.translation, quat=to_mujoco_quaternion(tool), gravcomp=1.0
             )
             body.mass, body.inertia, body.explicitinertial = _MASS, np.full(3, 1e-4), True
             joint = body.add_joint(name=name, type=kinds.mjJNT_SLIDE, axis=[-sign, 0.0, 0.0])
-            servo.give_motor(joint, builder.mj)
+            servo.configure_joint(joint, builder.mj)
             joint.limited, joint.range = (
                 builder.mj.mjtLimited.mjLIMITED_TRUE,
                 [0.0, self.sides.travel],
             )
             for number in shapes:
-                builder.moved[number] = (body, tool.actInv(builder.world.shapes[number].placement))
+                builder.moved_shapes[number] = (
+                    body,
+                    tool.actInv(builder.world.shapes[number].placement),
+                )
 
     def add_drives(self, builder: Builder) -> None:
-        """Add the motors of sides that slide, and what couples all fingers."""
+        """Add the motors of sliding sides and the coupling of all fingers."""
         for servo in self.servos:
             servo.add_to(builder.spec, builder.mj)
         kind, of = builder.mj.mjtEq.mjEQ_JOINT, builder.mj.mjtObj.mjOBJ_JOINT
@@ -101,45 +104,45 @@ class Fingers:
             couple.data[:2] = [self.open[k] - slope * self.open[0], slope]
             couple.solref = _COUPLING
 
-    def addresses(self, physical: PhysicalWorld) -> tuple[Ints, Ints]:
-        """Return where they are in MuJoCo's positions, and where their commands are, shape (k,) each."""
+    def find_addresses(self, physical: PhysicalWorld) -> tuple[Ints, Ints]:
+        """Return the indices of positions and of commands in MuJoCo, shape (k,) each."""
         model: Any = physical.model
         columns = [int(model.joint(name).qposadr[0]) for name in self.names]
         return np.array(columns), np.array([int(model.actuator(name).id) for name in self.names])
 
 
-def fingers_of(world: World, physics: Physics) -> Fingers:
+def find_fingers(world: World, physics: Physics) -> Fingers:
     """Return the fingers of a robot.
 
     Args:
         world: The scene.
-        physics: How hard they close.
+        physics: Settings with the closing force.
 
     Raises:
-        InputError: The hand has none that could close.
+        InputError: The hand has no fingers that could close.
     """
     gripper = world.scene.robot.gripper
     if gripper is not None:
         return Fingers(gripper.names, gripper.closed, gripper.open)
-    sides = _sides(world)
+    sides = _find_sides(world)
     names = ("side 0", "side 1")
     bandwidth, ratio = physics.arm_bandwidth, physics.damping_ratio
     servos = tuple(
-        position_servo(name, _MASS, physics.closing_force, "m", bandwidth, ratio) for name in names
+        make_servo(name, _MASS, physics.closing_force, "m", bandwidth, ratio) for name in names
     )
     return Fingers(names, np.full(2, sides.travel), np.zeros(2), sides, servos)
 
 
-def limited(
+def limit_finger_servos(
     servos: Sequence[Servo], fingers: Fingers, world: World, physics: Physics
 ) -> tuple[Servo, ...]:
-    """Return servos of which those of fingers close no harder than a hand does.
+    """Return the servos, those of fingers limited to the hand's closing force.
 
     Raises:
-        InputError: A finger turns, and nobody states how strong its motor is.
+        InputError: A finger is revolute and its URDF states no effort limit.
     """
     units = dict(zip(world.coordinates.names, world.coordinates.units, strict=True))
-    found = []
+    limited = []
     for servo in servos:
         name = servo.coordinate
         if name in fingers.names:
@@ -149,22 +152,23 @@ def limited(
                 limit = servo.limit
             else:
                 problem = (
-                    "a finger that turns, and the URDF states no effort: it cannot hold by friction"
+                    "a revolute finger without an effort limit in the URDF cannot hold by friction"
                 )
                 raise InputError(
-                    problem, field="grasp", expected='an effort, or grasp="weld"', got=name
+                    problem, field="grasp", expected='an effort limit, or grasp="weld"', got=name
                 )
             moved, bandwidth, ratio = (
                 servo.inertia - servo.armature,
                 physics.arm_bandwidth,
                 physics.damping_ratio,
             )
-            servo = position_servo(name, moved, limit, units[name], bandwidth, ratio)
-        found.append(servo)
-    return tuple(found)
+            servo = make_servo(name, moved, limit, units[name], bandwidth, ratio)
+        limited.append(servo)
+    return tuple(limited)
 
 
-def _sides(world: World) -> Sides:
+def _find_sides(world: World) -> Sides:
+    """Return the shapes of a hand on either side of its tool frame, and their travel."""
     robot, labels = world.scene.robot, world.collision_labels
     frame = world.model.frames[world.model.getFrameId(robot.tool_frame)]
     back, sides = frame.placement.inverse(), (list[int](), list[int]())
@@ -175,9 +179,9 @@ def _sides(world: World) -> Sides:
     ]
     for number, shape in hand:
         place = back * shape.placement
-        x = _across(place, shape)
+        x = _project_on_x(place, shape)
         if (x.min() > 0.0 or x.max() < 0.0) and not check_bar_fits(
-            2.0 * _FURTHEST, [(shape.geometry, place)]
+            2.0 * _REACH, [(shape.geometry, place)]
         ):
             sides[0 if x.min() > 0.0 else 1].append(number)
     travel = (
@@ -185,8 +189,11 @@ def _sides(world: World) -> Sides:
         if all(sides)
         else 0.0
     )
-    if not (all(sides) and 0.0 < travel < _FURTHEST):
-        expected = "a robot.yaml with a `gripper`, or touch_links on both sides of the tool frame, along its x axis"
+    if not (all(sides) and 0.0 < travel < _REACH):
+        expected = (
+            "a robot.yaml with a `gripper`, "
+            "or touch_links on both sides of the tool frame, along its x axis"
+        )
         raise InputError(
             f"the hand of '{robot.name}' has no fingers that close",
             field="grasp",
@@ -198,7 +205,7 @@ def _sides(world: World) -> Sides:
     )
 
 
-def _across(place: pin.SE3, shape: pin.GeometryObject) -> Floats:
-    """Return where the corners of a shape are along the x axis of the tool frame."""
+def _project_on_x(place: pin.SE3, shape: pin.GeometryObject) -> Floats:
+    """Return the x coordinates of a shape's vertices in the tool frame."""
     points = triangulate(shape.geometry)[0]
     return np.asarray(points @ place.rotation[0] + place.translation[0])

@@ -1,4 +1,4 @@
-"""What a hand holds by friction: when its fingers close and open, how hard they pull, and how far they slip."""
+"""Commands fingers that grasp by friction, and measures their load and slip."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ import numpy as np
 
 from vkc_pin.simulation.friction.fingers import Fingers
 from vkc_pin.simulation.model import PhysicalWorld
-from vkc_pin.simulation.physics import Physics, engine
+from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.welds import Grip
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.scene.contact_rules import grasped, touching
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Span", "Squeezes", "grip_changes", "split"]
+__all__ = ["Span", "Squeezes", "find_grip_changes", "split_spans"]
 
 Span = tuple[Hold, float, float]
-"""What is held, from when to when [s]."""
-# of their way that fingers are told to go on beyond where they are closed, so that thin things are
-# pressed as well
-_BITE = 0.15
-_LOST = 0.1  # [s] without touching, after which what was held is lost
-_AVERAGED = 2  # looks over which forces are averaged
+"""A hold with its begin and end [s]."""
+# Fingers are commanded this fraction of their travel beyond the closed position, so that thin
+# objects are pressed too.
+_OVERTRAVEL = 0.15
+_LOST_TIME = 0.1  # [s] without contact after which the object counts as lost
+_AVERAGED_SAMPLES = 2  # number of samples over which forces are averaged
 
 
-def grip_changes(trajectory: Trajectory, spans: Sequence[Span]) -> list[int]:
+def find_grip_changes(trajectory: Trajectory, spans: Sequence[Span]) -> list[int]:
     """Return the waypoints at which the hand closes or opens."""
     moments = {time for _, begin, end in spans for time in (begin, end) if np.isfinite(time)}
     return [
@@ -41,17 +41,16 @@ def grip_changes(trajectory: Trajectory, spans: Sequence[Span]) -> list[int]:
 
 @dataclass(eq=False)
 class _Squeeze:
-    """One hold.
+    """One grasp by friction.
 
     Attributes:
-        hold, begin, end: What is held, from when to when [s].
-        hand, link: Which of MuJoCo's geoms hold, and are held, shape (geoms,).
-        pairs: The names of these, which may touch.
-        grip: What is known of it.
-        forces: The last ones, and torques, shape (6,) each.
-        place: The tool in the link's frame when the fingers had closed [m]; None: they have not
-            yet.
-        missing: For how many looks nothing has touched.
+        hold, begin, end: The hold with its begin and end [s].
+        hand, link: Masks of the geoms of hand and grasped link, shape (geoms,).
+        pairs: Pairs of their labels, which may touch.
+        grip: Measurements so far.
+        forces: Latest forces and torques, shape (6,) each.
+        place: Tool position in the link's frame when the fingers had closed [m]; None before.
+        missing: Number of consecutive samples without contact.
     """
 
     hold: Hold
@@ -61,21 +60,21 @@ class _Squeeze:
     link: Bools
     pairs: frozenset[tuple[str, str]]
     grip: Grip
-    forces: deque[Floats] = field(default_factory=lambda: deque(maxlen=_AVERAGED))
+    forces: deque[Floats] = field(default_factory=lambda: deque(maxlen=_AVERAGED_SAMPLES))
     place: Floats | None = None
     missing: int = 0
 
 
 class Squeezes:
-    """Holds by friction that follow a schedule.
+    """Grasps by friction that follow a schedule.
 
     Args:
         physical: The model.
-        fingers: What closes.
-        spans: When; all by the robot's own hand.
-        trajectory: The motion.
-        physics: How long fingers take.
-        period: From look to look [s].
+        fingers: Fingers of the robot's own hand.
+        spans: Schedule of holds, all by the robot's own hand.
+        trajectory: The trajectory.
+        physics: Settings with the time that fingers take.
+        period: Sampling period [s].
     """
 
     def __init__(
@@ -93,7 +92,7 @@ class Squeezes:
             physics,
             period,
         )
-        self._engine = engine()
+        self._engine = import_mujoco()
         first, last = float(trajectory.times[0]), float(trajectory.times[-1])
         world, scene = physical.world, physical.world.scene
         labels = np.full(physical.model.ngeom, "", object)
@@ -114,11 +113,16 @@ class Squeezes:
 
     @property
     def grips(self) -> list[Grip]:
-        """What has been held."""
+        """Grips so far."""
         return [squeeze.grip for squeeze in self._squeezes]
 
-    def commands(self, times: Floats, planned: Floats) -> Floats:
-        """Return what fingers are told at times [s], shape (K, k), of where the plan has them, shape (K, k)."""
+    def compute_commands(self, times: Floats, planned: Floats) -> Floats:
+        """Return the finger commands at times [s], shape (K, k).
+
+        Args:
+            times: Times, shape (K,) [s].
+            planned: Planned finger positions, shape (K, k).
+        """
         shares, time = np.zeros(len(times)), self._physics.grip_time
         for squeeze in self._squeezes:
             begin = max(squeeze.begin, float(times[0]))
@@ -130,11 +134,11 @@ class Squeezes:
             ]
             shares = np.maximum(shares, np.interp(times, corners, [0.0, 1.0, 1.0, 0.0]))
         fingers = self._fingers
-        closed = fingers.closed + _BITE * (fingers.closed - fingers.open)
+        closed = fingers.closed + _OVERTRAVEL * (fingers.closed - fingers.open)
         return np.asarray(planned + shares[:, None] * (closed - planned))
 
-    def may_touch(self, clock: float) -> set[tuple[str, str]]:
-        """Return the names of what may touch at a time [s], because it is held, taken or let go."""
+    def allowed_contacts(self, clock: float) -> set[tuple[str, str]]:
+        """Return the label pairs that may touch at a time [s] because of a grasp."""
         time = self._physics.grip_time
         return {
             pair
@@ -144,14 +148,14 @@ class Squeezes:
         }
 
     def measure(self, data: Any, clock: float) -> None:
-        """Note how hard hands pull, and how far they have slipped."""
+        """Record the load and slip of each grasp."""
         for squeeze in self._squeezes:
             begin = max(squeeze.begin + self._physics.grip_time, squeeze.grip.begin)
             if not begin <= clock < squeeze.end or squeeze.grip.broken is not None:
                 continue
-            tool, place = self._places(data, squeeze)
+            tool, place = self._find_tool(data, squeeze)
             squeeze.place = place if squeeze.place is None else squeeze.place
-            pull = self._pull(data, squeeze, tool)
+            pull = self._compute_wrench(data, squeeze, tool)
             squeeze.missing = 0 if pull is not None else squeeze.missing + 1
             squeeze.forces.append(np.zeros(6) if pull is None else pull)
             mean = np.mean(squeeze.forces, axis=0)
@@ -161,11 +165,11 @@ class Squeezes:
                 max(grip.torque, float(np.linalg.norm(mean[3:]))),
             )
             slip = max(grip.slip, float(np.linalg.norm(place - squeeze.place)))
-            lost = clock if squeeze.missing * self._period >= _LOST else None
-            squeeze.grip = replace(grip, force=force, torque=torque, slip=slip, broken=lost)
+            lost_time = clock if squeeze.missing * self._period >= _LOST_TIME else None
+            squeeze.grip = replace(grip, force=force, torque=torque, slip=slip, broken=lost_time)
 
-    def _places(self, data: Any, squeeze: _Squeeze) -> tuple[Floats, Floats]:
-        """Return where the tool is in the world, and in the frame of the body that is held [m]."""
+    def _find_tool(self, data: Any, squeeze: _Squeeze) -> tuple[Floats, Floats]:
+        """Return the tool's position in the world and in the grasped body's frame [m]."""
         tool = int(self._physical.bodies[self._tool.parentJoint])
         where = (
             data.xpos[tool]
@@ -175,28 +179,34 @@ class Squeezes:
         turn = np.asarray(data.xmat[body]).reshape(3, 3)
         return np.asarray(where), np.asarray(turn.T @ (where - data.xpos[body]))
 
-    def _pull(self, data: Any, squeeze: _Squeeze, tool: Floats) -> Floats | None:
-        """Return force and torque of the hand on what it holds, at the tool frame's origin, shape (6,); None: nothing touches."""
+    def _compute_wrench(self, data: Any, squeeze: _Squeeze, tool: Floats) -> Floats | None:
+        """Return the hand's force and torque on the grasped link, shape (6,), at the tool's origin.
+
+        None means that they do not touch.
+        """
         pairs = np.asarray(data.contact.geom).reshape(-1, 2)
         ahead = squeeze.hand[pairs[:, 0]] & squeeze.link[pairs[:, 1]]
         back = squeeze.link[pairs[:, 0]] & squeeze.hand[pairs[:, 1]]
-        found, pushed, wrench = np.zeros(6), False, np.zeros(6)
+        total, pushed, wrench = np.zeros(6), False, np.zeros(6)
         for i in np.flatnonzero(ahead | back).tolist():
             self._engine.mj_contactForce(self._physical.model, data, i, wrench)
             pushed |= bool(wrench[0] > 0.0)
             axes = np.asarray(data.contact.frame[i]).reshape(3, 3)
             force, torque = (1.0 if ahead[i] else -1.0) * (wrench.reshape(2, 3) @ axes)
-            found[:3] += force
-            found[3:] += torque + np.cross(np.asarray(data.contact.pos[i]) - tool, force)
-        return found if pushed else None
+            total[:3] += force
+            total[3:] += torque + np.cross(np.asarray(data.contact.pos[i]) - tool, force)
+        return total if pushed else None
 
 
-def split(spans: Sequence[Span], begin: float) -> tuple[list[Span], list[Span]]:
-    """Return holds that are welds, and those by friction: the hand's own; what it has at the start is welded until it has closed.
+def split_spans(spans: Sequence[Span], begin: float) -> tuple[list[Span], list[Span]]:
+    """Divide holds into welds and grasps by friction.
+
+    The robot's own hand grasps by friction. An object that it holds at the start is welded until
+    the fingers have closed.
 
     Args:
-        spans: All.
-        begin: When the motion begins [s].
+        spans: All holds.
+        begin: Begin of the trajectory [s].
     """
     own = [span for span in spans if span[0].by is None]
     others = [span for span in spans if span[0].by is not None]

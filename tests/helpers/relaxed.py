@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from helpers.small_problems import random_configurations
-from vkc_pin.planning.nlp.merit import Merit, infeasibility, shortfalls
+from vkc_pin.planning.nlp.merit import Merit, compute_shortfalls, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
@@ -20,8 +20,8 @@ class Relaxed:
         self.problem, self.z = problem, z
         self.timing = p.timing_for(p.still)  # so that a wild motion is too fast
         contacts = p.evaluate_contacts(z, reach=p.options.contact_reach, nearest=t.slots)
-        self.slack = shortfalls(contacts, t.segments, t.slots)
-        self.found = infeasibility(p, z, self.timing, contacts, rates=True)
+        self.slack = compute_shortfalls(contacts, t.segments, t.slots)
+        self.found = measure_infeasibility(p, z, self.timing, contacts, rates=True)
         self.merit = Merit(REST)
         self.merit.weights["clearance"] = CLEARANCE
         self._planes = p.contacts.planes(z, contacts, slots=t.slots)
@@ -43,9 +43,9 @@ class Relaxed:
             )
             return np.concatenate([vector, np.zeros(len(f.rate_excess))])
         given |= {
-            "away": f.away,
+            "pose_offsets": f.pose_offsets,
             "excess": f.excess,
-            "prices": self.merit.price(f, clearance=False),
+            "relaxation_weights": self.merit.compute_penalty(f, clearance=False),
         }
         vector = p.transcription.parameter_vector(
             p.start, *self._planes, p.target_matrix(), **given
@@ -99,15 +99,15 @@ def check_relaxation(problem: TrajectoryProblem, z: np.ndarray) -> dict[str, flo
     )
     assert np.isfinite(raw).all()
     assert still.max() < 1e-8 * max(1.0, np.abs(raw).max())
-    own = problem.term_numbers.cost(z, at.timing.dt)
-    expected = at.of_squares() + own + at.merit.price(at.found, clearance=True).sum()
+    own = problem.term_evaluator.compute_cost(z, at.timing.dt)
+    expected = at.of_squares() + own + at.merit.compute_penalty(at.found, clearance=True).sum()
     np.testing.assert_allclose(at.cost(1.0), expected, rtol=1e-9)
     np.testing.assert_array_equal(raw, at.rows(0.0, relaxed=False))
     np.testing.assert_array_equal(raw, at.rows(1.0, relaxed=False))
     # Rows of planes have slacks of their own.
-    between, firm = at.rows(share), t.firm_rows
+    between, firm = at.rows(share), t.first_relaxed_row
     np.testing.assert_array_equal(between[t.slot_rows], raw[t.slot_rows])
-    owners = np.concatenate([t.owners, t.rate_owners])
+    owners = np.concatenate([t.row_waypoints, t.rate_waypoints])
     np.testing.assert_allclose(
         at.missing(between)[firm:],
         (1.0 - share[owners]) * at.missing(raw)[firm:],

@@ -48,7 +48,7 @@ EQUIVALENT: dict[str, str] = {
     "validation/validate.py: excess = np.maximum(lower - low, high - upper) | swapped: lower - low, high - upper → high - upper, lower - low": "max(a, b) is max(b, a)",
     "planning/chain/collision_pairs.py: np.array([half for _, half in boxes]).reshape(-1, 3), | constant: 1 → 2": "NumPy takes any negative number for the length that follows from the others",
     "validation/contact_windows.py: yield Window(self._pairs(self._shapes(owner), mates), phase.first, phase.last, -np.inf, together=True) | swapped: self._shapes(owner), mates → mates, self._shapes(owner)": "the smaller of a pair comes first anyhow, and the order of pairs in a window is nobody's business",
-    "planning/chain/easing.py: share = EASED_SHARE * max(distance, 0.0) | swapped: distance, 0.0 → 0.0, distance": "max(a, b) is max(b, a)",
+    "planning/chain/easing.py: share = REDUCED_MARGIN_RATIO * max(distance, 0.0) | swapped: distance, 0.0 → 0.0, distance": "max(a, b) is max(b, a)",
     "validation/rolling.py: if not amount <= (usual if tolerance is None else tolerance): | comparison: <= → <": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
     'solver/subproblem.py: "ipopt.constr_viol_tol": 1e-5, | constant: 1e-5 → 2e-05': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
     "validation/samples.py: far = np.argwhere(np.abs(self.trajectory.positions) > _LARGEST) | comparison: > → >=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",

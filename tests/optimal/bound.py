@@ -27,7 +27,7 @@ def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, in
     asked, rests, solve, rest = (
         dict[int, tuple[Any, ...]](),
         list[float](),
-        retime.speeds_along,
+        retime.compute_speeds,
         retime._straight,
     )
 
@@ -44,9 +44,9 @@ def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, in
         return curve
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(retime, "speeds_along", noted)
+        patch.setattr(retime, "compute_speeds", noted)
         patch.setattr(retime, "_straight", rested)
-        again = retime.retimed(scene, motion, _parts(motion))
+        again = retime.retime_trajectory(scene, motion, _parts(motion))
     assert abs(again.times[-1] - motion.times[-1]) <= _SAME, (
         "the motion that was timed anew is another one"
     )

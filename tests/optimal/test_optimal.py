@@ -9,7 +9,7 @@ from helpers.executions import door_plan, drawer_plan
 
 import vkc_pin as vkc
 from optimal.bound import bound
-from vkc_pin.planning.retiming.retime import retimed
+from vkc_pin.planning.retiming.retime import retime_trajectory
 
 
 @pytest.mark.parametrize("made", [door_plan, drawer_plan])
@@ -35,7 +35,7 @@ def test_the_bound_obeys_limits() -> None:
         robot, acceleration=robot.acceleration / 4.0, velocity=robot.velocity / 2.0
     )
     scene = dataclasses.replace(plan.scene, robot=weak)
-    slow = retimed(scene, plan.trajectory)
+    slow = retime_trajectory(scene, plan.trajectory)
     assert bound(scene, slow)[0] > 1.5 * bound(plan.scene, plan.trajectory)[0]
     with pytest.raises(AssertionError, match="another one"):
         bound(scene, plan.trajectory)

@@ -18,7 +18,7 @@ from vkc_pin.planning import one_problem as module
 from vkc_pin.planning.initialization.initial_guess import Seed
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import TIMES
-from vkc_pin.planning.retiming.retime import retimed
+from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.to_trajectory import as_trajectory
@@ -341,7 +341,7 @@ def test_ctrl_c_in_the_solver_returns_the_best(
     np.testing.assert_array_equal(script.one.z, script.z(script.one.problem, name, leads[name][0]))
     alone = program_of(drawer_scene(), PULL, options=SHORT)
     own = script.z(alone, name, leads[name][0])
-    expected = retimed(alone.scene, as_trajectory(alone, own, alone.timing_for(own).dt))
+    expected = retime_trajectory(alone.scene, as_trajectory(alone, own, alone.timing_for(own).dt))
     assert plan.metrics["duration"] == pytest.approx(float(expected.times[-1]), rel=1e-6)
 
 

@@ -241,7 +241,7 @@ class Attempt:
             began = time.perf_counter()
             followed = follow(problem, base, self.rng, refine=self.refine)
             pace = problem.pace(followed.z)
-            timing = problem.timing_for(followed.z).stretched(*pace)
+            timing = problem.timing_for(followed.z).stretch(*pace)
             self.times["following"] += time.perf_counter() - began
             cause = followed.cause
             if not cause and timing.violation(*pace) > TOLERANCE:

@@ -13,7 +13,7 @@ import pytest
 from vkc_pin.options import Options
 from vkc_pin.planning.chain import collision_pairs as module
 from vkc_pin.planning.chain.collision_pairs import _boxes, _Pairing
-from vkc_pin.planning.chain.contacts import Contacts, no_contacts
+from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
 from vkc_pin.world.scene.clearance_exemptions import Allowance
 from vkc_pin.world.scene.contact_rules import CONTACT
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -212,7 +212,7 @@ def test_contacts_in_numbers() -> None:
     assert found.place.tolist() == [0, 0, 1, 0]
     free = found.select(np.array([3]))
     assert (free.violation(), free.clearance()) == (0.0, 0.5)
-    none = no_contacts()
+    none = make_empty_contacts()
     assert (none.violation(), none.clearance(), none.shortfall(2).tolist()) == (
         0.0,
         np.inf,

@@ -23,7 +23,7 @@ from helpers.carrying import (
 from helpers.riding import cup, plates, scene_of
 from helpers.small_problems import SHORT, program_of
 
-from vkc_pin.planning.chain.easing import EASED_SHARE
+from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.scene.contact_rules import EASED_TIME
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -86,7 +86,7 @@ def test_what_is_lifted_may_be_close_to_what_it_lay_on_and_what_is_lowered_to_wh
     assert margins(p, 2) == {}
     found = margins(p, 1)
     assert set(found) == {("stick.stick", "table")}
-    only_near(found["stick.stick", "table"], EASED_SHARE * GAP, begin=True, end=True)
+    only_near(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True, end=True)
 
 
 def test_the_margin_is_half_the_distance_of_that_shape() -> None:
@@ -110,7 +110,7 @@ def test_the_margin_is_half_the_distance_of_that_shape() -> None:
     }
     ((begin, end, margin),) = eased["stick.tip_1", "wall"]  # at the other end the wall is far away
     assert (begin, end) == (first, first + NEAR)
-    assert margin == pytest.approx(EASED_SHARE * 0.01, abs=1e-6)
+    assert margin == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-6)
 
 
 def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> None:
@@ -148,8 +148,8 @@ def test_what_is_put_down_elsewhere_is_eased_there_alone() -> None:
     p = problem(room(small, other), Place("stick", lifted(STICK, [0.0, 1.0, 0.0])))
     found = margins(p, 1)
     assert set(found) == {("stick.stick", "table"), ("stick.stick", "other")}
-    only_near(found["stick.stick", "table"], EASED_SHARE * GAP, begin=True)
-    only_near(found["stick.stick", "other"], EASED_SHARE * GAP, end=True)
+    only_near(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True)
+    only_near(found["stick.stick", "other"], REDUCED_MARGIN_RATIO * GAP, end=True)
 
 
 def test_taken_again_it_is_eased_where_it_was_put() -> None:
@@ -160,10 +160,12 @@ def test_taken_again_it_is_eased_where_it_was_put() -> None:
         "reach stick.grip",
         "go to",
     ]
-    only_near(margins(p, 3)["stick.stick", "table"], EASED_SHARE * GAP, begin=True)
+    only_near(margins(p, 3)["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True)
 
 
-@pytest.mark.parametrize(("gap", "margin"), [(GAP, EASED_SHARE * GAP), (0.0, 0.0), (-1e-3, -1e-3)])
+@pytest.mark.parametrize(
+    ("gap", "margin"), [(GAP, REDUCED_MARGIN_RATIO * GAP), (0.0, 0.0), (-1e-3, -1e-3)]
+)
 def test_what_is_in_the_hand_at_the_start_may_leave_what_it_lies_on(
     gap: float, margin: float
 ) -> None:
@@ -189,7 +191,7 @@ def test_what_rides_is_eased_from_what_is_beside_it_where_the_ride_begins_alone(
     p = program_of(plates(cups=1, wall=0.01), [Actuate("plate", {"slide": 0.3})], options=options)
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.rides)
     row = margins(p, number)["cup.cup", "wall"]
-    assert row[0] == pytest.approx(EASED_SHARE * 0.01, abs=1e-4)
+    assert row[0] == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-4)
     assert row[-1] == LONG.dist_safe
 
 
@@ -206,7 +208,9 @@ def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_t
         Place("tray", (-0.5, -1.5, 0.7)),
     )
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.rides)
-    only_near(margins(p, number)["cup.cup", "wall"], EASED_SHARE * 0.01, begin=True, within=1e-4)
+    only_near(
+        margins(p, number)["cup.cup", "wall"], REDUCED_MARGIN_RATIO * 0.01, begin=True, within=1e-4
+    )
 
 
 def test_in_a_short_phase_both_ends_must_be_possible() -> None:
@@ -223,7 +227,7 @@ def test_the_floor_too() -> None:
     p = problem(room(), Place("stick", low))
     found = margins(p, 1)
     assert set(found) == {("stick.stick", FLOOR)}
-    only_near(found["stick.stick", FLOOR], EASED_SHARE * 1e-3, end=True)
+    only_near(found["stick.stick", FLOOR], REDUCED_MARGIN_RATIO * 1e-3, end=True)
 
 
 def tip_at_a_wall(gap: float, *steps: Step) -> tuple[TrajectoryProblem, np.ndarray]:
@@ -291,5 +295,8 @@ def test_a_motion_that_lifts_and_lowers_keeps_its_margins() -> None:
             lies[int(waypoint) + 1] = min(
                 lies.get(int(waypoint) + 1, (np.inf, 0.0)), (float(distance), float(margin))
             )
-    assert lies[2 * N] == (pytest.approx(GAP, abs=1e-6), pytest.approx(EASED_SHARE * GAP, abs=1e-7))
+    assert lies[2 * N] == (
+        pytest.approx(GAP, abs=1e-6),
+        pytest.approx(REDUCED_MARGIN_RATIO * GAP, abs=1e-7),
+    )
     assert all(distance >= margin for distance, margin in lies.values())

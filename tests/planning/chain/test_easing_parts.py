@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.planning.chain import easing as module
-from vkc_pin.planning.chain.easing import EASED_SHARE, _moments
+from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO, _moments
 from vkc_pin.world.scene.hold import Hold
 
 STICK, TRAY, PLATE = Hold("stick", "grip"), Hold("tray", "rim"), Hold("plate", "knob")
@@ -69,7 +69,7 @@ def phase(held: tuple[Hold, ...] = (), rides: tuple[Ride, ...] = (), **fields: A
 
 
 def test_the_margin_is_half_of_what_there_is() -> None:
-    assert EASED_SHARE == 0.5
+    assert REDUCED_MARGIN_RATIO == 0.5
 
 
 def test_what_is_in_the_hand_at_the_start_begins_there(monkeypatch: Any) -> None:

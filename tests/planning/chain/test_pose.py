@@ -9,13 +9,13 @@ import pytest
 from helpers.memory import growth
 
 from vkc_pin.planning.chain.pose import (
-    AWAY,
+    POSE_OFFSET_SIZE,
     ROW_BOUNDS,
     PoseRow,
-    away_from,
+    compute_pose_offsets,
     pose_residual,
     pose_rows,
-    receded,
+    relax_target,
     target_vector,
 )
 
@@ -399,8 +399,10 @@ def test_what_is_bound_to_a_value_and_what_only_from_below() -> None:
 # --- targets that recede
 # ------------------------------------------------------------------------------------------------
 
-_away, _share = ca.SX.sym("D", AWAY), ca.SX.sym("e")
-RECEDED = ca.Function("receded", [_target, _away, _share], [receded(_target, _away, _share)])
+_away, _share = ca.SX.sym("D", POSE_OFFSET_SIZE), ca.SX.sym("e")
+RECEDED = ca.Function(
+    "relax_target", [_target, _away, _share], [relax_target(_target, _away, _share)]
+)
 TURNS = [
     0.0,
     1e-9,
@@ -435,8 +437,8 @@ def away_of(kind: str, target: pin.SE3, *placements: pin.SE3) -> np.ndarray:
     rotations, translations = (
         np.array([getattr(p, part) for p in placements]) for part in ("rotation", "translation")
     )
-    found = away_from(kind, rotations, translations, target)
-    assert found.shape == (len(placements), AWAY)
+    found = compute_pose_offsets(kind, rotations, translations, target)
+    assert found.shape == (len(placements), POSE_OFFSET_SIZE)
     assert np.isfinite(found).all()
     np.testing.assert_allclose(np.linalg.norm(found[:, 3:6], axis=1), 1.0, rtol=0.0, atol=1e-12)
     assert ((found[:, 6] >= 0.0) & (found[:, 6] <= np.pi + 1e-12)).all()
@@ -526,7 +528,10 @@ def test_how_far_many_are_away_is_how_far_each_is(kind: str) -> None:
         np.sin(each[:, 6:]) * each[:, 3:6],
     )  # at 0 and π there may be any
     np.testing.assert_allclose(axes, axis, rtol=0.0, atol=1e-12)
-    assert away_from(kind, np.zeros((0, 3, 3)), np.zeros((0, 3)), target).shape == (0, AWAY)
+    assert compute_pose_offsets(kind, np.zeros((0, 3, 3)), np.zeros((0, 3)), target).shape == (
+        0,
+        POSE_OFFSET_SIZE,
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -610,7 +615,7 @@ def test_on_the_way_a_target_goes_straight_and_turns_evenly(kind: str, angle: fl
 def test_slopes_of_rows_with_a_target_that_recedes(kind: str, angle: float) -> None:
     """By finite differences of the share; a half turn is no worse than any other."""
     rng, target = np.random.default_rng(16), pin.SE3.Random()
-    rows = pose_rows(kind, _R, _p, receded(_target, _away, _share))
+    rows = pose_rows(kind, _R, _p, relax_target(_target, _away, _share))
     function = ca.Function(
         "rows", [_R, _p, _target, _away, _share], [rows, ca.jacobian(rows, _share)]
     )
@@ -657,7 +662,7 @@ def test_what_is_upright_has_nothing_to_turn_and_what_stands_on_its_head_half_a_
 ) -> None:
     target = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, heading), np.zeros(3))
     rotations = np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])])
-    found = away_from(kind, rotations, np.zeros((2, 3)), target)
+    found = compute_pose_offsets(kind, rotations, np.zeros((2, 3)), target)
     np.testing.assert_allclose(found[:, 6], [0.0, np.pi], rtol=0.0, atol=1e-12)
     assert found[1, 5] == 0.0  # about a level axis
     np.testing.assert_allclose(np.linalg.norm(found[:, 3:6], axis=1), 1.0)

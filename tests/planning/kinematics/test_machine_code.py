@@ -98,7 +98,7 @@ def test_waypoints_are_equal_bit_for_bit(task: str, folder: Libraries) -> None:
 
 def test_a_program_is_built_anew_when_machine_code_has_come(folder: Libraries) -> None:
     short = program_of(door_scene(), TASKS["reach"], options=OPTIONS).transcription
-    assert not short.interpreted, "three waypoints are not worth it"
+    assert not short.uncompiled_functions, "three waypoints are not worth it"
     options = Options(reach_waypoints=8, contact_slots=2)
     structure, cache = (
         program_of(door_scene(), TASKS["reach"], options=options).transcription.structure,
@@ -106,7 +106,7 @@ def test_a_program_is_built_anew_when_machine_code_has_come(folder: Libraries) -
     )
     first = transcribe(structure, cache)
     solver = first.solver(rates=True, options=QUIET)
-    assert len(first.interpreted) == 1
+    assert len(first.uncompiled_functions) == 1
     assert len(folder.jobs()) <= 1
     assert transcribe(structure, cache) is first
     assert wait()
@@ -114,7 +114,7 @@ def test_a_program_is_built_anew_when_machine_code_has_come(folder: Libraries) -
     assert second is not first
     assert second.solver(rates=True, options=QUIET) is not solver
     assert transcribe(structure, cache) is second
-    assert not second.interpreted
+    assert not second.uncompiled_functions
     rng = np.random.default_rng(0)
     x, parameters = rng.normal(size=first.size), rng.normal(size=first.parameters.numel())
     rows, others = (evaluated(program, x, parameters) for program in (first, second))

@@ -10,7 +10,13 @@ from helpers.drives import hall
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.nlp.merit import GROWTH, Infeasibility, Merit, infeasibility, shortfalls
+from vkc_pin.planning.nlp.merit import (
+    GROWTH,
+    Infeasibility,
+    Merit,
+    compute_shortfalls,
+    measure_infeasibility,
+)
 from vkc_pin.planning.solver.loop import _Loop
 from vkc_pin.planning.solver.trust_region import Trial
 
@@ -39,7 +45,7 @@ def look(kind: str, z: np.ndarray, *, rates: bool = True) -> Infeasibility:
     contacts = p.evaluate_contacts(
         z, reach=p.options.contact_reach, nearest=p.options.contact_slots
     )
-    return infeasibility(p, z, p.timing_for(p.still), contacts, rates=rates)
+    return measure_infeasibility(p, z, p.timing_for(p.still), contacts, rates=rates)
 
 
 def wild(kind: str, seed: int, size: float = 0.3) -> np.ndarray:
@@ -50,8 +56,8 @@ def wild(kind: str, seed: int, size: float = 0.3) -> np.ndarray:
 def test_nothing_is_missing_where_everything_holds() -> None:
     p = program_of(hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=SHORT)
     contacts = p.evaluate_contacts(p.still, reach=0.1)
-    found = infeasibility(p, p.still, p.timing_for(p.still), contacts, rates=True)
-    assert (found.total, found.others) == (0.0, 0.0)
+    found = measure_infeasibility(p, p.still, p.timing_for(p.still), contacts, rates=True)
+    assert (found.total, found.max_violation) == (0.0, 0.0)
     assert set(found.amounts) == set(KINDS)
 
 
@@ -67,7 +73,9 @@ def test_amounts_are_what_is_missing(seed: int) -> None:
     assert (found.amounts["rolling"] >= np.abs(aside) + fast - 1e-9).all()
     still = look("drive", z, rates=False).amounts["rolling"]
     np.testing.assert_allclose(still, np.abs(aside), atol=1e-12)
-    assert found.amounts["terms"].max() == pytest.approx(p.term_numbers.error(z, timing.dt))
+    assert found.amounts["terms"].max() == pytest.approx(
+        p.term_evaluator.compute_violation(z, timing.dt)
+    )
     first, second = p.rates(z)
     over = (
         np.maximum(np.abs(first) - timing.velocity, 0.0).sum()
@@ -84,7 +92,7 @@ def test_amounts_are_what_is_missing(seed: int) -> None:
 def test_shortfalls_are_of_the_pairs_that_have_planes() -> None:
     p, z = problem("drive"), wild("drive", 0)
     contacts = p.evaluate_contacts(z, reach=p.options.contact_reach)
-    found = shortfalls(contacts, p.segments, 2)
+    found = compute_shortfalls(contacts, p.segments, 2)
     for row in range(p.segments):
         mine = np.flatnonzero(contacts.waypoint == row)[:2]
         expected = np.maximum(contacts.margin[mine] - contacts.distance[mine], 0.0)
@@ -144,14 +152,18 @@ def test_a_step_is_refused_that_makes_more_of_any_kind_missing(kind: str) -> Non
     loop = _Loop(p, p.still, 200.0)
     loop.begin()
     amounts = {name: np.full(p.segments, 0.01) for name in KINDS}
-    loop.found = Infeasibility(amounts, loop.found.away, loop.found.excess, loop.found.rate_excess)
+    loop.found = Infeasibility(
+        amounts, loop.found.pose_offsets, loop.found.excess, loop.found.rate_excess
+    )
     loop.objective = 5.0
     fields = dict.fromkeys(Trial.__dataclass_fields__)
     for change, expected in ((0.01, False), (-0.01, True)):
         after = {**amounts, kind: np.full(p.segments, 0.01 + change)}
-        found = Infeasibility(after, loop.found.away, loop.found.excess, loop.found.rate_excess)
+        found = Infeasibility(
+            after, loop.found.pose_offsets, loop.found.excess, loop.found.rate_excess
+        )
         promise = (
-            loop.merit.price(loop.found, clearance=True) - 2.0
+            loop.merit.compute_penalty(loop.found, clearance=True) - 2.0
         )  # as much as this kind is worth
         trial = Trial(**{**fields, "objective": 0.0, "found": found, "promise": promise})  # type: ignore[arg-type]
         assert loop.judge(trial, *loop.prices(trial)) == expected
@@ -161,9 +173,11 @@ def test_weights_grow_where_something_is_missing() -> None:
     merit, amounts = Merit(200.0), {kind: np.zeros(3) for kind in KINDS}
     amounts["terms"][1] = 0.01
     found = Infeasibility(amounts, np.zeros((3, 0, 7)), np.zeros(0), np.zeros(0))
-    assert merit.grow(found, 1e-3)
+    assert merit.increase_weights(found, 1e-3)
     assert merit.weights == {**dict.fromkeys(KINDS, 200.0), "terms": GROWTH * 200.0}
-    assert merit.price(found, clearance=False) == pytest.approx([0.0, GROWTH * 200.0 * 0.01, 0.0])
-    assert merit.grow(found, 1e-3)
+    assert merit.compute_penalty(found, clearance=False) == pytest.approx(
+        [0.0, GROWTH * 200.0 * 0.01, 0.0]
+    )
+    assert merit.increase_weights(found, 1e-3)
     assert merit.weights["terms"] == GROWTH**2 * 200.0
-    assert not Merit(200.0).grow(found, 0.1)
+    assert not Merit(200.0).increase_weights(found, 0.1)

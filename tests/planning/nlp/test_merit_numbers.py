@@ -11,7 +11,12 @@ import pytest
 
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.chain.pose import PoseRow
-from vkc_pin.planning.nlp.merit import Infeasibility, Merit, infeasibility, shortfalls
+from vkc_pin.planning.nlp.merit import (
+    Infeasibility,
+    Merit,
+    compute_shortfalls,
+    measure_infeasibility,
+)
 
 
 def contacts(*rows: tuple[int, float, float]) -> Contacts:
@@ -33,11 +38,13 @@ NEAR = contacts((0, 0.01, 0.03), (0, 0.5, 0.02), (0, 0.0, 0.5), (2, -0.25, 0.25)
 
 
 def test_shortfalls_are_of_as_many_pairs_as_there_are_planes() -> None:
-    np.testing.assert_allclose(shortfalls(NEAR, 3, 2), [[0.02, 0.0], [0.0, 0.0], [0.5, 0.0]])
     np.testing.assert_allclose(
-        shortfalls(NEAR, 3, 3), [[0.02, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
+        compute_shortfalls(NEAR, 3, 2), [[0.02, 0.0], [0.0, 0.0], [0.5, 0.0]]
     )
-    np.testing.assert_allclose(shortfalls(NEAR, 4, 1)[:, 0], [0.02, 0.0, 0.5, 0.0])
+    np.testing.assert_allclose(
+        compute_shortfalls(NEAR, 3, 3), [[0.02, 0.0, 0.5], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
+    )
+    np.testing.assert_allclose(compute_shortfalls(NEAR, 4, 1)[:, 0], [0.02, 0.0, 0.5, 0.0])
 
 
 def goal(kind: str, waypoints: tuple[int, ...]) -> Any:
@@ -62,7 +69,7 @@ def look(*, rates: bool = False, goals: Any = None) -> Infeasibility:
     given: list[Any] = []
     problem: Any = SimpleNamespace(
         transcription=SimpleNamespace(
-            slots=2, owners=np.array([0, 0, 2, 1]), rate_owners=np.array([0, 1, 2, 0, 2])
+            slots=2, row_waypoints=np.array([0, 0, 2, 1]), rate_waypoints=np.array([0, 1, 2, 0, 2])
         ),
         pose_goals=[goal("pose", (1, 3)), goal("point", (2,)), goal("pose", ())]
         if goals is None
@@ -79,7 +86,7 @@ def look(*, rates: bool = False, goals: Any = None) -> Infeasibility:
         rates=lambda at: (np.array([[5.0], [-3.0], [1.0]]), np.array([[-9.0], [2.0]])),
     )
     timing: Any = SimpleNamespace(velocity=np.full((3, 1), 2.0), acceleration=np.full((2, 1), 4.0))
-    found = infeasibility(problem, z, timing, NEAR, rates=rates)
+    found = measure_infeasibility(problem, z, timing, NEAR, rates=rates)
     assert given == [(timing, rates)]
     return found
 
@@ -96,14 +103,14 @@ def test_how_much_is_missing_of_each_kind_at_each_waypoint() -> None:
     }
     assert found.excess.tolist() == [1.0, -2.0, 0.5, -0.25]
     assert found.rate_excess.shape == (0,)
-    assert found.away.shape == (3, 3, 7)
-    assert np.flatnonzero(found.away.any(axis=2).ravel()).tolist() == [
+    assert found.pose_offsets.shape == (3, 3, 7)
+    assert np.flatnonzero(found.pose_offsets.any(axis=2).ravel()).tolist() == [
         0,
         4,
         6,
     ]  # waypoint by waypoint
     assert found.total == pytest.approx(78.4 + 1.0 + 2.0 + 0.75 + 0.52)
-    assert found.others == pytest.approx(39.3)
+    assert found.max_violation == pytest.approx(39.3)
 
 
 def test_rates_beyond_their_limits_count_if_they_are_rows() -> None:
@@ -123,25 +130,25 @@ def amounts(**given: list[float]) -> Infeasibility:
 
 
 def test_the_most_that_is_missing_besides_clearance() -> None:
-    assert amounts(clearance=[9.0, 9.0], poses=[0.25, 0.5], terms=[0.75, 0.0]).others == 0.75
-    assert amounts(clearance=[9.0, 9.0]).others == 0.0
+    assert amounts(clearance=[9.0, 9.0], poses=[0.25, 0.5], terms=[0.75, 0.0]).max_violation == 0.75
+    assert amounts(clearance=[9.0, 9.0]).max_violation == 0.0
 
 
 def test_what_it_costs() -> None:
     merit, found = Merit(2.0), amounts(clearance=[1.0, 3.0], poses=[0.25, 0.0], rates=[0.0, 0.5])
     merit.weights["poses"] = 8.0
-    assert merit.price(found, clearance=True).tolist() == [4.0, 7.0]
-    assert merit.price(found, clearance=False).tolist() == [2.0, 1.0]
+    assert merit.compute_penalty(found, clearance=True).tolist() == [4.0, 7.0]
+    assert merit.compute_penalty(found, clearance=False).tolist() == [2.0, 1.0]
 
 
 def test_what_is_missing_somewhere_becomes_dearer() -> None:
     merit = Merit(2.0)
     found = amounts(clearance=[0.0, 0.2], poses=[0.09, 0.0], terms=[0.11, 0.0])
-    assert merit.grow(found, 0.1)
+    assert merit.increase_weights(found, 0.1)
     assert {kind for kind, weight in merit.weights.items() if weight == 8.0} == {
         "clearance",
         "terms",
     }
     assert set(merit.weights.values()) == {2.0, 8.0}
-    assert not merit.grow(amounts(poses=[0.09, 0.0]), 0.1)
-    assert not merit.grow(amounts(), 0.0)
+    assert not merit.increase_weights(amounts(poses=[0.09, 0.0]), 0.1)
+    assert not merit.increase_weights(amounts(), 0.0)

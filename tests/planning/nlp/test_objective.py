@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.planning.nlp.objective import STILL, Effort
-from vkc_pin.planning.nlp.sparse import differences
+from vkc_pin.planning.nlp.objective import SMOOTHING_LENGTH, MotionCost
+from vkc_pin.planning.nlp.sparse import make_differences
 
 METRIC = np.array([1.0, 1.0, 0.04, 0.01, 0.01, 1.0])
 ENDS, STOPS = np.array([6, 10, 19]), (6,)
 SMOOTHING = 4.8
-MATRICES = differences(ENDS[-1], STOPS)
+MATRICES = make_differences(ENDS[-1], STOPS)
 
 
-def effort(*, length: bool = True, smoothing: float = SMOOTHING) -> Effort:
-    return Effort(METRIC, smoothing, ENDS, STOPS, length=length)
+def effort(*, length: bool = True, smoothing: float = SMOOTHING) -> MotionCost:
+    return MotionCost(METRIC, smoothing, ENDS, STOPS, length=length)
 
 
 def parts(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,8 +56,8 @@ def by_hand(path: np.ndarray) -> float:
             squares = np.sum(
                 np.diff(path[begin : end + 1, group], axis=0) ** 2
             ) + SMOOTHING * np.sum(bends[inside][:, group] ** 2)
-            still = STILL * np.sqrt(weight)
-            total += np.sqrt(still**2 + (end - begin) * weight * squares) - still
+            epsilon = SMOOTHING_LENGTH * np.sqrt(weight)
+            total += np.sqrt(epsilon**2 + (end - begin) * weight * squares) - epsilon
     return float(total)
 
 
@@ -96,14 +96,14 @@ def test_a_way_at_even_speed_costs_its_length_however_many_waypoints_it_has() ->
             np.interp(np.arange(41), [0, ends[0], 40], [0.0, 1.0, 4.0]), [0.6, 0.8]
         )
         path[:, 3] = np.interp(np.arange(41), [0, ends[0], 40], [0.0, 1.5, 2.0])
-        first, second, start_first, start_second = differences(40, ())
+        first, second, start_first, start_second = make_differences(40, ())
         given = (
             first @ path[1:] + np.outer(start_first, path[0]),
             second @ path[1:] + np.outer(start_second, path[0]),
         )
-        assert Effort(METRIC, 0.0, np.array(ends), (), length=True).value(*given) == pytest.approx(
-            4.0 + 0.1 * 2.0, abs=0.07
-        )
+        assert MotionCost(METRIC, 0.0, np.array(ends), (), length=True).value(
+            *given
+        ) == pytest.approx(4.0 + 0.1 * 2.0, abs=0.07)
 
 
 @given(st.integers(0, 10**6), st.integers(0, 10**6), st.floats(0.01, 3.0), st.floats(0.01, 3.0))

@@ -494,9 +494,9 @@ def test_excess_is_how_far_rows_are_outside_their_bounds(carrying: TrajectoryPro
         bounds = p.row_bounds(timing if rates else None)
         found, lower, upper = (
             p.excess(z, timing, rates=rates),
-            *(bound[t.firm_rows : t.rows] for bound in bounds),
+            *(bound[t.first_relaxed_row : t.rows] for bound in bounds),
         )
-        assert found.shape == (t.rows - t.firm_rows,)
+        assert found.shape == (t.rows - t.first_relaxed_row,)
         values = np.full(t.rows, np.nan)
         path = p.waypoints(z)
         step, heading = np.diff(path[:, :2], axis=0), (path[1:, 2] + path[:-1, 2]) / 2
@@ -512,10 +512,10 @@ def test_excess_is_how_far_rows_are_outside_their_bounds(carrying: TrajectoryPro
             for column, first, last in t.structure.clamped
             for k in range(first + 1, last + 1)
         ]
-        clamped = np.flatnonzero(p.row_kinds["clamped"]) + t.firm_rows
+        clamped = np.flatnonzero(p.row_kinds["clamped"]) + t.first_relaxed_row
         values[clamped] = [path[k, column] - path[k - 1, column] for column, k in steps]
-        values[p.term_numbers.rows] = np.asarray(t.term_values(t.pack(z), p.start, dt)[0]).ravel()
-        values = values[t.firm_rows :]
+        values[p.term_evaluator.rows] = np.asarray(t.term_values(t.pack(z), p.start, dt)[0]).ravel()
+        values = values[t.first_relaxed_row :]
         assert np.isfinite(values).all()
         np.testing.assert_allclose(
             np.clip(values - found, lower, upper), values - found, rtol=0.0, atol=1e-12
@@ -543,19 +543,21 @@ def test_every_row_of_several_waypoints_is_of_one_kind(carrying: TrajectoryProbl
     p, t, count = (
         carrying,
         carrying.transcription,
-        carrying.transcription.rows - carrying.transcription.firm_rows,
+        carrying.transcription.rows - carrying.transcription.first_relaxed_row,
     )
     assert set(p.row_kinds) == {"rolling", "clamped", "terms"}
     assert all(of.shape == (count,) and (of >= 0.0).all() for of in p.row_kinds.values())
     np.testing.assert_array_equal(
         sum((of > 0.0).astype(int) for of in p.row_kinds.values()), np.ones(count, int)
     )
-    np.testing.assert_array_equal(np.flatnonzero(p.row_kinds["rolling"]) + t.firm_rows, t.base_rows)
+    np.testing.assert_array_equal(
+        np.flatnonzero(p.row_kinds["rolling"]) + t.first_relaxed_row, t.base_rows
+    )
     assert len(t.base_rows) == 3 * p.segments, "not aside, and no faster than either wheel"
     clamped = sum(last - first for _, first, last in t.structure.clamped)
     assert np.count_nonzero(p.row_kinds["clamped"]) == clamped > 0
     np.testing.assert_array_equal(
-        np.flatnonzero(p.row_kinds["terms"]) + t.firm_rows, p.term_numbers.rows
+        np.flatnonzero(p.row_kinds["terms"]) + t.first_relaxed_row, p.term_evaluator.rows
     )
     for kind in ("rolling", "clamped"):
         assert set(p.row_kinds[kind]) == {0.0, 1.0}
@@ -564,7 +566,7 @@ def test_every_row_of_several_waypoints_is_of_one_kind(carrying: TrajectoryProbl
     for term, at in zip(p.terms, t.term_rows, strict=True):
         for rows in at.values():
             np.testing.assert_allclose(
-                p.row_kinds["terms"][rows - t.firm_rows], 1e-3 / tolerances[term.name]
+                p.row_kinds["terms"][rows - t.first_relaxed_row], 1e-3 / tolerances[term.name]
             )
 
 
@@ -573,11 +575,11 @@ def test_rows_of_several_waypoints_belong_to_the_last_of_them(carrying: Trajecto
     owner = np.full(t.rows, -1)
     owner[t.base_rows] = np.repeat(np.arange(p.segments), 3)
     steps = [k for _, first, last in t.structure.clamped for k in range(first + 1, last + 1)]
-    owner[np.flatnonzero(p.row_kinds["clamped"]) + t.firm_rows] = np.array(steps) - 1
+    owner[np.flatnonzero(p.row_kinds["clamped"]) + t.first_relaxed_row] = np.array(steps) - 1
     for at in t.term_rows:
         for waypoint, rows in at.items():
             owner[rows] = waypoint - 1
-    np.testing.assert_array_equal(t.owners, owner[t.firm_rows :])
+    np.testing.assert_array_equal(t.row_waypoints, owner[t.first_relaxed_row :])
 
 
 def test_a_program_with_all_kinds_of_rows_is_feasible_where_it_is_set_up(
@@ -709,14 +711,14 @@ def test_a_step_that_is_too_fast_gets_more_time_within_reason() -> None:
         z[second.start + 2 :, 3] += jump
         rates, before = problem.rates(z), problem.timing_for(problem.still)
         assert before.violation(*rates) > 0.0
-        longer = before.stretched(*rates)
+        longer = before.stretch(*rates)
         np.testing.assert_array_equal(before.dt, np.full(problem.segments, SHORT.dt))
         np.testing.assert_array_equal(longer.dt[first], before.dt[first])
         assert np.all(longer.dt[second] > before.dt[second])
         assert np.ptp(longer.dt[second]) == 0.0
         assert (longer.violation(*rates) <= 1e-9) == enough
         assert longer.dt[second.start] <= 2.0 * SHORT.dt  # the rest is left to the solver
-        again = longer.stretched(*rates)
+        again = longer.stretch(*rates)
         assert np.all(again.dt <= 1.5 * before.dt)  # however often that is asked for
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from vkc_pin.planning.nlp.sparse import assemble, curvature, differences, sparse
+from vkc_pin.planning.nlp.sparse import assemble, make_curvature, make_differences, make_sparse
 
 
 def test_parts_go_to_their_places_and_add_up_where_they_meet() -> None:
@@ -23,13 +23,13 @@ def test_parts_go_to_their_places_and_add_up_where_they_meet() -> None:
 
 
 def test_small_matrices() -> None:
-    assert sparse(np.array([[0.0, 2.0], [0.0, 0.0]])).nnz() == 1
+    assert make_sparse(np.array([[0.0, 2.0], [0.0, 0.0]])).nnz() == 1
 
 
 def test_curvature_is_of_weighted_squares() -> None:
-    parts = differences(7, (3,))[:2]
+    parts = make_differences(7, (3,))[:2]
     weights = [np.random.default_rng(3).uniform(1.0, 2.0, len(part)) for part in parts]
-    (row, column), maps = curvature(parts)
+    (row, column), maps = make_curvature(parts)
     values = sum(
         np.asarray((matrix @ ca.DM(weight)).full()).ravel()
         for matrix, weight in zip(maps, weights, strict=True)

@@ -14,7 +14,7 @@ from helpers.relaxed import check_relaxation, iterates
 from helpers.small_problems import full_scene, program_of, random_configurations
 
 import vkc_pin as vkc
-from vkc_pin.planning.chain.pose import AWAY
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE
 from vkc_pin.planning.nlp.term_rows import TermProgram
 from vkc_pin.world.task.phases import Phase
 from vkc_pin.world.task.terms import Constraint, Cost
@@ -238,7 +238,7 @@ def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
                 atol = 1.01e-4 if term.name == "speed" else 1e-7
                 np.testing.assert_allclose(values[rows - first], expected[waypoint], atol=atol)
                 seen += len(rows)
-    assert seen == len(values) == len(p.term_numbers.rows)
+    assert seen == len(values) == len(p.term_evaluator.rows)
     assert float(cost) == pytest.approx(total, rel=1e-6)
     assert {name: len(at) for name, at in by_name.items()} == {
         # Where the tip still stands there is nothing to be done about it.
@@ -258,12 +258,15 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     )
     planes = rng.normal(size=(t.segments, t.slots, 12 * (p.chain.model.njoints - 1)))
     offsets = rng.normal(size=(t.segments, t.slots))
-    away = rng.normal(size=(t.segments, len(p.pose_goals), AWAY))
-    excess, prices = rng.normal(size=t.rows - t.firm_rows), rng.uniform(0.0, 50.0, t.segments)
+    pose_offsets = rng.normal(size=(t.segments, len(p.pose_goals), POSE_OFFSET_SIZE))
+    excess, relaxation_weights = (
+        rng.normal(size=t.rows - t.first_relaxed_row),
+        rng.uniform(0.0, 50.0, t.segments),
+    )
     taken = {
-        "away": away,
+        "pose_offsets": pose_offsets,
         "excess": excess,
-        "prices": prices,
+        "relaxation_weights": relaxation_weights,
         "weights": p.effort.weights(*p.rates(random_path(p, 2)[1:])),
     }
     parameters = t.parameter_vector(
@@ -271,7 +274,7 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     )
     slack, shares = rng.uniform(size=(t.segments, t.slots)), rng.uniform(0.05, 0.95, t.segments)
     x = t.pack(random_path(p, 2)[1:], slack, shares)
-    own, step, weight = p.term_numbers.rows, 1e-5, 0.7
+    own, step, weight = p.term_evaluator.rows, 1e-5, 0.7
     multipliers = np.zeros(t.rows)
     multipliers[own] = rng.normal(size=len(own))
 
@@ -296,18 +299,18 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     given = p.rates(z)
     squares = sum(np.sum(w * part**2) for w, part in zip(taken["weights"], given, strict=True))
     assert p.objective(z, times(p)) == pytest.approx(
-        p.effort.value(*given) + p.term_numbers.cost(z, times(p))
+        p.effort.value(*given) + p.term_evaluator.compute_cost(z, times(p))
     )
-    assert squares + p.term_numbers.cost(z, times(p)) == pytest.approx(
-        float(f) - PENALTY * slack.sum() - prices @ shares, rel=1e-9
+    assert squares + p.term_evaluator.compute_cost(z, times(p)) == pytest.approx(
+        float(f) - PENALTY * slack.sum() - relaxation_weights @ shares, rel=1e-9
     )
-    # A share takes away the excess of what its waypoint is asked for.
+    # A relaxation variable removes the excess of what its waypoint is asked for.
     owner = np.zeros(t.rows, int)
     for at in t.term_rows:
         for waypoint, rows in at.items():
             owner[rows] = waypoint - 1
     values = np.asarray(t.term_values(x, p.start, times(p))[0]).ravel()
-    expected = values - shares[owner[own]] * excess[own - t.firm_rows]
+    expected = values - shares[owner[own]] * excess[own - t.first_relaxed_row]
     np.testing.assert_allclose(
         np.asarray(constraints(x, parameters)[0]).ravel()[own], expected, rtol=0.0, atol=1e-9
     )
@@ -349,7 +352,7 @@ def test_programs_with_different_terms_are_told_apart() -> None:
     assert without.transcription is not first.transcription
     assert not hasattr(without.transcription, "term_values")
     assert first.transcription.rows == without.transcription.rows + OPTIONS.reach_waypoints
-    assert first.term_numbers.upper.tolist() == [1.0] * OPTIONS.reach_waypoints
+    assert first.term_evaluator.upper.tolist() == [1.0] * OPTIONS.reach_waypoints
     parameters = [p.transcription.parameters.numel() for p in (first, without)]
     assert (
         parameters[0] == parameters[1] + OPTIONS.reach_waypoints
@@ -366,13 +369,13 @@ def test_errors_count_in_tolerances() -> None:
     p = program_of(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[low])
     z = p.still
     dt = p.timing_for(z).dt
-    assert p.term_numbers.error(z, dt) == p.row_error(z, dt) - p.pose_error(z) == 0.0
+    assert p.term_evaluator.compute_violation(z, dt) == p.row_error(z, dt) - p.pose_error(z) == 0.0
     z[1, 0] = 0.54  # twice the tolerance
-    assert p.term_numbers.error(z, dt) == pytest.approx(2e-3)
+    assert p.term_evaluator.compute_violation(z, dt) == pytest.approx(2e-3)
     assert p.row_error(z, dt) == pytest.approx(2e-3)
     assert p.pose_error(z) == 0.0
     z[1, 0] = np.nan
-    assert p.term_numbers.error(z, dt) == np.inf
+    assert p.term_evaluator.compute_violation(z, dt) == np.inf
 
 
 def test_steps_take_longer_where_a_speed_asks_for_it() -> None:
@@ -395,7 +398,7 @@ def test_steps_take_longer_where_a_speed_asks_for_it() -> None:
     fastest = np.abs(np.diff(usual.waypoints(z)[:, 0])).max() / dt[0]
     limited = at(fastest / 2)
     slower = limited.timing_for(z)
-    assert limited.term_numbers.error(z, slower.dt) <= 1e-3
+    assert limited.term_evaluator.compute_violation(z, slower.dt) <= 1e-3
     assert 2.0 - 1e-2 <= slower.dt[0] / dt[0] <= 2.0 * 1.2
     np.testing.assert_allclose(slower.velocity, limited.chain.velocity * slower.dt[:, None])
     hopeless = at(fastest / 2, start=fastest / 3)  # at rest, too
@@ -410,7 +413,7 @@ def test_terms_without_a_slope_are_refused() -> None:
         for term in (vkc.Constraint("mine", expression, upper=0.2), vkc.Cost("mine", expression)):
             with pytest.raises(
                 vkc.InputError,
-                match=r"terms\['mine'\]\.expression: it has no value or no slope at the start",
+                match=r"terms\['mine'\]\.expression: its value or derivative is not finite at the start",
             ):
                 program_of(
                     room(table()).with_held({"stick": "grip"}),

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.planning.nlp.timing import Timing, runs_between, time_for
+from vkc_pin.planning.nlp.timing import Timing, compute_step_times, split_at_stops
 
 
 def test_runs_lie_between_rests() -> None:
-    assert list(runs_between([], 7)) == [(0, 7)]
-    assert list(runs_between([2, 5], 7)) == [(0, 2), (2, 5), (5, 7)]
+    assert list(split_at_stops([], 7)) == [(0, 7)]
+    assert list(split_at_stops([2, 5], 7)) == [(0, 2), (2, 5), (5, 7)]
 
 
 @settings(max_examples=60, deadline=None)
@@ -23,9 +23,9 @@ def test_the_profile_fits_into_the_time(seed: int, size: float) -> None:
     """A motion along 3s² − 2s³ over each run, in the time it is given, respects both limits, by finite differences."""
     rng = np.random.default_rng(seed)
     rests = sorted(rng.choice(np.arange(1, 12), 2, replace=False).tolist())
-    runs, limits = runs_between(rests, 12), (rng.uniform(0.3, 3.0, 4), rng.uniform(0.3, 6.0, 4))
+    runs, limits = split_at_stops(rests, 12), (rng.uniform(0.3, 3.0, 4), rng.uniform(0.3, 6.0, 4))
     path = np.cumsum(size * rng.normal(size=(13, 4)), axis=0)
-    times = time_for(path, 0.1, runs, limits)
+    times = compute_step_times(path, 0.1, runs, limits)
     assert (times >= 0.1).all()
     fine = np.linspace(0.0, 1.0, 401)
     profile = fine**2 * (3.0 - 2.0 * fine)
@@ -65,7 +65,7 @@ def test_stretching_gives_what_is_needed_and_no_more_than_allowed(seed: int, siz
     )
     assert timing.velocity.shape == first.shape
     assert timing.acceleration.shape == second.shape
-    longer = timing.stretched(first, second)
+    longer = timing.stretch(first, second)
     for number, (a, b) in enumerate(runs):
         part, strong = first[a:b], second[a + number : b + number + 1]
         excess = max(np.abs(part).max() / dt[a], np.sqrt(np.abs(strong).max() / 4.0) / dt[a])
@@ -90,4 +90,4 @@ def test_a_motion_that_is_slow_enough_keeps_its_time() -> None:
     timing = Timing(np.full(4, 0.5), np.full(4, 0.5), runs, (np.ones(2), np.full(2, 4.0)))
     first, second = differences(np.linspace(0.0, 0.1, 5)[:, None] * np.ones(2), runs)
     assert timing.violation(first, second) < 0.0
-    np.testing.assert_array_equal(timing.stretched(first, second).dt, timing.dt)
+    np.testing.assert_array_equal(timing.stretch(first, second).dt, timing.dt)

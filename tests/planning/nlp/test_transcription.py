@@ -19,7 +19,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.nlp.inspection import patterns
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.nlp.transcription import transcribe
-from vkc_pin.planning.nlp.waypoint import waypoint_functions
+from vkc_pin.planning.nlp.waypoint import get_waypoint_functions
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.scene import Scene
@@ -100,10 +100,10 @@ class Point:
     shares: np.ndarray  # (N,)
     planes: np.ndarray  # (N, K, 12·joints)
     offsets: np.ndarray  # (N, K)
-    away: np.ndarray  # (N, poses, 7)
+    pose_offsets: np.ndarray  # (N, poses, 7)
     excess: np.ndarray  # (rows after those of poses,)
     rate_excess: np.ndarray  # (rows of rates,)
-    prices: np.ndarray  # (N,)
+    relaxation_weights: np.ndarray  # (N,)
     weights: tuple[np.ndarray, np.ndarray]  # of squared steps (N, n), and of their squared changes
     dt: np.ndarray  # (N,)
     gears: np.ndarray  # (N,)
@@ -115,7 +115,7 @@ class Point:
     @property
     def penalties(self) -> float:
         """What slacks and shares cost."""
-        return float(PENALTY * self.slack.sum() + self.prices @ self.shares)
+        return float(PENALTY * self.slack.sum() + self.relaxation_weights @ self.shares)
 
     def parameters(self, *, rates: bool = False) -> np.ndarray:
         p = self.problem
@@ -127,22 +127,22 @@ class Point:
             weights=self.weights,
             penalty=PENALTY,
             dt=self.dt,
-            away=self.away,
+            pose_offsets=self.pose_offsets,
             excess=self.excess,
-            prices=self.prices,
+            relaxation_weights=self.relaxation_weights,
             gears=self.gears,
         )
         return np.concatenate([vector, self.rate_excess]) if rates else vector
 
-    def receded(self, waypoint: int, number: int) -> pin.SE3:
+    def relax_target(self, waypoint: int, number: int) -> pin.SE3:
         """Return where the target of a pose has gone at a waypoint, by Pinocchio."""
-        target, away, share = (
+        target, pose_offsets, share = (
             self.problem.targets[number],
-            self.away[waypoint - 1, number],
+            self.pose_offsets[waypoint - 1, number],
             self.shares[waypoint - 1],
         )
-        turn = pin.exp3(share * away[6] * away[3:6])
-        return pin.SE3(target.rotation @ turn, target.translation + share * away[:3])
+        turn = pin.exp3(share * pose_offsets[6] * pose_offsets[3:6])
+        return pin.SE3(target.rotation @ turn, target.translation + share * pose_offsets[:3])
 
     def at_shares(self, shares: float) -> Point:
         """Return the same point with all shares the same."""
@@ -150,7 +150,7 @@ class Point:
 
 
 def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:
-    """Return a point at which shares are between 0 and 1, and everything there is for them to take away is random."""
+    """Return a point at which shares are between 0 and 1, and everything there is for them to remove is random."""
     rng, t = np.random.default_rng(seed), p.transcription
     N, K = t.segments, t.slots
     axes = rng.normal(size=(N, len(p.pose_goals), 3))
@@ -163,10 +163,10 @@ def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:
         shares=rng.uniform(0.05, 0.95, N),
         planes=rng.normal(size=(N, K, 12 * (p.chain.model.njoints - 1))),
         offsets=rng.normal(size=(N, K)),
-        away=np.concatenate([rng.normal(size=axes.shape), axes, turns], axis=2),
-        excess=rng.normal(size=t.rows - t.firm_rows),
+        pose_offsets=np.concatenate([rng.normal(size=axes.shape), axes, turns], axis=2),
+        excess=rng.normal(size=t.rows - t.first_relaxed_row),
         rate_excess=rng.normal(size=t.rate_matrix.size1()),
-        prices=rng.uniform(0.0, 50.0, N),
+        relaxation_weights=rng.uniform(0.0, 50.0, N),
         weights=tuple(rng.uniform(0.1, 3.0, part.shape) for part in p.rates(p.still)),
         dt=rng.uniform(0.1, 0.4, N),
         gears=np.where(np.arange(N) % 2, 1.0, -1.0),
@@ -192,7 +192,7 @@ def taken_away(point: Point, waypoints: list[int], excess: np.ndarray) -> np.nda
 
 def excess_at(point: Point, which: np.ndarray) -> np.ndarray:
     """Return the excess of these rows."""
-    return np.asarray(point.excess[which - point.problem.transcription.firm_rows])
+    return np.asarray(point.excess[which - point.problem.transcription.first_relaxed_row])
 
 
 def differences(function, x: np.ndarray, step: float = 1e-5) -> np.ndarray:  # type: ignore[no-untyped-def]
@@ -280,7 +280,7 @@ def test_witness_rows_are_planes_over_the_placements_plus_slack(name: str) -> No
 
 @pytest.mark.parametrize("name", NAMES)
 def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
-    """To where the target has receded."""
+    """To where the target has relaxed."""
     p = problem(name)
     point, model = random_point(p), p.chain.model
     g, data, t = rows(point), model.createData(), p.transcription
@@ -288,7 +288,7 @@ def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
     for number, (pose, at) in enumerate(zip(t.structure.poses, t.pose_rows, strict=True)):
         assert tuple(sorted(at)) == pose.waypoints
         for waypoint, which in at.items():
-            target = point.receded(waypoint, number)
+            target = point.relax_target(waypoint, number)
             pin.forwardKinematics(model, data, p.chain.coordinates.q(point.z[waypoint - 1]))
             placement = data.oMi[pose.joint] * pose.local
             shift = (
@@ -424,7 +424,7 @@ def test_rate_rows_are_steps_and_their_changes(name: str) -> None:
     ]
     raw = point.at_shares(0.0)
     np.testing.assert_allclose(rows(raw, rates=True)[t.rows :], expected, rtol=0.0, atol=1e-12)
-    np.testing.assert_array_equal(t.rate_owners, np.repeat(np.array(owners) - 1, t.n))
+    np.testing.assert_array_equal(t.rate_waypoints, np.repeat(np.array(owners) - 1, t.n))
     expected = expected - taken_away(point, np.repeat(owners, t.n).tolist(), point.rate_excess)
     np.testing.assert_allclose(g[t.rows :], expected, rtol=0.0, atol=1e-12)
     assert len(expected) == p.chain.size * (p.segments + p.segments + len(changes))
@@ -445,8 +445,8 @@ def test_every_row_has_one_meaning(name: str) -> None:
     firm = np.concatenate(
         [t.slot_rows.ravel(), *(which for at in t.pose_rows for which in at.values())]
     )
-    np.testing.assert_array_equal(np.sort(firm), np.arange(t.firm_rows))
-    assert len(t.owners) == t.rows - t.firm_rows
+    np.testing.assert_array_equal(np.sort(firm), np.arange(t.first_relaxed_row))
+    assert len(t.row_waypoints) == t.rows - t.first_relaxed_row
 
 
 # --- derivatives
@@ -534,7 +534,7 @@ def test_patterns_hold_everywhere(name: str) -> None:
         touched = [
             which for at in t.pose_rows for waypoint, which in at.items() if waypoint == k + 1
         ]
-        touched.append(t.firm_rows + np.flatnonzero(t.owners == k))
+        touched.append(t.first_relaxed_row + np.flatnonzero(t.row_waypoints == k))
         np.testing.assert_array_equal(
             np.flatnonzero(pattern[:, columns[-1]]), np.sort(np.concatenate(touched))
         )
@@ -662,23 +662,27 @@ def test_functions_of_waypoints_are_shared_by_structures() -> None:
     """However many waypoints there are, and wherever they must satisfy poses."""
     structure, cache = problem("reach").transcription.structure, Cache()
     pose = structure.poses[0]
-    first = waypoint_functions(structure.model, 3, (pose,), cache)
+    first = get_waypoint_functions(structure.model, 3, (pose,), cache)
     assert (
-        waypoint_functions(
+        get_waypoint_functions(
             structure.model, 3, (dataclasses.replace(pose, waypoints=(1, 2)),), cache
         )
         is first
     )
     almost = pin.SE3(pose.local.rotation, pose.local.translation + 1e-14)  # other last digits
     others = [
-        waypoint_functions(structure.model, 4, (pose,), cache),
-        waypoint_functions(structure.model, 3, (), cache),
-        waypoint_functions(structure.model, 3, (pose, pose), cache),
-        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, kind="point"),), cache),
-        waypoint_functions(
+        get_waypoint_functions(structure.model, 4, (pose,), cache),
+        get_waypoint_functions(structure.model, 3, (), cache),
+        get_waypoint_functions(structure.model, 3, (pose, pose), cache),
+        get_waypoint_functions(
+            structure.model, 3, (dataclasses.replace(pose, kind="point"),), cache
+        ),
+        get_waypoint_functions(
             structure.model, 3, (dataclasses.replace(pose, local=pin.SE3.Random()),), cache
         ),
-        waypoint_functions(structure.model, 3, (dataclasses.replace(pose, local=almost),), cache),
+        get_waypoint_functions(
+            structure.model, 3, (dataclasses.replace(pose, local=almost),), cache
+        ),
     ]
     assert len({id(one) for one in [first, *others]}) == 7
 

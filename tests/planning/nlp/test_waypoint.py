@@ -15,8 +15,8 @@ from helpers.telescopes import coupled_scene
 
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
-from vkc_pin.planning.chain.pose import AWAY, PoseRow, target_vector
-from vkc_pin.planning.nlp.waypoint import Structure, WaypointFunctions, waypoint_functions
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, target_vector
+from vkc_pin.planning.nlp.waypoint import Structure, WaypointFunctions, get_waypoint_functions
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
@@ -55,7 +55,7 @@ class Numbers:
         self.multipliers = rng.normal(size=SLOTS + sum(pose.rows for pose in poses))
         axes = rng.normal(size=(len(poses), 3))
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-        self.away = np.column_stack(
+        self.pose_offsets = np.column_stack(
             [rng.normal(size=(len(poses), 3)), axes, rng.uniform(0.0, np.pi, len(poses))]
         )
 
@@ -71,7 +71,7 @@ class Numbers:
             self.planes.ravel(order="F"),
             self.offsets,
             targets.ravel(order="F"),
-            self.away.ravel(),
+            self.pose_offsets.ravel(),
         ]
 
     def rows(self, own: np.ndarray) -> np.ndarray:
@@ -81,9 +81,11 @@ class Numbers:
         pin.forwardKinematics(model, data, self.chain.coordinates.q(z))
         stacked = np.concatenate([target_vector(placement) for placement in list(data.oMi)[1:]])
         rows = [self.planes @ stacked - self.offsets + s]
-        for pose, there, away in zip(self.poses, self.targets, self.away, strict=True):
-            turn = pin.exp3(float(share[0]) * away[6] * away[3:6])
-            target = pin.SE3(there.rotation @ turn, there.translation + share * away[:3])
+        for pose, there, pose_offsets in zip(
+            self.poses, self.targets, self.pose_offsets, strict=True
+        ):
+            turn = pin.exp3(float(share[0]) * pose_offsets[6] * pose_offsets[3:6])
+            target = pin.SE3(there.rotation @ turn, there.translation + share * pose_offsets[:3])
             at = data.oMi[pose.joint] * pose.local
             if pose.shift is not None:
                 at.translation = at.translation + data.oMi[pose.shift[0]].rotation @ np.array(
@@ -158,7 +160,7 @@ def test_without_poses_only_slacks_help(chain: VirtualKinematicChain) -> None:
         numbers.planes.ravel(order="F"),
         numbers.offsets,
         np.ones(12),
-        np.ones(AWAY),
+        np.ones(POSE_OFFSET_SIZE),
     ]
     np.testing.assert_allclose(
         np.array(functions.value(*inputs)).ravel(), numbers.rows(numbers.own), atol=1e-12
@@ -180,18 +182,20 @@ def test_one_plane_and_no_pose(chain: VirtualKinematicChain) -> None:
 
 def test_functions_of_one_kind_are_built_once(chain: VirtualKinematicChain) -> None:
     model, poses, cache = door_scene().robot.model, some_poses(chain)[1:2], Cache(entries=4)
-    first = waypoint_functions(model, 1, poses, cache)
+    first = get_waypoint_functions(model, 1, poses, cache)
     later = (dataclasses.replace(poses[0], waypoints=(4, 5)),)
-    assert waypoint_functions(model.copy(), 1, later, cache) is first, (
+    assert get_waypoint_functions(model.copy(), 1, later, cache) is first, (
         "at which waypoints does not matter"
     )
-    second = waypoint_functions(model, 2, poses, cache)
+    second = get_waypoint_functions(model, 2, poses, cache)
     assert second is not first
-    assert waypoint_functions(model, 1, poses, cache) is first
+    assert get_waypoint_functions(model, 1, poses, cache) is first
     other = dataclasses.replace(poses[0], kind="point")
-    assert waypoint_functions(model, 1, (other,), cache) not in (first, second)
-    assert waypoint_functions(model, 1, poses, cache) is first, "what was asked for last is kept"
-    assert waypoint_functions(model, 2, poses, cache) is not second
+    assert get_waypoint_functions(model, 1, (other,), cache) not in (first, second)
+    assert get_waypoint_functions(model, 1, poses, cache) is first, (
+        "what was asked for last is kept"
+    )
+    assert get_waypoint_functions(model, 2, poses, cache) is not second
 
 
 def test_programs_are_shared_by_structures_that_are_equal(chain: VirtualKinematicChain) -> None:

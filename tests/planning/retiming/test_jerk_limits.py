@@ -10,8 +10,8 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from vkc_pin.planning.retiming.jerk_limits import eased
 from vkc_pin.planning.retiming.limits import Limits
-from vkc_pin.planning.retiming.spline_path import path_through
-from vkc_pin.planning.retiming.topp_ra import speeds_along
+from vkc_pin.planning.retiming.spline_path import fit_path
+from vkc_pin.planning.retiming.topp_ra import compute_speeds
 from vkc_pin.world.trajectory.curve import Curve
 
 
@@ -19,9 +19,9 @@ def made(points: np.ndarray, jerk: float) -> tuple[CubicHermiteSpline, Curve, Li
     """Return a path through points, the fastest pace along it, and the limits."""
     wide = np.full(points.shape[1], 10.0)
     limits = Limits(-wide, wide, 0.1 * wide, 0.2 * wide, np.full(len(wide), jerk))
-    path = path_through(points, np.ones(len(wide)), (-wide, wide))
+    path = fit_path(points, np.ones(len(wide)), (-wide, wide))
     places = np.unique(np.concatenate([np.linspace(0.0, path.x[-1], 60), path.x]))
-    speeds = speeds_along(path, places, limits.velocity, limits.acceleration)
+    speeds = compute_speeds(path, places, limits.velocity, limits.acceleration)
     assert speeds is not None
     times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
     return path, Curve(times, places[:, None], speeds[:, None]), limits

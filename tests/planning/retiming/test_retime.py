@@ -11,7 +11,7 @@ from helpers.small_problems import door_scene
 
 import vkc_pin as vkc
 from vkc_pin.planning.retiming import retime
-from vkc_pin.planning.retiming.retime import retimed
+from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
@@ -65,7 +65,7 @@ def straight(scene: vkc.Scene, seed: int = 0, count: int = 12) -> Trajectory:
 def test_any_waypoints(seed: int) -> None:
     scene = vkc.load_scene("door")
     slow = straight(scene, seed)
-    motion = retimed(scene, slow)
+    motion = retime_trajectory(scene, slow)
     np.testing.assert_array_equal(motion.positions, slow.positions)
     np.testing.assert_allclose(motion(motion.times), slow.positions, atol=1e-12)
     check_limits(
@@ -85,10 +85,10 @@ def test_it_is_nearly_as_fast_as_any_motion_along_its_path() -> None:
         axis=1,
     )
     slow = dataclasses.replace(slow, positions=slow.positions[:1] + bends @ ways)
-    usual = retimed(scene, slow).times[-1]
+    usual = retime_trajectory(scene, slow).times[-1]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(retime, "_PARTS", 4 * retime._PARTS)
-        best = retimed(scene, slow).times[-1]
+        best = retime_trajectory(scene, slow).times[-1]
     assert usual <= 1.1 * best
 
 
@@ -98,14 +98,16 @@ def test_it_rests_where_nothing_moves() -> None:
     rows = np.insert(slow.positions, 6, slow.positions[6], axis=0)
     spans = (vkc.PhaseSpan("reach", 0, 6), vkc.PhaseSpan("hold", 6, 13))
     times = np.concatenate([np.arange(7.0), [6.7], np.arange(7.7, 13.0)])
-    motion = retimed(scene, dataclasses.replace(slow, times=times, positions=rows, phases=spans))
+    motion = retime_trajectory(
+        scene, dataclasses.replace(slow, times=times, positions=rows, phases=spans)
+    )
     assert motion.times[7] - motion.times[6] == pytest.approx(
         0.7
     )  # as long as it did, where a phase begins
     inside = np.linspace(motion.times[6], motion.times[7], 50)
     np.testing.assert_allclose(motion.velocity(inside), 0.0, atol=1e-12)
     check_limits(scene, motion)
-    one = retimed(
+    one = retime_trajectory(
         scene,
         dataclasses.replace(
             slow, times=times, positions=rows, phases=(vkc.PhaseSpan("go", 0, 13),)
@@ -118,7 +120,7 @@ def test_what_does_not_move_at_all_stays() -> None:
     scene = vkc.load_scene("door")
     still = straight(scene)
     still = dataclasses.replace(still, positions=np.tile(still.positions[:1], (13, 1)))
-    motion = retimed(scene, still)
+    motion = retime_trajectory(scene, still)
     assert motion.times[-1] == pytest.approx(1.0, abs=0.05)  # its first step, and hardly more
     np.testing.assert_allclose(
         motion(np.linspace(0.0, 1.0, 30)), np.tile(still.positions[0], (30, 1)), atol=1e-12
@@ -126,10 +128,10 @@ def test_what_does_not_move_at_all_stays() -> None:
 
 
 def test_without_speeds_it_goes_from_stop_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retime, "speeds_along", lambda *_: None)
+    monkeypatch.setattr(retime, "compute_speeds", lambda *_: None)
     scene = vkc.load_scene("door")
     slow = straight(scene, 2)
-    motion = retimed(scene, slow)
+    motion = retime_trajectory(scene, slow)
     np.testing.assert_array_equal(motion.velocity(motion.times), 0.0)
     middle = motion((motion.times[1:] + motion.times[:-1]) / 2)
     np.testing.assert_allclose(middle, (slow.positions[1:] + slow.positions[:-1]) / 2, atol=1e-12)
@@ -141,7 +143,7 @@ def test_the_more_parts_the_straighter() -> None:
     slow = straight(scene, 5)
     off = []
     for parts in (1, 2, 4, 8):
-        motion = retimed(scene, slow, np.full(12, parts))
+        motion = retime_trajectory(scene, slow, np.full(12, parts))
         np.testing.assert_array_equal(motion.positions, slow.positions)
         fine = motion(np.linspace(motion.times[4], motion.times[5], 200))
         share = np.clip(

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.planning.retiming.spline_path import path_through
-from vkc_pin.planning.retiming.topp_ra import speeds_along
+from vkc_pin.planning.retiming.spline_path import fit_path
+from vkc_pin.planning.retiming.topp_ra import compute_speeds
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 
@@ -22,9 +22,11 @@ def test_a_straight_way_takes_as_long_as_it_must(
     length: float, fastest: float, strongest: float
 ) -> None:
     """Up with all there is and down again, with a stretch at full speed between them if it is long enough."""
-    path = path_through(np.array([[0.0, 0.0], [length, 0.0]]), np.ones(2), FREE)
+    path = fit_path(np.array([[0.0, 0.0], [length, 0.0]]), np.ones(2), FREE)
     places = np.linspace(0.0, length, 201)
-    speeds = speeds_along(path, places, np.array([fastest, np.inf]), np.array([strongest, np.inf]))
+    speeds = compute_speeds(
+        path, places, np.array([fastest, np.inf]), np.array([strongest, np.inf])
+    )
     assert speeds is not None
     ramp = fastest / strongest
     shortest = (
@@ -38,12 +40,12 @@ def test_a_straight_way_takes_as_long_as_it_must(
 @given(st.integers(0, 10**5))
 def test_limits_hold_all_along(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    path = path_through(np.cumsum(rng.normal(size=(6, 2)), axis=0), np.ones(2), FREE)
+    path = fit_path(np.cumsum(rng.normal(size=(6, 2)), axis=0), np.ones(2), FREE)
     places = np.unique(
         np.concatenate([np.linspace(a, b, 9) for a, b in zip(path.x, path.x[1:], strict=False)])
     )
     velocity, acceleration = rng.uniform(0.5, 3.0, 2), rng.uniform(0.5, 3.0, 2)
-    speeds = speeds_along(path, places, velocity, acceleration)
+    speeds = compute_speeds(path, places, velocity, acceleration)
     assert speeds is not None
     assert (speeds[1:-1] > 0.0).all()
     assert (np.abs(path(places, 1)) * speeds[:, None] <= velocity * (1 + 1e-3)).all()
@@ -55,5 +57,5 @@ def test_limits_hold_all_along(seed: int) -> None:
 
 
 def test_without_limits_nothing_is_known() -> None:
-    path = path_through(np.array([[0.0, 0.0], [1.0, 0.0]]), np.ones(2), FREE)
-    assert speeds_along(path, path.x, np.full(2, np.inf), np.full(2, np.inf)) is None
+    path = fit_path(np.array([[0.0, 0.0], [1.0, 0.0]]), np.ones(2), FREE)
+    assert compute_speeds(path, path.x, np.full(2, np.inf), np.full(2, np.inf)) is None

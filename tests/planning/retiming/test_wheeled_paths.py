@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.planning.retiming import retime
-from vkc_pin.planning.retiming.retime import retimed
-from vkc_pin.planning.retiming.spline_path import path_through
-from vkc_pin.planning.retiming.wheeled_paths import rolling_paths
+from vkc_pin.planning.retiming.retime import retime_trajectory
+from vkc_pin.planning.retiming.spline_path import fit_path
+from vkc_pin.planning.retiming.wheeled_paths import fit_rolling_paths
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import Rolling
 
@@ -41,7 +41,7 @@ def slip(path: np.ndarray, slopes: np.ndarray) -> float:
 def test_whatever_arcs_lead_to_is_passed_rolling(steps: list[tuple[float, float]]) -> None:
     points = arcs(steps)
     passed = [points[:1]]
-    for path, own in rolling_paths(points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, TANK):
+    for path, own in fit_rolling_paths(points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, TANK):
         knots = (len(path.x) - 1) // (len(own) - 1)
         np.testing.assert_allclose(path(path.x[::knots])[:, :4], own, atol=2e-5)
         at_knots = path(path.x)
@@ -66,13 +66,13 @@ def smooth_drive(count: int) -> np.ndarray:
 def test_between_waypoints_it_goes_where_the_base_would() -> None:
     """Through every second of the waypoints, it passes the others closely; splines of x, y and yaw go there, but slip."""
     fine, scale = smooth_drive(40), np.array([1.0, 1.0, 0.5, 0.3])
-    ((path, own),) = rolling_paths(fine[::2], scale, FAR, TANK)
+    ((path, own),) = fit_rolling_paths(fine[::2], scale, FAR, TANK)
     assert len(own) == 21
     dense = np.linspace(0.0, path.x[-1], 4000)
     found, slopes = path(dense), path(dense, 1)
     away = np.abs(found[:, None, :3] - fine[None, 1::2, :3]).max(axis=2).min(axis=0)
     assert away.max() < 3e-3
-    spline = path_through(fine[::2], scale, FAR)
+    spline = fit_path(fine[::2], scale, FAR)
     assert slip(found, slopes) < 1e-3
     assert slip(spline(dense), spline(dense, 1)) > 5.0 * slip(found, slopes)
 
@@ -82,7 +82,7 @@ def test_a_steered_base_stops_where_it_would_have_to_turn_too_tightly() -> None:
     scale = np.array([1.0, 1.0, 0.5, 0.3])
     for before, after, stops in ((-1.0, 1.0, 1), (np.inf, 1.0, 0), (-1.8, 1.8, 0)):
         points = arcs([(0.2, 0.2 / (1.001 * before))] * 5 + [(0.2, 0.2 / (1.001 * after))] * 5)
-        paths = rolling_paths(points, scale, FAR, Rolling(radius=1.0))
+        paths = fit_rolling_paths(points, scale, FAR, Rolling(radius=1.0))
         assert len(paths) == 1 + stops
         for path, _ in paths:
             dense = np.linspace(0.0, path.x[-1], 3000)
@@ -100,7 +100,7 @@ def drives(base: str) -> Trajectory:
     turned = np.exp(-0.9j) * (rows[:, 0] + 1j * rows[:, 1])
     rows[:, 0], rows[:, 1] = turned.real, turned.imag
     rows[:, 3] += np.linspace(0.0, 0.4, len(rows))
-    return retimed(scene, of_rows(scene, rows, dt=1.0))
+    return retime_trajectory(scene, of_rows(scene, rows, dt=1.0))
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -110,7 +110,7 @@ def test_motions_keep_to_what_wheels_can(
 ) -> None:
     """Also from stop to stop, where nobody knows how fast the path can be gone along."""
     if not known:
-        monkeypatch.setattr(retime, "speeds_along", lambda *_: None)
+        monkeypatch.setattr(retime, "compute_speeds", lambda *_: None)
     motion, wheels = drives(base), vkc.load_robot("husky_ur5e", base="differential").wheels
     assert wheels is not None
     times = np.arange(motion.times[0], motion.times[-1], 1e-3)
@@ -129,7 +129,7 @@ def test_motions_keep_to_what_wheels_can(
 def test_points_between_waypoints_lie_on_arcs(base: str) -> None:
     motion = drives(base)
     parts = np.array([1, 2, 4, 1, 1, 2])
-    divided = retimed(
+    divided = retime_trajectory(
         hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {})), motion, parts
     )
     middle = divided(divided.times[:-1] + 0.0)
@@ -145,7 +145,7 @@ def test_rounding_of_places_is_no_reason_to_stop() -> None:
     points[1:-1, :2] += 3e-7 * np.array(
         [[1.0, -1.0], [-1.0, 0.5], [0.7, 1.0], [-1.0, -1.0], [0.3, 1.0]]
     )
-    ((path, own),) = rolling_paths(
+    ((path, own),) = fit_rolling_paths(
         points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, Rolling(radius=radius)
     )
     assert len(own) == 7
@@ -161,7 +161,7 @@ def test_on_its_smallest_circle_a_steered_base_needs_no_stop() -> None:
     lengths = [0.02, 0.06, 0.1, 0.12, 0.12, 0.1, 0.05, 0.02]
     assert (
         len(
-            rolling_paths(
+            fit_rolling_paths(
                 arcs([(length, length / 0.8) for length in lengths]),
                 scale,
                 FAR,
@@ -171,4 +171,4 @@ def test_on_its_smallest_circle_a_steered_base_needs_no_stop() -> None:
         == 1
     )
     straight = arcs([(0.1, 0.0)] * 4 + [(0.1, 0.1 / 0.81)] * 4)
-    assert len(rolling_paths(straight, scale, FAR, Rolling(radius=0.8))) == 1
+    assert len(fit_rolling_paths(straight, scale, FAR, Rolling(radius=0.8))) == 1

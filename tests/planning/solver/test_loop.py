@@ -204,7 +204,7 @@ class Scripted:
             z=np.zeros((40, 1)),
             objective=objective,
             found=found,
-            promise=self.merit.price(
+            promise=self.merit.compute_penalty(
                 found, clearance=True
             ),  # just what came: nobody narrows the trust region
             pose_error=0.0,
@@ -225,7 +225,7 @@ class Scripted:
         return self.is_done
 
     def grow(self) -> bool:
-        return self.merit.grow(self.found, 1e-3)
+        return self.merit.increase_weights(self.found, 1e-3)
 
 
 def scripted(*rounds: tuple[float, float, bool], **how: Any) -> Scripted:
@@ -435,7 +435,8 @@ def test_the_merit_falls_from_one_accepted_step_to_the_next(
 
     def watch(loop, trial, *prices):  # type: ignore[no-untyped-def]
         before, after = (
-            loop.merit.price(found, clearance=True).sum() for found in (loop.found, trial.found)
+            loop.merit.compute_penalty(found, clearance=True).sum()
+            for found in (loop.found, trial.found)
         )
         accepted = judge(loop, trial, *prices)
         merits.append((loop.objective + before, trial.objective + after, accepted))
@@ -535,7 +536,7 @@ def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch
     problem = program_of(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
     least = problem.timing_for(problem.still)
     monkeypatch.setattr(vkc.TrajectoryProblem, "timing_for", lambda self, z: least)
-    monkeypatch.setattr(Timing, "stretched", lambda self, *pace: self)
+    monkeypatch.setattr(Timing, "stretch", lambda self, *pace: self)
     seed = straight(problem, 2.4)
     assert least.violation(*problem.rates(seed)) > 0.05
     solution = solve(problem, seed)

@@ -12,7 +12,7 @@ from helpers.drives import hall
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.chain.contacts import Contacts, no_contacts
+from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
 from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit
 from vkc_pin.planning.solver import loop as module
 from vkc_pin.planning.solver.loop import _Loop, solve
@@ -146,7 +146,7 @@ class Clock:
         assert pace == ("fast", "faster")
         return self.over
 
-    def stretched(self, *pace: str) -> Clock:
+    def stretch(self, *pace: str) -> Clock:
         assert pace == ("fast", "faster")
         return Clock("stretched", over=self.left)
 
@@ -320,7 +320,7 @@ def test_what_is_clearly_in_something_is_said_to_be_astray(
     monkeypatch.setattr(
         module, "_iterate", lambda loop, region, callback, rounds: asked.append((callback, rounds))
     )
-    monkeypatch.setattr(_Loop, "contacts", lambda loop, z: (no_contacts(), True, []))
+    monkeypatch.setattr(_Loop, "contacts", lambda loop, z: (make_empty_contacts(), True, []))
     monkeypatch.setattr(
         vkc.TrajectoryProblem, "evaluate_contacts", lambda self, z, **how: contact(0.02 - short)
     )
@@ -346,7 +346,7 @@ def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(
         raise SpentError("time limit")
 
     monkeypatch.setattr(module, "_iterate", ended)
-    monkeypatch.setattr(_Loop, "contacts", lambda loop, z: (no_contacts(), True, []))
+    monkeypatch.setattr(_Loop, "contacts", lambda loop, z: (make_empty_contacts(), True, []))
     monkeypatch.setattr(
         vkc.TrajectoryProblem, "evaluate_contacts", lambda self, z, **how: contact(-1.0)
     )

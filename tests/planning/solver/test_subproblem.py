@@ -51,12 +51,12 @@ def test_it_promises_no_more_than_a_motion_within_the_region_keeps(
     assert np.all((step.shares >= 0.0) & (step.shares <= 1.0))
     weights, found = state.merit.weights, state.missing(step.z, state.contacts(step.z)[0])
     before, after = state.objective, state.problem.objective(step.z, state.timing.dt)
-    others = state.merit.price(state.found, clearance=False)
-    promised = before + state.merit.price(state.found, clearance=True).sum() - after
+    others = state.merit.compute_penalty(state.found, clearance=False)
+    promised = before + state.merit.compute_penalty(state.found, clearance=True).sum() - after
     promised -= (weights["clearance"] * step.slack + others * step.shares).sum()
     assert promised >= -1e-3
     left = others @ step.shares
-    assert state.merit.price(found, clearance=False).sum() <= left + 1e-2 * max(1.0, left)
+    assert state.merit.compute_penalty(found, clearance=False).sum() <= left + 1e-2 * max(1.0, left)
     if kind == "there":
         assert not step.shares.any()
         assert step.satisfied

@@ -22,7 +22,7 @@ LOWER, UPPER = np.array([-0.05, -5.0]), np.array([5.0, 0.65])
 class Ipopt:
     """Notes what it is asked, and answers with numbers that tell where they come from."""
 
-    evaluating = 0.001
+    evaluation_time = 0.001
 
     def __init__(self) -> None:
         self.asked: list[dict[str, Any]] = []
@@ -157,7 +157,7 @@ def test_shares_are_where_something_else_is_missing(
     (asked,) = made.ipopt.asked
     np.testing.assert_array_equal(asked["x0"][2], shares)
     np.testing.assert_array_equal(asked["ubx"][2], shares)
-    np.testing.assert_allclose(made.noted["prices"], 3.0 * np.array(poses))
+    np.testing.assert_allclose(made.noted["relaxation_weights"], 3.0 * np.array(poses))
 
 
 def test_rows_on_rates_are_there_if_they_are_asked_for(made: Made) -> None:
@@ -181,7 +181,7 @@ def test_what_the_program_is_given(made: Made) -> None:
         "dt",
     )
     assert noted["gears"] == ("gears", "path")
-    assert (noted["away"].shape, noted["excess"].tolist()) == ((N, 1, 7), [0.25])
+    assert (noted["pose_offsets"].shape, noted["excess"].tolist()) == ((N, 1, 7), [0.25])
 
 
 def test_multipliers_are_taken_over_only_from_one_exact_round_to_the_next(made: Made) -> None:

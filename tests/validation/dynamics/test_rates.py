@@ -9,7 +9,7 @@ import pytest
 from helpers.executions import drawer_plan
 
 import vkc_pin as vkc
-from vkc_pin.planning.retiming.retime import retimed
+from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.validation.dynamics.rates import check_rates
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
@@ -24,7 +24,7 @@ def found(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violati
 
 def eased() -> Trajectory:
     plan = drawer_plan()
-    return retimed(plan.scene, plan.trajectory, jerk_time=0.2)
+    return retime_trajectory(plan.scene, plan.trajectory, jerk_time=0.2)
 
 
 def test_jerks_are_looked_at_where_they_are_limited() -> None:

@@ -13,7 +13,7 @@ from helpers.executions import door_plan, holding, still
 from oracle.judge import judge
 
 import vkc_pin as vkc
-from vkc_pin.planning.retiming.retime import retimed
+from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.validation.dynamics.torques import TORQUE_TOLERANCE, Motors
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.samples import Samples
@@ -55,7 +55,7 @@ def test_a_door_that_damps_is_too_fast_until_it_is_timed_for_it() -> None:
         violation.constraint == "torque" and "if it were slow" in violation.detail
         for violation in fast.violations
     )
-    slower = retimed(scene, plan.trajectory)
+    slower = retime_trajectory(scene, plan.trajectory)
     report = said(scene, slower)
     assert report.ok
     assert 0.9 < report.torque <= 1.0 + TORQUE_TOLERANCE, "no slower than it has to be"
@@ -71,7 +71,8 @@ def test_a_light_door_changes_nothing() -> None:
     assert report.ok
     assert 0.0 < report.torque < 0.5
     np.testing.assert_array_equal(
-        retimed(light, plan.trajectory).times, retimed(plan.scene, plan.trajectory).times
+        retime_trajectory(light, plan.trajectory).times,
+        retime_trajectory(plan.scene, plan.trajectory).times,
     )
 
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.chain.inversion import invert
-from vkc_pin.planning.chain.kinematics import Kinematics, kinematics_of
+from vkc_pin.planning.chain.kinematics import Kinematics, get_kinematics
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.cache import Cache
@@ -107,7 +107,7 @@ class VirtualKinematicChain:
     @cached_property
     def _kinematics(self) -> Kinematics:
         """Kept here: to look for it in the cache takes as long as to use it."""
-        return kinematics_of(self.model, self.cache)
+        return get_kinematics(self.model, self.cache)
 
     def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m], of all joints in the world.

@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
-from vkc_pin.planning.chain.easing import EASED_SHARE, eased_pairs
+from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO, find_reduced_margins
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import spend
@@ -183,7 +183,10 @@ class _Pairing:
             left=left,
         )
         return dataclasses.replace(
-            part, eased=eased_pairs(self.scene, self.chain, self.task, number, part, self.options)
+            part,
+            eased=find_reduced_margins(
+                self.scene, self.chain, self.task, number, part, self.options
+            ),
         )
 
     def _held_margin(self, hold: Hold, one: str, link: str) -> float:
@@ -228,7 +231,11 @@ class _Pairing:
         for one in self._allowances:
             near_pairs, within = place[rows[one]][kept[rows[one]]], self._within(phase, one.ranges)
             if one.ranges and len(near_pairs) and within is not None:
-                margin = one.margin if one.margin < 0.0 else EASED_SHARE * max(one.distance, 0.0)
+                margin = (
+                    one.margin
+                    if one.margin < 0.0
+                    else REDUCED_MARGIN_RATIO * max(one.distance, 0.0)
+                )
                 near.append(MarginRegion(near_pairs, margin, *within))
         return table[kept], near
 

@@ -30,7 +30,7 @@ from vkc_pin.world.scene.placed_object import standing_geometry
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 
-__all__ = ["ContactModel", "Contacts", "no_contacts"]
+__all__ = ["ContactModel", "Contacts", "make_empty_contacts"]
 
 # of coal's distances: at its own 1e-6 the gradients of planes are off by up to 5e-3; this takes no
 # longer
@@ -95,7 +95,7 @@ class Contacts:
         return float(np.min(self.distance, initial=np.inf))
 
 
-def no_contacts() -> Contacts:
+def make_empty_contacts() -> Contacts:
     """Return contacts of nothing with nothing."""
     none, vectors = np.zeros(0), np.zeros((0, 3))
     return Contacts(np.zeros(0, int), np.zeros((0, 2), int), none, none, vectors, vectors, vectors)
@@ -225,7 +225,7 @@ class ContactModel:
         if len(parts) == 1:
             return Contacts(*parts[0])
         if not parts:
-            return no_contacts()
+            return make_empty_contacts()
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         return Contacts(*columns).select(np.argsort(columns[0], kind="stable"))
 

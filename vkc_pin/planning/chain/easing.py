@@ -19,14 +19,14 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import Ride
 from vkc_pin.world.task.phases import Task
 
-__all__ = ["EASED_SHARE", "eased_pairs"]
+__all__ = ["REDUCED_MARGIN_RATIO", "find_reduced_margins"]
 
-EASED_SHARE = 0.5  # margin, as a share of the distance at the contact itself
+REDUCED_MARGIN_RATIO = 0.5  # margin, as a share of the distance at the contact itself
 
 Eased = dict[int, list[tuple[int, int, float]]]
 
 
-def eased_pairs(
+def find_reduced_margins(
     scene: Scene,
     chain: VirtualKinematicChain,
     task: Task,
@@ -71,7 +71,7 @@ def eased_pairs(
         for k in part.pairs_of(moving, beside).tolist():
             other = shapes[int(part.pairs[k, 1])]
             distance = compute_shape_distance(shape, where, other.geometry, other.placement)
-            share = EASED_SHARE * max(distance, 0.0)
+            share = REDUCED_MARGIN_RATIO * max(distance, 0.0)
             if distance < part.margins[k]:
                 eased.setdefault(k, []).append(
                     (begin, end, distance if inside and distance < -CONTACT else share)

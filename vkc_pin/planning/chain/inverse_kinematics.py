@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.kinematics import kinematics_of
+from vkc_pin.planning.chain.kinematics import get_kinematics
 from vkc_pin.planning.chain.pose import PoseRow, pose_residual, target_vector
 from vkc_pin.planning.kinematics.batch import BatchFunction
 from vkc_pin.utils.arrays import Bools, Floats
@@ -29,7 +29,7 @@ class PoseSolver:
     def __init__(self, model: pin.Model, pose: PoseRow, cache: Cache | None = None) -> None:
         self.size = model.nv
         z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
-        placements = kinematics_of(model, cache or Cache()).symbolic(z)
+        placements = get_kinematics(model, cache or Cache()).symbolic(z)
         residual = ca.densify(pose_residual(pose.kind, *pose.placement(placements), target))
         self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))

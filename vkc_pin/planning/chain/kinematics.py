@@ -9,11 +9,11 @@ import casadi as ca
 import pinocchio as pin
 
 from vkc_pin.planning import kinematics as cpin
-from vkc_pin.planning.kinematics.batch import BatchFunction, size_of
+from vkc_pin.planning.kinematics.batch import BatchFunction, estimate_size
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 
-__all__ = ["Kinematics", "kinematics_of"]
+__all__ = ["Kinematics", "get_kinematics"]
 
 
 class Kinematics:
@@ -37,9 +37,11 @@ class Kinematics:
     @property
     def nbytes(self) -> int:
         """Its size in memory, estimated [bytes]."""
-        return size_of(self._function) + (self.batch.nbytes if "batch" in self.__dict__ else 0)
+        return estimate_size(self._function) + (
+            self.batch.nbytes if "batch" in self.__dict__ else 0
+        )
 
 
-def kinematics_of(model: pin.Model, cache: Cache) -> Kinematics:
+def get_kinematics(model: pin.Model, cache: Cache) -> Kinematics:
     """Return the kinematics of a model, built if they are not in the cache."""
     return cache.get(("kinematics", model.saveToString()), lambda: Kinematics(model))

@@ -17,13 +17,13 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats
 
 __all__ = [
-    "AWAY",
+    "POSE_OFFSET_SIZE",
     "ROW_BOUNDS",
     "PoseRow",
-    "away_from",
+    "compute_pose_offsets",
     "pose_residual",
     "pose_rows",
-    "receded",
+    "relax_target",
     "target_vector",
 ]
 
@@ -146,14 +146,16 @@ def pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
 
 
 # numbers that say how far a frame is from its target: offset [m], axis and angle [rad] of the turn
-AWAY = 7
+POSE_OFFSET_SIZE = 7
 
 
-def away_from(kind: str, rotations: Floats, translations: Floats, target: pin.SE3) -> Floats:
+def compute_pose_offsets(
+    kind: str, rotations: Floats, translations: Floats, target: pin.SE3
+) -> Floats:
     """Return how far frames are from their target, shape (B, 7): p − p* [m], and axis a and angle θ [rad] of exp(θa) = R*ᵀR.
 
     For "upright" and "level" the turn is the shortest that makes the vertical the target's, for
-    "point" there is none, and no offset for "level"; see `receded`. It is as exact next to half
+    "point" there is none, and no offset for "level"; see `relax_target`. It is as exact next to half
     turns as anywhere else, which `pose_residual` is not.
 
     Args:
@@ -192,11 +194,11 @@ def away_from(kind: str, rotations: Floats, translations: Floats, target: pin.SE
     return np.column_stack([(kind != "level") * (translations - target.translation), axis, angle])
 
 
-def receded(target: Any, away: Any, share: Any) -> Any:
+def relax_target(target: Any, away: Any, share: Any) -> Any:
     """Return a target moved back along the way to it, R*·exp(share·θ·a) and p* + share·(p − p*), shape (12, 1).
 
     At a share of 1 it is where the frame was from which `away`, shape (7, 1), was taken, see
-    `away_from`; at 0 the target itself. On the way orientations turn about one axis (a geodesic),
+    `compute_pose_offsets`; at 0 the target itself. On the way orientations turn about one axis (a geodesic),
     so that a half turn is as good as any other.
     """
     skew = ca.skew(away[3:6])

@@ -8,7 +8,7 @@ import numpy as np
 
 from vkc_pin.planning.initialization.base_routes import Routes
 from vkc_pin.planning.initialization.keyframes import ALIKE, SCATTER, Knots
-from vkc_pin.planning.nlp.pose_goals import approach_at
+from vkc_pin.planning.nlp.pose_goals import find_approach_waypoint
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 __all__ = ["Beam", "Found"]
@@ -76,7 +76,9 @@ class Beam:
         self.knots, self.problem, self.routes, self.careful = knots, knots.problem, routes, careful
         self.metric = np.sqrt(self.problem.effort.metric / self.problem.options.velocity_weight_arm)
         self.approaches = {
-            int(end): approach_at(int(end) - phase.segments, int(end), self.problem.options)
+            int(end): find_approach_waypoint(
+                int(end) - phase.segments, int(end), self.problem.options
+            )
             for phase, end in zip(self.problem.task.phases, self.problem.ends, strict=True)
             if phase.grasps
         }

@@ -16,7 +16,7 @@ from vkc_pin.planning.initialization.initial_guess import Seed, perturbed
 from vkc_pin.planning.initialization.interpolation import Joiner, RrtPaths, base_paths
 from vkc_pin.planning.initialization.keyframes import ALIKE, Knots, Known, follow_objects
 from vkc_pin.planning.initialization.rrt import far_round
-from vkc_pin.planning.nlp.merit import Merit, infeasibility
+from vkc_pin.planning.nlp.merit import Merit, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats, Ints
 
@@ -156,8 +156,8 @@ def _merit(problem: TrajectoryProblem, z: Floats, waypoint: int) -> float:
     contacts = problem.evaluate_contacts(
         z, reach=options.largest_margin, nearest=options.contact_slots
     )
-    missing = Merit(options.penalty).price(
-        infeasibility(problem, z, timing, contacts, rates=False), clearance=True
+    missing = Merit(options.penalty).compute_penalty(
+        measure_infeasibility(problem, z, timing, contacts, rates=False), clearance=True
     )
     return problem.objective(z, timing.dt) + float(missing[:waypoint].sum())
 

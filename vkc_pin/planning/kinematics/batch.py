@@ -11,7 +11,7 @@ import numpy as np
 from vkc_pin.planning.kinematics.machine_code import MachineCode
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["BatchFunction", "size_of"]
+__all__ = ["BatchFunction", "estimate_size"]
 
 _KEPT = 16  # batch sizes whose buffers are kept
 _ROUND = 16  # they are multiples of this
@@ -86,9 +86,9 @@ class BatchFunction:
             for *_, inputs, outputs in self._buffers.values()
             for array in (*inputs, *outputs)
         )
-        return size_of(self.function) + sum(buffers)
+        return estimate_size(self.function) + sum(buffers)
 
 
-def size_of(*functions: ca.Function) -> int:
+def estimate_size(*functions: ca.Function) -> int:
     """Return the size of functions in memory, estimated [bytes]."""
     return _INSTRUCTION * sum(function.n_instructions() for function in functions)

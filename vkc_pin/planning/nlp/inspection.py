@@ -1,4 +1,4 @@
-"""What a program looks like, and what its witness planes say: for people who want to see it before it is solved."""
+"""Describes a program before it is solved: witness planes, size and sparsity."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from vkc_pin.world.task.terms import Term, check_active, traced
 
 __all__ = ["Plane", "build", "patterns", "planes", "sizes"]
 
-_FURTHER = 0.3  # [m]: pairs that much further apart than a plane's are not asked for
+_EXTRA_REACH = 0.3  # [m]: distances larger than the plane's by more than this are not computed
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plane:
-    """The witness plane of a pair at a waypoint: what the program knows of the pair's distance (eqs. 6 and 7).
+    """The witness plane of a pair at a waypoint, which models their distance (eqs. 6 and 7).
 
     Attributes:
         problem: The program.
-        contacts: What can collide with what along the motion that the plane belongs to.
-        waypoint: Counted from 1.
+        contacts: Collision model of the motion that the plane belongs to.
+        waypoint: Waypoint, counted from 1.
         names: The two links or obstacles.
         pair: Their geometries, shape (2,).
-        distance: Of the pair, from coal [m].
-        margin: The clearance that is asked for [m].
-        coefficients, offset: C, shape (12·joints,), and R: C·vec(M(z)) − R ≥ 0 says that the pair
+        distance: Signed distance of the pair, from coal [m].
+        margin: Required clearance [m].
+        coefficients, offset: C, shape (12·joints,), and R: C·vec(M(z)) − R ≥ 0 states that the pair
             keeps its margin.
-        gradient: Of the plane's value, as the solver has it, shape (n,), [m/m] or [m/rad].
+        gradient: Gradient of the plane's value used by the solver, shape (n,), [m/m] or [m/rad].
     """
 
     problem: TrajectoryProblem
@@ -55,7 +55,7 @@ class Plane:
     gradient: Floats
 
     def values(self, z: Floats) -> Floats:
-        """Return the distance that the plane takes the pair to have, shape (W,) [m], at z, shape (W, n)."""
+        """Return the distance predicted by the plane at z, shape (W, n): shape (W,) [m]."""
         rotations, translations = self.problem.chain.joint_placements(z)
         columns = np.concatenate(
             [rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]], axis=2
@@ -65,21 +65,21 @@ class Plane:
         )
 
     def distances(self, z: Floats) -> Floats:
-        """Return the pair's distance from coal, shape (W,) [m], at z, shape (W, n); NaN where it is far from this one."""
-        reach = max(self.distance, 0.0) + _FURTHER
+        """Return the distance from coal at z, shape (W, n): shape (W,) [m]; NaN if out of reach."""
+        reach = max(self.distance, 0.0) + _EXTRA_REACH
         found = self.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
-        mine, distances = (found.pair == self.pair).all(axis=1), np.full(len(z), np.nan)
-        distances[found.waypoint[mine]] = found.distance[mine]
+        is_pair, distances = (found.pair == self.pair).all(axis=1), np.full(len(z), np.nan)
+        distances[found.waypoint[is_pair]] = found.distance[is_pair]
         return distances
 
 
 def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
-    """Return the witness planes at a waypoint, those of the pairs that fall shortest of their margins, worst first.
+    """Return the witness planes at a waypoint, those with the largest shortfall first.
 
     Args:
         problem: The program.
         z: z_1..z_N, shape (N, n).
-        waypoint: Counted from 1.
+        waypoint: Waypoint, counted from 1.
     """
     t, labels = (
         problem.transcription,
@@ -117,14 +117,13 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
 
 
 def sizes(problem: TrajectoryProblem) -> dict[str, int]:
-    """Return how many variables and rows of each kind there are.
+    """Return the number of variables and rows of each kind.
 
-    The rows of velocity and acceleration are not among those of the program unless it turns out to
-    need them.
+    The velocity and acceleration rows are part of the program only if it turns out to need them.
     """
     t, (first, second) = problem.transcription, problem.rates(problem.still)
     fixed = int((problem.lower == problem.upper).sum())
-    found = {
+    counts = {
         "variables: coordinates": problem.lower.size - fixed,
         "variables: coordinates, fixed by bounds": fixed,
         "variables: slacks": t.slot_rows.size,
@@ -132,19 +131,19 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
     }
     for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
         kind = f"rows: {goal.name}"
-        found[kind] = found.get(kind, 0) + sum(len(rows) for rows in at.values())
-    found["rows: witness planes"] = t.slot_rows.size
-    found["rows: rolling"] = len(t.base_rows)
-    found["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
-    found["rows: pushes"] = len(t.pushed_rows)
-    found["rows: own constraints"] = len(problem.term_numbers.rows)
-    found["only if needed: velocities"] = first.size
-    found["only if needed: accelerations"] = second.size
-    return found
+        counts[kind] = counts.get(kind, 0) + sum(len(rows) for rows in at.values())
+    counts["rows: witness planes"] = t.slot_rows.size
+    counts["rows: rolling"] = len(t.base_rows)
+    counts["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
+    counts["rows: pushes"] = len(t.pushed_rows)
+    counts["rows: own constraints"] = len(problem.term_evaluator.rows)
+    counts["only if needed: velocities"] = first.size
+    counts["only if needed: accelerations"] = second.size
+    return counts
 
 
 def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
-    """Return where the rows' Jacobian and the Lagrangian's Hessian can differ from zero, as sparse matrices (SciPy)."""
+    """Return the sparsity of the rows' Jacobian and the Lagrangian's Hessian, as SciPy matrices."""
     t = problem.transcription
     upper = t.objective_curvature.sparsity() + t.hessian.sparsity()
     return ca.DM(t.jacobian.sparsity(), 1.0).sparse(), ca.DM(upper + upper.T, 1.0).sparse()
@@ -158,19 +157,18 @@ def build(
     terms: Sequence[Term] = (),
     cache: Cache | None = None,
 ) -> TrajectoryProblem:
-    """Return the nonlinear program of `steps` in `scene`, to look at before solving.
+    """Return the nonlinear program of `steps` in `scene`, for inspection before solving.
 
     Args:
         scene: Robot, objects and obstacles.
-        steps: What should change in the world.
-        options: How to plan.
-        terms: Own constraints and costs.
-        cache: Where the symbolic program is kept, for problems of the same structure in the same
-            thread; None: one of its own.
+        steps: Steps of the task.
+        options: Planning options.
+        terms: User-defined constraints and costs.
+        cache: Cache of symbolic programs, for problems of the same structure in the same thread.
+            Defaults to one of its own.
 
     Raises:
-        InputError: The steps or terms name something that is not there, or ask for what cannot be
-            done.
+        InputError: The steps or terms refer to an unknown name, or the task is impossible.
     """
     options = Options() if options is None else instance(options, Options, "options")
     cache = None if cache is None else instance(cache, Cache, "cache")

@@ -1,4 +1,4 @@
-"""The exact ℓ1 merit function: what a motion costs, and what everything costs that does not hold yet."""
+"""Computes the exact ℓ1 merit function: the objective plus weighted constraint violations."""
 
 from __future__ import annotations
 
@@ -8,122 +8,135 @@ from dataclasses import dataclass
 import numpy as np
 
 from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.planning.chain.pose import AWAY, away_from
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, compute_pose_offsets
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.nlp.timing import Timing
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["GROWTH", "TOLERANCE", "Infeasibility", "Merit", "infeasibility", "shortfalls"]
+__all__ = [
+    "GROWTH",
+    "TOLERANCE",
+    "Infeasibility",
+    "Merit",
+    "measure_infeasibility",
+    "compute_shortfalls",
+]
 
-# [m], [rad] and, of rates, relative to their limits: besides clearance, what is missing of what
-# holds
+# [m], [rad], and relative to the limits for rates: tolerance of all constraints except clearance
 TOLERANCE = 1e-4
-GROWTH = 4.0  # ratio of a weight to the one before, where it proved too small
+GROWTH = 4.0  # factor by which a weight grows if it proved too small
 
 
 @dataclass(frozen=True, eq=False)
 class Infeasibility:
-    """What does not hold along a motion.
+    """Constraint violations along a motion.
 
     Attributes:
-        amounts: For every kind of constraint, the sum of what is missing at every waypoint, shape
-            (N,): "clearance" [m], "poses" (closure, goals and grasps: distance and angle) [m] and
-            [rad], "rolling" [m], "clamped" [m] and [rad], "terms" (1e-3 is their tolerance),
-            "rates" [m] and [rad].
-        away: See `Transcription.parameter_vector`, shape (N, poses, 7).
-        excess: Of rolling, clamping and own constraints, in the order of their rows.
-        rate_excess: Of velocities and accelerations; empty if they are not rows of the program.
+        amounts: For each kind of constraint, the summed violation at each waypoint, shape (N,):
+            "clearance" [m], "poses" (closure, goals and grasps: distance and angle) [m] and [rad],
+            "rolling" [m], "clamped" [m] and [rad], "terms" (1e-3 is their tolerance), "rates" [m]
+            and [rad].
+        pose_offsets: See `Transcription.parameter_vector`, shape (N, poses, 7).
+        excess: Bound violations of rolling, clamping and user-defined rows, in the order of the
+            rows.
+        rate_excess: Bound violations of velocities and accelerations; empty if they are not rows of
+            the program.
     """
 
     amounts: Mapping[str, Floats]
-    away: Floats
+    pose_offsets: Floats
     excess: Floats
     rate_excess: Floats
 
     @property
     def total(self) -> float:
-        """All that is missing."""
+        """Sum of all violations."""
         return float(sum(amount.sum() for amount in self.amounts.values()))
 
     @property
-    def others(self) -> float:
-        """The most that is missing of one kind at a waypoint, clearance aside."""
+    def max_violation(self) -> float:
+        """Largest violation of one kind at a waypoint, except clearance."""
         return float(
             np.max([amount for kind, amount in self.amounts.items() if kind != "clearance"])
         )
 
 
-def shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
-    """Return by how much the pairs that have witness planes fall short of their margins, shape (N, K) [m]."""
+def compute_shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
+    """Return the clearance shortfall of the pairs with witness planes, shape (N, K) [m]."""
     plane = contacts.place
-    kept = plane < slots
-    found = np.zeros((segments, slots))
-    found[contacts.waypoint[kept], plane[kept]] = np.maximum(
-        contacts.margin[kept] - contacts.distance[kept], 0.0
+    has_plane = plane < slots
+    shortfalls = np.zeros((segments, slots))
+    shortfalls[contacts.waypoint[has_plane], plane[has_plane]] = np.maximum(
+        contacts.margin[has_plane] - contacts.distance[has_plane], 0.0
     )
-    return found
+    return shortfalls
 
 
-def infeasibility(
+def measure_infeasibility(
     problem: TrajectoryProblem, z: Floats, timing: Timing, contacts: Contacts, *, rates: bool
 ) -> Infeasibility:
-    """Return what does not hold at z_1..z_N, shape (N, n).
+    """Return the constraint violations at z_1..z_N, shape (N, n).
 
     Args:
-        problem: What is asked for.
+        problem: The planning problem.
         z: The waypoints.
-        timing: How long steps take.
-        contacts: What is close at the waypoints.
-        rates: Whether limits on velocity and acceleration count.
+        timing: Step durations.
+        contacts: Close pairs at the waypoints.
+        rates: Whether velocity and acceleration limits count.
     """
     t = problem.transcription
     amounts = {kind: np.zeros(len(z)) for kind in ("poses", "rolling", "clamped", "terms", "rates")}
-    amounts["clearance"] = shortfalls(contacts, len(z), t.slots).sum(axis=1)
-    away = np.zeros((len(z), len(problem.pose_goals), AWAY))
+    amounts["clearance"] = compute_shortfalls(contacts, len(z), t.slots).sum(axis=1)
+    pose_offsets = np.zeros((len(z), len(problem.pose_goals), POSE_OFFSET_SIZE))
     rotations, translations = problem.chain.joint_placements(z)
     for k, goal in enumerate(problem.pose_goals):
         if goal.row.waypoints:
             at = np.array(goal.row.waypoints) - 1
-            away[at, k] = away_from(
+            pose_offsets[at, k] = compute_pose_offsets(
                 goal.row.kind, *goal.row.placed(rotations[at], translations[at]), goal.target
             )
-    amounts["poses"] = np.linalg.norm(away[:, :, :3], axis=2).sum(axis=1) + away[:, :, 6].sum(
-        axis=1
-    )
+    amounts["poses"] = np.linalg.norm(pose_offsets[:, :, :3], axis=2).sum(axis=1) + pose_offsets[
+        :, :, 6
+    ].sum(axis=1)
     excess = problem.excess(z, timing, rates=rates)
     for kind, scale in problem.row_kinds.items():
-        np.add.at(amounts[kind], t.owners, scale * np.abs(excess))
+        np.add.at(amounts[kind], t.row_waypoints, scale * np.abs(excess))
     rate_excess = np.zeros(0)
     if rates:
         values = np.concatenate([part.ravel() for part in problem.rates(z)])
         bound = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
         rate_excess = values - np.clip(values, -bound, bound)
-        np.add.at(amounts["rates"], t.rate_owners, np.abs(rate_excess))
-    return Infeasibility(amounts, away, excess, rate_excess)
+        np.add.at(amounts["rates"], t.rate_waypoints, np.abs(rate_excess))
+    return Infeasibility(amounts, pose_offsets, excess, rate_excess)
 
 
 class Merit:
-    """φ(z) = f(z) + Σ_k ν_k Σ_t v_kt(z): f of eq. 1, and for kinds k of constraints their weights and `Infeasibility.amounts`.
+    """The merit function φ(z) = f(z) + Σ_k ν_k Σ_t v_kt(z), with f of eq. 1.
 
-    It is exact: where the weights exceed the multipliers, its minima are those of the program
-    (Nocedal and Wright, Numerical Optimization, theorem 17.3).
+    ν_k and v_k are the weight and `Infeasibility.amounts` of constraint kind k. φ is exact: if the
+    weights exceed the multipliers, its minima are those of the program (Nocedal and Wright,
+    Numerical Optimization, theorem 17.3).
 
     Attributes:
-        weights: ν_k of every kind, [1/m] and [1/rad].
+        weights: ν_k of each kind, [1/m] and [1/rad].
     """
 
     def __init__(self, weight: float) -> None:
         kinds = ("clearance", "poses", "rolling", "clamped", "terms", "rates")
         self.weights = dict.fromkeys(kinds, weight)
 
-    def price(self, found: Infeasibility, *, clearance: bool) -> Floats:
-        """Return what all that is missing costs at every waypoint, shape (N,), with or without clearance."""
+    def compute_penalty(self, infeasibility: Infeasibility, *, clearance: bool) -> Floats:
+        """Return the penalty at each waypoint, shape (N,), with or without clearance."""
         kinds = (kind for kind in self.weights if clearance or kind != "clearance")
-        return np.asarray(sum(self.weights[kind] * found.amounts[kind] for kind in kinds))
+        return np.asarray(sum(self.weights[kind] * infeasibility.amounts[kind] for kind in kinds))
 
-    def grow(self, found: Infeasibility, tolerance: float) -> bool:
-        """Make dearer what is still missing at some waypoint by more than `tolerance`; return whether anything is."""
-        low = [kind for kind in self.weights if found.amounts[kind].max(initial=0.0) > tolerance]
-        for kind in low:
+    def increase_weights(self, infeasibility: Infeasibility, tolerance: float) -> bool:
+        """Increase the weights of kinds violated by more than `tolerance`; return whether any."""
+        violated = [
+            kind
+            for kind in self.weights
+            if infeasibility.amounts[kind].max(initial=0.0) > tolerance
+        ]
+        for kind in violated:
             self.weights[kind] *= GROWTH
-        return bool(low)
+        return bool(violated)

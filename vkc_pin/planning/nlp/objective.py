@@ -1,4 +1,4 @@
-"""What a motion costs: the length of its way, or the squares of eq. 1; and the quadratic function that touches it at a motion."""
+"""Computes the cost of a motion (path length, or the squares of eq. 1) and a quadratic model."""
 
 from __future__ import annotations
 
@@ -9,42 +9,45 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["Effort", "changed_at"]
+__all__ = ["MotionCost", "find_change_steps"]
 
-# [m] and [rad] ways of a coordinate in a phase that are shorter count as squares: a length has a
-# slope at 0 then
-STILL = 0.03
+# [m] and [rad]: shorter displacements of a coordinate in a phase count as squares, because the
+# length is not differentiable at zero
+SMOOTHING_LENGTH = 0.03
 
 
-def changed_at(stops: Sequence[int], segments: int) -> list[int]:
-    """Return the step, counted from 0, that every change of the step belongs to: that before it, or the first of a motion.
+def find_change_steps(stops: Sequence[int], segments: int) -> list[int]:
+    """Return the step (from 0) to which each change of the step belongs, shape (N + 1 + stops,).
+
+    That is the step before the change, or the first step of a run.
 
     Args:
-        stops: Waypoints inside the motion at which it comes to rest, as it does at start and end.
+        stops: Interior waypoints at which the motion is at rest, as it is at its start and end.
         segments: Number of steps.
     """
     runs = itertools.pairwise([0, *stops, segments])
     return [max(waypoint, 1) - 1 for begin, end in runs for waypoint in range(begin, end + 1)]
 
 
-class Effort:
-    """The cost f of the steps δz_1..δz_N of a motion and their changes δδz, see `sparse.differences`.
+class MotionCost:
+    """The cost f of the steps δz_1..δz_N of a motion and of their changes δδz.
 
-    As squares it is eq. 1: Σ_t ‖δz_t‖²_W + κ·Σ_t ‖δδz_t‖²_W. As a length it is
+    As a sum of squares it is eq. 1: Σ_t ‖δz_t‖²_W + κ·Σ_t ‖δδz_t‖²_W. As a path length it is
 
         f = Σ_p Σ_g [ √(ε_g² + m_p·E_pg) − ε_g ],
 
-    where E_pg are the same two sums over phase p, of m_p steps, and the coordinates g alone: x and
-    y of the base are one g, every other coordinate is one of its own. At even speed √(m_p·E_pg) is
-    how long the way of g is, so that slow motion is not cheap, and a phase not the dearer the fewer
-    steps it has. It is a sum of norms, but for ε, and convex.
+    where E_pg are the same two sums restricted to phase p, of m_p steps, and to the coordinate
+    group g: x and y of the base form one group, every other coordinate is a group of its own. At
+    constant speed √(m_p·E_pg) is the path length of g, so that slow motion is not cheap, and a
+    phase with fewer steps does not cost more. Except for ε, f is a sum of norms; it is convex. See
+    `sparse.make_differences` for the changes.
 
     Args:
-        metric: The diagonal of W, shape (n,), [1/m²] and [1/rad²].
+        metric: Diagonal of W, shape (n,), [1/m²] and [1/rad²].
         smoothing: κ.
-        ends: The last waypoint of every phase, shape (P,).
-        stops: Waypoints inside the motion at which it comes to rest, as it does at start and end.
-        length: Whether it is a length; otherwise it is a sum of squares.
+        ends: Last waypoint of each phase, shape (P,).
+        stops: Interior waypoints at which the motion is at rest, as it is at its start and end.
+        length: Whether the cost is the path length; otherwise it is the sum of squares.
     """
 
     def __init__(
@@ -55,59 +58,67 @@ class Effort:
         phase = np.repeat(np.arange(len(self._counts)), self._counts)
         self._phases = (
             phase,
-            phase[changed_at(stops, len(phase))],
-        )  # of the steps, and of their changes
+            phase[find_change_steps(stops, len(phase))],
+        )  # phases of the steps, and of their changes
 
     def value(self, steps: Floats, changes: Floats) -> float:
-        """Return f.
+        """Return the cost f.
 
         Args:
-            steps: Shape (N, n).
-            changes: Shape (N + 1 + number of stops, n).
+            steps: Steps δz, shape (N, n).
+            changes: Changes δδz, shape (N + 1 + number of stops, n).
         """
-        energies = self._energies(steps, changes)
+        energies = self._compute_energies(steps, changes)
         if not self.length:
             return float(energies.sum())
-        still = self._still
+        epsilon = self._smoothing_lengths
         return float(
-            (np.sqrt(still**2 + self._counts[:, None] * energies) - still)[:, self._own].sum()
+            (np.sqrt(epsilon**2 + self._counts[:, None] * energies) - epsilon)[
+                :, self._group_representatives
+            ].sum()
         )
 
     def weights(self, steps: Floats, changes: Floats) -> tuple[Floats, Floats]:
-        """Return the weights of squared steps, shape (N, n), and of squared changes, in a quadratic function that stands for f.
+        """Return the weights of a quadratic model of f, for squared steps and for squared changes.
 
-        It has the value and slope of f at the steps given, up to a constant, and nowhere lies below
-        f: √q ≤ (q/√q̄ + √q̄)/2 (reweighted least squares; Hunter and Lange, A tutorial on MM
-        algorithms, 2004).
+        The model has the value (up to a constant) and the gradient of f at the given steps, and
+        bounds f from above: √q ≤ (q/√q̄ + √q̄)/2 (iteratively reweighted least squares; Hunter and
+        Lange, A tutorial on MM algorithms, 2004).
 
         Args:
-            steps: Shape (N, n).
-            changes: Shape (N + 1 + number of stops, n).
+            steps: Steps δz, shape (N, n).
+            changes: Changes δδz, shape (N + 1 + number of stops, n).
+
+        Returns:
+            Weights, shapes (N, n) and (N + 1 + number of stops, n).
         """
-        share = np.ones((len(self._counts), len(self.metric)))
+        scale = np.ones((len(self._counts), len(self.metric)))
         if self.length:
             counts = self._counts[:, None]
-            share = counts / (
-                2.0 * np.sqrt(self._still**2 + counts * self._energies(steps, changes))
+            scale = counts / (
+                2.0
+                * np.sqrt(
+                    self._smoothing_lengths**2 + counts * self._compute_energies(steps, changes)
+                )
             )
-        of_steps, of_changes = (share[phase] * self.metric for phase in self._phases)
-        return of_steps, self.smoothing * of_changes
+        step_weights, change_weights = (scale[phase] * self.metric for phase in self._phases)
+        return step_weights, self.smoothing * change_weights
 
     @property
-    def _still(self) -> Floats:
-        """ε of the group of every coordinate, shape (n,)."""
-        return STILL * np.sqrt(self.metric)
+    def _smoothing_lengths(self) -> Floats:
+        """ε of each coordinate's group, shape (n,)."""
+        return SMOOTHING_LENGTH * np.sqrt(self.metric)
 
     @property
-    def _own(self) -> Ints:
-        """One coordinate of every group: x stands for x and y."""
+    def _group_representatives(self) -> Ints:
+        """One coordinate of each group: x represents x and y."""
         return np.delete(np.arange(len(self.metric)), 1)
 
-    def _energies(self, steps: Floats, changes: Floats) -> Floats:
-        """Return E_pg for every coordinate's g, shape (P, n); of squares for every coordinate's own."""
-        found = np.zeros((len(self._counts), len(self.metric)))
-        np.add.at(found, self._phases[0], self.metric * steps**2)
-        np.add.at(found, self._phases[1], self.smoothing * self.metric * changes**2)
+    def _compute_energies(self, steps: Floats, changes: Floats) -> Floats:
+        """Return E_pg of each coordinate's group (for squares, of the coordinate), shape (P, n)."""
+        energies = np.zeros((len(self._counts), len(self.metric)))
+        np.add.at(energies, self._phases[0], self.metric * steps**2)
+        np.add.at(energies, self._phases[1], self.smoothing * self.metric * changes**2)
         if self.length:
-            found[:, :2] = found[:, :2].sum(axis=1, keepdims=True)
-        return found
+            energies[:, :2] = energies[:, :2].sum(axis=1, keepdims=True)
+        return energies

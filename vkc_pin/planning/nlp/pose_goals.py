@@ -1,4 +1,4 @@
-"""Which frames must be where and when: closures (eq. 2), grasps and the approaches to them, and the steps' own goals (eq. 3)."""
+"""Collects the pose goals of a task: closures (eq. 2), grasps, approaches, step goals (eq. 3)."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from vkc_pin.planning.chain.pose import PoseRow
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 
-__all__ = ["PoseGoal", "approach_at", "chosen_freedoms", "pose_goals"]
+__all__ = ["PoseGoal", "find_approach_waypoint", "find_chosen_freedoms", "make_pose_goals"]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseGoal:
-    """A frame that must be somewhere.
+    """A frame with a target pose.
 
     Attributes:
-        row: The frame, and the waypoints at which it must be there.
-        target: Where, in the world.
-        kind: "closure" of what stands fixed and is held; "grasp" of a free object; "approach":
-            where the straight path to a grasp begins; "level": what something rides on; "goal" of a
-            step.
-        about: What it is about, for people: an object, a hold or a frame.
+        row: The frame, and the waypoints at which the goal applies.
+        target: Target placement in the world.
+        kind: "closure" of a grasped object that is fixed in the world; "grasp" of a free object;
+            "approach", the start of the straight path to a grasp; "level", for a carrier on which
+            another object rests; "goal" of a step.
+        about: Subject for messages: an object, a hold or a frame.
         object: The object that is held or grasped; None for the goal of a step.
     """
 
@@ -39,20 +39,20 @@ class PoseGoal:
 
     @property
     def name(self) -> str:
-        """What people call it, e.g. "closure door" or "approach door.handle"."""
+        """Name for messages, e.g. "closure door" or "approach door.handle"."""
         return f"{self.kind} {self.about}"
 
 
-def pose_goals(
+def make_pose_goals(
     scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
 ) -> tuple[PoseGoal, ...]:
-    """Return the frames that must be somewhere: grasps and closures, then the approaches to grasps and the steps' own goals.
+    """Return the pose goals of a task: grasps and closures, then approaches and goals of steps.
 
     Args:
-        scene: Where objects stand.
-        chain: The chain.
-        task: What is held when, and what must be where at the ends of its phases.
-        options: How long the straight approach to a grasp is.
+        scene: Scene with the objects.
+        chain: Virtual kinematic chain.
+        task: Grasps and goals of each phase.
+        options: Options; the length of the straight approach.
     """
     goals: list[PoseGoal] = []
     ends = np.cumsum([phase.segments for phase in task.phases])
@@ -73,23 +73,24 @@ def pose_goals(
             row = PoseRow(closure.joint, closure.local, tuple(int(t) for t in waypoints))
             goals.append(PoseGoal(row, closure.target, "closure", hold.object, hold.object))
     for phase, first, last in zip(task.phases, starts, ends, strict=True):
-        for hold in phase.grasps:  # short of the grasp, straight back along the hand's approach
+        # retreat from the grasp, straight back along the approach direction
+        for hold in phase.grasps:
             closure, target = (
                 chain.closures[hold],
                 phase.standing.get(hold.object, chain.closures[hold].target),
             )
             joint, frame = chain.holder(hold)
             x, y, z = (options.approach * frame.rotation[:, 2]).tolist()
-            at = approach_at(int(first), int(last), options)
-            if at == last:  # no room for it
+            at = find_approach_waypoint(int(first), int(last), options)
+            if at == last:  # the phase is too short for an approach
                 continue
             row = PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z)))
             goals.append(PoseGoal(row, target, "approach", str(hold), hold.object))
         for hold, ride in {ride.hold: ride for ride in phase.rides}.items():
-            thing = scene.objects[hold.object].object
-            if thing.free:
+            carrier = scene.objects[hold.object].object
+            if carrier.free:
                 row = PoseRow(
-                    *chain.frame(thing.base_link, hold),
+                    *chain.frame(carrier.base_link, hold),
                     tuple(range(int(first) + 1, int(last) + 1)),
                     "level",
                 )
@@ -102,33 +103,41 @@ def pose_goals(
     return tuple(goals)
 
 
-def approach_at(first: int, last: int, options: Options) -> int:
-    """Return the waypoint from which a hand goes straight to a grasp, in a phase from waypoint `first` to `last`."""
+def find_approach_waypoint(first: int, last: int, options: Options) -> int:
+    """Return the waypoint at which the straight approach to a grasp begins.
+
+    Args:
+        first: First waypoint of the phase.
+        last: Last waypoint of the phase, at which the hand grasps.
+        options: Options; the duration of the approach.
+    """
     return max(first + 1, last - options.steps(options.approach_time))
 
 
-def pushed_steps(chain: VirtualKinematicChain, task: Task) -> tuple[tuple[int, int, int, int], ...]:
-    """Return column, first and last waypoint, and way (1 or -1), for every coordinate that a phase pushes."""
+def find_pushed_coordinates(
+    chain: VirtualKinematicChain, task: Task
+) -> tuple[tuple[int, int, int, int], ...]:
+    """Return (column, first waypoint, last waypoint, direction ±1) of each pushed coordinate."""
     ends = np.cumsum([phase.segments for phase in task.phases]).tolist()
     phases = zip(task.phases, [0, *ends[:-1]], ends, strict=True)
     return tuple(
-        (chain.index(name), first, last, way)
+        (chain.index(name), first, last, direction)
         for phase, first, last in phases
-        for name, way in phase.pushed.items()
+        for name, direction in phase.pushed.items()
     )
 
 
-def chosen_freedoms(
+def find_chosen_freedoms(
     scene: Scene, chain: VirtualKinematicChain, task: Task
 ) -> tuple[tuple[int, int, int], ...]:
-    """Return column, waypoint of the grasp and last waypoint of the hold, for every freedom that is chosen when a hand clamps.
+    """Return (column, grasp waypoint, last waypoint held) of each freedom chosen when clamping.
 
     Args:
-        scene: Whose objects they are.
-        chain: The chain.
-        task: What is held when.
+        scene: Scene with the objects.
+        chain: Virtual kinematic chain.
+        task: Grasps of each phase.
     """
-    found, ends = [], np.cumsum([phase.segments for phase in task.phases])
+    freedoms, ends = [], np.cumsum([phase.segments for phase in task.phases])
     for hold, names in chain.virtual.items():
         attachment = scene.objects[hold.object].object.attachments[hold.attachment]
         for number, phase in enumerate(task.phases):
@@ -137,5 +146,5 @@ def chosen_freedoms(
             last = number
             while last + 1 < len(task.phases) and hold in task.phases[last + 1].held:
                 last += 1
-            found += [(chain.index(name), int(ends[number]), int(ends[last])) for name in names]
-    return tuple(found)
+            freedoms += [(chain.index(name), int(ends[number]), int(ends[last])) for name in names]
+    return tuple(freedoms)

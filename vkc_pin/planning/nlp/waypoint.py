@@ -1,6 +1,6 @@
-"""The constraint rows of one waypoint (eqs. 2, 3, 6 and 7), and of one step of a base on wheels.
+"""Builds the constraint rows of one waypoint (eqs. 2, 3, 6, 7) and of one step of a wheeled base.
 
-They are SX functions, small, exact to second order, mapped over waypoints or steps.
+They are small SX functions with exact second derivatives, mapped over waypoints or steps.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.kinematics import kinematics_of
-from vkc_pin.planning.chain.pose import AWAY, PoseRow, pose_rows, receded
-from vkc_pin.planning.kinematics.batch import size_of
+from vkc_pin.planning.chain.kinematics import get_kinematics
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, pose_rows, relax_target
+from vkc_pin.planning.kinematics.batch import estimate_size
 from vkc_pin.planning.kinematics.machine_code import MachineCode
 from vkc_pin.planning.nlp.sparse import assemble
 from vkc_pin.planning.nlp.term_rows import TermRow
@@ -25,29 +25,29 @@ from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.trajectory.wheels import ANYWHERE, Rolling
 
-__all__ = ["StepRows", "Structure", "WaypointFunctions", "waypoint_functions"]
+__all__ = ["StepRows", "Structure", "WaypointFunctions", "get_waypoint_functions"]
 
-# waypoints of one kind from which on it is compiled: most kinds have one, at a grasp, or some
-# thirty
-_WORTH = 4
+# Minimum number of waypoints of one kind for which compilation pays off. Most kinds occur once, at
+# a grasp, or about thirty times.
+_MIN_WAYPOINTS_TO_COMPILE = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
-    """What a symbolic program depends on.
+    """Everything that a symbolic program depends on.
 
     Attributes:
-        model: The chain.
+        model: Model of the virtual kinematic chain.
         segments: N, the number of waypoints after the start.
-        poses: Frames that must be somewhere.
+        poses: Frames with a pose goal.
         slots: K, witness planes per waypoint.
-        stops: Waypoints inside the motion at which it comes to rest, as it does at start and end.
-        rolling: How the base may move.
-        clamped: (column, first, last): coordinates that keep their value from waypoint `first` to
-            `last`, as a hand does that clamps.
-        pushed: (column, first, last, way): coordinates that only go up (way 1) or down (-1) from
-            waypoint `first` to `last`.
-        terms: The user's own constraints and costs.
+        stops: Interior waypoints at which the motion is at rest, as it is at its start and end.
+        rolling: Motion constraints of the base.
+        clamped: (column, first, last): coordinates that are constant from waypoint `first` to
+            `last`, such as the freedoms of a clamped grasp.
+        pushed: (column, first, last, direction): coordinates that may only increase (direction 1)
+            or decrease (-1) from waypoint `first` to `last`.
+        terms: User-defined constraints and costs.
     """
 
     model: pin.Model
@@ -62,71 +62,77 @@ class Structure:
 
     @property
     def timed(self) -> bool:
-        """Whether the time of a step counts."""
+        """Whether any term depends on the step duration."""
         return any(term.formula.timed for term in self.terms)
 
     @cached_property
     def key(self) -> tuple[Any, ...]:
-        """Equal for structures that share one program."""
-        poses = tuple((*_key(pose), pose.waypoints) for pose in self.poses)
+        """Cache key, equal for structures that share one program."""
+        poses = tuple((*_pose_key(pose), pose.waypoints) for pose in self.poses)
         others = (self.stops, self.rolling, self.clamped, self.pushed, self.terms)
         return (self.model.saveToString(), self.segments, poses, self.slots, *others)
 
 
-def _key(pose: PoseRow) -> tuple[Any, ...]:
-    """Equal for poses that are asked for with the same rows."""
+def _pose_key(pose: PoseRow) -> tuple[Any, ...]:
+    """Return a key that is equal for poses with the same constraint rows."""
     return pose.joint, (pose.local.homogeneous + 0.0).tobytes(), pose.kind, pose.shift
 
 
-def waypoint_functions(
+def get_waypoint_functions(
     model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
 ) -> WaypointFunctions:
     """Return the functions of one kind of waypoint, built if they are not in the cache."""
-    key = ("waypoint", model.saveToString(), slots, *(_key(pose) for pose in poses))
+    key = ("waypoint", model.saveToString(), slots, *(_pose_key(pose) for pose in poses))
     return cache.get(key, lambda: WaypointFunctions(model, slots, poses, cache))
 
 
 class WaypointFunctions:
-    """The SX functions of one kind of waypoint: a model, so many witness planes, and which poses it must satisfy."""
+    """SX functions of one kind of waypoint: model, number of witness planes, and pose goals."""
 
     def __init__(
         self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
     ) -> None:
         n, joints = Coordinates(model).size, model.njoints - 1
-        z, s, share = ca.SX.sym("z", n), ca.SX.sym("s", slots), ca.SX.sym("e")
+        z, s, relaxation = ca.SX.sym("z", n), ca.SX.sym("s", slots), ca.SX.sym("e")
         planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
-        targets, away = (
+        targets, pose_offsets = (
             ca.SX.sym("W", 12, max(len(poses), 1)),
-            ca.SX.sym("D", AWAY, max(len(poses), 1)),
+            ca.SX.sym("D", POSE_OFFSET_SIZE, max(len(poses), 1)),
         )
         sweep = cache.get(
-            ("sweep", model.saveToString(), slots), lambda: _Sweep(model, slots, cache)
+            ("sweep", model.saveToString(), slots), lambda: _KinematicSweep(model, slots, cache)
         )
-        placements, slopes_of_planes = sweep.function(z, planes)
+        placements, coordinate_jacobian = sweep.function(z, planes)
         stacked = ca.vec(placements)
-        # Every row is linear in the placements: rows = L·vec(M) + const, so one sweep of the
-        # kinematics serves them all.
+        # Every row is linear in the placements, rows = L·vec(M) + const, so one kinematic sweep
+        # serves all of them.
         parts = []
         for k, pose in enumerate(poses):
-            target = receded(targets[:, k], away[:, k], share)
+            target = relax_target(targets[:, k], pose_offsets[:, k], relaxation)
             parts.append(pose_rows(pose.kind, *pose.placement(placements), target))
         pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
         self.pose_rows = [pose.rows for pose in poses]
         self.rows = slots + sum(self.pose_rows)
         rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
         multipliers = ca.SX.sym("lam", self.rows)
-        of_planes, of_poses = ca.vertsplit(
+        plane_multipliers, pose_multipliers = ca.vertsplit(
             multipliers, [0, slots, self.rows]
-        )  # a slice of a scalar would be a row
-        own = ca.vertcat(z, s, share)
-        slopes = ca.horzcat(slopes_of_planes, ca.SX.eye(slots), ca.SX(slots, 1))
-        jacobian = ca.vertcat(slopes, ca.jacobian(pose_values, own))
+        )  # vertsplit, because slicing a scalar would give a row
+        variables = ca.vertcat(z, s, relaxation)
+        plane_jacobian = ca.horzcat(coordinate_jacobian, ca.SX.eye(slots), ca.SX(slots, 1))
+        jacobian = ca.vertcat(plane_jacobian, ca.jacobian(pose_values, variables))
         spend()
         w = ca.SX.sym("w", 12 * joints)
-        hessian = ca.triu(ca.hessian(ca.dot(w, stacked) + ca.dot(of_poses, pose_values), own)[0])
-        inner = ca.Function("inner", [z, share, targets, away, w, multipliers], [hessian])
-        hessian = inner(z, share, targets, away, planes.T @ of_planes, multipliers)
-        inputs = [own, ca.vec(planes), offsets, ca.vec(targets), ca.vec(away)]
+        hessian = ca.triu(
+            ca.hessian(ca.dot(w, stacked) + ca.dot(pose_multipliers, pose_values), variables)[0]
+        )
+        inner = ca.Function(
+            "inner", [z, relaxation, targets, pose_offsets, w, multipliers], [hessian]
+        )
+        hessian = inner(
+            z, relaxation, targets, pose_offsets, planes.T @ plane_multipliers, multipliers
+        )
+        inputs = [variables, ca.vec(planes), offsets, ca.vec(targets), ca.vec(pose_offsets)]
         spend()
         self.value = ca.Function("g", inputs, [rows])
         self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())])
@@ -137,11 +143,11 @@ class WaypointFunctions:
         )
         self.hessian_pattern = hessian.sparsity().get_triplet()
         self.code = MachineCode(self.value, self.jacobian, self.hessian)
-        self.nbytes = size_of(self.value, self.jacobian, self.hessian)
+        self.nbytes = estimate_size(self.value, self.jacobian, self.hessian)
 
-    def hasten(self, waypoints: int) -> list[MachineCode]:
-        """Become machine code if there is some and so many waypoints are worth it; return what is worth waiting for."""
-        if waypoints < _WORTH:
+    def use_machine_code(self, waypoints: int) -> list[MachineCode]:
+        """Switch to machine code if it pays off; return the code that is not available yet."""
+        if waypoints < _MIN_WAYPOINTS_TO_COMPILE:
             return []
         self.code.look()
         self.value, self.jacobian, self.hessian = self.code.functions
@@ -149,21 +155,22 @@ class WaypointFunctions:
 
 
 class StepRows:
-    """The rows of all steps of a base on wheels, from one pose (x, y, yaw) to the next, in gears, 1 ahead or -1 back.
+    """Constraint rows of all steps of a wheeled base, from one pose (x, y, yaw) to the next.
 
-    Those of a step, all in metres, with c along, s aside and δθ turned (see `Rolling.steps`), are
-    s, which must be 0; of bases that are steered gear·c ∓ radius·δθ, which must not be negative;
-    and c ∓ track/2·δθ, what wheels go, if they have a limit.
+    The rows of one step, all in metres, use its longitudinal displacement c, lateral displacement s
+    and rotation δθ (see `Rolling.steps`): s, which must be zero; for steered bases, gear·c ∓
+    radius·δθ, which must not be negative; and, if the wheel speed is limited, the wheel travel c ∓
+    track/2·δθ.
 
     Args:
-        rolling: The limits of the base.
-        path: z_0..z_N, shape (n, N + 1), of which z_1..z_N are variables.
-        gears: Shape (N,).
-        width: How many variables a waypoint has; the first three are the base's.
+        rolling: Limits of the base.
+        path: z_0..z_N, shape (n, N + 1); z_1..z_N are variables.
+        gears: 1 (forward) or -1 (backward) for each step, shape (N,).
+        width: Number of variables per waypoint; the first three are the base's.
 
     Attributes:
-        values, jacobian: Of the rows, step by step.
-        owners: The waypoints at which steps end, counted from 0, one for each row.
+        values, jacobian: Row values and their Jacobian, step by step.
+        waypoints: Waypoint at which the step of each row ends, counted from 0.
     """
 
     def __init__(self, rolling: Rolling, path: ca.MX, gears: ca.MX, *, width: int) -> None:
@@ -172,60 +179,74 @@ class StepRows:
             path.shape[1] - 1,
             width * (path.shape[1] - 1),
         )
-        value, jacobian, self._hessian = _step_functions(rolling)
-        self.rows, every = value.size1_out(0), np.arange(self.segments)
+        value, jacobian, self._hessian = _make_step_functions(rolling)
+        self.rows, steps = value.size1_out(0), np.arange(self.segments)
         self._inputs = [ca.vertcat(path[:3, :-1], path[:3, 1:]), gears.T]
-        before = (every[:, None, None] + [[-1], [0]]) * width + np.arange(3)
-        self._columns = before.reshape(-1, 6)  # of both poses in x, where the start has none
-        self.owners = np.repeat(every, self.rows)
+        columns = (steps[:, None, None] + [[-1], [0]]) * width + np.arange(3)
+        # columns of both poses in x; negative for the start, which is no variable
+        self._columns = columns.reshape(-1, 6)
+        self.waypoints = np.repeat(steps, self.rows)
         self.values = ca.vec(value.map(self.segments)(*self._inputs))
         row, column = (np.array(part) for part in jacobian.sparsity_out(0).get_triplet())
         slopes = jacobian.map(self.segments)(*self._inputs)
-        self.jacobian = self._placed(
-            slopes, every[:, None] * self.rows + row, self._columns[:, column], len(self.owners)
+        self.jacobian = self._place_nonzeros(
+            slopes, steps[:, None] * self.rows + row, self._columns[:, column], len(self.waypoints)
         )
 
     def hessian(self, multipliers: ca.MX) -> ca.MX:
-        """Return the upper half of the Hessian of the rows, times their multipliers."""
+        """Return the upper triangle of the Hessian of multipliers·rows."""
         row, column = (np.array(part) for part in self._hessian.sparsity_out(0).get_triplet())
-        bends = self._hessian.map(self.segments)(
+        curvatures = self._hessian.map(self.segments)(
             *self._inputs, ca.reshape(multipliers, self.rows, self.segments)
         )
-        return self._placed(bends, self._columns[:, row], self._columns[:, column], self.size)
+        return self._place_nonzeros(
+            curvatures, self._columns[:, row], self._columns[:, column], self.size
+        )
 
-    def _placed(self, parts: ca.MX, row: Ints, column: Ints, height: int) -> ca.MX:
-        """Return the matrix of the nonzeros of every step, without those of the start."""
-        at = np.stack([row.ravel(), column.ravel()])
-        kept = (at >= 0).all(axis=0)
+    def _place_nonzeros(self, parts: ca.MX, row: Ints, column: Ints, height: int) -> ca.MX:
+        """Return the sparse matrix of all steps' nonzeros, without those of the start."""
+        positions = np.stack([row.ravel(), column.ravel()])
+        is_variable = (positions >= 0).all(axis=0)
         nonzeros = ca.vertcat(
             *(part.nz[:] for part in ca.horzsplit(parts, parts.shape[1] // self.segments))
         )
-        return assemble([nonzeros[np.flatnonzero(kept).tolist()]], [at[:, kept]], height, self.size)
+        return assemble(
+            [nonzeros[np.flatnonzero(is_variable).tolist()]],
+            [positions[:, is_variable]],
+            height,
+            self.size,
+        )
 
     def bounds(self, dt: Floats | None) -> tuple[Floats, Floats]:
-        """Return the bounds of the rows; wheels have some only where steps take times dt, shape (N,) [s]."""
-        far = np.full(self.segments, np.inf) if dt is None else self.rolling.rim * dt
+        """Return the bounds of the rows; `dt`, shape (N,) [s], limits wheel travel if given."""
+        travel = np.full(self.segments, np.inf) if dt is None else self.rolling.rim * dt
         lower, upper = np.zeros((self.segments, self.rows)), np.zeros((self.segments, self.rows))
         upper[:, 1:] = np.inf
         if self.rolling.timed:
-            lower[:, -2:], upper[:, -2:] = -far[:, None], far[:, None]
+            lower[:, -2:], upper[:, -2:] = -travel[:, None], travel[:, None]
         return lower.ravel(), upper.ravel()
 
 
-def _step_functions(rolling: Rolling) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Return the SX functions of one step: its rows, their Jacobian, and the upper half of their Hessian times multipliers."""
+def _make_step_functions(rolling: Rolling) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return the SX functions of one step: rows, Jacobian, and upper triangle of the Hessian."""
     poses, gear = ca.SX.sym("b", 6), ca.SX.sym("g")
     dx, dy, turn = ca.vertsplit(poses[3:] - poses[:3])
     heading = (poses[2] + poses[5]) / 2
-    along, aside = (
+    longitudinal, lateral = (
         ca.cos(heading) * dx + ca.sin(heading) * dy,
         ca.cos(heading) * dy - ca.sin(heading) * dx,
     )
     steered = (
-        [gear * along + side * rolling.radius * turn for side in (-1, 1)] if rolling.radius else []
+        [gear * longitudinal + side * rolling.radius * turn for side in (-1, 1)]
+        if rolling.radius
+        else []
     )
-    wheels = [along + side * rolling.track / 2 * turn for side in (-1, 1)] if rolling.timed else []
-    rows = ca.vertcat(aside, *steered, *wheels)
+    wheels = (
+        [longitudinal + side * rolling.track / 2 * turn for side in (-1, 1)]
+        if rolling.timed
+        else []
+    )
+    rows = ca.vertcat(lateral, *steered, *wheels)
     multipliers = ca.SX.sym("lam", rows.numel())
     hessian = ca.triu(ca.hessian(ca.dot(multipliers, rows), poses)[0])
     return (
@@ -235,8 +256,8 @@ def _step_functions(rolling: Rolling) -> tuple[ca.Function, ca.Function, ca.Func
     )
 
 
-class _Sweep:
-    """One sweep over a model's joints, for all kinds of waypoints: z, planes → placements, slopes of the planes' values."""
+class _KinematicSweep:
+    """One kinematic sweep for all kinds of waypoints: (z, planes) → placements, plane gradients."""
 
     def __init__(self, model: pin.Model, slots: int, cache: Cache) -> None:
         coordinates = Coordinates(model)
@@ -244,23 +265,25 @@ class _Sweep:
             ca.SX.sym("z", coordinates.size),
             ca.SX.sym("C", slots, 12 * (model.njoints - 1)),
         )
-        placements = kinematics_of(model, cache).symbolic(z)
+        placements = get_kinematics(model, cache).symbolic(z)
         self.function = ca.Function(
-            "sweep", [z, planes], [placements, _slopes(model, coordinates, z, placements, planes)]
+            "sweep",
+            [z, planes],
+            [placements, _differentiate_planes(model, coordinates, z, placements, planes)],
         )
-        self.nbytes = size_of(self.function)
+        self.nbytes = estimate_size(self.function)
 
 
-def _slopes(
+def _differentiate_planes(
     model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any
 ) -> Any:
     """Return the derivatives of planes·vec(M(z)), shape (K, n), with respect to z.
 
-    A coordinate of a joint turns and shifts all that this joint carries by one twist (ω, v): dR = ω
-    × R, dt = ω × t + v. So a plane's derivative is m·ω + f·v, where m = Σ (Σ_c R_c × C_c + t × C_t)
-    and f = Σ C_t add up over what the joint carries: a fraction of the work of multiplying with the
-    derivatives of all placements. Where it moves several joints, each adds its own twist to that of
-    those before it, and these add up.
+    A coordinate of a joint moves everything that the joint supports by one twist (ω, v): dR = ω ×
+    R, dt = ω × t + v. The derivative of a plane is therefore m·ω + f·v, where m = Σ (Σ_c R_c × C_c
+    + t × C_t) and f = Σ C_t are accumulated over the supported joints. This takes a fraction of the
+    work of multiplying by the derivatives of all placements. If a coordinate moves several joints,
+    each contributes its twist relative to its nearest ancestor moved by the same coordinate.
     """
     forces: list[Any] = []
     moments: list[Any] = []
@@ -277,24 +300,24 @@ def _slopes(
     slopes, twists = [ca.SX(planes.shape[0], 1)] * coordinates.size, dict[tuple[int, int], Any]()
     for column, joint, *_ in coordinates.moves:
         placement = placements[:, joint - 1]
-        change = ca.jacobian(placement, z[column])
-        turns = [
-            ca.cross(placement[3 * c : 3 * c + 3], change[3 * c : 3 * c + 3]) for c in range(3)
+        derivative = ca.jacobian(placement, z[column])
+        rotation_terms = [
+            ca.cross(placement[3 * c : 3 * c + 3], derivative[3 * c : 3 * c + 3]) for c in range(3)
         ]
-        omega = sum(turns, ca.SX(3, 1)) / 2
+        omega = sum(rotation_terms, ca.SX(3, 1)) / 2
         twist = twists[column, joint] = ca.vertcat(
-            omega, change[9:] - ca.cross(omega, placement[9:])
+            omega, derivative[9:] - ca.cross(omega, placement[9:])
         )
-        above = [k for k in model.supports[joint] if (column, k) in twists and k != joint]
-        own = twist - twists[column, above[-1]] if above else twist
+        ancestors = [k for k in model.supports[joint] if (column, k) in twists and k != joint]
+        relative = twist - twists[column, ancestors[-1]] if ancestors else twist
         slopes[column] = slopes[column] + (
-            moments[joint - 1] @ own[:3] + forces[joint - 1] @ own[3:]
+            moments[joint - 1] @ relative[:3] + forces[joint - 1] @ relative[3:]
         )
     return ca.horzcat(*slopes)
 
 
 def _cross_rows(point: Any, rows: Any) -> Any:
-    """Return point × row of each of the K `rows`, shape (K, 3)."""
+    """Return the cross product of `point` with each of the K `rows`, shape (K, 3)."""
     x, y, z = point[0], point[1], point[2]
     return ca.horzcat(
         y * rows[:, 2] - z * rows[:, 1],

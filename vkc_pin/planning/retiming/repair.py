@@ -7,7 +7,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from vkc_pin.planning.retiming.retime import retimed
+from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -48,7 +48,7 @@ def accepted(
     repairs: int = _REPAIRS,
     jerk_time: float = 0.0,
 ) -> tuple[Trajectory, R]:
-    """Return a motion through waypoints, see `retimed`, and what a check says of it; a last one, if none is accepted.
+    """Return a motion through waypoints, see `retime_trajectory`, and what a check says of it; a last one, if none is accepted.
 
     Where something is wrong, the path passes the middles of the straight lines as well, which the
     program has looked along.
@@ -61,7 +61,7 @@ def accepted(
         jerk_time: See `Options.jerk_time`.
     """
     parts = np.ones(len(waypoints.times) - 1, int)
-    trajectory = retimed(scene, waypoints, jerk_time=jerk_time)
+    trajectory = retime_trajectory(scene, waypoints, jerk_time=jerk_time)
     report = check(trajectory)
     for _ in range(repairs):
         near = {
@@ -73,6 +73,6 @@ def accepted(
         if not near:  # all is well, or too heavy on whatever curve
             break
         parts[[k for k in near if 0 <= k < len(parts)]] *= 2
-        trajectory = retimed(scene, waypoints, parts, jerk_time=jerk_time)
+        trajectory = retime_trajectory(scene, waypoints, parts, jerk_time=jerk_time)
         report = check(trajectory)
     return trajectory, report

@@ -13,10 +13,10 @@ import numpy as np
 from vkc_pin.planning.base_paths.arcs import between
 from vkc_pin.planning.retiming.jerk_limits import eased
 from vkc_pin.planning.retiming.limits import Limits
-from vkc_pin.planning.retiming.spline_path import path_through
-from vkc_pin.planning.retiming.topp_ra import speeds_along
+from vkc_pin.planning.retiming.spline_path import fit_path
+from vkc_pin.planning.retiming.topp_ra import compute_speeds
 from vkc_pin.planning.retiming.torque_bounds import Load
-from vkc_pin.planning.retiming.wheeled_paths import rolling_paths, slip
+from vkc_pin.planning.retiming.wheeled_paths import fit_rolling_paths, slip
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import SHORTEST, Curve, joined, moments_at
@@ -27,7 +27,7 @@ from vkc_pin.world.trajectory.wheels import Rolling, rolling_of
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
-__all__ = ["retimed"]
+__all__ = ["retime_trajectory"]
 
 _PARTS = 3  # pieces of a step in which the speed along the path changes evenly
 _STILL = 1e-6  # [m] or [rad] of a step in which a joint of an object stays where it is
@@ -44,7 +44,7 @@ _SLIP = 2e-4
 _FINEST = 8  # times as many of them, at most
 
 
-def retimed(
+def retime_trajectory(
     scene: Scene, trajectory: Trajectory, parts: Ints | None = None, *, jerk_time: float = 0.0
 ) -> Trajectory:
     """Return a motion along smooth curves through the same waypoints, from rest to rest, as fast as its limits let it be.
@@ -52,8 +52,8 @@ def retimed(
     It rests where it does not move from one waypoint to the next; if a phase begins with that, as
     where a hand opens or closes, for as long as it did. It stops where a joint of an object begins
     or ceases to move: there, the hand that has it turns a corner. Between two rests it goes along
-    one path, see `path_through`, at the speeds of `speeds_along`; where none are known, straight
-    from waypoint to waypoint, with a stop at each. A base on wheels goes along `rolling_paths`. The
+    one path, see `fit_path`, at the speeds of `compute_speeds`; where none are known, straight
+    from waypoint to waypoint, with a stop at each. A base on wheels goes along `fit_rolling_paths`. The
     cubics in time through the places at which speeds are known are slowed down until they keep the
     limits of velocity and acceleration exactly, and of torque where these can be kept at all. With
     limits of jerk they are `eased`.
@@ -125,7 +125,7 @@ def _divided(positions: Floats, places: Ints, rolling: Rolling) -> Floats:
 
 
 def _runs(still: Bools, moves: Bools) -> Iterator[list[int]]:
-    """Yield the steps between rests, or of one: see `retimed`.
+    """Yield the steps between rests, or of one: see `retime_trajectory`.
 
     Args:
         still: In which steps nothing moves, shape (N,).
@@ -143,12 +143,12 @@ def _along(
     bounds = limits.lower, limits.upper
     if not rolling.aside:
         return list(_rolling(points, limits.with_wheels(rolling), scale, rolling, load))
-    found = _smooth(path_through(points, scale, bounds), points, limits, load)
+    found = _smooth(fit_path(points, scale, bounds), points, limits, load)
     if found is not None:
         return [found]
     if not limits.jerky:
         steps = [
-            _stepping(path_through(step, scale, bounds), step, limits)
+            _stepping(fit_path(step, scale, bounds), step, limits)
             for step in map(np.array, itertools.pairwise(points))
         ]
         return [
@@ -169,13 +169,13 @@ def _rolling(
 ) -> Iterator[tuple[Curve, Ints]]:
     """Yield the same of a base on wheels, with so many times the usual knots, or more where it would slip between them."""
     bounds, begin = (limits.lower[:-2], limits.upper[:-2]), 0
-    for path, own in rolling_paths(points, scale, bounds, rolling, finer):
+    for path, own in fit_rolling_paths(points, scale, bounds, rolling, finer):
         part = None if load is None else load.part(begin, len(own) - 1)
         begin += len(own) - 1
         found = _smooth(path, own, limits, part)
         if found is None:
             for k in range(len(own) - 1):
-                ((path, step),) = rolling_paths(own[k : k + 2], scale, bounds, rolling, _FINEST)
+                ((path, step),) = fit_rolling_paths(own[k : k + 2], scale, bounds, rolling, _FINEST)
                 curve, at = _stepping(path, step, limits)
                 yield curve if part is None else part.part(k, 1).slowed(curve), at
         elif finer < _FINEST and slip(found[0]) > _SLIP:
@@ -196,7 +196,7 @@ def _smooth(
     knots = (len(path.x) - 1) // (len(points) - 1)  # a step
     parts = knots * max(_PARTS // knots, 1)
     places = moments_at(path.x, np.arange(parts // knots) / (parts // knots), last=True)
-    speeds = speeds_along(path, places, limits.velocity, limits.acceleration)
+    speeds = compute_speeds(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None
     curve, waypoints = _timed(path, places, points, speeds, limits)
@@ -211,7 +211,7 @@ def _smooth(
         # drag is not linear in the square of the speed: it is taken as it is around the speed before
     ):
         linear = partial(load.linear, path, places, speeds)
-        slower = speeds_along(path, places, limits.velocity, limits.acceleration, linear)
+        slower = compute_speeds(path, places, limits.velocity, limits.acceleration, linear)
         if slower is None:
             break
         settled, speeds = np.allclose(slower, speeds, rtol=_SETTLED), slower

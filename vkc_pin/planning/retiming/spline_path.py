@@ -12,12 +12,10 @@ from vkc_pin.world.trajectory.curve import Curve
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
-__all__ = ["path_through"]
+__all__ = ["fit_path"]
 
 
-def path_through(
-    points: Floats, scale: Floats, limits: tuple[Floats, Floats]
-) -> CubicHermiteSpline:
+def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> CubicHermiteSpline:
     """Return cubics through waypoints, over the length of the way between them.
 
     They are the spline that is twice differentiable. It is linear in the waypoints, so that what

@@ -13,7 +13,7 @@ from vkc_pin.utils.arrays import Floats, Ints
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
-__all__ = ["speeds_along"]
+__all__ = ["compute_speeds"]
 
 _ASIDE = (
     1e-3,
@@ -21,7 +21,7 @@ _ASIDE = (
 )  # share of a segment beside its ends at which accelerations are limited: at the end they jump
 
 
-def speeds_along(
+def compute_speeds(
     path: CubicHermiteSpline,
     places: Floats,
     velocity: Floats,

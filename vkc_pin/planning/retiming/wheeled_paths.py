@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vkc_pin.planning.retiming.spline_path import path_through
+from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.trajectory.curve import Curve, moments_at
 from vkc_pin.world.trajectory.wheels import Rolling, seen
@@ -15,7 +15,7 @@ from vkc_pin.world.trajectory.wheels import Rolling, seen
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
-__all__ = ["rolling_paths", "slip"]
+__all__ = ["fit_rolling_paths", "slip"]
 
 _PARTS = 3  # pieces of a step, at least
 _TURN = 0.05  # [rad] of a piece, at most
@@ -31,7 +31,7 @@ _ROUNDING = 2e-6  # [m] of a place that no bump is worth if it makes a turn too 
 _TIGHT = 3e-4  # share by which a turn may be tighter than the least radius, to allow for rounding
 
 
-def rolling_paths(
+def fit_rolling_paths(
     points: Floats, scale: Floats, limits: tuple[Floats, Floats], rolling: Rolling, finer: int = 1
 ) -> list[tuple[CubicHermiteSpline, Floats]]:
     """Return paths through waypoints, one from each stop to the next, on which a base rolls, each with its waypoints.
@@ -54,7 +54,7 @@ def rolling_paths(
         finer: How many times as many knots there are as usual.
 
     Returns:
-        Paths, see `path_through`, with as many knots in every step, of the n coordinates, and of
+        Paths, see `fit_path`, with as many knots in every step, of the n coordinates, and of
         how far left and right wheels have gone [m], which are none of the motion's, but have a
         limit of their own.
     """
@@ -70,7 +70,9 @@ def rolling_paths(
         corner = _corner(points, wrong, rolling)
         pieces = [points[: corner + 1], points[corner:]]
     return [
-        found for piece in pieces for found in rolling_paths(piece, scale, limits, rolling, finer)
+        found
+        for piece in pieces
+        for found in fit_rolling_paths(piece, scale, limits, rolling, finer)
     ]
 
 
@@ -100,7 +102,7 @@ def _corner(points: Floats, wrong: Bools, rolling: Rolling) -> int:
 def _rolled(
     points: Floats, scale: Floats, limits: tuple[Floats, Floats], rolling: Rolling, finer: int
 ) -> tuple[CubicHermiteSpline, Bools]:
-    """Return the path, see `rolling_paths`, without a stop, and in which steps it is none that the base can drive."""
+    """Return the path, see `fit_rolling_paths`, without a stop, and in which steps it is none that the base can drive."""
     from scipy.interpolate import CubicHermiteSpline
 
     along, _, turn = rolling.steps(points)
@@ -109,7 +111,7 @@ def _rolled(
         np.append(limits[0], np.inf),
         np.append(limits[1], -np.inf),
     )  # it goes back nowhere but where it turns round
-    path = path_through(np.column_stack([points, driven]), np.append(scale, 0.0), bounds)
+    path = fit_path(np.column_stack([points, driven]), np.append(scale, 0.0), bounds)
     parts = finer * max(_PARTS, int(np.ceil(np.abs(turn).max() / _TURN)))
     slopes = path(path.x, 1)[:, [2, -1]]
     if rolling.radius > 0.0:

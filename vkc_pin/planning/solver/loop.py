@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit, infeasibility
+from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.segment_planes import collisions_between, merge
 from vkc_pin.planning.solver.solution import Iteration, Solution
@@ -66,7 +66,7 @@ class _Loop:
 
     def missing(self, z: Floats, at: Contacts) -> Infeasibility:
         """Return what does not hold at waypoints."""
-        return infeasibility(self.problem, z, self.timing, at, rates=self.rates)
+        return measure_infeasibility(self.problem, z, self.timing, at, rates=self.rates)
 
     def contacts(self, z: Floats) -> tuple[Contacts, bool, list[Passage]]:
         """Return what is close at the waypoints and between them, whether all is far enough, and what goes through each other."""
@@ -87,7 +87,7 @@ class _Loop:
         contacts, clear, passed = self.contacts(z)
         promise = (
             self.merit.weights["clearance"] * slack
-            + self.merit.price(self.found, clearance=False) * shares
+            + self.merit.compute_penalty(self.found, clearance=False) * shares
         )
         return Trial(
             z=z,
@@ -110,7 +110,7 @@ class _Loop:
         motion yet that says nothing.
         """
         before, after = (
-            self.merit.price(found, clearance=True) for found in (self.found, trial.found)
+            self.merit.compute_penalty(found, clearance=True) for found in (self.found, trial.found)
         )
         if self.found.amounts["poses"].max() < NEARLY:
             for passage in new(trial.passages, self.passages):
@@ -128,7 +128,7 @@ class _Loop:
 
     def accept(self, trial: Trial) -> None:
         """Go on from `trial`."""
-        far = self.found.others > TOLERANCE
+        far = self.found.max_violation > TOLERANCE
         self.z, self.at, self.found, self.passages = (
             trial.z,
             trial.contacts,
@@ -144,7 +144,7 @@ class _Loop:
         nearly = trial.contacts.violation() < NEARLY
         if nearly and trial.rate > TOLERANCE:  # before, limits on rates only cost time
             pace = self.problem.pace(trial.z)
-            self.timing = self.timing.stretched(*pace)
+            self.timing = self.timing.stretch(*pace)
             self.solution.dt = self.timing.dt
             if not self.rates and self.timing.violation(*pace) > TOLERANCE:
                 self.rates = True
@@ -163,7 +163,7 @@ class _Loop:
     def grow(self) -> bool:
         """Make dearer what is missing; return whether anything could be."""
         self.subproblem.forget()
-        return self.merit.grow(self.found, CLOSE_ENOUGH)
+        return self.merit.increase_weights(self.found, CLOSE_ENOUGH)
 
 
 def solve(
@@ -273,4 +273,4 @@ def _iterate(
 
 def _nearly(found: Infeasibility) -> bool:
     """Return whether everything holds but for a little clearance."""
-    return bool(found.amounts["clearance"].max() < NEARLY) and found.others < TOLERANCE
+    return bool(found.amounts["clearance"].max() < NEARLY) and found.max_violation < TOLERANCE

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.planning.chain.contacts import Contacts, no_contacts
+from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
 from vkc_pin.planning.solver.tunnelling import Passage, passages
@@ -62,7 +62,7 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
         1 / counts[segment[rows]],
     )
     if not len(rows):
-        return Between(no_contacts(), True, [])
+        return Between(make_empty_contacts(), True, [])
     segment = np.repeat(segment, FINER)
     s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
     states, waypoints = _states(path, segment, s)

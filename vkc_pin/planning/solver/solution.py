@@ -54,7 +54,7 @@ class Solution:
             of its margin [m], if that is so much that `validation` cannot accept it; otherwise 0.
         radius: How far planes were believed in the end, shape (N,).
         rounds, iterations: Of the outer loop and of Ipopt.
-        timings: Seconds in "coal", "casadi" (evaluating functions) and "ipopt" (all the rest of
+        timings: Seconds in "coal", "casadi" (evaluation_time functions) and "ipopt" (all the rest of
             it).
         history: One `Iteration` per round.
     """

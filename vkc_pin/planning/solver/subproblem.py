@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit, shortfalls
+from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit, compute_shortfalls
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.nlp.timing import Timing
 from vkc_pin.planning.solver.solution import Solution
@@ -123,7 +123,7 @@ class Subproblem:
             np.minimum(problem.upper, z + radius[:, None]),
         )
         bounds = problem.row_bounds(timing if rates else None)
-        relaxed = found.others > TOLERANCE
+        relaxed = found.max_violation > TOLERANCE
         if (
             relaxed
         ):  # on the way: the rows of the round before were others, and its end need not be exact
@@ -136,8 +136,8 @@ class Subproblem:
             **how,
         }
         solver = t.solver(rates=rates, options=options)
-        prices = merit.price(found, clearance=False)
-        shares = np.where(relaxed & (prices > 0.0), 1.0, 0.0)
+        penalties = merit.compute_penalty(found, clearance=False)
+        shares = np.where(relaxed & (penalties > 0.0), 1.0, 0.0)
         parameters = t.parameter_vector(
             problem.start,
             planes,
@@ -146,12 +146,12 @@ class Subproblem:
             weights=problem.effort.weights(*problem.rates(z)),
             penalty=merit.weights["clearance"],
             dt=timing.dt,
-            away=found.away,
+            pose_offsets=found.pose_offsets,
             excess=found.excess,
-            prices=prices,
+            relaxation_weights=penalties,
             gears=problem.rolling.gears(problem.waypoints(z)),
         )
-        short = shortfalls(at, t.segments, t.slots)
+        short = compute_shortfalls(at, t.segments, t.slots)
         room = np.where(short > 0.0, np.inf, 0.0)  # what keeps its margin now must go on keeping it
         arguments = {
             "x0": t.pack(z, short, shares),
@@ -164,8 +164,8 @@ class Subproblem:
         begin = time.perf_counter()
         result = solver(**arguments, **self._multipliers)
         total = time.perf_counter() - begin
-        self.solution.timings["casadi"] += solver.evaluating
-        self.solution.timings["ipopt"] += total - solver.evaluating
+        self.solution.timings["casadi"] += solver.evaluation_time
+        self.solution.timings["ipopt"] += total - solver.evaluation_time
         self.solution.iterations += int(solver.stats["iter_count"])
         self._multipliers = {"lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
         x = result["x"].reshape(t.segments, t.width)

@@ -18,8 +18,8 @@ __all__ = [
     "TOLERANCE",
     "Infeasibility",
     "Merit",
-    "measure_infeasibility",
     "compute_shortfalls",
+    "measure_infeasibility",
 ]
 
 # [m], [rad], and relative to the limits for rates: tolerance of all constraints except clearance

@@ -11,7 +11,7 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["Timing", "split_at_stops", "compute_step_times"]
+__all__ = ["Timing", "compute_step_times", "split_at_stops"]
 
 # Factor by which a motion may be slowed down before rate limits become rows of the program.
 _MAX_STRETCH = 1.5

@@ -20,7 +20,7 @@ from vkc_pin.visualization import viewer as visualization
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.models.shapes import triangulate
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.trajectory.dynamics.torques import Torques
 from vkc_pin.world.trajectory.world_model import World
 
@@ -141,7 +141,7 @@ def furniture_picture() -> None:
                     for name, high in zip(thing.coordinates.names, thing.upper, strict=True)
                 ]
             )
-            shapes = standing_geometry(
+            shapes = make_world_shapes(
                 vkc.PlacedObject(kind, thing, pin.SE3.Identity(), state), visual=True
             )
             faces, colours = list[np.ndarray](), list[np.ndarray]()

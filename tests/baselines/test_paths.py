@@ -19,7 +19,7 @@ from vkc_pin.baselines.paths import BasePaths, headings
 from vkc_pin.planning.base_paths.base_path import shortest_path
 from vkc_pin.world.models.shapes import list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 
 START, BESIDE = np.array([-1.5, 1.5, 0.0]), np.array([0.5, 1.0, 0.8])
 AISLE = np.array([1.0, -1.4, 0.0])  # behind the post
@@ -47,7 +47,7 @@ def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("d
     labels = zip(scene.obstacle_labels, scene.obstacles, strict=True)
     still = [shape for label, shape in labels if label != FLOOR]
     for name, placed in scene.objects.items():
-        still += standing_geometry(placed) if name not in without else []
+        still += make_world_shapes(placed) if name not in without else []
     rows = np.vstack([between(a, b, length=0.05, angle=0.1) for a, b in itertools.pairwise(poses)])
     return min(distance(base, list_placed_shapes(still), row.tolist()) for row in rows)
 

@@ -17,9 +17,9 @@ from vkc_pin.benchmarks.harness import step_by_step as stepwise
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.shapes import compute_clearance
-from vkc_pin.world.scene.clearance_exemptions import close_pairs
-from vkc_pin.world.scene.placed_object import standing_geometry
-from vkc_pin.world.task.actions import actions_of, foresee
+from vkc_pin.world.scene.clearance_exemptions import find_close_pairs
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.task.actions import group_into_actions, compile_each_step
 
 
 @pytest.mark.parametrize(
@@ -29,8 +29,8 @@ def test_chores_have_the_papers_steps(name: str, number: int, actions: int) -> N
     chore = chores.CHORES[name]
     scene, listed = chore.scene(), chore.planned()
     assert len(listed) == number
-    assert len(actions_of(listed)) == actions
-    foresee(scene, listed, chore.options)  # none of them is impossible at its place
+    assert len(group_into_actions(listed)) == actions
+    compile_each_step(scene, listed, chore.options)  # none of them is impossible at its place
 
 
 def test_the_cluttered_home_is_the_home_and_more() -> None:
@@ -45,7 +45,7 @@ def test_the_cluttered_home_is_the_home_and_more() -> None:
 def gap(scene: vkc.Scene, first: str, second: str) -> float:
     """Return how far two links stand apart [m]."""
     (pair,) = [
-        pair for pair in close_pairs(scene, 0.02) if {pair.first, pair.second} == {first, second}
+        pair for pair in find_close_pairs(scene, 0.02) if {pair.first, pair.second} == {first, second}
     ]
     return pair.distance
 
@@ -68,7 +68,7 @@ def test_the_cluttered_home_is_as_tight_as_real_ones() -> None:
 def test_what_is_carried_has_a_neighbour(carried: str, other: str) -> None:
     full = chores.cluttered_home()
     shapes = [
-        (shape.geometry, shape.placement) for shape in standing_geometry(full.objects[carried])
+        (shape.geometry, shape.placement) for shape in make_world_shapes(full.objects[carried])
     ]
     (index,) = [i for i, label in enumerate(full.obstacle_labels) if label == other]
     assert compute_clearance(
@@ -82,7 +82,7 @@ def test_one_step_less_is_noticed() -> None:
     steps = chores.home(scene)
     del steps[15]
     with pytest.raises(InputError, match=r"steps\[15\]"):
-        foresee(scene, steps, vkc.Options())
+        compile_each_step(scene, steps, vkc.Options())
 
 
 def stay(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:

@@ -33,7 +33,7 @@ from vkc_pin.benchmarks.household import (
 from vkc_pin.cli import main
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 
 GOOD = {("cup", "B1"): {0}, ("cup", "B2"): {0, 1}, ("door", "B2"): {1}}
 """(task, method) → the starts from which `solve` has it succeed; VKC always does."""
@@ -159,7 +159,7 @@ def test_the_variant_has_the_numbers_of_the_papers_code() -> None:
     }
     assert upper == {**was, "dishwasher": {**was["dishwasher"], "rack": 0.8}}
     there = theirs.with_placement("cup", pin.SE3(np.eye(3), np.array([-0.6, -1.6, 1.11])))
-    cup = list_placed_shapes(standing_geometry(there.objects["cup"]))
+    cup = list_placed_shapes(make_world_shapes(there.objects["cup"]))
     assert compute_clearance(cup, list_placed_shapes(there.obstacles)) == pytest.approx(
         1e-3, abs=1e-6
     )
@@ -263,7 +263,7 @@ def test_the_cup_stands_wholly_on_the_coffee_table() -> None:
     poses = np.array([on_the_coffee_table(scene, rng)["cup"] for _ in range(300)])
     for pose in poses[:40]:
         there = scene.with_placement("cup", pin.SE3(pin.rpy.rpyToMatrix(*pose[3:]), pose[:3]))
-        cup = list_placed_shapes(standing_geometry(there.objects["cup"]))
+        cup = list_placed_shapes(make_world_shapes(there.objects["cup"]))
         off = np.abs(pose[:2] - plate.placement.translation[:2])
         assert np.all(off + 0.035 < plate.geometry.halfSide[:2]), "all of its foot"
         assert compute_clearance(cup, list_placed_shapes([plate])) == pytest.approx(

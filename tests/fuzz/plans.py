@@ -32,7 +32,7 @@ def _base() -> tuple[dict[str, Any], dict[str, Any]]:
     steps: list[Any] = [vkc.Actuate("drawer", {"slide": 0.1}), vkc.GoTo(0.1, 0.1)]
     report = vkc.validate(scene(), steps, motion(), terms=terms)
     planned = saved()
-    from vkc_pin.world.task.terms import traced
+    from vkc_pin.world.task.terms import trace_terms
 
     plan = vkc.Plan(
         scene(),
@@ -43,7 +43,7 @@ def _base() -> tuple[dict[str, Any], dict[str, Any]]:
         "rejected",
         planned.metrics,
         history=planned.history,
-        terms=traced(scene(), terms),
+        terms=trace_terms(scene(), terms),
     )
     file = plan.save(folder() / "base.npz")
     with np.load(file) as archive:

@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from helpers.drives import DT, hall
 from vkc_pin.world.models.object_file import load_object
-from vkc_pin.world.scene.hold import holds_of
+from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
@@ -165,7 +165,7 @@ class Script:
         smooth, before = share**2 * (3.0 - 2.0 * share), self.rows[-1]
         first = len(self.rows) - 1
         self.rows += list(before + smooth * (row - before))
-        holds = holds_of(self.held, self.by)
+        holds = make_holds(self.held, self.by)
         self.phases.append(PhaseSpan(f"phase {len(self.phases)}", first, len(self.rows) - 1, holds))
         return self
 

@@ -14,7 +14,7 @@ from helpers.carrying import reaching
 from vkc_pin.options import Options
 from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
 
 MARGIN, BESIDE_HANDLE = 0.02, 0.005  # [m]: Options.dist_safe and Options.grasp_clearance
@@ -125,7 +125,7 @@ def _things(
     for name, placed in scene.objects.items():
         things += [
             (f"{name}.{get_link_name(s.name)}", s)
-            for s in standing_geometry(placed.with_state(state.get(name, {})))
+            for s in make_world_shapes(placed.with_state(state.get(name, {})))
         ]
     return things
 

@@ -20,7 +20,7 @@ import vkc_pin as vkc
 from vkc_pin.planning.chain.chain import consolidate
 from vkc_pin.planning.chain.contacts import ContactModel
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.scene.contact_rules import opening_at_start
+from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
@@ -276,7 +276,7 @@ def test_a_plan_ends_and_goes_on_with_the_fingers_where_they_are(
 ) -> None:
     end = plan.end_scene()
     assert end.opening == NARROW
-    assert opening_at_start(end) == NARROW
+    assert compute_start_opening(end) == NARROW
     assert end.document["start"]["opening"] == NARROW
     again = Scene.from_document(end.document, end.folder)
     assert again.opening == NARROW
@@ -285,7 +285,7 @@ def test_a_plan_ends_and_goes_on_with_the_fingers_where_they_are(
     assert world.start[world.coordinates.index("finger_a_joint")] == pytest.approx(
         NARROW / 2.0, abs=1e-5
     )
-    assert opening_at_start(between_cheeks(robot)) is None
+    assert compute_start_opening(between_cheeks(robot)) is None
     assert "opening" not in between_cheeks(robot).document["start"]
 
 

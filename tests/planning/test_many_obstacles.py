@@ -35,7 +35,7 @@ from vkc_pin.world.collision.shapes import count_distance_queries
 from vkc_pin.world.models import shapes as geometry
 from vkc_pin.world.models.shapes import compute_clearance, compute_shape_distance
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -440,7 +440,7 @@ def test_the_clearance_at_the_start_is_that_of_all_pairs(
     standing = [
         s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR
     ]
-    standing += standing_geometry(scene.objects["door"])
+    standing += make_world_shapes(scene.objects["door"])
     expected = min(
         compute_shape_distance(shape, where, other.geometry, other.placement)
         for shape, where in moving

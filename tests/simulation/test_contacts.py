@@ -10,8 +10,8 @@ from vkc_pin.options import Options
 from vkc_pin.simulation.contacts import find_contact_pairs, find_unplanned_contacts
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
-from vkc_pin.world.scene.clearance_exemptions import allowances
-from vkc_pin.world.scene.contact_rules import grasped, touching
+from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
+from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.trajectory.world_model import World
 
@@ -31,7 +31,7 @@ def test_contact_pairs_include_all_pairs_of_the_planner(grip: bool) -> None:
     table = PairTable(plan.scene, Solids(world), plan.trajectory, 0.01)
     exempt = {
         frozenset((one.first, one.second))
-        for one in allowances(plan.scene, Options().dist_safe)
+        for one in find_clearance_exemptions(plan.scene, Options().dist_safe)
         if one.margin < 0.0
     }
     wanted = {
@@ -42,7 +42,7 @@ def test_contact_pairs_include_all_pairs_of_the_planner(grip: bool) -> None:
     assert wanted <= colliding
     assert pairs.overlapping == ()
     if grip:
-        hand, link = touching(plan.scene, holds[0]), grasped(plan.scene, holds[0])
+        hand, link = find_touch_links(plan.scene, holds[0]), find_grasped_link(plan.scene, holds[0])
         never = {
             frozenset((i, j))
             for i in range(len(labels))

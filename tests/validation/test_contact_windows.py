@@ -35,7 +35,7 @@ from vkc_pin.validation.contact_windows import check_gripper, windows
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.scene.contact_rules import CONTACT
+from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
@@ -62,7 +62,7 @@ def near(
             assert held or window.margin == (
                 -np.inf if window.together else min(0.005, dist_safe) if by_hand else 0.0
             )
-            assert window.contact == (0.0 if by_hand and not window.together else CONTACT)
+            assert window.contact == (0.0 if by_hand and not window.together else CONTACT_DEPTH)
             at = found.setdefault((first, second), [])
             at += [(window.first, window.last)] * ((window.first, window.last) not in at)
     return {pair: sorted(at) for pair, at in found.items()}
@@ -126,7 +126,7 @@ def test_only_a_grasp_without_freedom_moves_as_one(attachment: str, rigid: bool)
     near, lever = windows(samples, Solids(samples.world), [], Options())
     assert (near.together, near.margin, near.contact) == (False, 0.005, 0.0)
     assert (lever.together, lever.margin, lever.contact) == (
-        (True, 0.0, CONTACT) if rigid else (False, 0.005, CONTACT)
+        (True, 0.0, CONTACT_DEPTH) if rigid else (False, 0.005, CONTACT_DEPTH)
     )
 
 
@@ -218,13 +218,13 @@ def test_what_lies_on_the_floor() -> None:
         (
             0.005,
             [],
-            (2, 6, 0.0, CONTACT, False, True),
+            (2, 6, 0.0, CONTACT_DEPTH, False, True),
         ),  # until the front, 18 mm thick, has left it by √(20² - 5²) mm
         (-0.002, [], (2, 6, -np.inf, np.inf, True, True)),
         (
             -0.002,
             [{"pair": ["drawer.tray", "side"], "margin": -0.003}],
-            (0, 8, -0.003, CONTACT + 0.003, False, True),
+            (0, 8, -0.003, CONTACT_DEPTH + 0.003, False, True),
         ),
     ],
 )
@@ -288,7 +288,7 @@ def test_what_stands_in_something_leaves_it_once_and_within_a_second() -> None:
         assert (window.first, window.last) == (20, 20 + STEPS)
         assert (window.margin, window.contact) == (
             pytest.approx(-0.002, abs=1e-6),
-            pytest.approx(0.002 + CONTACT, abs=1e-6),
+            pytest.approx(0.002 + CONTACT_DEPTH, abs=1e-6),
         )
         assert {
             samples.world.collision_labels[k] for pair in window.pairs.tolist() for k in pair

@@ -14,8 +14,8 @@ from vkc_pin.validation import contact_windows as touching
 from vkc_pin.validation.contact_windows import Window, _Windows, check_gripper, check_pushes
 from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
-from vkc_pin.world.scene.clearance_exemptions import Allowance
-from vkc_pin.world.scene.contact_rules import CONTACT
+from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption
+from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
 
 STICK, DOOR = Hold("stick", "grip"), Hold("door", "handle")
@@ -233,23 +233,23 @@ def test_what_is_pushed_never_comes_back_with_the_hand(monkeypatch: pytest.Monke
     assert pushed(there, there, monkeypatch) == []
     back = [0.0, 0.1, 0.3, 0.25, 0.2, 0.6]
     assert pushed(back, back, monkeypatch) == [
-        ("push", "door.handle", 1, 7.0, pytest.approx(0.1 - CONTACT), "m")
+        ("push", "door.handle", 1, 7.0, pytest.approx(0.1 - CONTACT_DEPTH), "m")
     ]
     assert pushed(back, back, monkeypatch, "grasp") == []
     assert pushed(back, [0.0] * 6, monkeypatch) == []  # the hand goes alone
     for slack, wrong in ((0.9, False), (1.1, True)):
-        little = [0.0, 0.1, 0.1 - slack * CONTACT]
+        little = [0.0, 0.1, 0.1 - slack * CONTACT_DEPTH]
         assert bool(pushed(little, little, monkeypatch)) == wrong
 
 
 def test_what_it_had_gone_back_counts_from_the_furthest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice by half of what is all right, and forward in between: together it is as far as before."""
-    half = 0.6 * CONTACT
+    half = 0.6 * CONTACT_DEPTH
     ways = [0.0, 0.1, 0.1 - half, 0.1, 0.1 - half]
     assert pushed(ways, ways, monkeypatch) == []
     ways = [0.0, 0.1, 0.1 - half, 0.1 - 2 * half]
     assert pushed(ways, ways, monkeypatch) == [
-        ("push", "door.handle", 1, 6.5, pytest.approx(2 * half - CONTACT), "m")
+        ("push", "door.handle", 1, 6.5, pytest.approx(2 * half - CONTACT_DEPTH), "m")
     ]
 
 
@@ -311,10 +311,10 @@ def test_pairs_are_of_the_smaller_and_the_larger() -> None:
 
 
 def test_a_window_is_no_window_of_what_moves_as_one_unless_that_is_said() -> None:
-    assert Window(np.zeros((0, 2), int), 0, 1, 0.0)[3:] == (0.0, CONTACT, False, False)
+    assert Window(np.zeros((0, 2), int), 0, 1, 0.0)[3:] == (0.0, CONTACT_DEPTH, False, False)
 
 
-class Allowed(Allowance):
+class Allowed(ClearanceExemption):
     """An allowance of two links that holds at some of the waypoints."""
 
     def __init__(self, holds: list[bool], margin: float) -> None:
@@ -340,9 +340,9 @@ class Allowed(Allowance):
 @pytest.mark.parametrize(
     ("margin", "contact", "together"),
     [
-        (0.005, CONTACT, False),
-        (-0.003, CONTACT + 0.003, False),
-        (-0.5 * CONTACT, 1.5 * CONTACT, False),
+        (0.005, CONTACT_DEPTH, False),
+        (-0.003, CONTACT_DEPTH + 0.003, False),
+        (-0.5 * CONTACT_DEPTH, 1.5 * CONTACT_DEPTH, False),
         (-np.inf, np.inf, True),
     ],
 )

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from vkc_pin.errors import InputError
 from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MOST, Samples
-from vkc_pin.world.scene.hold import Hold, holds_of
+from vkc_pin.world.scene.hold import Hold, make_holds
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -168,8 +168,8 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
 def test_what_a_hand_moves() -> None:
     samples = Samples(full_scene(), motion(full_scene(), 0))
     assert samples.moved_by(()) == set()
-    assert samples.moved_by(holds_of({"cabinet": "grip"})) == {"cabinet.swing", "cabinet.slide"}
-    assert samples.moved_by(holds_of({"door": "handle", "drawer": "handle"})) == {
+    assert samples.moved_by(make_holds({"cabinet": "grip"})) == {"cabinet.swing", "cabinet.slide"}
+    assert samples.moved_by(make_holds({"door": "handle", "drawer": "handle"})) == {
         "door.hinge",
         "door.knob",
         "drawer.slide",

@@ -14,7 +14,7 @@ import vkc_pin as vkc
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.terms import BETWEEN, _inputs, _rows, check_terms
 from vkc_pin.world.task.formula import Formula
-from vkc_pin.world.task.terms import traced
+from vkc_pin.world.task.terms import trace_terms
 
 
 def looked_at(
@@ -84,12 +84,12 @@ def test_formulas_are_given_frames_coordinates_and_the_last_steps(moving: bool) 
         )
         return value + s.rate("base_x") if moving else value
 
-    (term,) = traced(scene, [vkc.Constraint("any", expression, upper=0.0)])
+    (term,) = trace_terms(scene, [vkc.Constraint("any", expression, upper=0.0)])
     formula = term.formula
-    assert formula.moving == moving
+    assert formula.uses_previous == moving
     asked = np.sort(np.append(samples.waypoint_rows[1:], samples.waypoint_rows[1:] - 1))
     inputs = _inputs(samples, formula, asked)
-    half = formula.half
+    half = formula.state_size
     assert inputs.shape == (len(asked), 2 * half + 1)
     model, data = samples.world.model, samples.world.model.createData()
 
@@ -132,7 +132,7 @@ def test_by_how_much_and_on_which_side(
     given = vkc.Constraint("x", lambda s: s.coordinate("base_x"), lower=lower, upper=upper)
     found = [
         one
-        for one in check_terms(Samples(scene, motion), traced(scene, [given]))
+        for one in check_terms(Samples(scene, motion), trace_terms(scene, [given]))
         if "between" not in one.detail
     ]
     assert [(one.detail, one.subject, one.unit) for one in found] == [(detail, "x", "")]
@@ -157,7 +157,7 @@ def test_between_waypoints_ten_times_as_much_is_all_right() -> None:
             ),
             upper=0.0,
         )
-        found = check_terms(samples, traced(scene, [bump]))
+        found = check_terms(samples, trace_terms(scene, [bump]))
         assert len(found) == told
         if told:
             assert (found[0].waypoint, found[0].time) == (1, pytest.approx(0.375))
@@ -171,7 +171,7 @@ def test_what_is_never_asked_about_is_not_worked_out(monkeypatch: pytest.MonkeyP
     motion = of_rows(scene, np.array([moved(scene.start, x=x) for x in (0.0, 0.5, 1.0)]))
     never = vkc.Constraint("never", lambda s: s.coordinate("base_x"), upper=0.5, during="another")
     always = vkc.Constraint("always", lambda s: s.coordinate("base_x"), upper=0.5)
-    terms, asked, values = traced(scene, [never, always]), list[int](), Formula.values
+    terms, asked, values = trace_terms(scene, [never, always]), list[int](), Formula.values
 
     def counted(formula: Formula, inputs: np.ndarray) -> np.ndarray:
         asked.append(len(inputs))

@@ -16,7 +16,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.validation.validate import validate
 from vkc_pin.visualization.plots.clearance import clearance_curves
-from vkc_pin.world.scene.hold import holds_of
+from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
@@ -627,14 +627,17 @@ def test_bad_trajectories(door_plan: vkc.Plan, empty: Scene) -> None:
         )
     assert other.value.field == "trajectory.names"
     for held, kind in (({"dor": "handle"}, "object"), ({"door": "handl"}, "attachment")):
-        phases = (*motion.phases[:-1], dataclasses.replace(motion.phases[-1], holds=holds_of(held)))
+        phases = (
+            *motion.phases[:-1],
+            dataclasses.replace(motion.phases[-1], holds=make_holds(held)),
+        )
         with pytest.raises(UnknownNameError, match=kind) as caught:
             check(door_plan, trajectory=dataclasses.replace(motion, phases=phases))
         assert caught.value.field == "trajectory.phases[2].held"
         assert caught.value.nearest in ("door", "handle")
     phases = (
         *motion.phases[:-1],
-        dataclasses.replace(motion.phases[-1], holds=holds_of({"door": "handle_free"})),
+        dataclasses.replace(motion.phases[-1], holds=make_holds({"door": "handle_free"})),
     )
     with pytest.raises(InputError, match="missing") as other:
         check(door_plan, trajectory=dataclasses.replace(motion, phases=phases))

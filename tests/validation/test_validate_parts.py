@@ -21,9 +21,9 @@ from vkc_pin.validation.validate import (
     WAYPOINT_TOLERANCE,
     _Check,
 )
-from vkc_pin.world.scene.clearance_exemptions import Allowance
+from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.support import LEVEL
+from vkc_pin.world.scene.support import MAX_TILT
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 
@@ -346,18 +346,18 @@ def test_only_a_hand_that_clamps_must_not_slide() -> None:
     assert noted == [("q", "slide", f"stick.{name}", *said) for name in clamps.coordinates]
 
 
-@pytest.mark.parametrize(("angle", "tips"), [(0.9 * LEVEL, False), (1.1 * LEVEL, True)])
+@pytest.mark.parametrize(("angle", "tips"), [(0.9 * MAX_TILT, False), (1.1 * MAX_TILT, True)])
 def test_what_something_stands_on_stays_level(angle: float, tips: bool) -> None:
     """As it was at the phase's begin, whichever way it turns about the vertical."""
     made = check(phases=[PhaseSpan("p", 0, 1), PhaseSpan("q", 1, 3)])
     made.samples.free = SimpleNamespace(rides=[{}, {"cup": "tray.plate"}])
     start = pin.utils.rotate("x", 0.3)
-    little = pin.utils.rotate("z", 1.0) @ pin.utils.rotate("y", -0.2 * LEVEL) @ start
+    little = pin.utils.rotate("z", 1.0) @ pin.utils.rotate("y", -0.2 * MAX_TILT) @ start
     turns = [start, little, pin.utils.rotate("y", angle) @ start, start, start]
     made.samples.placements = lambda rows, label: [pin.SE3(turn, np.zeros(3)) for turn in turns]
     made._tips()
     assert told(made) == (
-        [("tips", "cup", 2, 2.0, pytest.approx(angle - LEVEL), "rad")] if tips else []
+        [("tips", "cup", 2, 2.0, pytest.approx(angle - MAX_TILT), "rad")] if tips else []
     )
 
 
@@ -365,7 +365,7 @@ def test_what_something_stands_on_stays_level(angle: float, tips: bool) -> None:
 # --------------------------------------------------------------------------------------------------------
 
 
-class Near(Allowance):
+class Near(ClearanceExemption):
     """An allowance of two links that holds at some samples."""
 
     def __init__(self, first: str, second: str, rows: set[int], margin: float = -np.inf) -> None:

@@ -21,7 +21,7 @@ from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
 from vkc_pin.options import Options
 from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
-from vkc_pin.procedural.rooms.clutter import cluttered
+from vkc_pin.procedural.rooms.clutter import add_clutter
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 
@@ -144,7 +144,7 @@ def cluttered_home() -> Scene:
         tight = Scene.from_document(
             {**home.document, "obstacles": [*home.document["obstacles"], *TIGHT]}, home.folder
         )
-        return cluttered(tight, THINGS, clear=[(place, _AROUND) for place in places])
+        return add_clutter(tight, THINGS, clear=[(place, _AROUND) for place in places])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
-from vkc_pin.world.task.terms import Term, traced
+from vkc_pin.world.task.terms import Term, trace_terms
 
 __all__ = ["grasped"]
 
@@ -52,7 +52,7 @@ def grasped(
             holding,
             compile_task(holding, [step], options),
             options,
-            traced(scene, terms),
+            trace_terms(scene, terms),
             cache=cache,
         )
         chain, robot = problem.chain, scene.robot.coordinates.size

@@ -18,7 +18,7 @@ from vkc_pin.errors import VkcError
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner
 from vkc_pin.procedural.rooms.parts import CARRIED, Part
-from vkc_pin.procedural.rooms.random_room import Layout, random_layout
+from vkc_pin.procedural.rooms.random_room import Layout, sample_layout
 from vkc_pin.procedural.rooms.settings import RoomSettings
 from vkc_pin.procedural.tasks import goals
 from vkc_pin.utils.arrays import Floats
@@ -140,7 +140,7 @@ def _layout(said: str, room: int) -> Layout:
         width=fields.rooms.width,
         front=fields.rooms.front,
     )
-    return random_layout(room, settings)
+    return sample_layout(room, settings)
 
 
 @functools.lru_cache(maxsize=_KEPT)
@@ -148,7 +148,7 @@ def _place(said: str, room: int, robot: str, height: float | None) -> _Place:
     """Return a random room with a robot in it; processes keep the last ones."""
     try:
         layout = _layout(said, room)
-        scene = layout.scene()
+        scene = layout.make_scene()
         document = scene.document
         if robot != scene.robot.name or height is not None:
             document["robot"] = {"name": robot}
@@ -241,7 +241,7 @@ def _on_table(
     depth, width, height = on.size
     x = -depth / 2.0 + min(float(rng.uniform(*edge)), depth - _MARGIN)
     y = float(rng.uniform(-1.0, 1.0)) * (width / 2.0 - _MARGIN)
-    return *on.frame.point(x, y), round(height + CARRIED[kind] + _ON, 4)
+    return *on.frame.transform_point(x, y), round(height + CARRIED[kind] + _ON, 4)
 
 
 def _started(recipe: Recipe, place: _Place, rng: np.random.Generator, goal: Floats) -> Scene:
@@ -273,10 +273,10 @@ def _connected(place: _Place, base: Floats) -> bool:
         return True
     standing = [part.footprint for part in place.layout.parts if part.size != (0.0, 0.0, 0.0)]
     where = (float(base[0]), float(base[1]))
-    if not place.layout.floor.free(standing, place.layout.radius, [where])[0]:
+    if not place.layout.floor.find_free(standing, place.layout.radius, [where])[0]:
         return False
-    spots = [part.spot for part in place.layout.parts if part.spot is not None]
-    return place.layout.floor.connected(standing, place.layout.radius, [*spots, where])
+    spots = [part.standing_place for part in place.layout.parts if part.standing_place is not None]
+    return place.layout.floor.is_connected(standing, place.layout.radius, [*spots, where])
 
 
 def _kind(recipe: Recipe, called: str) -> str:

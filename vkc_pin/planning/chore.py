@@ -12,10 +12,10 @@ from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.planning.window import SlidingWindow
 from vkc_pin.utils.arguments import whole
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.actions import foresee
-from vkc_pin.world.task.phases import stretches
-from vkc_pin.world.task.steps import Step, as_list
-from vkc_pin.world.task.terms import Term, check_active
+from vkc_pin.world.task.actions import compile_each_step
+from vkc_pin.world.task.phases import summarize_phases
+from vkc_pin.world.task.steps import Step, as_steps
+from vkc_pin.world.task.terms import Term, check_terms_active
 
 __all__ = ["plan_chore"]
 
@@ -77,11 +77,13 @@ def plan_chore(
         seed=seed,
         terms=terms,
     )
-    window, asked = whole(window, "window", low=1), as_list(steps)
+    window, asked = whole(window, "window", low=1), as_steps(steps)
 
     def run(settings: Settings) -> Plan:
-        tasks = foresee(scene, asked, settings.options)
-        check_active(settings.terms, [stretch for task in tasks for stretch in stretches(task)])
+        tasks = compile_each_step(scene, asked, settings.options)
+        check_terms_active(
+            settings.terms, [stretch for task in tasks for stretch in summarize_phases(task)]
+        )
         through = dict.fromkeys(
             hold for task in tasks for hold in task.holds if hold.by is not None
         )

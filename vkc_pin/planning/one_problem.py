@@ -32,7 +32,7 @@ from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
-from vkc_pin.world.task.terms import traced
+from vkc_pin.world.task.terms import trace_terms
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["OneProblem"]
@@ -292,7 +292,9 @@ class OneProblem:
     @cached_property
     def _paced(self) -> bool:
         """Whether own constraints say something of velocities, which are those of the program's own time then."""
-        return any(term.formula.moving for term in traced(self.scene, self.settings.terms))
+        return any(
+            term.formula.uses_previous for term in trace_terms(self.scene, self.settings.terms)
+        )
 
     def _check(self, trajectory: Trajectory) -> Report:
         """Check a motion, and note how long that takes."""

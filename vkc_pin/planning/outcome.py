@@ -14,7 +14,7 @@ from vkc_pin.planning.settings import Settings
 from vkc_pin.utils.budget import ENDINGS
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.scene.contact_rules import opening_at_start
+from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.task.terms import Term
@@ -188,7 +188,7 @@ def still(scene: Scene, options: Options) -> Trajectory:
             f"{hold.object}.{name}": value for name, value in zip(names, hold.at, strict=True)
         }
     row = list(values.values())
-    phases = (PhaseSpan("stand", 0, 1, scene.holds, opening_at_start(scene)),)
+    phases = (PhaseSpan("stand", 0, 1, scene.holds, compute_start_opening(scene)),)
     return Trajectory(
         tuple(values), np.array([0.0, options.dt]), np.array([row, row]), phases, len(scene.start)
     )

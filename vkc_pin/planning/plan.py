@@ -18,7 +18,7 @@ from vkc_pin.validation.validate import check_fits, validate
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.actions import foresee
+from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.world.trajectory.formats.archives import (
@@ -95,7 +95,7 @@ class Plan:
                 expected="a motion that is valid",
                 got=self.status,
             )
-        after = foresee(self.scene, self.steps, self.options)[-1].after
+        after = compile_each_step(self.scene, self.steps, self.options)[-1].after
         return scene_after(self.scene, self.trajectory, after)
 
     def simulate(self, **options: Any) -> SimulationResult:

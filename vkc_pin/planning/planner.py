@@ -17,9 +17,9 @@ from vkc_pin.utils.arguments import flag, instance, number, whole
 from vkc_pin.utils.cache import Cache, CacheInfo
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
-from vkc_pin.world.task.phases import stretches
+from vkc_pin.world.task.phases import summarize_phases
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.task.terms import Term, check_active
+from vkc_pin.world.task.terms import Term, check_terms_active
 
 __all__ = ["Planner", "borrowed", "guarded", "plan"]
 
@@ -168,7 +168,7 @@ def plan(
             (hold for hold in task.holds if hold.by is not None), stacklevel=5
         )
         task = task if ready is scene else compile_task(ready, steps, settings.options)
-        check_active(settings.terms, stretches(task))
+        check_terms_active(settings.terms, summarize_phases(task))
         return all_at_once(ready, task, settings) if joint else step_by_step(ready, task, settings)
 
     return guarded(run, settings, progress, planner)

@@ -18,7 +18,12 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arguments import instance, whole
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
-from vkc_pin.world.scene.clearance_exemptions import Allowance, Close, allowances, close_pairs
+from vkc_pin.world.scene.clearance_exemptions import (
+    ClearanceExemption,
+    ClosePair,
+    find_clearance_exemptions,
+    find_close_pairs,
+)
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Grasp, Reach
@@ -82,9 +87,9 @@ class SceneCheck:
 
     scene: Scene
     dist_safe: float
-    robot: tuple[Close, ...]
-    close: tuple[Close, ...]
-    allowed: tuple[Allowance, ...]
+    robot: tuple[ClosePair, ...]
+    close: tuple[ClosePair, ...]
+    allowed: tuple[ClearanceExemption, ...]
     attachments: tuple[ReachableAttachment, ...]
     problems: tuple[str, ...]
 
@@ -189,12 +194,12 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
         dist_safe=options.dist_safe,
         robot=tuple(
             sorted(
-                (Close(*key, distance) for key, distance in pairs.items()),
+                (ClosePair(*key, distance) for key, distance in pairs.items()),
                 key=lambda pair: pair.distance,
             )
         ),
-        close=tuple(close_pairs(scene, options.dist_safe)),
-        allowed=allowances(scene, options.dist_safe),
+        close=tuple(find_close_pairs(scene, options.dist_safe)),
+        allowed=find_clearance_exemptions(scene, options.dist_safe),
         attachments=tuple(_attachments(scene, options, seed, cache)),
         problems=tuple(f"{one.subject}: {one.detail}" for one in impossible(problem)),
     )
@@ -244,7 +249,7 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
     return {"because": blocked[0].text if blocked else "no free configuration was found"}
 
 
-def _said(one: Allowance) -> str:
+def _said(one: ClearanceExemption) -> str:
     kept = "at any distance" if one.margin == -np.inf else f"down to {1e3 * one.margin:.4g} mm"
     ends = {
         name: [f"{end:.3g}" if np.isfinite(end) else "its limit" for end in both]

@@ -14,7 +14,7 @@ from vkc_pin.utils.arguments import instance, known, number, whole
 from vkc_pin.utils.budget import Budget
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.terms import Term, traced
+from vkc_pin.world.task.terms import Term, trace_terms
 
 __all__ = ["Settings", "budget_for", "check_arguments", "settings_for"]
 
@@ -77,7 +77,13 @@ def settings_for(
             got=shown(callback),
         )
     return Settings(
-        initialization, options, callback, int(seed), noise, traced(scene, terms), budget=budget
+        initialization,
+        options,
+        callback,
+        int(seed),
+        noise,
+        trace_terms(scene, terms),
+        budget=budget,
     )
 
 

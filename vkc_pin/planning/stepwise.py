@@ -12,8 +12,8 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
 from vkc_pin.utils.budget import ENDINGS
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.actions import alternatives, is_open
-from vkc_pin.world.task.actuation import clash
+from vkc_pin.world.task.actions import generate_alternatives, has_open_attachment
+from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
@@ -62,12 +62,12 @@ def all_at_once(scene: Scene, task: Task, settings: Settings) -> Plan:
         task: What should change in the world.
         settings: How to plan.
     """
-    if clash(scene, task.holds) is not None:
+    if find_shared_coordinate(scene, task.holds) is not None:
         return step_by_step(scene, task, settings)
     if len(task.steps) == 1:
         return by_any_attachment(scene, task, settings)[1]
     result = OneProblem(scene, task, settings).run()
-    final = ENDINGS if any(is_open(scene, step) for step in task.steps) else FINAL
+    final = ENDINGS if any(has_open_attachment(scene, step) for step in task.steps) else FINAL
     if result.success or result.status in final:
         return result
     apart = step_by_step(scene, task, settings)
@@ -94,7 +94,7 @@ def by_any_attachment(scene: Scene, task: Task, settings: Settings) -> tuple[One
     first = OneProblem(scene, task, settings)
     result = first.run()
     plans, notes = [result], list[str]()
-    for name, steps in alternatives(
+    for name, steps in generate_alternatives(
         scene, task, anew=not settings.terms
     ):  # terms may name phases by their numbers
         if plans[-1].success or plans[-1].status in ENDINGS or first.hindered:
@@ -128,7 +128,7 @@ def stages(scene: Scene, task: Task, settings: Settings) -> list[Stage]:
     for number, step in enumerate(task.steps):
         # Where a step ends is known only once it is planned; the first begins where all do.
         own = (
-            task.until(1)
+            task.truncate(1)
             if not number
             else compile_task(current, [step], settings.options, nothing=True)
         )

@@ -17,8 +17,8 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.settings import Settings
 from vkc_pin.utils.budget import ENDINGS
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.actions import actions_of, alternatives
-from vkc_pin.world.task.actuation import clash
+from vkc_pin.world.task.actions import generate_alternatives, group_into_actions
+from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
@@ -64,7 +64,7 @@ class SlidingWindow:
         self, scene: Scene, steps: tuple[Step, ...], window: int, settings: Settings
     ) -> None:
         self.scene, self.steps, self.window, self.settings = scene, steps, window, settings
-        self.actions = actions_of(steps)
+        self.actions = group_into_actions(steps)
         self.kept: list[_Part] = []
         self.ahead: list[_Part] = []
         self.spent: list[Mapping[str, float]] = []
@@ -148,7 +148,7 @@ class SlidingWindow:
                 holds = self._task(self._now, first, last + 1, self.settings.options).holds
             except InputError:
                 break
-            if clash(self._now, holds) is not None:
+            if find_shared_coordinate(self._now, holds) is not None:
                 break
             last += 1
         return last
@@ -166,12 +166,14 @@ class SlidingWindow:
         failed, chosen = self._alone(number, scene), self.actions[number]
         if failed is None or failed.status in ENDINGS:
             return failed
-        for _, steps in alternatives(
+        for _, steps in generate_alternatives(
             scene, self._task(scene, number, number + 1, self.settings.options)
         ):
             self.actions[number] = steps
             held_twice = (
-                clash(scene, self._task(scene, number, number + 1, self.settings.options).holds)
+                find_shared_coordinate(
+                    scene, self._task(scene, number, number + 1, self.settings.options).holds
+                )
                 is not None
             )
             other = failed if held_twice else self._alone(number, scene, goals_first=True)
@@ -214,7 +216,7 @@ class SlidingWindow:
         scene, begin, parts, whole = one.scene, 0, [], one.piece()
         ahead = dict(enumerate(self.ahead, start=len(self.kept)))
         for number in range(first, last):
-            task = one.task.until(len(self._steps(first, number + 1)))
+            task = one.task.truncate(len(self._steps(first, number + 1)))
             end = len(task.phases)
             names = [
                 *one.scene.robot.coordinates.names,

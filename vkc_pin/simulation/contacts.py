@@ -17,8 +17,8 @@ import numpy as np
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Ints
 from vkc_pin.validation.distances import Solids
-from vkc_pin.world.scene.clearance_exemptions import allowances
-from vkc_pin.world.scene.contact_rules import CONTACT, EASED_TIME, grasped, touching
+from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
+from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH, CONTACT_WINDOW, find_grasped_link, find_touch_links
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
@@ -95,15 +95,15 @@ def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
     ).reshape(-1, 2)
     exempt = {
         pair
-        for one in allowances(world.scene, Options().dist_safe)
-        for pair in one.shape_pairs(labels, world.collision_keys)
+        for one in find_clearance_exemptions(world.scene, Options().dist_safe)
+        for pair in one.find_shape_pairs(labels, world.collision_keys)
         if one.margin < 0.0
     }
     excluded = np.array([(min(pair), max(pair)) in exempt for pair in pairs.tolist()], bool)
     named = [frozenset((labels[i], labels[j])) for i, j in pairs.tolist()]
     placed = Solids(world).at(world.coordinates.q(world.start[None]))
     near = np.flatnonzero(placed.bounds(np.zeros(len(pairs), int), pairs) < 0.0)
-    deep = near[placed.distances(np.zeros(len(near), int), pairs[near]) < -CONTACT]
+    deep = near[placed.distances(np.zeros(len(near), int), pairs[near]) < -CONTACT_DEPTH]
     overlapping = {named[k] for k in deep.tolist() if not excluded[k]}
     excluded[deep] = True
     never = {named[k] for k in np.flatnonzero(excluded).tolist()}
@@ -114,7 +114,7 @@ def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
         set[frozenset[str]](),
     )
     for hold in holds:
-        hands, link = frozenset(touching(world.scene, hold)), grasped(world.scene, hold)
+        hands, link = frozenset(find_touch_links(world.scene, hold)), find_grasped_link(world.scene, hold)
         own = {frozenset((hand, link)) for hand in hands}
         bits[hold] = groups.get((hands, link), 0)
         if (hands, link) not in groups and not own & never and len(groups) < _GROUPS:
@@ -156,7 +156,7 @@ def find_unplanned_contacts(
 ) -> tuple[Contact, ...]:
     """Return the contacts that the plan does not have.
 
-    A contact is unplanned if the links stay apart in the plan for `EASED_TIME` before and after it.
+    A contact is unplanned if the links stay apart in the plan for `CONTACT_WINDOW` before and after it.
 
     Args:
         scene: Scene of the plan.
@@ -182,7 +182,7 @@ def find_unplanned_contacts(
             together = trajectory.times[distances < _TOUCHING]
         moments = np.array(samples)
         far = np.array(
-            [np.min(np.abs(together - t), initial=np.inf) > EASED_TIME for t in moments[:, 0]]
+            [np.min(np.abs(together - t), initial=np.inf) > CONTACT_WINDOW for t in moments[:, 0]]
         )
         moments = moments[far]
         if len(moments):

@@ -32,10 +32,10 @@ from vkc_pin.simulation.servos import (
 from vkc_pin.simulation.welds import Grips, Latches, find_hold_spans, find_latches
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.scene.contact_rules import CONTACT
+from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Step, as_list
+from vkc_pin.world.task.steps import Step, as_steps
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
@@ -86,7 +86,7 @@ def simulate(
         raise InputError(
             "unknown grasp model", field="grasp", expected=", ".join(GRASPS), got=grasp
         )
-    steps = as_list(steps)
+    steps = as_steps(steps)
     executed_scene = scene if actual is None else instance(actual, Scene, "actual")
     for name, placed in scene.objects.items():
         if (
@@ -269,7 +269,7 @@ class _Run:
         depths = -np.asarray(contacts.dist)
         allowed = set() if self.squeezes is None else self.squeezes.allowed_contacts(clock)
         deepest: dict[tuple[str, str], float] = {}
-        for i in np.flatnonzero(depths > CONTACT).tolist():
+        for i in np.flatnonzero(depths > CONTACT_DEPTH).tolist():
             one, other = (names[labels[geom]] for geom in np.asarray(contacts.geom)[i])
             pair = (min(one, other), max(one, other))
             if pair in allowed:

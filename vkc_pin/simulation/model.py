@@ -24,7 +24,7 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.dynamics.joint_resistance import Resistance
 from vkc_pin.world.models.shapes import triangulate
-from vkc_pin.world.scene.contact_rules import moves_as_one
+from vkc_pin.world.scene.contact_rules import is_rigid_grasp
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.world_model import World
 
@@ -315,7 +315,7 @@ class Builder:
         attachment = scene.objects[hold.object].object.attachment(hold.attachment)
         holder, _ = self.find_frame(hold.frame or scene.robot.tool_frame)
         held, place = self.find_frame(f"{hold.object}.{attachment.link}")
-        if not moves_as_one(scene, hold):
+        if not is_rigid_grasp(scene, hold):
             held = self._add_carrier(hold, held, place * attachment.placement)
         weld = self.spec.add_equality(
             type=self.mj.mjtEq.mjEQ_WELD, objtype=self.mj.mjtObj.mjOBJ_BODY, active=False

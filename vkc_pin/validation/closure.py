@@ -15,7 +15,7 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.samples import LENGTH_STEP, MOST, Samples
-from vkc_pin.world.scene.contact_rules import hand_frame
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -192,7 +192,9 @@ def _rotation_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats
 def _hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]:
     """Return what moves the frame that holds an object, from the world on."""
     scene = samples.scene
-    tip = hand_frame(scene.robot, scene.objects[hold.object].object.attachments[hold.attachment])
+    tip = compute_hand_frame(
+        scene.robot, scene.objects[hold.object].object.attachments[hold.attachment]
+    )
     reach, backwards = float(np.linalg.norm(tip.translation)), list[_Lever]()
     frame, through = hold.frame, hold.by
     while (

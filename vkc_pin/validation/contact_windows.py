@@ -15,17 +15,17 @@ from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
-from vkc_pin.world.scene.clearance_exemptions import Allowance, allowances
+from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption, find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import (
-    CONTACT,
-    EASED_TIME,
-    grasped,
-    hand_clearance,
-    hand_frame,
-    in_gripper,
-    moves_as_one,
-    opening_for,
-    touching,
+    CONTACT_DEPTH,
+    CONTACT_WINDOW,
+    find_grasped_link,
+    compute_hand_clearance,
+    compute_hand_frame,
+    find_gripper_hold,
+    is_rigid_grasp,
+    compute_grasp_opening,
+    find_touch_links,
 )
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -56,7 +56,7 @@ class Window(NamedTuple):
     first: int
     last: int
     margin: float
-    contact: float = CONTACT
+    contact: float = CONTACT_DEPTH
     together: bool = False
     exempt: bool = False
 
@@ -113,9 +113,9 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
                     detail=detail,
                 )
         after = trajectory.phases[number + 1].holds if number + 1 < len(trajectory.phases) else ()
-        hold = in_gripper(phase.holds) or in_gripper(after)
+        hold = find_gripper_hold(phase.holds) or find_gripper_hold(after)
         if gripper is not None and hold is not None:
-            asked = opening_for(scene, hold)
+            asked = compute_grasp_opening(scene, hold)
             wide, right = (
                 gripper.resting if opening is None else opening
                 for opening in (phase.opening, asked)
@@ -153,7 +153,7 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
                 samples.placements(rows, tool),
                 samples.placements(rows, f"{hold.object}.{attachment.link}"),
             )
-            foremost = hand_frame(scene.robot, attachment) * attachment.offset.inverse()
+            foremost = compute_hand_frame(scene.robot, attachment) * attachment.offset.inverse()
             gone = [0.0]
             for hand, link, after in zip(hands, links, links[1:], strict=False):
                 contact = (hand * foremost).translation
@@ -161,8 +161,8 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
                 gone.append(gone[-1] + float(into @ (after.act(link.actInv(contact)) - contact)))
             back = np.maximum.accumulate(gone) - gone
             worst = int(np.argmax(back))
-            if not back[worst] <= CONTACT:
-                row, amount = int(rows[worst]), float(back[worst] - CONTACT)
+            if not back[worst] <= CONTACT_DEPTH:
+                row, amount = int(rows[worst]), float(back[worst] - CONTACT_DEPTH)
                 at, time = samples.waypoint(row), float(samples.times[row])
                 detail = f"goes back by {1e3 * back[worst]:.2f} mm where the hand only pushes"
                 yield Violation(
@@ -188,7 +188,7 @@ class _Windows:
         self.rides = samples.free.rides
 
     def of(self, steps: Sequence[Step]) -> Iterator[Window]:
-        for one in allowances(self.scene, self.options.dist_safe):
+        for one in find_clearance_exemptions(self.scene, self.options.dist_safe):
             yield from self._allowed(one)
         holds = [set(phase.holds) for phase in self.trajectory.phases]
         for hold, first, last in self._runs([set(self.scene.holds), *holds]):
@@ -221,13 +221,13 @@ class _Windows:
                 )
         yield from self._touches([step for step in steps if isinstance(step, Touch)])
 
-    def _allowed(self, one: Allowance) -> Iterator[Window]:
+    def _allowed(self, one: ClearanceExemption) -> Iterator[Window]:
         """Yield when two links or shapes may be closer than others: always, or while joints are where that holds."""
-        pairs = np.array(one.shape_pairs(self.labels.tolist(), self.keys), int).reshape(-1, 2)
+        pairs = np.array(one.find_shape_pairs(self.labels.tolist(), self.keys), int).reshape(-1, 2)
         count = len(self.steps) + 1
         rows = self.samples.z[self.samples.waypoint_rows]
-        holds = one.holds(self.samples.world.coordinates.names, rows)
-        contact, together = CONTACT + max(0.0, -one.margin), one.margin == -np.inf
+        holds = one.is_active(self.samples.world.coordinates.names, rows)
+        contact, together = CONTACT_DEPTH + max(0.0, -one.margin), one.margin == -np.inf
         for begin, end in (
             np.flatnonzero(np.diff(holds, prepend=False, append=False)).reshape(-1, 2).tolist()
         ):
@@ -244,15 +244,15 @@ class _Windows:
             end if last is None else self._until(end),
         )
         yield from self._near(hold, since, until)
-        gripped = self._between(touching(self.scene, hold), {grasped(self.scene, hold)})
-        if moves_as_one(self.scene, hold):
+        gripped = self._between(find_touch_links(self.scene, hold), {find_grasped_link(self.scene, hold)})
+        if is_rigid_grasp(self.scene, hold):
             yield Window(gripped, begin, end, 0.0, together=True)
         else:
             yield Window(
                 gripped,
                 begin,
                 end,
-                hand_clearance(self.scene, hold, grasped(self.scene, hold), self.options),
+                compute_hand_clearance(self.scene, hold, find_grasped_link(self.scene, hold), self.options),
             )
 
     def _near(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
@@ -262,15 +262,15 @@ class _Windows:
             label for label in self.labels.tolist() if label.startswith(f"{hold.object}.")
         ):
             by_clearance.setdefault(
-                hand_clearance(self.scene, hold, link, self.options), set()
+                compute_hand_clearance(self.scene, hold, link, self.options), set()
             ).add(link)
         for least, links in by_clearance.items():
             yield Window(
-                self._between(touching(self.scene, hold), links),
+                self._between(find_touch_links(self.scene, hold), links),
                 first,
                 last,
                 least,
-                0.0 if least else CONTACT,
+                0.0 if least else CONTACT_DEPTH,
             )
 
     def _grasps(self, steps: Sequence[Grasp]) -> Iterator[Window]:
@@ -316,9 +316,9 @@ class _Windows:
         distances = placed.distances(here[: len(pairs)], pairs)
         first, last = (at, other) if begin else (other, at)
         yield Window(pairs[distances < self.options.dist_safe], first, last, 0.0)
-        for k in np.flatnonzero(distances < -CONTACT).tolist() if new else ():
+        for k in np.flatnonzero(distances < -CONTACT_DEPTH).tolist() if new else ():
             yield Window(
-                pairs[[k]], first, last, float(distances[k]), CONTACT - float(distances[k])
+                pairs[[k]], first, last, float(distances[k]), CONTACT_DEPTH - float(distances[k])
             )
 
     def _touches(self, steps: Sequence[Touch]) -> Iterator[Window]:
@@ -389,12 +389,12 @@ class _Windows:
         return np.array([(min(i, j), max(i, j)) for i in ones for j in others], int).reshape(-1, 2)
 
     def _until(self, at: int) -> int:
-        """Return the waypoint up to which what was in contact at one may be close: `EASED_TIME`, or as many steps that move."""
+        """Return the waypoint up to which what was in contact at one may be close: `CONTACT_WINDOW`, or as many steps that move."""
         times, moved, last = self.trajectory.times, 0, at
         while last < len(self.steps):
             moved += int(self.steps[last])
-            if times[last + 1] - times[at] > EASED_TIME + _STILL and moved > self.options.steps(
-                EASED_TIME
+            if times[last + 1] - times[at] > CONTACT_WINDOW + _STILL and moved > self.options.steps(
+                CONTACT_WINDOW
             ):
                 break
             last += 1
@@ -405,8 +405,8 @@ class _Windows:
         times, moved, first = self.trajectory.times, 0, at
         while first > 0:
             moved += int(self.steps[first - 1])
-            if times[at] - times[first - 1] > EASED_TIME + _STILL and moved > self.options.steps(
-                EASED_TIME
+            if times[at] - times[first - 1] > CONTACT_WINDOW + _STILL and moved > self.options.steps(
+                CONTACT_WINDOW
             ):
                 break
             first -= 1

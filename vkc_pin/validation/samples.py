@@ -12,7 +12,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.articulated_object import Freedom
 from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
-from vkc_pin.world.scene.contact_rules import hand_frame
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects
@@ -289,7 +289,7 @@ class Samples:
         self, owner: str, name: str, times: Floats, z: Floats, by: str | None
     ) -> Floats:
         attachment = self.scene.objects[owner].object.attachments[name]
-        hand = hand_frame(self.scene.robot, attachment)
+        hand = compute_hand_frame(self.scene.robot, attachment)
         turns, origins = self._frames(
             z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}"
         )

@@ -36,8 +36,8 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
         rows = np.sort(np.concatenate([at, between]))
         if not len(rows):
             continue
-        values = term.formula.values(_inputs(samples, term.formula, rows))
-        lower, upper = term.box(term.formula.rows)
+        values = term.formula.evaluate(_inputs(samples, term.formula, rows))
+        lower, upper = term.compute_bounds(term.formula.rows)
         excess = np.maximum(lower - values, values - upper)
         excess[np.isnan(excess)] = np.inf
         for which, tolerance in ((at, term.tolerance), (between, BETWEEN * term.tolerance)):
@@ -79,7 +79,7 @@ def _rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
     trajectory = samples.trajectory
     asked = np.zeros(len(trajectory.times), bool)
     for phase in trajectory.phases:
-        if term.active(phase.name, phase.held):
+        if term.is_active(phase.name, phase.held):
             inside = slice(phase.first + 1, phase.last + 1)
             left = (
                 np.abs(trajectory.positions[inside] - trajectory.positions[phase.first]).max(axis=1)
@@ -104,7 +104,7 @@ def _inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
     )  # the waypoint in which the segment of a sample ends
     dt = np.diff(samples.trajectory.times, prepend=samples.trajectory.times[0] - 1.0)[ends]
     now = before = _half(samples, formula, samples.z[rows])
-    if formula.moving:
+    if formula.uses_previous:
         times = samples.times[rows] - dt
         order = np.argsort(times, kind="stable")
         earlier = np.empty((len(rows), samples.z.shape[1]))
@@ -120,7 +120,7 @@ def _half(samples: Samples, formula: Formula, z: Floats) -> Floats:
     model, coordinates = samples.world.model, samples.world.coordinates
     data = model.createData()
     frames = [model.getFrameId(name) for name in formula.frames]
-    found = np.empty((len(z), formula.half))
+    found = np.empty((len(z), formula.state_size))
     for row, q in zip(found, coordinates.q(z) if frames else (), strict=False):
         pin.forwardKinematics(model, data, q)
         for k, frame in enumerate(frames):

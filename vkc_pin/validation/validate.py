@@ -26,11 +26,15 @@ from vkc_pin.validation.rolling import check_rolling
 from vkc_pin.validation.samples import MOST, Samples
 from vkc_pin.validation.sweep import Hit, sweep
 from vkc_pin.validation.terms import check_terms
-from vkc_pin.world.scene.clearance_exemptions import CONTACT, Allowance, allowances
+from vkc_pin.world.scene.clearance_exemptions import (
+    CONTACT_DEPTH,
+    ClearanceExemption,
+    find_clearance_exemptions,
+)
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.scene.support import LEVEL, tilt
-from vkc_pin.world.task.steps import Step, as_list
-from vkc_pin.world.task.terms import Term, traced
+from vkc_pin.world.scene.support import MAX_TILT, compute_tilt
+from vkc_pin.world.task.steps import Step, as_steps
+from vkc_pin.world.task.terms import Term, trace_terms
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -84,10 +88,10 @@ def check_fits(
     """Return what `validate` checks, for its arguments; raise what it raises. That takes a few milliseconds."""
     samples, asked = (
         Samples(instance(scene, Scene, "scene"), instance(trajectory, Trajectory, "trajectory")),
-        as_list(steps),
+        as_steps(steps),
     )
     check_steps(samples, asked)
-    return samples, asked, traced(scene, terms)
+    return samples, asked, trace_terms(scene, terms)
 
 
 class _Check:
@@ -238,12 +242,12 @@ class _Check:
             rows = self.samples.rows(phase)
             for owner, label in riding.items():
                 links = self.samples.placements(rows, label)
-                angles = np.array([tilt(links[0], link) for link in links])
+                angles = np.array([compute_tilt(links[0], link) for link in links])
                 worst = int(np.argmax(angles))
-                if not angles[worst] <= LEVEL:
-                    detail = f"'{label}', on which it stands, tilts by {angles[worst]:.2f} rad, more than {LEVEL:g} rad"
+                if not angles[worst] <= MAX_TILT:
+                    detail = f"'{label}', on which it stands, tilts by {angles[worst]:.2f} rad, more than {MAX_TILT:g} rad"
                     self._add(
-                        "tips", owner, angles[worst] - LEVEL, "rad", detail, row=int(rows[worst])
+                        "tips", owner, angles[worst] - MAX_TILT, "rad", detail, row=int(rows[worst])
                     )
 
     def _unheld(self) -> None:
@@ -375,10 +379,14 @@ class _Check:
             # Also on the way to the waypoint at which the exemption ends, or from that at which it
             # begins.
             tolerated = max(
-                (-one.margin for one in exempt.get(hit.shapes, ()) if one.holds(names, state)[0]),
+                (
+                    -one.margin
+                    for one in exempt.get(hit.shapes, ())
+                    if one.is_active(names, state)[0]
+                ),
                 default=0.0,
             )
-            overlap = max(hit.contact, CONTACT + tolerated if tolerated > 0.0 else 0.0)
+            overlap = max(hit.contact, CONTACT_DEPTH + tolerated if tolerated > 0.0 else 0.0)
             if hit.margin > -np.inf and not tolerated > 0.0:
                 np.minimum.at(
                     nearest, np.searchsorted(lasts, samples.waypoint(hit.row)), hit.distance
@@ -403,21 +411,21 @@ class _Check:
                     f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
                 )
                 self._add("clearance", subject, short, "m", detail, row=hit.row)
-            elif hit.distance < -CONTACT or (
+            elif hit.distance < -CONTACT_DEPTH or (
                 hit.at_waypoint and hit.row > 0 and hit.distance < hit.usual - WAYPOINT_TOLERANCE
             ):
                 self._note_exemption(hit, exempt.get(hit.shapes, ()))
         return nearest
 
-    def _exempt_pairs(self) -> dict[tuple[int, int], list[Allowance]]:
+    def _exempt_pairs(self) -> dict[tuple[int, int], list[ClearanceExemption]]:
         """Return the pairs of shapes that the scene exempts from clearance, each with its allowances."""
-        world, found = self.samples.world, dict[tuple[int, int], list[Allowance]]()
-        for one in allowances(self.scene, self.options.dist_safe):
-            for pair in one.shape_pairs(world.collision_labels, world.collision_keys):
+        world, found = self.samples.world, dict[tuple[int, int], list[ClearanceExemption]]()
+        for one in find_clearance_exemptions(self.scene, self.options.dist_safe):
+            for pair in one.find_shape_pairs(world.collision_labels, world.collision_keys):
                 found.setdefault(pair, []).append(one)
         return found
 
-    def _note_exemption(self, hit: Hit, allowed: Sequence[Allowance]) -> None:
+    def _note_exemption(self, hit: Hit, allowed: Sequence[ClearanceExemption]) -> None:
         """Note that a pair came closer than others may, at its closest."""
         known = self.exemptions.get((hit.first, hit.second))
         if known is not None and known.distance <= hit.distance:

@@ -11,7 +11,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems import poses
 from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, TASKS, kind_of, problem, started
-from vkc_pin.procedural.rooms.random_room import random_layout
+from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.scene.scene import START_CLEARANCE
 from vkc_pin.world.task.compiler import compile_task
@@ -86,8 +86,8 @@ def test_poses_are_those_of_configurations_that_touch_nothing(
     drawn: list[tuple[pin.SE3, np.ndarray]] = []
     draw = poses._drawn
     monkeypatch.setattr(poses, "_drawn", lambda *given: drawn.append(draw(*given)) or drawn[-1])  # type: ignore[func-returns-value]
-    layout, rng = random_layout(number, clutter=0.6), np.random.default_rng(number)
-    scene, table = layout.scene(), layout.part("table_1")
+    layout, rng = sample_layout(number, clutter=0.6), np.random.default_rng(number)
+    scene, table = layout.make_scene(), layout.find_part("table_1")
 
     over = poses.pose_over(layout, scene, table, rng)
     free(scene, over, drawn[-1][1])
@@ -100,17 +100,17 @@ def test_poses_are_those_of_configurations_that_touch_nothing(
     assert scene.with_start(base=z[:3], arm=z[3:]).start_clearance() < poses.NEAR
     assert np.linalg.norm(z[:2] - layout.start[:2]) >= poses.FAR
     places = [layout.start[:2], (float(z[0]), float(z[1]))]
-    assert layout.floor.connected([part.footprint for part in layout.parts], layout.radius, places)
+    assert layout.floor.is_connected([part.footprint for part in layout.parts], layout.radius, places)
 
 
 def test_poses_that_cannot_be_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(poses, "_TRIES", 3)
-    layout = random_layout(0)
+    layout = sample_layout(0)
     for find in (
         lambda: poses.pose_over(
-            layout, layout.scene(), layout.part("table_1"), np.random.default_rng(0)
+            layout, layout.make_scene(), layout.find_part("table_1"), np.random.default_rng(0)
         ),
-        lambda: poses.pose_among(layout, layout.scene(), np.random.default_rng(0)),
+        lambda: poses.pose_among(layout, layout.make_scene(), np.random.default_rng(0)),
     ):
         with pytest.raises(vkc.InputError, match="no configuration"):
             find()

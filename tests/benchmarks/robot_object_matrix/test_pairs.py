@@ -24,7 +24,7 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.furniture.catalogue import KINDS
 from vkc_pin.world.files.resources import folder
 from vkc_pin.world.models.shapes import compute_world_box
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
 SMOOTH = """<robot name="smooth"><link name="frame"/>
@@ -72,7 +72,7 @@ def test_everything_stands_where_it_belongs(name: str) -> None:
     boxes = np.array(
         [
             compute_world_box(shape.geometry, shape.placement)
-            for shape in standing_geometry(scene.objects["it"])
+            for shape in make_world_shapes(scene.objects["it"])
         ]
     )
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
@@ -145,7 +145,7 @@ def test_what_is_low_stands_on_a_counter(tmp_path: Path, height: float, raised: 
     boxes = np.array(
         [
             compute_world_box(shape.geometry, shape.placement)
-            for shape in standing_geometry(scene.objects["it"])
+            for shape in make_world_shapes(scene.objects["it"])
         ]
     )
     counters = [label for label in scene.obstacle_names if "worktop" in label]

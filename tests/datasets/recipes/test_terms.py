@@ -64,11 +64,11 @@ def test_what_each_kind_says() -> None:
         now.translation, before.translation = rng.uniform(-2.0, 2.0, (2, 3))
         row = inputs(now, before, dt)
         tilt = math.acos(float((now.rotation @ axis)[2] / np.linalg.norm(axis)))
-        assert (upright.formula.values(row)[0, 0] >= upright.lower) == (tilt <= 0.3)
+        assert (upright.formula.evaluate(row)[0, 0] >= upright.lower) == (tilt <= 0.3)
         expected = np.linalg.norm(now.translation - before.translation) / dt
-        assert speed.formula.values(row)[0, 0] == pytest.approx(expected, rel=1e-6)
+        assert speed.formula.evaluate(row)[0, 0] == pytest.approx(expected, rel=1e-6)
         inside = np.all(np.abs(now.translation - [1.0, -0.5, 0.2]) < [1.0, 0.3, 0.5])
-        assert (away.formula.values(row)[0, 0] < 0.0) == inside
+        assert (away.formula.evaluate(row)[0, 0] < 0.0) == inside
 
 
 @pytest.fixture(scope="module")

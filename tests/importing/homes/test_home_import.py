@@ -9,7 +9,7 @@ from helpers.homes import HOME_MJCF, PLACES, WALLS, home_urdf
 
 import vkc_pin as vkc
 from vkc_pin.world.models.shapes import compute_world_box
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
 pytestmark = pytest.mark.filterwarnings(
@@ -69,7 +69,7 @@ def test_everything_stands_where_the_file_has_it(home: vkc.ImportedHome) -> None
             np.array(
                 [
                     compute_world_box(shape.geometry, shape.placement)
-                    for shape in standing_geometry(one)
+                    for shape in make_world_shapes(one)
                 ]
             )
             for one in (scene.objects[name], there.objects["it"])
@@ -152,7 +152,7 @@ def test_a_floor_that_is_higher_in_the_file(tmp_path: Path) -> None:
     assert "cupboard" in done.scene.objects
     low = min(
         compute_world_box(shape.geometry, shape.placement)[0][2]
-        for shape in standing_geometry(done.scene.objects["cupboard"])
+        for shape in make_world_shapes(done.scene.objects["cupboard"])
     )
     assert low == pytest.approx(0.0, abs=1e-6)
 
@@ -263,7 +263,7 @@ def test_objects_whose_names_look_alike_stay_what_they_are(
         boxes = np.array(
             [
                 compute_world_box(shape.geometry, shape.placement)
-                for shape in standing_geometry(item)
+                for shape in make_world_shapes(item)
             ]
         )
         assert boxes[:, 0].min(axis=0) == pytest.approx(low, abs=1e-5), name

@@ -26,7 +26,7 @@ from vkc_pin.planning.chain.chain import (
     consolidate,
 )
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.world_model import World
 
@@ -510,7 +510,7 @@ def test_what_is_carried_is_where_the_hand_and_the_grasp_have_it(holds: tuple[Ho
             assert_same(data.oMi[closure.joint] * closure.local, base)
             assert_same(closure.target, placed.placement)
             state = object_state(chain, scene, hold.object, z)
-            there = standing_geometry(dataclasses.replace(placed, placement=base, state=state))
+            there = make_world_shapes(dataclasses.replace(placed, placement=base, state=state))
             indices = chain.held_geometries[hold]
             assert [
                 chain.collision.geometryObjects[i].name.rpartition(".")[2] for i in indices

@@ -14,12 +14,12 @@ from vkc_pin.options import Options
 from vkc_pin.planning.chain import collision_pairs as module
 from vkc_pin.planning.chain.collision_pairs import _boxes, _Pairing
 from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
-from vkc_pin.world.scene.clearance_exemptions import Allowance
-from vkc_pin.world.scene.contact_rules import CONTACT
+from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption
+from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.scene.obstacles import FLOOR
 
 
-def pairing(*allowances: Allowance, **fields: Any) -> Any:
+def pairing(*allowances: ClearanceExemption, **fields: Any) -> Any:
     made = object.__new__(_Pairing)
     made._allowances = allowances
     made.options = Options(dist_safe=0.02)
@@ -37,7 +37,7 @@ def pairing(*allowances: Allowance, **fields: Any) -> Any:
         ("hand", "panel", True, 0.0, 0.0),
         ("hand", "lever", True, 0.005, -np.inf),
         ("hand", "lever", False, 0.005, 0.005),
-        ("hand", "lever", False, 0.0, -CONTACT),  # it touches it
+        ("hand", "lever", False, 0.0, -CONTACT_DEPTH),  # it touches it
     ],
 )
 def test_what_is_kept_from_what_is_held(
@@ -63,7 +63,7 @@ SLIDE = {"drawer.slide": (-0.1, 0.4)}
 WITHIN = np.array([5]), np.array([-0.1]), np.array([0.4])
 
 
-def allowed(*allowances: Allowance, within: Any = WITHIN) -> Any:
+def allowed(*allowances: ClearanceExemption, within: Any = WITHIN) -> Any:
     """Return the pairs with their margins, and where some may be close: (pairs, margin) each."""
     made = pairing(*allowances)
     made._within = lambda phase, ranges: (
@@ -80,7 +80,7 @@ def test_what_a_scene_allows_keeps_what_it_says() -> None:
     rows = [list(row) for row in TABLE]
     assert allowed() == (rows, [])
     for pair in (("side", "tray"), ("tray", "side")):
-        kept, near = allowed(Allowance(*pair, 0.003, 0.003))
+        kept, near = allowed(ClearanceExemption(*pair, 0.003, 0.003))
         assert near == []
         assert kept == [
             [
@@ -89,16 +89,16 @@ def test_what_a_scene_allows_keeps_what_it_says() -> None:
             ]
             for row in rows
         ]
-        kept, _ = allowed(Allowance(*pair, 0.015, 0.015))
+        kept, _ = allowed(ClearanceExemption(*pair, 0.015, 0.015))
         assert [row[2] for row in kept] == [0.02, 0.015, 0.01, 0.02, 0.02, 0.02]
-    assert allowed(Allowance("side", "cup", 0.0, 0.0), Allowance("cup", "tray", 0.0, 0.0)) == (
+    assert allowed(ClearanceExemption("side", "cup", 0.0, 0.0), ClearanceExemption("cup", "tray", 0.0, 0.0)) == (
         rows,
         [],
     )
 
 
 def test_what_may_overlap_is_no_pair_any_more() -> None:
-    kept, near = allowed(Allowance("tray", "side", -np.inf, -np.inf))
+    kept, near = allowed(ClearanceExemption("tray", "side", -np.inf, -np.inf))
     assert kept == [[0.0, 1.0, 0.02], [0.0, 4.0, 0.02], [3.0, 4.0, 0.02], [2.0, 4.0, 0.02]]
     assert near == []
 
@@ -111,15 +111,15 @@ def test_neighbours_keep_half_of_what_they_have_where_they_are(
     margin: float, distance: float, expected: float
 ) -> None:
     """Rows are those of the table without what is no pair."""
-    gone = Allowance("tray", "side", -np.inf, -np.inf)
-    kept, near = allowed(gone, Allowance("tray", "lid", margin, distance, SLIDE))
+    gone = ClearanceExemption("tray", "side", -np.inf, -np.inf)
+    kept, near = allowed(gone, ClearanceExemption("tray", "lid", margin, distance, SLIDE))
     assert len(kept) == 4
     assert near == [([2], expected)]
-    assert allowed(Allowance("side", "tray", margin, distance, SLIDE))[1] == [([1, 2], expected)]
-    assert allowed(Allowance("arm", "side", margin, distance, SLIDE))[1] == []  # they are no pair
-    assert allowed(gone, Allowance("tray", "side", margin, distance, SLIDE))[1] == []
+    assert allowed(ClearanceExemption("side", "tray", margin, distance, SLIDE))[1] == [([1, 2], expected)]
+    assert allowed(ClearanceExemption("arm", "side", margin, distance, SLIDE))[1] == []  # they are no pair
+    assert allowed(gone, ClearanceExemption("tray", "side", margin, distance, SLIDE))[1] == []
     assert (
-        allowed(Allowance("tray", "lid", margin, distance, SLIDE), within=None)[1] == []
+        allowed(ClearanceExemption("tray", "lid", margin, distance, SLIDE), within=None)[1] == []
     )  # never where that holds
 
 

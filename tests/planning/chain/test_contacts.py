@@ -29,8 +29,8 @@ from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.budget import Budget, SpentError
 from vkc_pin.world.models.shapes import get_link_name
-from vkc_pin.world.scene.clearance_exemptions import allowances
-from vkc_pin.world.scene.contact_rules import EASED_TIME
+from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
+from vkc_pin.world.scene.contact_rules import CONTACT_WINDOW
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -174,7 +174,7 @@ def test_the_hand_comes_closer_to_what_it_will_grasp_or_has_let_go_of() -> None:
     problem = door_problem()
     hand = set(problem.scene.robot.touch_links)
     assert CLOSE < MARGIN
-    near, begins = problem.options.steps(EASED_TIME), problem.contacts.first_waypoint
+    near, begins = problem.options.steps(CONTACT_WINDOW), problem.contacts.first_waypoint
     for phase, at, away in ((0, begins[1], -1), (3, begins[3], 1)):
         for steps, close in ((0, CLOSE), (near, CLOSE), (near + 1, MARGIN)):
             for (first, second), margins in pairs(
@@ -220,7 +220,7 @@ def test_objects_stand_where_the_phases_before_left_them() -> None:
     placed = problem.scene.objects["door"]
     for phase, state in (
         (0, {"hinge": 0.0, "knob": 0.0}),
-        (3, {"hinge": 1.2, "knob": problem.task.phases[3].before["door.knob"]}),
+        (3, {"hinge": 1.2, "knob": problem.task.phases[3].initial_values["door.knob"]}),
     ):
         part, moved = problem.contacts.phases[phase], placed.with_state(state)
         for index, label in enumerate(part.labels):
@@ -660,7 +660,7 @@ def side_by_side(*, out: float = 0.0) -> Scene:
 def test_neighbours_may_be_close_as_long_as_both_are_where_they_are() -> None:
     """Half as close as they stand; not where one that stands still has left the other's side."""
     shut = program_of(side_by_side(), [Actuate("near", {"slide": 0.3})], options=SHORT)
-    (allowance,) = allowances(side_by_side(), SHORT.dist_safe)
+    (allowance,) = find_clearance_exemptions(side_by_side(), SHORT.dist_safe)
     part = shut.contacts.phases[shut.contacts.phase_of(waypoint_in(shut, "move"))]
     (near,) = part.neighbours
     labels = {frozenset((part.labels[i], part.labels[j])) for i, j in part.pairs[near.pairs]}

@@ -13,7 +13,7 @@ from helpers.small_problems import SHORT, program_of, random_configurations
 
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import GoTo, Grasp, Place, Reach, Release
 
@@ -118,7 +118,7 @@ def test_a_placed_thing_stands_where_it_was_put(phase: int) -> None:
     part = placing().contacts.phases[phase]
     for name, where in (("stick", (STICK, None, ASIDE)[phase]), ("ball", BALL)):
         shapes = {shape.name: shape for shape in part.shapes if shape.parentJoint == 0}
-        own = standing_geometry(scene().objects[name])
+        own = make_world_shapes(scene().objects[name])
         standing = [shape for shape in own if f"{name}.{shape.name}" in shapes]
         assert len(standing) == (0 if where is None else len(own))
         for shape in standing:
@@ -152,7 +152,7 @@ def test_what_is_let_go_of_somewhere_stands_there(seed: int) -> None:
     left = {"ball": (problem.ends[2], (3, 4, 5)), "stick": (problem.ends[4], (5,))}
     for name, (end, later) in left.items():
         where = expected_placement(problem, name, z[end - 1])
-        there = standing_geometry(dataclasses.replace(scene().objects[name], placement=where))
+        there = make_world_shapes(dataclasses.replace(scene().objects[name], placement=where))
         for number in later:
             part = contacts.phases[number]
             index = {

@@ -25,13 +25,13 @@ from helpers.small_problems import SHORT, program_of
 
 from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.scene.contact_rules import EASED_TIME
+from vkc_pin.world.scene.contact_rules import CONTACT_WINDOW
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch
 
 GAP = 4e-3  # [m] of what the stick lies on
-NEAR = SHORT.steps(EASED_TIME)
+NEAR = SHORT.steps(CONTACT_WINDOW)
 LONG = dataclasses.replace(SHORT, reach_waypoints=2 * NEAR + 3)
 N = LONG.reach_waypoints
 ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
@@ -129,7 +129,7 @@ def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> 
                 for begin, end, _ in moments
             }
         )
-    assert spans[0] == spans[1] == {(0.0, EASED_TIME), (N * LONG.dt - EASED_TIME, N * LONG.dt)}
+    assert spans[0] == spans[1] == {(0.0, CONTACT_WINDOW), (N * LONG.dt - CONTACT_WINDOW, N * LONG.dt)}
 
 
 @pytest.mark.parametrize("gap", [0.0, -1e-3])
@@ -189,7 +189,7 @@ def test_taken_again_it_stands_in_nothing() -> None:
 def test_what_rides_is_eased_from_what_is_beside_it_where_the_ride_begins_alone() -> None:
     options = dataclasses.replace(LONG, move_waypoints=N)
     p = program_of(plates(cups=1, wall=0.01), [Actuate("plate", {"slide": 0.3})], options=options)
-    (number,) = (k for k, phase in enumerate(p.task.phases) if phase.rides)
+    (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
     row = margins(p, number)["cup.cup", "wall"]
     assert row[0] == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-4)
     assert row[-1] == LONG.dist_safe
@@ -207,7 +207,7 @@ def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_t
         scene_of(things, [box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]),
         Place("tray", (-0.5, -1.5, 0.7)),
     )
-    (number,) = (k for k, phase in enumerate(p.task.phases) if phase.rides)
+    (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
     only_near(
         margins(p, number)["cup.cup", "wall"], REDUCED_MARGIN_RATIO * 0.01, begin=True, within=1e-4
     )

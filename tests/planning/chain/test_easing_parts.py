@@ -42,7 +42,7 @@ def moments(
         "plate": Placed("plate", False)
     }
     scene: Any = SimpleNamespace(objects=objects, holds=holds)
-    rides = {ride for phase in phases for ride in phase.rides}
+    rides = {ride for phase in phases for ride in phase.supported}
     chain: Any = SimpleNamespace(
         held_geometries={hold: hold.object for hold in (STICK, TRAY, PLATE)},
         ride_geometries={ride: ride.object for ride in rides},
@@ -64,8 +64,8 @@ def moments(
 
 
 def phase(held: tuple[Hold, ...] = (), rides: tuple[Ride, ...] = (), **fields: Any) -> Any:
-    empty = {"lifted": {}, "lowered": {}, "before": {}, "values": {}, "ranges": {}}
-    return SimpleNamespace(held=held, rides=rides, **{**empty, **fields})
+    empty = {"lifted": {}, "lowered": {}, "initial_values": {}, "values": {}, "ranges": {}}
+    return SimpleNamespace(held=held, supported=rides, **{**empty, **fields})
 
 
 def test_the_margin_is_half_of_what_there_is() -> None:

@@ -14,7 +14,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.diagnosis.swept_volumes import swept
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.models.shapes import compute_world_box, get_link_name
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
@@ -124,7 +124,7 @@ def test_an_overlap_that_validation_might_overlook_proves_nothing(
     placed = door_scene().objects["door"].with_state({"hinge": 0.6})
     boxes = [
         compute_world_box(shape.geometry, shape.placement)
-        for shape in standing_geometry(placed)
+        for shape in make_world_shapes(placed)
         if get_link_name(shape.name) == "panel"
     ]
     low = min(lower[2] for lower, _ in boxes)

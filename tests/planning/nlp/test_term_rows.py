@@ -182,10 +182,10 @@ class Numbers:
             state = [self._value(f"{owner}.{name}", t) for name in placed.object.coordinates.names]
             return placed.placement * placed.object.link_placement(link, state)
         hold = next((h for h in phase.held if h.object == owner), None)
-        if hold is None and owner in phase.left:
-            hold, last = phase.left[owner]
+        if hold is None and owner in phase.released_by:
+            hold, last = phase.released_by[owner]
             t = self.ends[last + 1]
-        where = self._held(owner, t, hold) if hold else phase.standing[owner]
+        where = self._held(owner, t, hold) if hold else phase.resting[owner]
         return where * placed.object.link_placement(link, placed.state)
 
     def position(self, frame: str) -> ca.DM:
@@ -211,7 +211,7 @@ def expected_values(
     """Return the term's value at every waypoint of its phases after their first."""
     found = {}
     for phase, first, last in zip(p.task.phases, [0, *p.ends[:-1]], p.ends, strict=True):
-        if term.active(phase.name, [hold.object for hold in phase.held]):
+        if term.is_active(phase.name, [hold.object for hold in phase.held]):
             for t in range(first + 1, last + 1):
                 found[int(t)] = np.asarray(
                     ca.DM(term.expression(Numbers(p, path, int(t), dt[t - 1])))

@@ -18,11 +18,11 @@ def phase(
     name: str,
     *,
     held: tuple[Hold, ...] = (),
-    leaves: tuple[Hold, ...] = (),
+    released: tuple[Hold, ...] = (),
     grasps: tuple[Hold, ...] = (),
     opening: Any = None,
 ) -> Any:
-    return SimpleNamespace(name=name, held=held, leaves=leaves, grasps=grasps, opening=opening)
+    return SimpleNamespace(name=name, held=held, released=released, grasps=grasps, opening=opening)
 
 
 def made(
@@ -83,14 +83,15 @@ def test_it_waits_where_something_is_grasped() -> None:
 def test_it_waits_where_something_is_let_go_of() -> None:
     """In the first phase, too."""
     motion, _ = made(
-        [phase("away", leaves=(STICK,)), phase("on"), phase("again", leaves=(STICK,))], [1, 2, 4]
+        [phase("away", released=(STICK,)), phase("on"), phase("again", released=(STICK,))],
+        [1, 2, 4],
     )
     assert seen(motion) == (
         [10, 10, 11, 12, 12, 13, 14],
         [0.1, 1, 2, 0.1, 3, 4],
         [("away", 0, 2), ("on", 2, 3), ("again", 3, 6)],
     )
-    both = [phase("reach", grasps=(STICK,)), phase("on", leaves=(STICK,))]
+    both = [phase("reach", grasps=(STICK,)), phase("on", released=(STICK,))]
     assert seen(made(both, [1, 2])[0])[1] == [1, 0.1, 2]  # once, for both
 
 
@@ -124,7 +125,7 @@ def chosen(
 def test_what_the_hand_will_choose_is_open_until_then_and_kept_after() -> None:
     """While the door is held it is the program's own; where it is grasped and held on to are the same place."""
     hold = (DOOR,)
-    grasp = [phase("reach", grasps=hold), phase("pull", held=hold), phase("away", leaves=hold)]
+    grasp = [phase("reach", grasps=hold), phase("pull", held=hold), phase("away", released=hold)]
     assert chosen(grasp, [2, 4, 6]) == [2, 2, 2, 3, 4, 4, 4]
     again = [phase("pull", held=hold), phase("away"), phase("reach", grasps=hold)]
     assert chosen(again, [1, 4, 6], holds=hold, after=hold) == [0, 1, 6, 6, 6, 6, 6]

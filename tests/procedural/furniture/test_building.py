@@ -6,14 +6,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.procedural.furniture.building import Article, Link
+from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder
 from vkc_pin.world.models.object_file import load_object
 
 
-def built() -> Article:
-    made = Article("thing", Link("base"))
-    made.base.box((0.0, -0.2, 0.0), (0.3, 0.2, 0.5), "oak")
-    moved = made.joint(
+def built() -> ObjectBuilder:
+    builder = ObjectBuilder("thing", LinkBuilder("base"))
+    builder.base.add_box((0.0, -0.2, 0.0), (0.3, 0.2, 0.5), "oak")
+    moved = builder.add_joint(
         "slide",
         "prismatic",
         (0.0, 0.0, 0.6),
@@ -23,11 +23,11 @@ def built() -> Article:
         link="tray",
         acceleration=1.5,
     )
-    moved.box((-0.1, -0.1, -0.05), (0.1, 0.1, 0.05), "white")
-    moved.cylinder((-0.2, 0.0, 0.0), 0.02, 0.3, "y", "steel")
-    moved.ball((0.0, 0.0, 0.2), 0.05, "steel")
-    moved.rod((0.1, 0.0, 0.0), (0.3, -0.2, 0.4), 0.03, "steel")
-    made.attach(
+    moved.add_box((-0.1, -0.1, -0.05), (0.1, 0.1, 0.05), "white")
+    moved.add_cylinder((-0.2, 0.0, 0.0), 0.02, 0.3, "y", "steel")
+    moved.add_sphere((0.0, 0.0, 0.2), 0.05, "steel")
+    moved.add_rod((0.1, 0.0, 0.0), (0.3, -0.2, 0.4), 0.03, "steel")
+    builder.add_attachment(
         "grip",
         moved,
         (-0.2, 0.0, 0.0),
@@ -37,7 +37,7 @@ def built() -> Article:
         axis=[0, 1, 0],
         limits=(-0.5, 0.5),
     )
-    return made
+    return builder
 
 
 def test_masses_and_inertias_are_those_of_the_shapes() -> None:
@@ -101,11 +101,11 @@ def test_what_is_drawn_is_what_collides() -> None:
 
 
 def test_a_case_is_open_in_front_and_closed_elsewhere() -> None:
-    link = Link("case")
-    link.case((0.0, -0.3, 0.1), (0.5, 0.3, 0.9), 0.02, "white", "oak")
-    made = Article("case", link)
-    made.attach("grip", link, (0, 0, 0), (1, 0, 0), (0, 0, 1))
-    shapes = load_object(made.description).collision.geometryObjects
+    link = LinkBuilder("case")
+    link.add_case((0.0, -0.3, 0.1), (0.5, 0.3, 0.9), 0.02, "white", "oak")
+    builder = ObjectBuilder("case", link)
+    builder.add_attachment("grip", link, (0, 0, 0), (1, 0, 0), (0, 0, 1))
+    shapes = load_object(builder.description).collision.geometryObjects
     middle = np.array([0.25, 0.0, 0.5])
     blocked = []
     for axis in range(3):

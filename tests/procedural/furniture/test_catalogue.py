@@ -20,7 +20,7 @@ from vkc_pin.world.models.shapes import (
     compute_shape_distance,
     list_placed_shapes,
 )
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 
 ROBOT = vkc.load_robot("husky_ur5e")
 FEW = settings(max_examples=30, deadline=None, phases=[Phase.generate])
@@ -62,7 +62,7 @@ def test_the_hand_fits_around_every_handle(kind: str, seed: int) -> None:
         tool = own.link_placement(attachment.link) * attachment.tool(
             np.zeros(len(attachment.freedoms))
         )
-        for shape in standing_geometry(own):
+        for shape in make_world_shapes(own):
             link = shape.name.rpartition("_")[0]
             least = min(
                 compute_shape_distance(solid, tool * where, shape.geometry, shape.placement)
@@ -85,7 +85,7 @@ def test_links_pass_each_other(kind: str, seed: int) -> None:
         if model.parents[model.getJointId(joint)] != 0:
             continue  # a door's lever has its spindle in the panel
         for value in np.linspace(own.object.lower[k], own.object.upper[k], 7):
-            shapes = standing_geometry(own.with_state({joint: value}))
+            shapes = make_world_shapes(own.with_state({joint: value}))
             parents = [shape.parentJoint for shape in own.object.collision.geometryObjects]
             moved = own.object.links_moved_by({joint})
             moving = [s for s in shapes if s.name.rpartition("_")[0] in moved]

@@ -7,30 +7,32 @@ import itertools
 import numpy as np
 import pytest
 
-from vkc_pin.procedural.furniture.building import Article, Link
-from vkc_pin.procedural.furniture.handles import knob, level_bar, upright_bar
+from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder
+from vkc_pin.procedural.furniture.handles import add_knob, add_level_bar, add_upright_bar
 from vkc_pin.world.models.object_file import load_object
 
 FACE = (-0.01, 0.2, 0.3)
 
 
-def made(kind: str, height: float = 0.9) -> Article:
-    article = Article("thing", Link("base"))
-    article.base.box((0, -0.3, 0), (0.4, 0.3, 0.6), "oak")
-    leaf = article.joint("hinge", "revolute", (0, 0, height - FACE[2]), (0, 0, 1), 1.0, link="leaf")
-    leaf.box((-0.01, 0.0, 0.0), (0.01, 0.4, 0.6), "oak")
+def builder(kind: str, height: float = 0.9) -> ObjectBuilder:
+    builder = ObjectBuilder("thing", LinkBuilder("base"))
+    builder.base.add_box((0, -0.3, 0), (0.4, 0.3, 0.6), "oak")
+    leaf = builder.add_joint(
+        "hinge", "revolute", (0, 0, height - FACE[2]), (0, 0, 1), 1.0, link="leaf"
+    )
+    leaf.add_box((-0.01, 0.0, 0.0), (0.01, 0.4, 0.6), "oak")
     if kind == "upright":
-        upright_bar(article, leaf, FACE, 0.3, 0.06)
+        add_upright_bar(builder, leaf, FACE, 0.3, 0.06)
     elif kind == "level":
-        level_bar(article, leaf, FACE, 0.3, 0.06, height=height)
+        add_level_bar(builder, leaf, FACE, 0.3, 0.06, height=height)
     else:
-        knob(article, leaf, FACE, 0.05)
-    return article
+        add_knob(builder, leaf, FACE, 0.05)
+    return builder
 
 
 @pytest.mark.parametrize(("kind", "along"), [("upright", 2), ("level", 1)])
 def test_a_bar_is_held_anywhere_between_its_posts(kind: str, along: int) -> None:
-    thing = load_object(made(kind).description)
+    thing = load_object(builder(kind).description)
     fixed, free = thing.attachment("handle"), thing.attachment("handle_free")
     centre = np.array(FACE) - [0.06, 0.0, 0.0]
     np.testing.assert_allclose(fixed.placement.translation, centre, atol=1e-9)
@@ -49,13 +51,15 @@ def test_a_bar_is_held_anywhere_between_its_posts(kind: str, along: int) -> None
 @pytest.mark.parametrize(("height", "down"), [(0.9, 0.0), (0.55, 0.0), (0.3, 0.65), (0.1, 0.65)])
 def test_low_bars_are_taken_from_above(height: float, down: float) -> None:
     approach = (
-        load_object(made("level", height).description).attachment("handle").placement.rotation[:, 2]
+        load_object(builder("level", height).description)
+        .attachment("handle")
+        .placement.rotation[:, 2]
     )
     np.testing.assert_allclose(approach, [np.cos(down), 0.0, -np.sin(down)], atol=1e-6)
 
 
 def test_a_knob_is_held_from_any_direction_before_it() -> None:
-    free = load_object(made("knob").description).attachment("handle_free")
+    free = load_object(builder("knob").description).attachment("handle_free")
     rng = np.random.default_rng(0)
     for _ in range(20):
         tool = free.tool(

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.procedural.rooms.clutter import cluttered
+from vkc_pin.procedural.rooms.clutter import add_clutter
 from vkc_pin.world.models.shapes import compute_clearance, compute_shape_distance
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 
 PLACE = ((-3.0, 1.3, 1.051), 0.2)
 
@@ -30,14 +30,14 @@ def parts(scene: vkc.Scene) -> tuple[list, list]:
     new = [shape for shape in scene.obstacles if shape.name.startswith("clutter_")]
     old = [shape for shape in scene.obstacles if not shape.name.startswith("clutter_")]
     return old + [
-        shape for placed in scene.objects.values() for shape in standing_geometry(placed)
+        shape for placed in scene.objects.values() for shape in make_world_shapes(placed)
     ], new
 
 
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 60))
 def test_everything_stands_or_hangs_and_hits_nothing(seed: int, things: int) -> None:
-    old, new = parts(cluttered(home(), things, seed=seed, clear=[PLACE]))
+    old, new = parts(add_clutter(home(), things, seed=seed, clear=[PLACE]))
     assert len(new) == things
     for shape in new:
         picture = isinstance(shape.geometry, coal.Box) and 2 * min(shape.geometry.halfSide) == 0.025
@@ -58,7 +58,7 @@ def test_everything_stands_or_hangs_and_hits_nothing(seed: int, things: int) -> 
 
 
 def test_hands_have_room_and_so_have_places_that_stay_clear() -> None:
-    _, new = parts(cluttered(home(), 250, seed=2, clear=[PLACE]))
+    _, new = parts(add_clutter(home(), 250, seed=2, clear=[PLACE]))
     shapes = [(shape.geometry, shape.placement) for shape in new]
     ball = vkc.load_scene("household").objects["cup"].placement.copy()
     for middle, radius in [
@@ -70,15 +70,15 @@ def test_hands_have_room_and_so_have_places_that_stay_clear() -> None:
 
 
 def test_the_same_seed_gives_the_same_and_another_another() -> None:
-    one, same, other = (cluttered(home(), 20, seed=seed).document for seed in (3, 3, 4))
+    one, same, other = (add_clutter(home(), 20, seed=seed).document for seed in (3, 3, 4))
     assert one == same
     assert one != other
 
 
 def test_there_is_an_end_to_it() -> None:
     with pytest.raises(InputError, match="no place"):
-        cluttered(home(), 5000)
+        add_clutter(home(), 5000)
     with pytest.raises(InputError, match="no place"):
-        cluttered(vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}), 1)
+        add_clutter(vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}), 1)
     with pytest.raises(InputError, match="things"):
-        cluttered(home(), -1)
+        add_clutter(home(), -1)

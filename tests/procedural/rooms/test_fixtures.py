@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.procedural.rooms.fixtures import OPENED, fixture, known_objects, own_name
+from vkc_pin.procedural.rooms.fixtures import (
+    OPENABLE,
+    list_openable_types,
+    make_fixture,
+    make_fixture_name,
+)
 
 
 def test_measures_are_those_of_what_is_shut() -> None:
-    drawer = fixture("drawer")
+    drawer = make_fixture("drawer")
     np.testing.assert_allclose(
         [drawer.low, drawer.high], [[-0.125, -0.3, 0.0], [0.55, 0.3, 0.9]], atol=6e-3
     )
@@ -22,22 +27,22 @@ def test_measures_are_those_of_what_is_shut() -> None:
         0.0,
         None,
     )
-    door = fixture("narrow_door")
+    door = make_fixture("narrow_door")
     assert (door.low[1], door.high[1]) == pytest.approx((-0.81, 0.095))
     assert door.in_wall
 
 
 def test_names() -> None:
-    assert own_name("random_oven") == "oven"
-    assert own_name("door") == "door"
-    assert own_name("/some/where/my.oven.yaml") == "my_oven"
-    assert own_name(vkc.random_object("valve")) == "valve"
-    assert {*OPENED, "random_oven", "dishwasher", "counter_drawer"} <= set(known_objects())
-    assert len(set(known_objects())) == len(known_objects())
+    assert make_fixture_name("random_oven") == "oven"
+    assert make_fixture_name("door") == "door"
+    assert make_fixture_name("/some/where/my.oven.yaml") == "my_oven"
+    assert make_fixture_name(vkc.random_object("valve")) == "valve"
+    assert {*OPENABLE, "random_oven", "dishwasher", "counter_drawer"} <= set(list_openable_types())
+    assert len(set(list_openable_types())) == len(list_openable_types())
 
 
 def test_sizes_follow_from_the_seed() -> None:
-    one, same, other = (fixture("random_microwave", seed) for seed in (1, 1, 2))
+    one, same, other = (make_fixture("random_microwave", seed) for seed in (1, 1, 2))
     assert (one.type, one.counter) == (same.type, same.counter)
     assert one.type != other.type
     assert one.counter != other.counter
@@ -47,7 +52,7 @@ def test_what_stands_high_in_its_file_stands_on_the_floor(tmp_path: Path) -> Non
     description = vkc.random_object("oven", 1)
     description["urdf"] = description["urdf"].replace('<link name="body">', '<link name="root"/><joint name="up" type="fixed">'
         '<parent link="root"/><child link="body"/><origin xyz="0 0 0.7"/></joint><link name="body">')  # fmt: skip
-    assert fixture(description).lift == pytest.approx(-0.7, abs=1e-3)
+    assert make_fixture(description).lift == pytest.approx(-0.7, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -55,10 +60,10 @@ def test_what_stands_high_in_its_file_stands_on_the_floor(tmp_path: Path) -> Non
 )
 def test_unknown_objects(kind: str, nearest: str) -> None:
     with pytest.raises(vkc.UnknownNameError) as found:
-        fixture(kind)
+        make_fixture(kind)
     assert (found.value.field, found.value.nearest) == ("objects", nearest)
 
 
 def test_what_is_carried_is_refused() -> None:
     with pytest.raises(vkc.InputError, match="carried, not opened"):
-        fixture("cup")
+        make_fixture("cup")

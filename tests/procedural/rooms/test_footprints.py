@@ -29,8 +29,8 @@ def test_the_gap_is_no_more_than_the_distance_and_positive_where_that_is(
     one: Rectangle, other: Rectangle
 ) -> None:
     distance = compute_shape_distance(*as_box(one), *as_box(other))
-    gap = one.gap(other)
-    assert gap == pytest.approx(other.gap(one))
+    gap = one.compute_gap(other)
+    assert gap == pytest.approx(other.compute_gap(one))
     if distance > 1e-6:
         assert -1e-6 < gap < distance + 1e-6
     elif distance < -1e-6:
@@ -41,7 +41,7 @@ def test_the_gap_is_no_more_than_the_distance_and_positive_where_that_is(
 def test_the_distance_of_a_point(one: Rectangle, x: float, y: float) -> None:
     point = coal.Sphere(1e-3), pin.SE3(np.eye(3), np.array([x, y, 0.0]))
     expected = max(compute_shape_distance(*as_box(one), *point) + 1e-3, 0.0)
-    (found,) = one.distance([[x, y]])
+    (found,) = one.compute_distances([[x, y]])
     assert found == pytest.approx(expected, abs=2e-3)
 
 
@@ -49,23 +49,23 @@ def test_the_distance_of_a_point(one: Rectangle, x: float, y: float) -> None:
     ("side", "expected"), [(0, (3.0, 1.0)), (1, (-1.0, 2.0)), (2, (-3.0, -1.0)), (3, (1.0, -2.0))]
 )
 def test_frames_at_walls_look_out_of_the_room(side: int, expected: tuple[float, float]) -> None:
-    frame = Floor(6.0, 4.0).at_wall(side, 1.0)
+    frame = Floor(6.0, 4.0).make_wall_frame(side, 1.0)
     assert (frame.x, frame.y) == pytest.approx(expected)
-    out = np.subtract(frame.point(0.5, 0.0), (frame.x, frame.y))
+    out = np.subtract(frame.transform_point(0.5, 0.0), (frame.x, frame.y))
     middle = [(3.0, 0.0), (0.0, 2.0), (-3.0, 0.0), (0.0, -2.0)][side]
     assert out == pytest.approx(0.5 * np.array(middle) / np.linalg.norm(middle))
 
 
 def test_what_a_floor_holds() -> None:
     floor = Floor(4.0, 6.0)
-    assert floor.holds(Rectangle(1.5, 2.5, 1.0, 1.0))
-    assert not floor.holds(Rectangle(1.5, 2.5, 1.0, 1.0, 0.5))
-    assert floor.free([], 0.5, [[1.4, 0.0], [1.6, 0.0], [0.0, 2.6]]).tolist() == [
+    assert floor.contains(Rectangle(1.5, 2.5, 1.0, 1.0))
+    assert not floor.contains(Rectangle(1.5, 2.5, 1.0, 1.0, 0.5))
+    assert floor.find_free([], 0.5, [[1.4, 0.0], [1.6, 0.0], [0.0, 2.6]]).tolist() == [
         True,
         False,
         False,
     ]
-    assert floor.free([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [[0.9, 0.0], [1.1, 0.0]]).tolist() == [
+    assert floor.find_free([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [[0.9, 0.0], [1.1, 0.0]]).tolist() == [
         False,
         True,
     ]
@@ -74,11 +74,11 @@ def test_what_a_floor_holds() -> None:
 @pytest.mark.parametrize(("width", "expected"), [(2.4, True), (2.8, False)])
 def test_a_way_needs_room_for_the_disc(width: float, expected: bool) -> None:
     """A wall across a room 4 m wide leaves a passage at one end."""
-    barrier = Frame(2.0, 0.0, 0.0).rectangle((-width, 0.0), (-0.1, 0.1))
-    assert Floor(4.0, 6.0).connected([barrier], 0.65, [(0.0, -2.0), (0.0, 2.0)]) is expected
-    assert Floor(4.0, 6.0).connected([barrier], 0.65, [(0.0, -2.0), (0.5, -2.0)])
+    barrier = Frame(2.0, 0.0, 0.0).make_rectangle((-width, 0.0), (-0.1, 0.1))
+    assert Floor(4.0, 6.0).is_connected([barrier], 0.65, [(0.0, -2.0), (0.0, 2.0)]) is expected
+    assert Floor(4.0, 6.0).is_connected([barrier], 0.65, [(0.0, -2.0), (0.5, -2.0)])
 
 
 def test_a_place_that_is_not_free_is_connected_to_nothing() -> None:
-    assert not Floor(4.0, 4.0).connected([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [(0.0, 0.0)])
-    assert Floor(4.0, 4.0).connected([], 0.5, [])
+    assert not Floor(4.0, 4.0).is_connected([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [(0.0, 0.0)])
+    assert Floor(4.0, 4.0).is_connected([], 0.5, [])

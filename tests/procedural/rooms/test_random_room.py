@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.procedural.furniture.catalogue import KINDS
-from vkc_pin.procedural.rooms.fixtures import OPENED, fixture
-from vkc_pin.procedural.rooms.random_room import Layout, random_layout
+from vkc_pin.procedural.rooms.fixtures import OPENABLE, make_fixture
+from vkc_pin.procedural.rooms.random_room import Layout, sample_layout
 from vkc_pin.world.models.shapes import (
     compute_clearance,
     compute_shape_distance,
@@ -25,11 +25,11 @@ from vkc_pin.world.models.shapes import (
     list_placed_shapes,
 )
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
 NUMBERS = st.integers(0, 10_000)
-KNOWN = sorted([*OPENED, *(f"random_{kind}" for kind in KINDS)])
+KNOWN = sorted([*OPENABLE, *(f"random_{kind}" for kind in KINDS)])
 OBJECTS = st.one_of(st.none(), st.lists(st.sampled_from(KNOWN), max_size=2).map(tuple))
 
 
@@ -49,7 +49,7 @@ def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
         elif label != FLOOR:
             found.setdefault(owners.get(label, "walls"), []).append(shape)
     for name, placed in scene.objects.items():
-        found[name] = standing_geometry(placed)
+        found[name] = make_world_shapes(placed)
     return found
 
 
@@ -58,10 +58,10 @@ def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
 def test_a_room_is_sound(
     number: int, clutter: float, objects: tuple[str, ...] | None, cup: bool
 ) -> None:
-    layout = random_layout(
+    layout = sample_layout(
         number, clutter=clutter, objects=objects, carried=("cup",) if cup else ()
     )
-    scene = layout.scene()
+    scene = layout.make_scene()
     assert all(4.0 <= size <= 7.0 for size in (layout.floor.width, layout.floor.depth))
 
     shapes = groups(layout, scene)
@@ -84,20 +84,20 @@ def test_a_room_is_sound(
         )
 
     for part in layout.parts:
-        if part.before is None:
+        if part.clear_floor is None:
             continue
-        assert layout.floor.holds(part.before)
+        assert layout.floor.contains(part.clear_floor)
         assert all(
-            part.before.gap(other.footprint) > 0.0
+            part.clear_floor.compute_gap(other.footprint) > 0.0
             for other in layout.parts
             if other.footprint != part.footprint
         )
-        assert part.spot is not None
+        assert part.standing_place is not None
         for yaw in (0.0, 1.5, 3.0):  # and where it has to stand
-            there = scene.with_start(base=[*part.spot, yaw])
+            there = scene.with_start(base=[*part.standing_place, yaw])
             assert there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE, part.name
-    spots = [part.spot for part in layout.parts if part.spot is not None]
-    assert layout.floor.connected(
+    spots = [part.standing_place for part in layout.parts if part.standing_place is not None]
+    assert layout.floor.is_connected(
         [p.footprint for p in layout.parts], layout.radius, [layout.start[:2], *spots]
     )
 
@@ -123,7 +123,7 @@ def test_another_process_makes_the_same_room() -> None:
 
 def test_one_room_in_numbers() -> None:
     """It must stay what it is on all machines: results on record are of these rooms."""
-    layout = random_layout(0)
+    layout = sample_layout(0)
     assert (layout.floor.width, layout.floor.depth) == (5.54, 6.85)
     assert [part.name for part in layout.parts][:2] == ["narrow_door", "table_1"]
 
@@ -181,7 +181,7 @@ def test_objects_by_path_and_by_description(
     for name in room.objects:
         low = min(
             compute_world_box(shape.geometry, shape.placement)[0][2]
-            for shape in standing_geometry(room.objects[name])
+            for shape in make_world_shapes(room.objects[name])
         )
         assert low == pytest.approx(0.0, abs=1e-4)
 
@@ -214,7 +214,7 @@ def test_unknown_settings_and_parts() -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'clutter'"):
         vkc.random_room(0, cluter=0.5)
     with pytest.raises(vkc.UnknownNameError, match="table_9"):
-        random_layout(0).part("table_9")
+        sample_layout(0).part("table_9")
 
 
 def test_what_finds_no_place_is_said() -> None:
@@ -235,9 +235,9 @@ def test_things_and_robots_as_imports_write_them(
     )
     joint = f'<joint name="hinge" type="revolute">{ends}</joint>'
     urdf = f'<robot name="oven"><link name="body">{body}</link><link name="door">{door}</link>{joint}</robot>'
-    own = fixture({"urdf": urdf, "attachments": []})
+    own = make_fixture({"urdf": urdf, "attachments": []})
     assert own.face == pytest.approx(-0.29)
-    assert fixture("dishwasher").face == pytest.approx(0.0, abs=0.03)
+    assert make_fixture("dishwasher").face == pytest.approx(0.0, abs=0.03)
     write_gripper(tmp_path / "mine")
     monkeypatch.chdir(tmp_path)
     room = vkc.random_room(

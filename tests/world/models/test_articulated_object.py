@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
-from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
 
 def test_door() -> None:
@@ -117,7 +117,7 @@ def test_moving_parts_keep_away_from_the_base_over_the_whole_range(
     ]
     nearest = np.inf
     for state in itertools.product(*grids):
-        placed = standing_geometry(PlacedObject(name, thing, pin.SE3.Identity(), np.array(state)))
+        placed = make_world_shapes(PlacedObject(name, thing, pin.SE3.Identity(), np.array(state)))
         moving = [
             s
             for s, original in zip(placed, thing.collision.geometryObjects, strict=True)

@@ -15,7 +15,7 @@ from vkc_pin.planning.chain.pose import PoseRow
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import compute_clearance, get_link_name, list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 SCENES = ("corridor_door", "aisle_drawer")
@@ -50,7 +50,7 @@ def standing(name: str, *names: str) -> Shapes:
 
 def parts(placed: PlacedObject, *links: str) -> Shapes:
     """Shapes of some of an object's links."""
-    found = [shape for shape in standing_geometry(placed) if get_link_name(shape.name) in links]
+    found = [shape for shape in make_world_shapes(placed) if get_link_name(shape.name) in links]
     assert found
     return list_placed_shapes(found)
 
@@ -310,7 +310,7 @@ def room(
     world = list_placed_shapes([shape for shape, label in labels if label != FLOOR])
     others = [
         link
-        for link in {get_link_name(shape.name) for shape in standing_geometry(placed)}
+        for link in {get_link_name(shape.name) for shape in make_world_shapes(placed)}
         if link != HELD[name]
     ]
     held, touch = parts(placed, HELD[name]), here.robot.touch_links
@@ -403,7 +403,7 @@ def test_the_robot_fits_through_door_and_aisle() -> None:
             "wrist_2_link",
             "wrist_3_link",
         }
-        around = list_placed_shapes(world) + list_placed_shapes(standing_geometry(placed))
+        around = list_placed_shapes(world) + list_placed_shapes(make_world_shapes(placed))
         for heading in headings:
             for x, y in path:
                 z = np.concatenate([[x, y, heading], here.robot.home])

@@ -18,9 +18,9 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
 from vkc_pin.world.scene import clearance_exemptions as neighbours
-from vkc_pin.world.scene.clearance_exemptions import Allowance, allowances, close_pairs
+from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption, find_clearance_exemptions, find_close_pairs
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
 
 SAFE = 0.02
@@ -63,10 +63,10 @@ def in_wall(depth: float = 0.05, **fields: Any) -> Scene:
 def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(
     gap: float, begin: float
 ) -> None:
-    (close,) = close_pairs(beside(gap, begin), SAFE)
+    (close,) = find_close_pairs(beside(gap, begin), SAFE)
     assert close[:2] == ("drawer.tray", "side")
     assert close.distance == pytest.approx(gap, abs=1e-6)
-    (one,) = allowances(beside(gap, begin), SAFE)
+    (one,) = find_clearance_exemptions(beside(gap, begin), SAFE)
     assert (one.margin, one.distance) == (0.0, close.distance)
     lower, upper = one.ranges["drawer.slide"]
     assert lower == -np.inf
@@ -84,7 +84,7 @@ def test_the_distance_of_two_links_is_that_of_their_closest_shapes() -> None:
     scene = beside(0.012).with_state("drawer", {"slide": 0.2})
     shapes = [
         (f"drawer.{get_link_name(shape.name)}", shape)
-        for shape in standing_geometry(scene.objects["drawer"])
+        for shape in make_world_shapes(scene.objects["drawer"])
     ]
     moving = [shape for label, shape in shapes if label == "drawer.tray"]
     least: dict[str, float] = {}
@@ -94,7 +94,7 @@ def test_the_distance_of_two_links_is_that_of_their_closest_shapes() -> None:
                 shape.geometry, shape.placement, other.geometry, other.placement
             )
             least[label] = min(least.get(label, np.inf), distance)
-    found = {pair.second: pair.distance for pair in close_pairs(scene, 0.6)}
+    found = {pair.second: pair.distance for pair in find_close_pairs(scene, 0.6)}
     assert len(moving) > 3
     assert found == pytest.approx(
         {label: distance for label, distance in least.items() if distance < 0.6}, abs=1e-9
@@ -104,19 +104,19 @@ def test_the_distance_of_two_links_is_that_of_their_closest_shapes() -> None:
 
 def test_what_is_remembered_is_of_these_obstacles_and_states() -> None:
     scene = beside(0.004, 1.4)
-    (one,) = allowances(scene, SAFE)
+    (one,) = find_clearance_exemptions(scene, SAFE)
     kept = [k for k, label in enumerate(scene.obstacle_labels) if label != "side"]
     parts = {
         name: tuple(getattr(scene, name)[k] for k in kept)
         for name in ("obstacles", "obstacle_labels")
     }
-    assert allowances(dataclasses.replace(scene, **parts), SAFE) == ()
-    assert allowances(scene.with_start(base=[0.0, 0.0, 0.0]), SAFE) == (one,)
+    assert find_clearance_exemptions(dataclasses.replace(scene, **parts), SAFE) == ()
+    assert find_clearance_exemptions(scene.with_start(base=[0.0, 0.0, 0.0]), SAFE) == (one,)
     ahead = with_boxes(
         drawer_scene(), ahead=((0.1, 0.5, 0.2), (1.43, 0.0, 0.755))
     )  # 0.37 m before the front, which is 0.59 m wide
-    assert allowances(ahead, SAFE) == ()
-    met = allowances(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
+    assert find_clearance_exemptions(ahead, SAFE) == ()
+    met = find_clearance_exemptions(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
     assert {(one.first, one.second) for one in met} == {("drawer.tray", "ahead")}
     assert -np.inf in {one.margin for one in met}
     assert len({one.shapes for one in met}) == len(
@@ -133,21 +133,21 @@ def test_two_drawers_side_by_side_are_neighbours_until_either_is_past_the_other(
         for name, place in zip(("near", "next"), at, strict=True)
     ]
     scene = changed(drawer_scene(), objects=pair, obstacles=[])
-    (one,) = allowances(scene, SAFE)
-    assert one.between("near.tray", "next.tray")
+    (one,) = find_clearance_exemptions(scene, SAFE)
+    assert one.is_between("near.tray", "next.tray")
     leaves = thick + np.sqrt(SAFE**2 - gap**2)
     assert {name: ends[1] for name, ends in one.ranges.items()} == {
         f"{name}.slide": pytest.approx(leaves, abs=2e-4) for name in ("near", "next")
     }
     out = np.array([[0.0, 0.0], [0.02, 0.03], [0.05, 0.0], [0.0, 0.05]])
-    assert one.holds(["near.slide", "next.slide"], out).tolist() == [True, True, False, False]
+    assert one.is_active(["near.slide", "next.slide"], out).tolist() == [True, True, False, False]
 
 
 def test_nothing_is_close_in_scenes_that_come_along() -> None:
     for name in ("door", "drawer", "fetch", "household", "corridor_door", "aisle_drawer"):
         scene = load_scene(name)
-        assert allowances(scene, SAFE) == ()
-        assert close_pairs(scene, SAFE) == []
+        assert find_clearance_exemptions(scene, SAFE) == ()
+        assert find_close_pairs(scene, SAFE) == []
 
 
 def test_a_leaf_in_its_wall_is_warned_of_by_name() -> None:
@@ -156,8 +156,8 @@ def test_a_leaf_in_its_wall_is_warned_of_by_name() -> None:
     ) as caught:
         scene = in_wall()
     assert len(caught) == 1
-    (one,) = allowances(scene, SAFE)
-    assert one.between("wall", "door.panel")
+    (one,) = find_clearance_exemptions(scene, SAFE)
+    assert one.is_between("wall", "door.panel")
     assert one.margin == -np.inf
     assert one.ranges == {"door.hinge": (-np.inf, np.inf)}  # its hinge is in the wall for ever
 
@@ -166,18 +166,18 @@ def test_a_door_that_stands_open_is_still_built_into_its_wall() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scene = in_wall(0.003)
-    shut = allowances(scene, SAFE)
+    shut = find_clearance_exemptions(scene, SAFE)
     (ajar,) = {
         one.ranges["door.hinge"]
-        for one in allowances(scene.with_state("door", {"hinge": 1.0}), SAFE)
+        for one in find_clearance_exemptions(scene.with_state("door", {"hinge": 1.0}), SAFE)
     }
     assert {one.ranges["door.hinge"] for one in shut} == {ajar}
 
 
 def test_a_drawer_that_stands_open_is_a_neighbour_of_what_it_was_built_beside() -> None:
-    (one,) = allowances(beside(0.004), SAFE)
-    assert close_pairs(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE) == []
-    (other,) = allowances(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE)
+    (one,) = find_clearance_exemptions(beside(0.004), SAFE)
+    assert find_close_pairs(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE) == []
+    (other,) = find_clearance_exemptions(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE)
     assert (other.first, other.second, other.margin, other.ranges) == (
         one.first,
         one.second,
@@ -188,25 +188,25 @@ def test_a_drawer_that_stands_open_is_a_neighbour_of_what_it_was_built_beside() 
 
 def test_what_is_in_the_hand_or_on_a_table_is_nobodys_neighbour() -> None:
     scene = load_scene("init_1")
-    assert close_pairs(scene, 0.3) == []
+    assert find_close_pairs(scene, 0.3) == []
     with pytest.warns(UserWarning, match="overlap by 10"):
         sunk = changed(
             scene, objects=[{**scene.document["objects"][0], "position": [2.5, 1.0, 0.76]}]
         )
-    (close,) = close_pairs(sunk, SAFE)
+    (close,) = find_close_pairs(sunk, SAFE)
     assert close[:2] == ("stick.stick", "table_top")
     held = sunk.with_held({"stick": "grip"})
-    assert close_pairs(held, SAFE) == []
+    assert find_close_pairs(held, SAFE) == []
     assert (
-        allowances(sunk, SAFE) == ()
+        find_clearance_exemptions(sunk, SAFE) == ()
     )  # it may leave when it is lifted; that is not told by joints
 
 
 def test_holds_where_every_joint_is_within_its_range() -> None:
-    one = Allowance("a.b", "c", 0.0, 0.01, {"a.x": (0.0, 1.0), "a.y": (-np.inf, 0.5)})
+    one = ClearanceExemption("a.b", "c", 0.0, 0.01, {"a.x": (0.0, 1.0), "a.y": (-np.inf, 0.5)})
     states = np.array([[9.0, 0.5, 0.0], [9.0, 1.5, 0.0], [9.0, 1.0, 0.6], [9.0, 0.0, -7.0]])
-    assert one.holds(["q", "a.x", "a.y"], states).tolist() == [True, False, False, True]
-    assert Allowance("a", "b", 0.0, 0.0).holds([], np.zeros((2, 0))).all()
+    assert one.is_active(["q", "a.x", "a.y"], states).tolist() == [True, False, False, True]
+    assert ClearanceExemption("a", "b", 0.0, 0.0).is_active([], np.zeros((2, 0))).all()
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_what_a_scene_allows(tmp_path: Path, allow: list[Any], margin: float) ->
         warnings.simplefilter("error")  # what is allowed is not told of
         scene = Scene.from_document({**in_wall(-0.004).document, "allow": allow}, tmp_path)
     assert scene.allowed[frozenset(("door.panel", "wall"))] == margin
-    assert close_pairs(scene, SAFE) == []
+    assert find_close_pairs(scene, SAFE) == []
     assert all(isinstance(label, str) for pair in scene.allowed for label in pair)
     again = Scene.from_document(scene.document, tmp_path)
     assert dict(again.allowed) == dict(scene.allowed)
@@ -375,21 +375,21 @@ def test_of_ten_thousand_obstacles_only_those_nearby_are_measured(
         neighbours, "compute_shape_distance", lambda *given: asked.append(given) or measured(*given)
     )
     scene = Scene.from_document({**document, "obstacles": [*document["obstacles"], *boxes]})
-    assert [pair[:2] for pair in close_pairs(scene, SAFE)] == [("door.panel", "wall")]
+    assert [pair[:2] for pair in find_close_pairs(scene, SAFE)] == [("door.panel", "wall")]
     assert 1 <= len(asked) < 10
 
 
 def test_what_a_link_does_not_reach_is_never_near() -> None:
     """Of all that stands in a home a refrigerator's door meets few things, and none but those that it reaches."""
     home = load_scene("household")
-    standing = neighbours.Standing(home, home.objects)
+    standing = neighbours.PlacedShapes(home, home.objects)
     label, values = "refrigerator.door", np.linspace(0.0, 2.0, 9)
-    reached = standing.reached(label, 0, values)
+    reached = standing.find_links_near_sweep(label, 0, values)
     others = {one for one in standing.labels if not one.startswith("refrigerator.")}
     met = {
         one
         for one in others
-        if standing.distances(label, 0, values, standing.of([one]), 0.0).min() < 0.0
+        if standing.compute_distances(label, 0, values, standing.find_shapes([one]), 0.0).min() < 0.0
     }
     assert met <= reached
     assert len(reached & others) < len(others) / 5
@@ -453,7 +453,7 @@ def test_an_exemption_is_of_two_shapes_and_not_of_their_links(tmp_path: Path) ->
     )
 
     blocked = hinged_at_post(tmp_path / "blocked", block=True)
-    (one,) = allowances(blocked, SAFE)
+    (one,) = find_clearance_exemptions(blocked, SAFE)
     assert one.shapes == ("door.leaf_0", "wall_0")
     report = validate(blocked, steps, opened.trajectory)
     (hit,) = (found for found in report.violations if found.constraint == "penetration")
@@ -496,12 +496,12 @@ def test_shapes_that_two_joints_move_overlap_no_deeper_than_either_alone_takes_t
     }
     with pytest.warns(UserWarning, match=r"door\.lever – panel overlap by 5"):
         scene = Scene.from_document(document)
-    (one,) = (one for one in allowances(scene, SAFE) if one.first == "door.lever")
+    (one,) = (one for one in find_clearance_exemptions(scene, SAFE) if one.first == "door.lever")
     assert set(one.ranges) == {"door.hinge", "door.turn"}
-    standing, least = neighbours.Standing(scene, scene.objects), 0.0
+    standing, least = neighbours.PlacedShapes(scene, scene.objects), 0.0
     for index, upper in ((0, 1.5), (1, 0.5)):
-        (alone,) = standing.distances(
-            "door.lever", index, np.linspace(0.0, upper, 2001), standing.of(["panel"]), 0.1
+        (alone,) = standing.compute_distances(
+            "door.lever", index, np.linspace(0.0, upper, 2001), standing.find_shapes(["panel"]), 0.1
         ).T
         inside = (
             alone[0][: int(np.argmax(alone[0] >= SAFE))] if (alone[0] >= SAFE).any() else alone[0]

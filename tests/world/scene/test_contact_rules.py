@@ -15,15 +15,15 @@ from helpers.small_problems import door_scene
 from vkc_pin.options import Options
 from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.scene.contact_rules import (
-    EASED_TIME,
-    grasped,
-    hand_clearance,
-    hand_frame,
-    in_gripper,
-    moves_as_one,
-    opening_at_start,
-    opening_for,
-    touching,
+    CONTACT_WINDOW,
+    compute_grasp_opening,
+    compute_hand_clearance,
+    compute_hand_frame,
+    compute_start_opening,
+    find_grasped_link,
+    find_gripper_hold,
+    find_touch_links,
+    is_rigid_grasp,
 )
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -43,10 +43,10 @@ def door(attachment: str = "handle", **fields: object) -> Scene:
 
 def test_who_takes_hold_of_what() -> None:
     scene = door_scene()
-    assert EASED_TIME == 1.0  # [s], as the pages say
-    assert grasped(scene, HANDLE) == LEVER
-    assert tuple(touching(scene, HANDLE)) == scene.robot.touch_links
-    assert touching(scene, THROUGH) == ("stick.tip",)
+    assert CONTACT_WINDOW == 1.0  # [s], as the pages say
+    assert find_grasped_link(scene, HANDLE) == LEVER
+    assert tuple(find_touch_links(scene, HANDLE)) == scene.robot.touch_links
+    assert find_touch_links(scene, THROUGH) == ("stick.tip",)
 
 
 @pytest.mark.parametrize(
@@ -56,18 +56,20 @@ def test_who_takes_hold_of_what() -> None:
 def test_a_hand_keeps_the_attachments_clearance(clearance: float | None, expected: float) -> None:
     scene = door(clearance=clearance)
     for link in (LEVER, PANEL):
-        assert hand_clearance(scene, HANDLE, link, Options()) == expected
-    assert hand_clearance(scene, HANDLE, LEVER, Options(dist_safe=0.001)) == min(expected, 0.001)
+        assert compute_hand_clearance(scene, HANDLE, link, Options()) == expected
+    assert compute_hand_clearance(scene, HANDLE, LEVER, Options(dist_safe=0.001)) == min(
+        expected, 0.001
+    )
 
 
 def test_what_pushes_or_holds_through_another_needs_none_from_what_it_is_at() -> None:
     options = Options()
     pushed = door(contact="push")
-    assert hand_clearance(pushed, HANDLE, LEVER, options) == 0.0
-    assert hand_clearance(pushed, HANDLE, PANEL, options) == 0.005
-    assert hand_clearance(door(), THROUGH, LEVER, options) == 0.0
-    assert hand_clearance(door(), THROUGH, PANEL, options) == 0.005
-    assert hand_clearance(door(), HANDLE, LEVER, options) == 0.005
+    assert compute_hand_clearance(pushed, HANDLE, LEVER, options) == 0.0
+    assert compute_hand_clearance(pushed, HANDLE, PANEL, options) == 0.005
+    assert compute_hand_clearance(door(), THROUGH, LEVER, options) == 0.0
+    assert compute_hand_clearance(door(), THROUGH, PANEL, options) == 0.005
+    assert compute_hand_clearance(door(), HANDLE, LEVER, options) == 0.005
 
 
 @pytest.mark.parametrize(
@@ -86,22 +88,22 @@ def test_who_moves_as_one(attachment: str, contact: str, firm: bool, as_one: boo
     assert bool(scene.objects["door"].object.attachments[attachment].freedoms) == (
         attachment == "handle_free"
     )
-    assert moves_as_one(scene, Hold("door", attachment)) == as_one
+    assert is_rigid_grasp(scene, Hold("door", attachment)) == as_one
 
 
 def test_what_the_gripper_itself_holds() -> None:
     stick = Hold("stick", "grip")
-    assert in_gripper([]) is None
-    assert in_gripper([THROUGH]) is None
-    assert in_gripper([THROUGH, stick]) is stick
-    assert in_gripper([stick, THROUGH]) is stick
+    assert find_gripper_hold([]) is None
+    assert find_gripper_hold([THROUGH]) is None
+    assert find_gripper_hold([THROUGH, stick]) is stick
+    assert find_gripper_hold([stick, THROUGH]) is stick
 
 
 def test_only_a_push_brings_the_foremost_point() -> None:
     robot = door_scene().robot
     grip = door_scene().objects["door"].object.attachments["handle"]
-    assert hand_frame(robot, grip) == pin.SE3.Identity()
-    front = hand_frame(robot, dataclasses.replace(grip, contact="push"))
+    assert compute_hand_frame(robot, grip) == pin.SE3.Identity()
+    front = compute_hand_frame(robot, dataclasses.replace(grip, contact="push"))
     np.testing.assert_array_equal(front.translation, robot.front.translation)
     assert front.translation[2] > 0.0
 
@@ -110,13 +112,14 @@ def test_how_far_the_gripper_is_open(tmp_path: Path) -> None:
     """For what is held, and at the start; what has no gripper rests."""
     scene = between_cheeks(write_gripper(tmp_path / "mine"), opening=0.04, start=0.03)
     hold = Hold("drawer", "grip")
-    assert opening_for(scene, hold) == pytest.approx(0.04)
-    assert opening_at_start(scene) == pytest.approx(0.03)
-    assert opening_at_start(scene.with_held({"drawer": "grip"})) == pytest.approx(0.04)
-    assert opening_for(door_scene(), HANDLE) is None
-    assert opening_at_start(door_scene()) is None
+    assert compute_grasp_opening(scene, hold) == pytest.approx(0.04)
+    assert compute_start_opening(scene) == pytest.approx(0.03)
+    assert compute_start_opening(scene.with_held({"drawer": "grip"})) == pytest.approx(0.04)
+    assert compute_grasp_opening(door_scene(), HANDLE) is None
+    assert compute_start_opening(door_scene()) is None
     grip = scene.objects["drawer"].object.attachments["grip"]
     pushed = dataclasses.replace(grip, contact="push")
     np.testing.assert_array_equal(
-        hand_frame(scene.robot, pushed).translation, scene.robot.opened(0.04).front.translation
+        compute_hand_frame(scene.robot, pushed).translation,
+        scene.robot.opened(0.04).front.translation,
     )

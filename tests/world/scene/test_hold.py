@@ -15,7 +15,7 @@ import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.resources import folder
 from vkc_pin.world.models.object_file import load_object
-from vkc_pin.world.scene.hold import Hold, holds_of, in_order
+from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
 from vkc_pin.world.scene.scene import Scene
 
 STICK = Hold("stick", "grip")
@@ -24,8 +24,8 @@ FLY = Hold("fly", "leg", BALL, "ball")
 
 
 def test_the_tool_and_what_is_held_through_something() -> None:
-    assert holds_of({}, {}) == ()
-    assert holds_of({"door": "handle", "drawer": "knob"}, {}) == (
+    assert make_holds({}, {}) == ()
+    assert make_holds({"door": "handle", "drawer": "knob"}, {}) == (
         Hold("door", "handle"),
         Hold("drawer", "knob"),
     )
@@ -41,7 +41,7 @@ def test_the_tool_and_what_is_held_through_something() -> None:
 @pytest.mark.parametrize("order", list(itertools.permutations(["stick", "ball", "fly", "door"])))
 def test_each_follows_the_one_it_depends_on(order: tuple[str, ...]) -> None:
     attachments = {"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}
-    found = holds_of(
+    found = make_holds(
         {name: attachments[name] for name in order}, {"fly": "ball.ball", "ball": "stick.tip"}
     )
     assert sorted(found, key=str) == sorted([STICK, BALL, FLY, Hold("door", "handle")], key=str)
@@ -73,25 +73,25 @@ def test_equal_holds_are_one_key() -> None:
     ],
 )
 def test_mappings_round_trip(held: dict[str, str], by: dict[str, str]) -> None:
-    found = holds_of(held, by)
+    found = make_holds(held, by)
     assert {hold.object: hold.attachment for hold in found} == held
     assert {hold.object: hold.frame for hold in found if hold.by} == by
     assert (
-        holds_of({hold.object: hold.attachment for hold in found}, by)
-        == in_order(iter(found))
+        make_holds({hold.object: hold.attachment for hold in found}, by)
+        == check_hold_order(iter(found))
         == found
     )
 
 
 def test_values_do_not_make_another_hold() -> None:
-    (again,) = holds_of({"stick": "grip"}, at={"stick": [0.1, 2]})
+    (again,) = make_holds({"stick": "grip"}, at={"stick": [0.1, 2]})
     assert (again, hash(again), again.at, STICK.at) == (STICK, hash(STICK), (0.1, 2.0), ())
 
 
 def test_a_hold_comes_after_the_one_it_depends_on() -> None:
     for holds in ((BALL,), (BALL, STICK), (STICK, FLY), (Hold("stick", "end"), BALL)):
         with pytest.raises(InputError, match="not held before"):
-            in_order(holds)
+            check_hold_order(holds)
 
 
 @pytest.mark.parametrize(
@@ -104,20 +104,20 @@ def test_a_hold_comes_after_the_one_it_depends_on() -> None:
 )
 def test_nothing_holds_itself_up(by: dict[str, str], got: str) -> None:
     with pytest.raises(InputError, match="in a circle") as caught:
-        holds_of({"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}, by)
+        make_holds({"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}, by)
     assert (caught.value.field, caught.value.got) == ("by", got)
 
 
 @pytest.mark.parametrize("frame", ["tip", "stick.", "stick", "", None, 3])
 def test_what_is_no_link_of_an_object(frame: object) -> None:
     with pytest.raises(InputError, match="not a link of an object") as caught:
-        holds_of({"stick": "grip", "ball": "pull"}, {"ball": frame})  # type: ignore[dict-item]
+        make_holds({"stick": "grip", "ball": "pull"}, {"ball": frame})  # type: ignore[dict-item]
     assert caught.value.field == "by"
 
 
 def test_what_is_not_held_holds_nothing() -> None:
     with pytest.raises(UnknownNameError) as caught:
-        holds_of({"stick": "grip", "ball": "pull"}, {"ball": "stik.tip"})
+        make_holds({"stick": "grip", "ball": "pull"}, {"ball": "stik.tip"})
     assert (caught.value.field, caught.value.nearest) == ("by", "stick")
 
 

@@ -20,7 +20,7 @@ from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import compute_clearance, get_link_name, list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], the planner's
@@ -75,7 +75,7 @@ def parts(placed: PlacedObject, *links: str) -> Shapes:
     """Shapes of some of an object's links, or of all."""
     return list_placed_shapes(
         shape
-        for shape in standing_geometry(placed)
+        for shape in make_world_shapes(placed)
         if not links or get_link_name(shape.name) in links
     )
 
@@ -225,7 +225,7 @@ def test_refrigerator_and_cabinet_have_room_for_cup_and_ball() -> None:
         shelf = {"refrigerator": 0.98, "cabinet": 0.81}[name]
         height = shelf + {"cup": 0.001, "ball": 0.036}[item]
         inside = list_placed_shapes(
-            standing_geometry(
+            make_world_shapes(
                 PlacedObject(
                     item, thing(item), pin.SE3(np.eye(3), np.array([x, 0, height])), np.zeros(0)
                 )

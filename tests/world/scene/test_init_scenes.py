@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 SCENES = ("init_1", "init_2", "init_3")
@@ -155,7 +155,7 @@ def test_two_things_are_in_the_way_of_most_starts_of_the_second_scene() -> None:
 def test_the_stick_lies_on_its_table_without_touching_it() -> None:
     for name in SCENES:
         here = scene(name)
-        stick = list_placed_shapes(standing_geometry(here.objects["stick"]))
+        stick = list_placed_shapes(make_world_shapes(here.objects["stick"]))
         top = [shape for shape in here.obstacles if shape.name == "table_top"]
         assert 0.0005 <= compute_clearance(stick, list_placed_shapes(top)) < 0.002
         others = [shape for shape in here.obstacles if shape.name != "table_top"]
@@ -241,7 +241,7 @@ def test_the_hand_fits_round_the_stick_along_the_whole_range(turn: float, table:
         (-0.095, 0.095),
         (-1.2, 1.2),
     ]
-    dowel, butt, front, *tip = list_placed_shapes(standing_geometry(placed))
+    dowel, butt, front, *tip = list_placed_shapes(make_world_shapes(placed))
     world = [shape for shape in here.obstacles if shape.name in (*TABLES, "floor")]
     for slide in SLIDES:
         tool = placed.link_placement("stick") * grip.placement * grip.motion([slide, turn])
@@ -277,7 +277,7 @@ def test_sliding_goes_towards_the_tip_and_stays_in_the_half_away_from_it() -> No
 @pytest.mark.parametrize("turn", [1.2, -1.2])
 def test_in_the_air_the_hand_fits_at_the_ends_of_its_turn_too(turn: float) -> None:
     placed = scene("init_1").objects["stick"]
-    grip, shapes = placed.object.attachments["grip"], list_placed_shapes(standing_geometry(placed))
+    grip, shapes = placed.object.attachments["grip"], list_placed_shapes(make_world_shapes(placed))
     for slide in SLIDES:
         tool = placed.link_placement("stick") * grip.placement * grip.motion([slide, turn])
         assert compute_clearance(hand(scene("init_1").robot, tool), shapes) > 0.005

@@ -13,7 +13,7 @@ import trimesh
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.models.shapes import compute_world_box, triangulate
-from vkc_pin.world.scene.obstacles import FLOOR, floor_shape, obstacle_shapes
+from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
 from vkc_pin.world.scene.scene_schema import ObstacleSchema
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([1.0, -2.0, 0.5]))
@@ -29,7 +29,7 @@ def described(
     item = pydantic.TypeAdapter(ObstacleSchema).validate_python(
         {"name": "thing", "position": [0, 0, 0], **fields}
     )
-    return obstacle_shapes(item, POSE, folder)
+    return make_obstacle_shapes(item, POSE, folder)
 
 
 def volume(shape: pin.GeometryObject) -> float:
@@ -89,7 +89,7 @@ def test_a_file_that_is_not_there(kind: str, tmp_path: Path) -> None:
 
 
 def test_the_floor_lies_under_the_whole_arena_and_a_border() -> None:
-    floor = floor_shape((-1.0, 4.0, 0.0, 2.5))
+    floor = make_floor_shape((-1.0, 4.0, 0.0, 2.5))
     low, high = compute_world_box(floor.geometry, floor.placement)
     np.testing.assert_allclose(low, [-3.0, -2.0, -0.1])
     np.testing.assert_allclose(high, [6.0, 4.5, 0.0], atol=1e-12)

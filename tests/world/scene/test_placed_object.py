@@ -10,17 +10,17 @@ import pytest
 from helpers.rooms import TINY, load
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 
 
 def test_standing_objects_are_where_their_joints_put_them(tmp_path: Path) -> None:
     placed = load(tmp_path, TINY).objects["front"]
     np.testing.assert_array_equal(placed.state, [0.3, 0.0])
-    shapes = {s.name: s for s in standing_geometry(placed)}
+    shapes = {s.name: s for s in make_world_shapes(placed)}
     middle = np.array([3.0, 0.0, 0.0]) + pin.utils.rotate("z", 0.3) @ [0.0, -0.45, 1.01]
     np.testing.assert_allclose(shapes["panel_0"].placement.translation, middle, atol=1e-12)
     assert {s.parentJoint for s in shapes.values()} == {0}
-    assert len(standing_geometry(placed, visual=True)) == len(placed.object.visual.geometryObjects)
+    assert len(make_world_shapes(placed, visual=True)) == len(placed.object.visual.geometryObjects)
     np.testing.assert_allclose(
         placed.link_placement("panel").rotation, pin.utils.rotate("z", 0.3), atol=1e-12
     )

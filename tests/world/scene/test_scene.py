@@ -11,7 +11,7 @@ from helpers.rooms import TINY, load
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 
@@ -53,7 +53,7 @@ def test_moving_parts_keep_clear_of_the_room_over_the_whole_range(name: str, joi
     )
     nearest = np.inf
     for value in np.linspace(placed.object.lower[index], placed.object.upper[index], 80):
-        moved = standing_geometry(placed.with_state({joint: value}))
+        moved = make_world_shapes(placed.with_state({joint: value}))
         moving = [
             s
             for s, original in zip(moved, placed.object.collision.geometryObjects, strict=True)
@@ -65,7 +65,7 @@ def test_moving_parts_keep_clear_of_the_room_over_the_whole_range(name: str, joi
 
 def test_the_frame_fills_the_opening_without_a_gap_wider_than_a_finger(door: Scene) -> None:
     walls = [s for s in door.obstacles if s.name.startswith("wall_")]
-    frame = [s for s in standing_geometry(door.objects["door"]) if s.name.startswith("frame_")]
+    frame = [s for s in make_world_shapes(door.objects["door"]) if s.name.startswith("frame_")]
     assert len(frame) == 3
     for part in frame:
         assert abs(compute_clearance(list_placed_shapes([part]), list_placed_shapes(walls))) < 1e-3

@@ -9,9 +9,9 @@ from helpers.carrying import lifted
 from helpers.riding import TOP, cup, folder, plates, scene_of
 
 from vkc_pin.world.models.shapes import get_link_name
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.scene.support import RESTING, borne, supports, tilt
+from vkc_pin.world.scene.support import RESTING_DISTANCE, find_supported_objects, find_supports, compute_tilt
 
 
 def on(scene: Scene, name: str = "cup") -> set[str]:
@@ -19,10 +19,10 @@ def on(scene: Scene, name: str = "cup") -> set[str]:
         (f"{other}.{get_link_name(shape.name)}", shape)
         for other, placed in scene.objects.items()
         if other != name
-        for shape in standing_geometry(placed)
+        for shape in make_world_shapes(placed)
     ]
     shapes += zip(scene.obstacle_labels, scene.obstacles, strict=True)
-    return supports(scene.objects[name], shapes)
+    return find_supports(scene.objects[name], shapes)
 
 
 @pytest.mark.parametrize(
@@ -55,14 +55,14 @@ def test_what_stands_on_what_stands_on_what_moves() -> None:
         {**scene.document, "objects": [*scene.document["objects"], upper]}, folder()
     )
     assert on(stacked, "upper") == {"cup.cup"}
-    assert borne(stacked.objects, {"plate": {"plate"}}, ["cup", "upper"]) == {
+    assert find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["cup", "upper"]) == {
         "cup": "plate.plate",
         "upper": "plate.plate",
     }
-    assert borne(stacked.objects, {"cup": {"cup"}}, ["cup", "upper"]) == {"upper": "cup.cup"}
-    assert borne(stacked.objects, {"plate": {"post"}}, ["cup", "upper"]) == {}
+    assert find_supported_objects(stacked.objects, {"cup": {"cup"}}, ["cup", "upper"]) == {"upper": "cup.cup"}
+    assert find_supported_objects(stacked.objects, {"plate": {"post"}}, ["cup", "upper"]) == {}
     assert (
-        borne(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}
+        find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}
     )  # what is between is held by somebody
 
 
@@ -72,14 +72,14 @@ def test_tilt_is_the_angle_of_the_vertical_whatever_the_heading(angle: float) ->
     before = pin.SE3.Random()
     first, last = (pin.utils.rotate("z", rng.uniform()) for _ in range(2))
     leaning = pin.SE3(first @ pin.utils.rotate("x", angle) @ last, rng.normal(size=3))
-    assert tilt(before, leaning * before) == pytest.approx(angle, abs=1e-9)
+    assert compute_tilt(before, leaning * before) == pytest.approx(angle, abs=1e-9)
 
 
 def test_how_far_it_is_lowered_is_more_than_rounding_and_less_than_a_shelf() -> None:
-    assert 1e-3 < RESTING < 0.02
+    assert 1e-3 < RESTING_DISTANCE < 0.02
     thin = [
         {"name": "sheet", "type": "box", "size": [0.3, 0.3, 0.002], "position": [0.0, 0.0, 0.499]}
     ]
     for at, stands in ((0.5, True), (0.502, True), (0.51, False)):
         assert on(scene_of([cup(at=(0.0, 0.0, at))], thin)) == ({"sheet"} if stands else set())
-    assert lifted(pin.SE3.Identity()).translation[2] > RESTING
+    assert lifted(pin.SE3.Identity()).translation[2] > RESTING_DISTANCE

@@ -7,7 +7,7 @@ import pytest
 from helpers.litter import AT, BIN, littered
 
 import vkc_pin as vkc
-from vkc_pin.world.task.actions import actions_of, alternatives, foresee
+from vkc_pin.world.task.actions import compile_each_step, generate_alternatives, group_into_actions
 from vkc_pin.world.task.compiler import compile_task
 
 A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
@@ -33,7 +33,7 @@ def test_what_is_done_with_one_thing_is_one_action() -> None:
         vkc.Release(),
         vkc.GoTo(0, 0),
     ]
-    assert actions_of(steps) == [
+    assert group_into_actions(steps) == [
         tuple(steps[0:2]),
         tuple(steps[2:4]),
         (SHUT,),
@@ -54,7 +54,7 @@ def test_no_step_is_lost() -> None:
         OPEN,
         vkc.Release(),
     ]
-    actions = actions_of(steps)
+    actions = group_into_actions(steps)
     assert [step for action in actions for step in action] == steps
     assert len(actions) == 6  # a grasp of one thing is no part of what is done with another
 
@@ -63,7 +63,7 @@ def test_what_is_foreseen_is_what_each_step_asks_for_where_it_stands() -> None:
     """Steps are compiled one by one, each in the scene that the steps before leave: an open door, a cup on the table."""
     scene, options = vkc.load_scene("household"), vkc.Options()
     steps = [OPEN, *CUP, SHUT]
-    tasks = foresee(scene, steps, options)
+    tasks = compile_each_step(scene, steps, options)
     assert [task.steps for task in tasks] == [(step,) for step in steps]
     assert [[phase.name for phase in task.phases] for task in tasks] == [
         ["reach refrigerator.handle", "move refrigerator.hinge"],
@@ -75,9 +75,9 @@ def test_what_is_foreseen_is_what_each_step_asks_for_where_it_stands() -> None:
     assert tasks[-1].phases[-1].values == {"refrigerator.hinge": 0.0}
     assert [hold.object for hold in tasks[1].after] == ["cold_cup"]
     assert scene.objects["refrigerator"].state[0] == 0.0
-    again = foresee(scene, [*steps, G("cold_cup")], options)[-1]
+    again = compile_each_step(scene, [*steps, G("cold_cup")], options)[-1]
     (grasp,) = again.phases
-    np.testing.assert_allclose(grasp.standing["cold_cup"].translation, TABLE, atol=1e-6)
+    np.testing.assert_allclose(grasp.resting["cold_cup"].translation, TABLE, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_the_first_step_that_cannot_be_done_is_named(
     steps: list[vkc.Step], field: str, problem: str
 ) -> None:
     with pytest.raises(vkc.InputError, match=problem) as caught:
-        foresee(vkc.load_scene("household"), steps, vkc.Options())
+        compile_each_step(vkc.load_scene("household"), steps, vkc.Options())
     assert str(caught.value.field).startswith(field)
 
 
@@ -111,9 +111,10 @@ def test_a_free_object_is_taken_anew_where_it_stands_only(stands: bool) -> None:
     task = compile_task(scene, [place], vkc.Options())
     again = (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
     assert (
-        list(alternatives(scene, task, anew=True)) == [("litter.grip, taken anew", again)] * stands
+        list(generate_alternatives(scene, task, anew=True))
+        == [("litter.grip, taken anew", again)] * stands
     )
-    assert not list(alternatives(scene, task)), "only where phases may be more"
+    assert not list(generate_alternatives(scene, task)), "only where phases may be more"
 
 
 def test_where_it_stands_is_known_if_nothing_has_moved_before() -> None:

@@ -17,7 +17,7 @@ from vkc_pin.options import Options
 from vkc_pin.world.models.articulated_object import Attachment, Freedom
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.actuation import advance
+from vkc_pin.world.task.actuation import compute_advance
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 
@@ -64,7 +64,7 @@ def test_the_advance_is_that_of_finite_differences(
         contact="push",
     )
     for joint in ("swing", "slide"):
-        least, most = advance(arm, face, joint)
+        least, most = compute_advance(arm, face, joint)
         corners = [moved(arm, face, joint, [x, y, 0.3]) for x in (-0.1, 0.2) for y in (-0.1, 0.2)]
         np.testing.assert_allclose([least, most], [min(corners), max(corners)], rtol=0.0, atol=1e-8)
         inside = [
@@ -83,7 +83,7 @@ def test_a_rim_is_looked_at_all_along() -> None:
     rim = Attachment(
         name="rim", link="tray", placement=pin.SE3.Identity(), freedoms=(around,), contact="push"
     )
-    least, most = advance(arm, rim, "swing")
+    least, most = compute_advance(arm, rim, "swing")
     every = [moved(arm, rim, "swing", [value]) for value in np.linspace(-np.pi, np.pi, 200)]
     assert most - least > 0.1
     assert abs(least - min(every)) < 0.1 * (most - least)
@@ -132,16 +132,20 @@ def test_which_way_a_push_moves_a_joint_is_asked_where_the_steps_before_have_lef
         return Attachment(name="face", link="tray", placement=placement, contact="push")
 
     def yields(value: float, shift: float) -> float:
-        return advance(scene.objects["cabinet"].with_state({"slide": value}), face(shift), "swing")[
-            0
-        ]
+        return compute_advance(
+            scene.objects["cabinet"].with_state({"slide": value}), face(shift), "swing"
+        )[0]
 
     root = yields(0.0, 0.0) / (
         yields(0.0, 0.0) - yields(0.0, 1.0)
     )  # the lever is linear along the axis
     middle = face(root - sum(slides) / 2.0)
     signs = [
-        np.sign(advance(scene.objects["cabinet"].with_state({"slide": value}), middle, "swing")[0])
+        np.sign(
+            compute_advance(scene.objects["cabinet"].with_state({"slide": value}), middle, "swing")[
+                0
+            ]
+        )
         for value in slides
     ]
     assert signs[0] == -signs[1] != 0.0

@@ -21,9 +21,9 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.actuation import clash
+from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import LATCH_MARGIN, compile_task
-from vkc_pin.world.task.lookup import path_joints
+from vkc_pin.world.task.lookup import find_path_joints
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Release, Step
 
@@ -79,13 +79,17 @@ def test_opening_a_door_is_reaching_turning_and_moving() -> None:
     assert task.state == SHUT
     reach, turn, move = task.phases
     assert (reach.held, reach.grasps, reach.ranges, reach.values) == ((), (HANDLE,), {}, {})
-    assert (turn.held, turn.grasps, turn.leaves) == ((HANDLE,), (), ())
+    assert (turn.held, turn.grasps, turn.released) == ((HANDLE,), (), ())
     assert turn.ranges == {"door.knob": KNOB}
     assert turn.values == {"door.knob": TURNED}
     assert move.held == (HANDLE,)
     assert move.ranges == {"door.hinge": HINGE, "door.knob": (TURNED, KNOB[1])}
     assert move.values == {"door.hinge": 1.2, "door.knob": TURNED}
-    assert [phase.before for phase in task.phases] == [SHUT, SHUT, {**SHUT, "door.knob": TURNED}]
+    assert [phase.initial_values for phase in task.phases] == [
+        SHUT,
+        SHUT,
+        {**SHUT, "door.knob": TURNED},
+    ]
     assert all(phase.base is None and phase.frames == () for phase in task.phases)
 
 
@@ -96,7 +100,7 @@ def test_a_knob_that_is_turned_already() -> None:
         "move door.hinge, door.knob",
     ]
     assert task.phases[1].ranges["door.knob"] == (TURNED, KNOB[1])
-    assert task.phases[1].before == {"door.hinge": 0.0, "door.knob": 0.6}
+    assert task.phases[1].initial_values == {"door.hinge": 0.0, "door.knob": 0.6}
 
 
 def test_a_door_that_is_ajar() -> None:
@@ -140,14 +144,14 @@ def test_hinge_and_knob_together() -> None:
     assert back.phases[2].values == {"door.hinge": 1.2, "door.knob": TURNED}
     assert back.phases[3].values == {"door.knob": 0.0}
     assert back.phases[3].ranges == {"door.knob": KNOB}
-    assert back.phases[3].before == {"door.hinge": 1.2, "door.knob": TURNED}
+    assert back.phases[3].initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
 
 
 def test_a_held_object_needs_no_reaching() -> None:
     task = phases([OPEN], door_scene().with_held({"door": "handle"}))
     assert [phase.name for phase in task.phases] == ["turn door.knob", "move door.hinge, door.knob"]
     assert task.phases[0].held == task.holds == (HANDLE,)
-    assert task.phases[0].leaves == ()
+    assert task.phases[0].released == ()
     assert task.state == SHUT
 
 
@@ -157,7 +161,7 @@ def test_twice_the_same_object_is_grasped_once() -> None:
         "move door.hinge, door.knob",
         "move door.hinge",
     ]
-    assert task.phases[3].before == {"door.hinge": 1.2, "door.knob": TURNED}
+    assert task.phases[3].initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
 
 
 def test_the_task_of_the_first_steps_is_as_if_there_were_no_others() -> None:
@@ -165,10 +169,10 @@ def test_the_task_of_the_first_steps_is_as_if_there_were_no_others() -> None:
     steps = [GoTo(0.3, 0.2), OPEN, back, drawer, Release()]
     whole = phases(steps, full_scene())
     for count in range(1, len(steps) + 1):
-        part, alone = whole.until(count), phases(steps[:count], full_scene())
+        part, alone = whole.truncate(count), phases(steps[:count], full_scene())
         assert part == alone
-        assert [list(phase.before) for phase in part.phases] == [
-            list(phase.before) for phase in alone.phases
+        assert [list(phase.initial_values) for phase in part.phases] == [
+            list(phase.initial_values) for phase in alone.phases
         ]
         assert list(part.state) == list(alone.state)
 
@@ -204,12 +208,12 @@ def test_reach() -> None:
 def test_go_to_lets_go() -> None:
     task = phases([OPEN, GoTo(1.0, 2.0, 0.3)])
     last = task.phases[-1]
-    assert (last.name, last.held, last.leaves) == ("go to", (), (HANDLE,))
+    assert (last.name, last.held, last.released) == ("go to", (), (HANDLE,))
     assert last.base == (1.0, 2.0, 0.3)
-    assert last.before == {"door.hinge": 1.2, "door.knob": TURNED}
+    assert last.initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
     assert phases([GoTo(1.0, 2.0)]).phases[0].base == (1.0, 2.0, None)
     held = door_scene().with_held({"door": "handle"})
-    assert phases([GoTo(1.0, 2.0)], held).phases[0].leaves == (HANDLE,)
+    assert phases([GoTo(1.0, 2.0)], held).phases[0].released == (HANDLE,)
 
 
 def test_one_object_after_another() -> None:
@@ -226,9 +230,9 @@ def test_one_object_after_another() -> None:
     drawer = Hold("drawer", "handle")
     assert task.holds == (HANDLE, drawer)
     assert task.state == {**SHUT, "drawer.slide": 0.0}
-    assert all(phase.before["drawer.slide"] == 0.0 for phase in task.phases)
-    assert (task.phases[3].leaves, task.phases[3].held) == ((HANDLE,), ())
-    assert task.phases[4].before["door.hinge"] == 1.2
+    assert all(phase.initial_values["drawer.slide"] == 0.0 for phase in task.phases)
+    assert (task.phases[3].released, task.phases[3].held) == ((HANDLE,), ())
+    assert task.phases[4].initial_values["door.hinge"] == 1.2
     assert task.phases[4].held == task.after == (drawer,)
 
 
@@ -236,14 +240,14 @@ def test_joints_that_the_grasp_cannot_move_are_none_of_the_task() -> None:
     task = phases([Actuate("cabinet", {"slide": 0.2})], full_scene())
     assert task.state == {f"cabinet.{joint}": CABINET_STATE[joint] for joint in ("swing", "slide")}
     placed = full_scene().objects["cabinet"]
-    assert path_joints(placed, placed.object.attachment()) == ["swing", "slide"]
+    assert find_path_joints(placed, placed.object.attachment()) == ["swing", "slide"]
 
 
 def test_a_goal_beyond_the_limits_ends_at_the_limit() -> None:
     """It is compiled, so that planning can say by how much it fails; what follows starts from the limit."""
     task = phases([Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)])
     assert task.phases[2].values["door.hinge"] == 2.0
-    assert task.phases[3].before["door.hinge"] == HINGE[1]
+    assert task.phases[3].initial_values["door.hinge"] == HINGE[1]
 
 
 @pytest.mark.parametrize(
@@ -371,16 +375,16 @@ def test_one_object_held_here_and_then_there() -> None:
         "move cabinet.lid_hinge",
     ]
     assert [phase.held for phase in task.phases] == [(), (grip,), (), (other,)]
-    assert task.phases[2].leaves == (grip,)
-    assert task.phases[3].before == {
+    assert task.phases[2].released == (grip,)
+    assert task.phases[3].initial_values == {
         "cabinet.swing": 0.5,
         "cabinet.slide": 0.1,
         "cabinet.lid_hinge": -0.4,
     }
-    assert clash(lid, task.holds) is None
+    assert find_shared_coordinate(lid, task.holds) is None
     both = phases([OPEN, Actuate("door", {"hinge": 0.5}, "handle_free")])
     assert both.holds == (HANDLE, Hold("door", "handle_free"))
-    assert clash(door_scene(), both.holds) == "door.hinge"
+    assert find_shared_coordinate(door_scene(), both.holds) == "door.hinge"
 
 
 def test_what_the_start_holds_is_let_go_of_where_another_hold_moves_the_same() -> None:
@@ -397,8 +401,8 @@ def test_what_the_start_holds_is_let_go_of_where_another_hold_moves_the_same() -
         task = phases(steps, scene)
         assert task.holds == (Hold("door", "plate"),)
         assert task.state == {"door.hinge": 0.4}
-        assert all(phase.before == {"door.hinge": 0.4} for phase in task.phases)
-        assert task.phases[0].leaves == (HANDLE,)
+        assert all(phase.initial_values == {"door.hinge": 0.4} for phase in task.phases)
+        assert task.phases[0].released == (HANDLE,)
 
 
 def test_an_object_without_attachments() -> None:

@@ -56,8 +56,8 @@ def test_touching_with_a_stick_is_taking_it_and_carrying_it() -> None:
     reach, touch = task.phases
     assert names(task) == ["reach stick.grip", "touch with stick.tip"]
     assert (task.segments, task.holds, task.after) == (20, (GRIP,), (GRIP,))
-    assert (reach.held, reach.grasps, reach.leaves, reach.frames) == ((), (GRIP,), (), ())
-    assert (touch.held, touch.grasps, touch.leaves) == ((GRIP,), (), ())
+    assert (reach.held, reach.grasps, reach.released, reach.frames) == ((), (GRIP,), (), ())
+    assert (touch.held, touch.grasps, touch.released) == ((GRIP,), (), ())
     (goal,) = touch.frames
     assert (goal.frame, goal.kind, goal.hold, goal.touches) == ("tip", "point", GRIP, True)
     np.testing.assert_array_equal(goal.placement.translation, POINT)
@@ -84,12 +84,12 @@ def test_touching_with_the_robot_itself() -> None:
 def test_what_stands_where_before_and_after_it_is_taken() -> None:
     task = phases(Touch("stick.tip", POINT))
     for phase, standing in zip(task.phases, [{"stick", "ball"}, {"ball"}], strict=True):
-        assert set(phase.standing) == standing
-    assert task.phases[0].standing["stick"] == STICK
-    assert task.phases[1].standing["ball"] == BALL
+        assert set(phase.resting) == standing
+    assert task.phases[0].resting["stick"] == STICK
+    assert task.phases[1].resting["ball"] == BALL
     assert task.phases[1].lifted == {GRIP: STICK}
     assert task.phases[0].lifted == {}
-    assert all(not phase.lowered and not phase.left for phase in task.phases)
+    assert all(not phase.lowered and not phase.released_by for phase in task.phases)
 
 
 def test_a_stick_in_the_hand_is_used_at_once() -> None:
@@ -100,8 +100,8 @@ def test_a_stick_in_the_hand_is_used_at_once() -> None:
             [(hold,)],
             (hold,),
         )
-        assert task.phases[0].leaves == ()
-        assert "stick" not in task.phases[0].standing
+        assert task.phases[0].released == ()
+        assert "stick" not in task.phases[0].resting
         assert task.phases[0].lifted == {}
     taken = phases(Grasp("stick", "end"), Touch("stick.tip", POINT))
     assert names(taken) == ["reach stick.end", "touch with stick.tip"]
@@ -125,11 +125,11 @@ def test_placing_is_taking_bringing_and_letting_go() -> None:
         POSE,
     )
     assert (place.held, place.lifted, place.lowered) == ((GRIP,), {GRIP: STICK}, {GRIP: POSE})
-    assert (leave.held, leave.leaves) == ((), (GRIP,))
-    assert leave.standing["stick"] == POSE
-    assert leave.left == {}
+    assert (leave.held, leave.released) == ((), (GRIP,))
+    assert leave.resting["stick"] == POSE
+    assert leave.released_by == {}
     assert task.after == ()
-    assert reach.leaves == place.leaves == ()
+    assert reach.released == place.released == ()
 
 
 def test_placing_at_a_point_keeps_it_upright_and_leaves_open_where_exactly() -> None:
@@ -139,9 +139,9 @@ def test_placing_at_a_point_keeps_it_upright_and_leaves_open_where_exactly() -> 
     assert goal.kind == "upright"
     np.testing.assert_array_equal(goal.placement.translation, [0.0, 1.0, 0.5])
     np.testing.assert_array_equal(goal.placement.rotation, POSE.rotation)
-    assert task.phases[1].left == {}
-    assert task.phases[2].left == {"stick": (GRIP, 1)}  # as the phase before left it
-    assert "stick" in task.phases[2].standing
+    assert task.phases[1].released_by == {}
+    assert task.phases[2].released_by == {"stick": (GRIP, 1)}  # as the phase before left it
+    assert "stick" in task.phases[2].resting
 
 
 def test_placing_at_another_attachment() -> None:
@@ -158,25 +158,25 @@ def test_placing_at_another_attachment() -> None:
 def test_releasing() -> None:
     task = phases(Touch("stick.tip", POINT), Release(), GoTo(0.0, 0.0))
     assert names(task) == ["reach stick.grip", "touch with stick.tip", "go to"]
-    assert (task.phases[2].held, task.phases[2].leaves) == ((), (GRIP,))
-    assert task.phases[2].left == {"stick": (GRIP, 1)}
+    assert (task.phases[2].held, task.phases[2].released) == ((), (GRIP,))
+    assert task.phases[2].released_by == {"stick": (GRIP, 1)}
     assert task.after == ()
     assert phases(Touch("stick.tip", POINT), Release("stick")).after == ()
-    assert phases(Grasp("door"), Release(), GoTo(0.0, 0.0)).phases[1].leaves == (HANDLE,)
+    assert phases(Grasp("door"), Release(), GoTo(0.0, 0.0)).phases[1].released == (HANDLE,)
 
 
 def test_releasing_what_is_held_at_the_start() -> None:
     task = phases(Release(), of=scene().with_held({"stick": "grip"}))
     assert (names(task), held(task), task.after) == (["stand still"], [(GRIP,)], ())
     later = phases(Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"}))
-    assert later.phases[1].leaves == (GRIP,)
-    assert not later.phases[1].left, (
+    assert later.phases[1].released == (GRIP,)
+    assert not later.phases[1].released_by, (
         "where it stands is known: it is let go of before anything has moved"
     )
     moved = phases(
         GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"})
     )
-    assert moved.phases[1].left == {"stick": (GRIP, 0)}
+    assert moved.phases[1].released_by == {"stick": (GRIP, 0)}
 
 
 def test_what_cannot_be_released() -> None:
@@ -212,10 +212,10 @@ def test_a_ball_is_fetched_with_the_stick() -> None:
     assert held(task) == [(), (GRIP,), (GRIP, PULLED), (GRIP, PULLED), (GRIP,)]
     assert task.holds == (GRIP, PULLED)
     assert [phase.grasps for phase in task.phases] == [(GRIP,), (PULLED,), (), (), ()]
-    assert [phase.leaves for phase in task.phases] == [(), (), (), (), (PULLED,)]
+    assert [phase.released for phase in task.phases] == [(), (), (), (), (PULLED,)]
     assert task.phases[2].lifted == {PULLED: BALL}
     assert task.phases[3].frames[0].hold == PULLED
-    assert task.phases[4].left == {"ball": (PULLED, 3)}
+    assert task.phases[4].released_by == {"ball": (PULLED, 3)}
     assert task.after == ()
 
 
@@ -224,9 +224,9 @@ def test_letting_go_of_the_stick_lets_go_of_the_ball_on_it() -> None:
     for step in (Release(), Release("stick"), Place("stick", POSE)):
         task = phases(*fetch, step, GoTo(0.0, 0.0))
         assert (task.phases[-1].held, task.after) == ((), ())
-        assert {hold.object for hold in task.phases[-1].leaves} == {"stick", "ball"}
-        assert "ball" in task.phases[-1].left
-        assert ("stick" in task.phases[-1].left) == isinstance(step, Release)
+        assert {hold.object for hold in task.phases[-1].released} == {"stick", "ball"}
+        assert "ball" in task.phases[-1].released_by
+        assert ("stick" in task.phases[-1].released_by) == isinstance(step, Release)
     task = phases(*fetch, Release("ball"), GoTo(0.0, 0.0))
     assert (task.phases[-1].held, task.after) == ((GRIP,), (GRIP,))
 
@@ -313,17 +313,17 @@ def test_what_is_carried_comes_along_and_a_door_does_not() -> None:
     ):
         carried = phases(Grasp("stick"), step)
         assert held(carried) == [(), (GRIP,)]
-        assert (carried.phases[1].leaves, carried.after) == ((), (GRIP,))
+        assert (carried.phases[1].released, carried.after) == ((), (GRIP,))
         shut = phases(Grasp("door"), step)
         assert held(shut) == [(), ()]
-        assert (shut.phases[1].leaves, shut.after) == ((HANDLE,), ())
+        assert (shut.phases[1].released, shut.after) == ((HANDLE,), ())
     drawer = Actuate("drawer", {"slide": 0.2})
     after = phases(
         Actuate("door", {"knob": 0.1}), Grasp("stick"), GoTo(0.0, 0.0), Place("stick", POSE), drawer
     )
     assert [len(phase.held) for phase in after.phases] == [0, 1, 0, 1, 1, 0, 1]
-    assert after.phases[2].leaves == (HANDLE,)
-    assert after.phases[5].leaves == (GRIP,)
+    assert after.phases[2].released == (HANDLE,)
+    assert after.phases[5].released == (GRIP,)
 
 
 # --- again
@@ -342,11 +342,11 @@ def test_what_was_placed_can_be_taken_again() -> None:
     assert task.holds == (GRIP,)
     again, touch = task.phases[3:]
     assert again.grasps == (GRIP,)
-    assert again.standing["stick"] == POSE
+    assert again.resting["stick"] == POSE
     assert touch.lifted == {GRIP: POSE}
     elsewhere = phases(Place("stick", POSE), Grasp("stick", "end"))
     assert elsewhere.holds == (GRIP, END)
-    assert elsewhere.phases[2].leaves == (GRIP,)
+    assert elsewhere.phases[2].released == (GRIP,)
 
 
 def test_the_attachment_that_was_used_is_used_again() -> None:
@@ -432,15 +432,15 @@ def test_every_phase_says_where_everything_is() -> None:
     )
 
     def where(phase: Phase) -> tuple[set[str], set[str]]:
-        return {hold.object for hold in phase.held}, set(phase.standing)
+        return {hold.object for hold in phase.held}, set(phase.resting)
 
     for phase in task.phases:
         carried, standing = where(phase)
         assert not carried & standing
         assert (carried | standing) >= {"stick", "ball"}
-        assert set(phase.left) <= standing
+        assert set(phase.released_by) <= standing
     for before, after in zip(task.phases[:-1], task.phases[1:], strict=True):
-        assert set(after.held) == ({*before.held, *before.grasps} - set(after.leaves))
+        assert set(after.held) == ({*before.held, *before.grasps} - set(after.released))
         assert set(after.lifted) == {
             hold
             for hold in before.grasps

@@ -19,7 +19,7 @@ def state() -> State:
 
 def numbers(formula: Formula, count: int = 5) -> np.ndarray:
     """Return random inputs, shape (count, 2·half + 1); the step takes DT."""
-    inputs = np.random.default_rng(0).normal(size=(count, 2 * formula.half + 1))
+    inputs = np.random.default_rng(0).normal(size=(count, 2 * formula.state_size + 1))
     inputs[:, -1] = DT
     return inputs
 
@@ -32,10 +32,15 @@ def test_a_state_gives_what_it_says() -> None:
         s.position("cup.cup"),
         s.velocity("tool"),
     ]
-    formula = s.formula(ca.vertcat(*parts, s.coordinate("door.hinge"), s.rate("elbow_joint")))
+    formula = s.make_formula(ca.vertcat(*parts, s.coordinate("door.hinge"), s.rate("elbow_joint")))
     assert formula.frames == ("cup.cup", "tool")
     assert formula.coordinates == ("door.hinge", "elbow_joint")
-    assert (formula.half, formula.rows, formula.moving, formula.timed) == (26, 10, True, True)
+    assert (formula.state_size, formula.rows, formula.uses_previous, formula.uses_time_step) == (
+        26,
+        10,
+        True,
+        True,
+    )
     x = numbers(formula)
     before = x[:, 26:]
     rotation = x[:, :9].reshape(5, 3, 3).swapaxes(1, 2)  # by columns
@@ -46,17 +51,21 @@ def test_a_state_gives_what_it_says() -> None:
         *((x[:, 21:24] - before[:, 21:24]) / DT).T,
     ]
     expected += [x[:, 24], (x[:, 25] - before[:, 25]) / DT]
-    np.testing.assert_allclose(formula.values(x), np.stack(expected, axis=1), atol=1e-12)
+    np.testing.assert_allclose(formula.evaluate(x), np.stack(expected, axis=1), atol=1e-12)
 
 
 def test_what_a_formula_depends_on() -> None:
     s = state()
-    assert not s.formula(s.position("tool")).moving
+    assert not s.make_formula(s.position("tool")).uses_previous
     s = state()
-    change = s.formula(s.rate("elbow_joint") * 2.0)
-    assert (change.moving, change.timed, change.inputs) == (True, True, {0, 1, 2})
+    change = s.make_formula(s.rate("elbow_joint") * 2.0)
+    assert (change.uses_previous, change.uses_time_step, change.input_indices) == (
+        True,
+        True,
+        {0, 1, 2},
+    )
     s = state()
-    assert s.formula(ca.sin(s.coordinate("elbow_joint"))).inputs == {0}
+    assert s.make_formula(ca.sin(s.coordinate("elbow_joint"))).input_indices == {0}
 
 
 @pytest.mark.parametrize(
@@ -77,18 +86,18 @@ def test_what_a_formula_depends_on() -> None:
 )
 def test_a_formula_computes_what_was_written(expression) -> None:  # type: ignore[no-untyped-def]
     s = state()
-    formula = s.formula(expression(s.coordinate("elbow_joint"), s.coordinate("door.hinge")))
+    formula = s.make_formula(expression(s.coordinate("elbow_joint"), s.coordinate("door.hinge")))
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     direct = ca.Function("direct", [x, y], [expression(x, y)])
     inputs = numbers(formula, 20)
     expected = [np.asarray(direct(row[0], row[1])).ravel() for row in inputs]
-    np.testing.assert_allclose(formula.values(inputs), expected, atol=2 * ROUNDING)
+    np.testing.assert_allclose(formula.evaluate(inputs), expected, atol=2 * ROUNDING)
 
 
 def test_formulas_are_equal_if_they_compute_the_same_way_and_survive_json() -> None:
     def make(limit: float) -> Formula:
         s = state()
-        return s.formula(ca.sumsqr(s.velocity("tool")) - limit)
+        return s.make_formula(ca.sumsqr(s.velocity("tool")) - limit)
 
     assert make(0.5) == make(0.5)
     assert hash(make(0.5)) == hash(make(0.5))
@@ -103,7 +112,7 @@ def test_formulas_are_equal_if_they_compute_the_same_way_and_survive_json() -> N
 
 def test_roots_have_slopes_at_zero() -> None:
     s = state()
-    formula = s.formula(ca.norm_2(s.velocity("tool")))
+    formula = s.make_formula(ca.norm_2(s.velocity("tool")))
     x = ca.SX.sym("x", 25)
     value = formula.function(x)
     derivatives = ca.Function("d", [x], [value, ca.jacobian(value, x), ca.hessian(value, x)[0]])
@@ -128,6 +137,6 @@ def test_unknown_names_are_named_with_the_nearest() -> None:
             ask(state(), name)
         assert caught.value.nearest == nearest
     s = state()
-    formula = s.formula(s.position("tool"))
+    formula = s.make_formula(s.position("tool"))
     with pytest.raises(UnknownNameError, match="there is no frame 'tool'"):
-        State(["other"], COORDINATES).know(formula)
+        State(["other"], COORDINATES).check_names(formula)

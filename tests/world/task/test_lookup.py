@@ -11,41 +11,41 @@ from helpers.small_problems import CABINET_STATE, full_scene
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.task.lookup import (
-    attachment_of,
     check_link,
-    joint_limits,
-    path_joints,
-    placed_object,
-    robot_frame,
+    find_attachment,
+    find_joint_limits,
+    find_object,
+    find_path_joints,
+    find_robot_frame,
 )
 
 
 def test_objects_attachments_links_and_frames() -> None:
     scene = full_scene()
-    cabinet = placed_object(scene, "cabinet", "object")
+    cabinet = find_object(scene, "cabinet", "object")
     assert cabinet is scene.objects["cabinet"]
-    assert attachment_of(cabinet, None, "attachment").name == "grip"
-    assert attachment_of(cabinet, "bar", "attachment").name == "bar"
+    assert find_attachment(cabinet, None, "attachment").name == "grip"
+    assert find_attachment(cabinet, "bar", "attachment").name == "bar"
     check_link(cabinet, "tray", "link")
-    assert robot_frame(scene, None, "frame") == scene.robot.tool_frame
-    assert robot_frame(scene, "forearm_link", "frame") == "forearm_link"
+    assert find_robot_frame(scene, None, "frame") == scene.robot.tool_frame
+    assert find_robot_frame(scene, "forearm_link", "frame") == "forearm_link"
 
 
 def test_what_there_is_not() -> None:
     scene = full_scene()
     cabinet = scene.objects["cabinet"]
     for call, nearest in (
-        (lambda: placed_object(scene, "cabinett", "here"), "cabinet"),
-        (lambda: attachment_of(cabinet, "gripp", "here"), "grip"),
+        (lambda: find_object(scene, "cabinett", "here"), "cabinet"),
+        (lambda: find_attachment(cabinet, "gripp", "here"), "grip"),
         (lambda: check_link(cabinet, "try", "here"), "tray"),
-        (lambda: robot_frame(scene, "forearm", "here"), "forearm_link"),
+        (lambda: find_robot_frame(scene, "forearm", "here"), "forearm_link"),
     ):
         with pytest.raises(UnknownNameError) as caught:
             call()
         assert (caught.value.field, caught.value.nearest) == ("here", nearest)
     bare = dataclasses.replace(cabinet, object=dataclasses.replace(cabinet.object, attachments={}))
     with pytest.raises(InputError, match="cannot be grasped"):
-        attachment_of(bare, None, "here")
+        find_attachment(bare, None, "here")
 
 
 def test_the_joints_on_the_path_are_those_that_move_the_attachment() -> None:
@@ -62,18 +62,18 @@ def test_the_joints_on_the_path_are_those_that_move_the_attachment() -> None:
                 pin.framesForwardKinematics(model, other, placed.object.coordinates.q(state))
                 if not data.oMf[frame].isApprox(other.oMf[frame], 1e-9):
                     moving.append(name)
-            assert sorted(path_joints(placed, attachment)) == sorted(moving)
+            assert sorted(find_path_joints(placed, attachment)) == sorted(moving)
     cabinet = full_scene().objects["cabinet"]
-    assert path_joints(cabinet, cabinet.object.attachments["grip"]) == ["swing", "slide"], (
+    assert find_path_joints(cabinet, cabinet.object.attachments["grip"]) == ["swing", "slide"], (
         "base first"
     )
 
 
 def test_limits_of_joints_are_those_of_the_file() -> None:
     cabinet = full_scene().objects["cabinet"]
-    assert joint_limits(cabinet, "cabinet.swing") == (-1.0, 2.0)
-    assert joint_limits(cabinet, "cabinet.slide") == (0.0, 0.3)
+    assert find_joint_limits(cabinet, "cabinet.swing") == (-1.0, 2.0)
+    assert find_joint_limits(cabinet, "cabinet.slide") == (0.0, 0.3)
     for name, value in CABINET_STATE.items():
-        low, high = joint_limits(cabinet, f"cabinet.{name}")
+        low, high = find_joint_limits(cabinet, f"cabinet.{name}")
         assert low <= value <= high
-    assert np.isfinite(joint_limits(full_scene().objects["door"], "door.hinge")).all()
+    assert np.isfinite(find_joint_limits(full_scene().objects["door"], "door.hinge")).all()

@@ -11,7 +11,7 @@ from helpers.small_problems import SHORT, full_scene
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
-from vkc_pin.world.task.phases import FrameGoal, Phase, Task, stretches
+from vkc_pin.world.task.phases import FrameGoal, Phase, Task, summarize_phases
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
@@ -47,9 +47,9 @@ def told(task: Task) -> list[tuple[object, ...]]:
             dict(p.values),
             p.base,
             p.grasps,
-            p.leaves,
-            dict(p.before),
-            set(p.left),
+            p.released,
+            dict(p.initial_values),
+            set(p.released_by),
         )
         for p in task.phases
     ]
@@ -60,7 +60,7 @@ def test_a_task_that_is_cut_off_is_that_of_the_first_steps(steps: list[Step]) ->
     scene = scene_for(steps)
     whole = compile_task(scene, steps, SHORT)
     for count in range(1, len(steps) + 1):
-        part, alone = whole.until(count), compile_task(scene, steps[:count], SHORT)
+        part, alone = whole.truncate(count), compile_task(scene, steps[:count], SHORT)
         assert told(part) == told(alone)
         assert (part.steps, part.holds, part.after, part.segments) == (
             alone.steps,
@@ -69,9 +69,9 @@ def test_a_task_that_is_cut_off_is_that_of_the_first_steps(steps: list[Step]) ->
             alone.segments,
         )
         assert dict(part.state) == dict(alone.state)
-        assert part.marks == alone.marks
+        assert part.boundaries == alone.boundaries
     assert whole.segments == sum(phase.segments for phase in whole.phases)
-    assert told(whole.until(len(steps))) == told(whole)
+    assert told(whole.truncate(len(steps))) == told(whole)
 
 
 def test_phases_are_called_after_what_happens_in_them() -> None:
@@ -99,7 +99,7 @@ def test_the_same_happens_in_phases_of_one_key() -> None:
 
 
 def test_stretches_say_what_is_in_the_hand() -> None:
-    found = stretches(compile_task(scene_for(CARRYING), CARRYING, SHORT))
+    found = summarize_phases(compile_task(scene_for(CARRYING), CARRYING, SHORT))
     assert found[:4] == [
         ("reach stick.grip", ()),
         ("touch with stick.tip", ("stick",)),

@@ -22,7 +22,7 @@ def compiled(scene: Scene, *steps: vkc.Step) -> Task:
 
 
 def rides(task: Task) -> list[list[tuple[str, str]]]:
-    return [[(ride.object, ride.on) for ride in phase.rides] for phase in task.phases]
+    return [[(ride.object, ride.support) for ride in phase.supported] for phase in task.phases]
 
 
 def test_a_cup_rides_on_the_plate_and_stands_elsewhere_then() -> None:
@@ -32,10 +32,10 @@ def test_a_cup_rides_on_the_plate_and_stands_elsewhere_then() -> None:
     assert rides(task) == [[], [("cup", "plate.plate"), ("cup_1", "plate.plate")], [], []]
     for name, y in (("cup", 0.05), ("cup_1", -0.07)):
         np.testing.assert_allclose(
-            task.phases[1].standing[name].translation, [0.8, y, TOP], rtol=0.0, atol=1e-12
+            task.phases[1].resting[name].translation, [0.8, y, TOP], rtol=0.0, atol=1e-12
         )
         np.testing.assert_allclose(
-            task.phases[2].standing[name].translation, [0.4, y, TOP], rtol=0.0, atol=1e-12
+            task.phases[2].resting[name].translation, [0.4, y, TOP], rtol=0.0, atol=1e-12
         )
     assert [hold.object for hold in task.phases[3].held] == ["cup"]
 
@@ -85,14 +85,14 @@ def test_a_cup_put_on_the_plate_rides_from_then_on() -> None:
     steps = vkc.Place("cup", [0.8, 0.05, TOP]), vkc.Actuate("plate", {"slide": 0.4})
     task = compiled(scene, *steps)
     assert rides(task)[-1] == [("cup", "plate.plate")]
-    assert "cup" in task.phases[-2].left  # at a heading that the motion decides
-    assert "cup" not in task.phases[-1].left
+    assert "cup" in task.phases[-2].released_by  # at a heading that the motion decides
+    assert "cup" not in task.phases[-1].released_by
 
 
 def test_a_cup_rides_on_the_tray_in_the_hand() -> None:
     task = compiled(trays(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
     assert rides(task) == [[], [("cup", "tray.tray")], []]
-    left = task.phases[2].standing["cup"].translation
+    left = task.phases[2].resting["cup"].translation
     np.testing.assert_allclose(
         left, THERE.translation + np.array([0.02, 0.05, 0.02]), rtol=0.0, atol=1e-12
     )

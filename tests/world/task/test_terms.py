@@ -12,7 +12,7 @@ from helpers.carrying import room, table
 from helpers.drives import hall
 
 import vkc_pin as vkc
-from vkc_pin.world.task.terms import check_active, term_from_dict, term_to_dict, traced
+from vkc_pin.world.task.terms import check_terms_active, term_from_dict, term_to_dict, trace_terms
 
 PERSON = np.array([1.0, 2.0, 1.0])
 SHORT = vkc.Options(reach_waypoints=3)
@@ -49,20 +49,20 @@ def three() -> list[vkc.Constraint | vkc.Cost]:
 
 
 def test_terms_become_data_and_back() -> None:
-    found = traced(room(table()), three())
+    found = trace_terms(room(table()), three())
     assert [term.name for term in found] == ["slow", "within", "elbow"]
-    assert [term.formula.timed for term in found] == [True, False, False]
+    assert [term.formula.uses_time_step for term in found] == [True, False, False]
     for term in found:
         again = term_from_dict(json.loads(json.dumps(term_to_dict(term))))
         assert again == term
         assert hash(again) == hash(term)
-    assert traced(room(table()), found) == found
-    assert traced(room(table()), []) == ()
+    assert trace_terms(room(table()), found) == found
+    assert trace_terms(room(table()), []) == ()
 
 
 def test_bounds() -> None:
     unbounded = np.inf
-    slow, within, _ = traced(room(table()), three())
+    slow, within, _ = trace_terms(room(table()), three())
     assert isinstance(slow, vkc.Constraint)
     assert isinstance(within, vkc.Constraint)
     np.testing.assert_array_equal(slow.box(1), [[-unbounded], [0.0]])
@@ -73,19 +73,19 @@ def test_bounds() -> None:
 def test_when_terms_are_active() -> None:
     always, placing, carrying = tilt(), tilt(during="place stick"), tilt(holding="stick")
     assert placing.during == ("place stick",)
-    assert [term.active("place stick", ()) for term in (always, placing, carrying)] == [
+    assert [term.is_active("place stick", ()) for term in (always, placing, carrying)] == [
         True,
         True,
         False,
     ]
-    assert [term.active("go to", ("stick",)) for term in (always, placing, carrying)] == [
+    assert [term.is_active("go to", ("stick",)) for term in (always, placing, carrying)] == [
         True,
         False,
         True,
     ]
     both = tilt(during=["place stick", "go to"], holding="stick")
     assert [
-        both.active(*when) for when in (("go to", ()), ("go to", ["stick"]), ("move", ["stick"]))
+        both.is_active(*when) for when in (("go to", ()), ("go to", ["stick"]), ("move", ["stick"]))
     ] == [False, True, False]
 
 
@@ -154,16 +154,18 @@ def own(s: vkc.State) -> Any:
 )
 def test_wrong_expressions_are_named(expression: Callable[[vkc.State], Any], message: str) -> None:
     with pytest.raises(vkc.InputError, match=rf"(?s)^terms\['mine'\]\.expression: {message}"):
-        traced(hall(), [vkc.Constraint("mine", expression, lower=0.0)])
+        trace_terms(hall(), [vkc.Constraint("mine", expression, lower=0.0)])
 
 
 def test_costs_are_numbers_and_bounds_fit_expressions() -> None:
     with pytest.raises(vkc.InputError, match=r"wrong shape.*a number, got shape"):
-        traced(hall(), [vkc.Cost("far", lambda s: s.position("tool"))])
+        trace_terms(hall(), [vkc.Cost("far", lambda s: s.position("tool"))])
     with pytest.raises(vkc.InputError, match=r"wrong number of bounds.*one number, or 3"):
-        traced(hall(), [vkc.Constraint("far", lambda s: s.position("tool"), lower=[0.0, 0.0])])
+        trace_terms(hall(), [vkc.Constraint("far", lambda s: s.position("tool"), lower=[0.0, 0.0])])
     with pytest.raises(vkc.InputError, match="wrong number of bounds"):
-        traced(hall(), [vkc.Constraint("far", lambda s: s.coordinate("base_x"), lower=[0.0, 0.0])])
+        trace_terms(
+            hall(), [vkc.Constraint("far", lambda s: s.coordinate("base_x"), lower=[0.0, 0.0])]
+        )
 
 
 def test_unknown_names_are_named() -> None:
@@ -174,37 +176,37 @@ def test_unknown_names_are_named() -> None:
         (lambda s: s.coordinate("elbow_jiont"), "elbow_joint"),
     ):
         with pytest.raises(vkc.UnknownNameError) as caught:
-            traced(scene, [vkc.Cost("mine", expression)])
+            trace_terms(scene, [vkc.Cost("mine", expression)])
         assert (caught.value.nearest, caught.value.field) == (nearest, "terms['mine'].expression")
     with pytest.raises(vkc.UnknownNameError) as caught:
-        traced(scene, [tilt(holding="stik")])
+        trace_terms(scene, [tilt(holding="stik")])
     assert (caught.value.nearest, caught.value.field) == ("stick", "terms['upright'].holding")
     with pytest.raises(vkc.UnknownNameError, match="there is no frame 'stick"):  # traced elsewhere
-        traced(hall(), traced(scene, [tilt()]))
+        trace_terms(hall(), trace_terms(scene, [tilt()]))
 
 
 def test_lists_of_terms_are_checked() -> None:
     for terms in (tilt(), 3, "upright"):
         with pytest.raises(vkc.InputError, match=r"^terms(\[0\])?: not a list"):
-            traced(room(table()), terms)  # type: ignore[arg-type]
+            trace_terms(room(table()), terms)  # type: ignore[arg-type]
     with pytest.raises(vkc.InputError, match=r"terms\[1\]: wrong kind of entry"):
-        traced(room(table()), [tilt(), lambda s: 0])  # type: ignore[list-item]
+        trace_terms(room(table()), [tilt(), lambda s: 0])  # type: ignore[list-item]
     with pytest.raises(vkc.InputError, match="two terms share a name"):
-        traced(room(table()), [tilt(), tilt(lower=0.5)])
+        trace_terms(room(table()), [tilt(), tilt(lower=0.5)])
 
 
 def test_phases_that_there_are_not() -> None:
     phases = [("reach stick.grip", ()), ("place stick", ("stick",))]
-    check_active([tilt(), tilt(during="place stick"), tilt(holding="stick")], phases)
+    check_terms_active([tilt(), tilt(during="place stick"), tilt(holding="stick")], phases)
     with pytest.raises(vkc.UnknownNameError, match="there is no phase 'place stik'") as caught:
-        check_active([tilt(during=["place stick", "place stik"])], phases)
+        check_terms_active([tilt(during=["place stick", "place stik"])], phases)
     assert (caught.value.nearest, caught.value.choices) == (
         "place stick",
         ("reach stick.grip", "place stick"),
     )
     for wrong in (tilt(holding="ball"), tilt(holding="stick", during="reach stick.grip")):
         with pytest.raises(vkc.InputError, match="never held in these phases"):
-            check_active([wrong], phases)
+            check_terms_active([wrong], phases)
 
 
 @pytest.mark.parametrize("function", [vkc.plan, vkc.build, vkc.plan_chore])
@@ -239,14 +241,14 @@ def test_wrong_terms_are_found_before_anything_is_planned(function: Callable[...
     ],
 )
 def test_saved_expressions_that_are_damaged_are_refused(wrong: dict[str, Any]) -> None:
-    (term,) = traced(room(table()), [tilt()])
+    (term,) = trace_terms(room(table()), [tilt()])
     data = term_to_dict(term)
     with pytest.raises(vkc.InputError, match="not a saved term"):
         term_from_dict({**data, "expression": {**data["expression"], **wrong}})
 
 
 def test_saved_terms_that_are_damaged_are_refused() -> None:
-    (term,) = traced(room(table()), [tilt()])
+    (term,) = trace_terms(room(table()), [tilt()])
     data = term_to_dict(term)
     for broken in (
         {**data, "term": "Wish"},

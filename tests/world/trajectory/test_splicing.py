@@ -7,7 +7,7 @@ import pytest
 from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.scene.hold import Hold, holds_of
+from vkc_pin.world.scene.hold import Hold, make_holds
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import cut, filled, join
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -63,7 +63,11 @@ def test_motions_are_joined() -> None:
 
 def test_what_is_held_through_another_thing_makes_a_pause_too() -> None:
     both = {"stick": "grip", "ball": "pull"}
-    holds = [holds_of(both, {"ball": "stick.tip"}), holds_of(both), holds_of({"stick": "grip"})]
+    holds = [
+        make_holds(both, {"ball": "stick.tip"}),
+        make_holds(both),
+        make_holds({"stick": "grip"}),
+    ]
     spans = [PhaseSpan(name, 0, 1, held) for name, held in zip("abc", holds, strict=True)]
     motions = [Trajectory(NAMES, np.array([0.0, 1.0]), ROWS[[1, 2]], (span,), 5) for span in spans]
     np.testing.assert_allclose(join(motions, pause=0.5).times, [0.0, 1.0, 1.5, 2.5, 3.0, 4.0])

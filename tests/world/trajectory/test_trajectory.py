@@ -10,7 +10,7 @@ import pytest
 from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.scene.hold import holds_of
+from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -88,13 +88,13 @@ def test_round_trip() -> None:
 
 def test_what_is_held_through_something_is_kept_too() -> None:
     held, by = {"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"}
-    phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, holds_of(held, by)))
+    phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, make_holds(held, by)))
     data = json.loads(json.dumps(example(phases=phases).to_dict()))
     assert [phase["by"] for phase in data["phases"]] == [{}, by]
     assert Trajectory.from_dict(data).phases == phases
     for phase in data["phases"]:  # as motions were saved before there was such a thing
         del phase["by"]
-    assert [phase.holds for phase in Trajectory.from_dict(data).phases] == [(), holds_of(held)]
+    assert [phase.holds for phase in Trajectory.from_dict(data).phases] == [(), make_holds(held)]
 
 
 @pytest.mark.parametrize("key", ["names", "times", "positions", "phases", "robot_size"])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.planning.plan import Plan
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World, units_of
@@ -84,7 +84,7 @@ def test_every_shape_is_where_it_is_alone(world: World, kind: str) -> None:
         joints = placed.object.coordinates.names
         posed = placed.with_state(dict(zip(joints, z[n : n + len(joints)].tolist(), strict=True)))
         n += len(joints)
-        for shape in standing_geometry(posed, visual=kind == "visual"):
+        for shape in make_world_shapes(posed, visual=kind == "visual"):
             expected[f"{name}.{shape.name}"] = shape, shape.placement
     obstacles = scene.obstacles if kind == "collision" else scene.obstacle_visual
     for shape in obstacles:

@@ -13,7 +13,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.initialization.keyframes import depth, scatter
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.procedural.rooms.random_room import random_layout
+from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -67,11 +67,11 @@ def given(task: str, seed: int, number: int) -> Given:
     """
     rng = np.random.default_rng([seed, list(TASKS).index(task), number])
     if task == "reach":
-        layout = random_layout(_ROOMS + 1000 * seed + number, clutter=number % 10 / 10.0)
-        scene = layout.scene()
+        layout = sample_layout(_ROOMS + 1000 * seed + number, clutter=number % 10 / 10.0)
+        scene = layout.make_scene()
         over = number % 2 == 0
         pose = (
-            pose_over(layout, scene, layout.part("table_1"), rng)
+            pose_over(layout, scene, layout.find_part("table_1"), rng)
             if over
             else pose_among(layout, scene, rng)
         )

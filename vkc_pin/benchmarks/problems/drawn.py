@@ -16,13 +16,13 @@ import pinocchio as pin
 from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.procedural.rooms.fixtures import OPENED
+from vkc_pin.procedural.rooms.fixtures import OPENABLE
 from vkc_pin.procedural.rooms.random_room import random_room
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.resources import available
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch
@@ -66,7 +66,7 @@ def drawn(seed: int, number: int) -> Problem:
 def _room(rng: np.random.Generator) -> Scene:
     """Return a room with one or two things to open and something to carry."""
     count = int(rng.integers(1, 3))
-    objects = tuple(str(kind) for kind in rng.choice(list(OPENED), count, replace=False))
+    objects = tuple(str(kind) for kind in rng.choice(list(OPENABLE), count, replace=False))
     carried = tuple(str(kind) for kind in rng.choice(["cup", "ball"], int(rng.integers(1, 3))))
     clutter = round(
         float(rng.uniform(0.0, 0.6)), 2
@@ -165,7 +165,7 @@ def _place(scene: Scene, name: str, rng: np.random.Generator) -> Step:
     placed = scene.objects[name]
     below = min(
         compute_world_box(shape.geometry, shape.placement)[0][2]
-        for shape in standing_geometry(placed)
+        for shape in make_world_shapes(placed)
     )
     shapes = zip(scene.obstacles, scene.obstacle_labels, strict=True)
     boxes = [

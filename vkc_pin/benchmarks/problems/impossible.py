@@ -17,7 +17,7 @@ from vkc_pin.benchmarks.problems.ablation import every_trial
 from vkc_pin.errors import InputError
 from vkc_pin.planning.diagnosis.proofs import PROVEN
 from vkc_pin.planning.planner import plan
-from vkc_pin.procedural.rooms.random_room import random_layout
+from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
 
@@ -306,10 +306,10 @@ def _shut(rng: np.random.Generator) -> _Problem:
 
 
 def _cup(rng: np.random.Generator) -> tuple[Scene, Any]:
-    layout = random_layout(
+    layout = sample_layout(
         int(rng.integers(1000)), clutter=0.0, objects=(), tables=2, carried=("cup",)
     )
-    return layout.scene(), layout.part("table_2")
+    return layout.make_scene(), layout.find_part("table_2")
 
 
 def _covered(rng: np.random.Generator) -> _Problem:
@@ -333,7 +333,7 @@ def _sides(x: float, y: float, z: float) -> list[dict[str, Any]]:
 def _occupied(rng: np.random.Generator) -> _Problem:
     """Return a cup that is to be put where something stands."""
     scene, table = _cup(rng)
-    x, y = table.frame.point(float(rng.uniform(-0.15, 0.0)), 0.0)
+    x, y = table.frame.transform_point(float(rng.uniform(-0.15, 0.0)), 0.0)
     vase = {
         "name": "vase",
         "type": "cylinder",

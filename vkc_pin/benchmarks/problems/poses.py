@@ -45,7 +45,10 @@ def pose_over(layout: Layout, scene: Scene, table: Part, rng: np.random.Generato
     own = into.inverse()
     for _ in range(_TRIES):
         ahead, side = rng.uniform((0.4, -0.6), (1.0, 0.6))
-        base = (*table.frame.point(-depth / 2.0 - ahead, side), rng.uniform(-np.pi, np.pi))
+        base = (
+            *table.frame.transform_point(-depth / 2.0 - ahead, side),
+            rng.uniform(-np.pi, np.pi),
+        )
         at, z = _drawn(scene, base, rng)
         x, y, up = own.act(at.translation)
         over = (
@@ -81,11 +84,11 @@ def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE
     for _ in range(_TRIES):
         x, y, yaw = rng.uniform([*-half, -np.pi], [*half, np.pi])
         apart = np.hypot(x - layout.start[0], y - layout.start[1]) >= FAR
-        if not apart or not layout.floor.free(standing, layout.radius, [[x, y]])[0]:
+        if not apart or not layout.floor.find_free(standing, layout.radius, [[x, y]])[0]:
             continue
         at, z = _drawn(scene, (x, y, yaw), rng)
         free = 0.2 < at.translation[2] < 1.4 and _free(scene, z, NEAR)
-        if free and layout.floor.connected(standing, layout.radius, [layout.start[:2], (x, y)]):
+        if free and layout.floor.is_connected(standing, layout.radius, [layout.start[:2], (x, y)]):
             return at
     raise InputError(
         "no configuration is near anything",

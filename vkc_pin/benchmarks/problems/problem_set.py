@@ -17,7 +17,7 @@ from vkc_pin.benchmarks import baselines, door, household, initialization
 from vkc_pin.benchmarks.comparison import Assignment, placed
 from vkc_pin.benchmarks.problems.poses import pose_among, pose_over
 from vkc_pin.errors import InputError
-from vkc_pin.procedural.rooms.random_room import random_layout
+from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Reach, Step, Touch
 
@@ -149,11 +149,11 @@ def _clutter(number: int) -> float:
 
 
 def _reach(number: int) -> tuple[Scene, Step, str]:
-    layout = random_layout(number, clutter=_clutter(number))
-    scene, rng = layout.scene(), np.random.default_rng([2, number])
+    layout = sample_layout(number, clutter=_clutter(number))
+    scene, rng = layout.make_scene(), np.random.default_rng([2, number])
     over = number % 2 == 0
     pose: pin.SE3 = (
-        pose_over(layout, scene, layout.part("table_1"), rng)
+        pose_over(layout, scene, layout.find_part("table_1"), rng)
         if over
         else pose_among(layout, scene, rng)
     )
@@ -162,14 +162,14 @@ def _reach(number: int) -> tuple[Scene, Step, str]:
 
 def _door(number: int) -> tuple[Scene, Step, str]:
     name, attachment = _DOORS[number % len(_DOORS)]
-    scene = random_layout(number, clutter=_clutter(number), objects=(name,)).scene()
+    scene = sample_layout(number, clutter=_clutter(number), objects=(name,)).make_scene()
     angle = round(float(np.random.default_rng([2, number]).uniform(*_SWUNG)), 2)
     return scene, Actuate(name, {"hinge": angle}, attachment), f"push {name} by {angle:g} rad"
 
 
 def _pull(number: int) -> tuple[Scene, Step, str]:
     name, joint, interval = _PULLED[number % len(_PULLED)]
-    scene = random_layout(number, clutter=_clutter(number), objects=(name,)).scene()
+    scene = sample_layout(number, clutter=_clutter(number), objects=(name,)).make_scene()
     value = round(float(np.random.default_rng([2, number]).uniform(*interval)), 2)
     return (
         scene,
@@ -179,10 +179,10 @@ def _pull(number: int) -> tuple[Scene, Step, str]:
 
 
 def _carry(number: int) -> tuple[Scene, Step, str]:
-    layout = random_layout(number, clutter=_clutter(number), tables=2, carried=("cup",))
-    rng, table = np.random.default_rng([2, number]), layout.part("table_2")
+    layout = sample_layout(number, clutter=_clutter(number), tables=2, carried=("cup",))
+    rng, table = np.random.default_rng([2, number]), layout.find_part("table_2")
     depth, width, _ = table.size
     x = -depth / 2.0 + float(rng.uniform(_EDGE, 0.3))
     y = float(rng.uniform(_EDGE - width / 2.0, width / 2.0 - _EDGE))
-    place = (*table.frame.point(x, y), round(table.size[2] + 0.001, 3))
-    return layout.scene(), Place("cup", place), "carry the cup to table_2"
+    place = (*table.frame.transform_point(x, y), round(table.size[2] + 0.001, 3))
+    return layout.make_scene(), Place("cup", place), "carry the cup to table_2"

@@ -19,7 +19,7 @@ from vkc_pin.planning.diagnosis.diagnosis import explain
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.furniture.catalogue import KINDS, random_object
 from vkc_pin.procedural.rooms import parts
-from vkc_pin.procedural.rooms.fixtures import RANDOM, Counter, Fixture, fixture
+from vkc_pin.procedural.rooms.fixtures import RANDOM, Counter, Fixture, make_fixture
 from vkc_pin.procedural.rooms.footprints import Floor
 from vkc_pin.procedural.tasks import goals
 from vkc_pin.utils.cache import Cache
@@ -143,10 +143,10 @@ def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
         description: Of the object.
     """
     match, floor = _of_kind(name), Floor(_SIZE, _SIZE)
-    own = fixture(RANDOM + match[0], match[1]) if match else fixture(name)
+    own = make_fixture(RANDOM + match[0], match[1]) if match else make_fixture(name)
     if _is_path(name) and own.high[2] - own.low[2] < _LOW:
         own = _on_a_counter(own)
-    part = parts.opened(_IT, own, floor, 0, 0.0, _FRONT)
+    part = parts.make_openable(_IT, own, floor, 0, 0.0, _FRONT)
     (entry,) = part.objects
     half = _SIZE / 2.0
     document = {
@@ -155,7 +155,7 @@ def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
         "start": {"base": [0.0, 0.0, 0.0]},
         "arena": {"x": [-half, half + (_BEYOND if own.in_wall else 0.0)], "y": [-half, half]},
         "start_region": dict(_START),
-        "obstacles": [*parts.walls(floor, _HEIGHT, [part]), *part.obstacles],
+        "obstacles": [*parts.make_walls(floor, _HEIGHT, [part]), *part.obstacles],
         "objects": [{**entry, "type": dict(description)}],
     }
     return Scene.from_document(document, folder("scenes"))

@@ -16,7 +16,7 @@ from pydantic import Field
 from vkc_pin.datasets.recipes.terms import TermSchema, check_entries
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
-from vkc_pin.procedural.rooms.fixtures import known_objects
+from vkc_pin.procedural.rooms.fixtures import list_openable_types
 from vkc_pin.procedural.rooms.parts import CARRIED
 from vkc_pin.procedural.rooms.settings import RoomSettings
 from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
@@ -35,7 +35,7 @@ from vkc_pin.world.files.fields import (
 )
 from vkc_pin.world.files.resources import available, located
 from vkc_pin.world.models.robot_file import find_robot
-from vkc_pin.world.task.terms import Term, as_data
+from vkc_pin.world.task.terms import Term, trace_terms_without_scene
 
 __all__ = [
     "CAMERAS",
@@ -210,7 +210,7 @@ class Recipe:
     @functools.cached_property
     def terms(self) -> tuple[Term, ...]:
         """Its own constraints and costs, in order: what every motion keeps to, about frames by words; see `terms`."""
-        return as_data([entry.term() for entry in self.fields.terms])
+        return trace_terms_without_scene([entry.term() for entry in self.fields.terms])
 
     def terms_of(self, task: str) -> tuple[Term, ...]:
         """Return those of its terms that a task has to keep to."""
@@ -341,8 +341,10 @@ def _robots(
 
 def _object(document: Document, place: int, name: str, folder: Path) -> str:
     if not _is_path(name):
-        if name not in known_objects():
-            raise document.unknown(("objects", place), "object that opens", name, known_objects())
+        if name not in list_openable_types():
+            raise document.unknown(
+                ("objects", place), "object that opens", name, list_openable_types()
+            )
         return name
     return _file(document, ("objects", place), folder / name)
 

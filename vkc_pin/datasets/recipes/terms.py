@@ -18,10 +18,10 @@ from vkc_pin.world.task.terms import (
     Constraint,
     State,
     Term,
-    as_data,
-    renamed,
+    rename_term,
     term_from_dict,
     term_to_dict,
+    trace_terms_without_scene,
 )
 
 __all__ = [
@@ -148,12 +148,12 @@ def as_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
     Raises:
         InputError: They are no terms, or name phases, which are called after what is drawn.
     """
-    for term in (found := as_data(terms)):
+    for term in (found := trace_terms_without_scene(terms)):
         if term.during is not None:
             expected = (
                 f"holding={OBJECT!r}, or nothing: phases are called after objects that are drawn"
             )
-            raise term.error("phases are not known yet", "during", expected, list(term.during))
+            raise term.make_error("phases are not known yet", "during", expected, list(term.during))
     return [{"type": "traced", "traced": term_to_dict(term)} for term in found]
 
 
@@ -170,7 +170,7 @@ def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[
             if task not in tasks:
                 raise document.unknown(("terms", k, "tasks", j), "task", task, tasks)
         with document.at(("terms", k)):
-            (term,) = as_data([entry.term()])
+            (term,) = trace_terms_without_scene([entry.term()])
         if term.name in names:
             raise document.error(
                 ("terms", k), "two terms of one name", expected="another `name`", got=term.name
@@ -208,4 +208,4 @@ def meant(terms: Sequence[Term], scene: Scene, name: str, attachment: str) -> tu
     frames = {word: resolve_frame(scene.robot, word) for word in (BASE, HAND)} | {
         OBJECT: f"{name}.{link}"
     }
-    return tuple(renamed(term, frames, {OBJECT: name}) for term in terms)
+    return tuple(rename_term(term, frames, {OBJECT: name}) for term in terms)

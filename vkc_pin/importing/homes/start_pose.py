@@ -11,7 +11,7 @@ from vkc_pin.planning.base_paths.reachable_floor import Cells, Discs, taken
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
 __all__ = ["free_start"]
@@ -48,7 +48,7 @@ def free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
         if label != FLOOR
     ]
     for placed in scene.objects.values():
-        standing += standing_geometry(placed)
+        standing += make_world_shapes(placed)
     cells = Cells.over(low, high, _CELL)
     free = np.ones(cells.shape, bool)
     for wall in Discs(list_placed_shapes(base)).walls(list_placed_shapes(standing)):

@@ -19,11 +19,11 @@ from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import graft, graft_geometry, round_placement
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.scene.contact_rules import hand_frame
-from vkc_pin.world.scene.hold import Hold, checked_holds, holds_of
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
+from vkc_pin.world.scene.hold import Hold, make_holds, resolve_holds
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.scene.support import Ride
+from vkc_pin.world.scene.support import SupportedObject
 
 __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
 
@@ -83,7 +83,7 @@ class VirtualKinematicChain:
     acceleration: Floats
     collision: pin.GeometryModel
     held_geometries: Mapping[Hold, tuple[int, ...]]
-    ride_geometries: Mapping[Ride, tuple[int, ...]]
+    ride_geometries: Mapping[SupportedObject, tuple[int, ...]]
     closures: Mapping[Hold, Closure]
     virtual: Mapping[Hold, tuple[str, ...]]
     added: Mapping[Hold, tuple[str, ...]]
@@ -229,7 +229,7 @@ def consolidate(
     scene: Scene,
     holds: Iterable[Hold] | Mapping[str, str],
     *,
-    rides: Iterable[Ride] = (),
+    rides: Iterable[SupportedObject] = (),
     cache: Cache | None = None,
 ) -> VirtualKinematicChain:
     """Merge the scene's robot with the objects it holds into one model (section III of the paper).
@@ -252,7 +252,7 @@ def consolidate(
             joint of its object.
     """
     robot = instance(scene, Scene, "scene").robot
-    holds = checked_holds(scene.objects, holds_of(holds) if isinstance(holds, Mapping) else holds)
+    holds = resolve_holds(scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds)
     cache = Cache() if cache is None else instance(cache, Cache, "cache")
     model, collision = pin.Model(robot.model), pin.GeometryModel()
     graft_geometry(
@@ -276,7 +276,7 @@ def consolidate(
         tool = model.frames[model.getFrameId(holder)]
         parent, placement = (
             tool.parentJoint,
-            tool.placement * hand_frame(robot, attachment) * attachment.offset.inverse(),
+            tool.placement * compute_hand_frame(robot, attachment) * attachment.offset.inverse(),
         )
         added = []
         # J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed.
@@ -345,10 +345,10 @@ def consolidate(
     for number, ride in enumerate(rides):
         frame = model.frames[model.getFrameId(prefixes[ride.hold] + ride.link)]
         placed = dataclasses.replace(
-            scene.objects[ride.object], placement=frame.placement * ride.local
+            scene.objects[ride.object], placement=frame.placement * ride.placement_in_link
         )
         prefix = ride.object + "^" * (number + 1) + "."
-        shapes = standing_geometry(placed)
+        shapes = make_world_shapes(placed)
         ride_geometries[ride] = tuple(
             graft_geometry(
                 collision,

@@ -18,17 +18,17 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import spend
 from vkc_pin.world.collision.margins import MarginRegion
 from vkc_pin.world.models.shapes import compute_bounding_box, get_link_name, get_local_name
-from vkc_pin.world.scene.clearance_exemptions import allowances, shape_keys
+from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions, make_shape_keys
 from vkc_pin.world.scene.contact_rules import (
-    CONTACT,
-    grasped,
-    hand_clearance,
-    moves_as_one,
-    touching,
+    CONTACT_DEPTH,
+    find_grasped_link,
+    compute_hand_clearance,
+    is_rigid_grasp,
+    find_touch_links,
 )
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase, Task
 
@@ -71,7 +71,7 @@ class _Pairing:
                 f"{name}.{get_link_name(get_local_name(chain.collision.geometryObjects[i].name))}"
                 for i in indices
             ]
-        self._allowances = allowances(scene, options.dist_safe)
+        self._allowances = find_clearance_exemptions(scene, options.dist_safe)
         self._obstacles = scene.obstacles
         self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
 
@@ -103,7 +103,7 @@ class _Pairing:
                 if self._own_pair(hold.object, labels[i], labels[j])
             ]
             moving += mine[hold.object]
-        for ride in phase.rides:
+        for ride in phase.supported:
             mine[ride.object] = chain.ride_geometries[ride]
             together = {
                 shapes[j].parentJoint for j in mine[ride.object]
@@ -120,20 +120,20 @@ class _Pairing:
         for name, placed in scene.objects.items():
             state = {
                 c.removeprefix(f"{name}."): v
-                for c, v in phase.before.items()
+                for c, v in phase.initial_values.items()
                 if c.startswith(f"{name}.")
             }
             if placed.object.free:
                 if name in mine:
                     continue
                 placed = dataclasses.replace(
-                    placed, placement=phase.standing.get(name, placed.placement)
+                    placed, placement=phase.resting.get(name, placed.placement)
                 )
-            standing = standing_geometry(placed.with_state(state))
+            standing = make_world_shapes(placed.with_state(state))
             if name in mine:  # its frame stands on, the rest is in the hand
                 held_shapes = {get_local_name(shapes[i].name) for i in mine[name]}
                 standing = [shape for shape in standing if shape.name not in held_shapes]
-            if name in phase.left:
+            if name in phase.released_by:
                 left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
             for shape in standing:
                 label = f"{name}.{get_link_name(shape.name)}"
@@ -160,7 +160,7 @@ class _Pairing:
         )
         labels += scene.obstacle_labels
         names = [shape.name for shape in shapes] + [shape.name for shape in self._obstacles]
-        table, near = self._allowed(phase, table, labels, shape_keys(labels, names))
+        table, near = self._allowed(phase, table, labels, make_shape_keys(labels, names))
         if not len(table):
             expected = "collision geometry in robot or scene"
             raise InputError(
@@ -195,13 +195,13 @@ class _Pairing:
         The hand and what it grasps move together, so that there is nothing to plan, unless the
         grasp leaves a freedom.
         """
-        if one not in touching(self.scene, hold):
+        if one not in find_touch_links(self.scene, hold):
             return self.options.dist_safe
-        if link != grasped(self.scene, hold):
-            return hand_clearance(self.scene, hold, link, self.options)
-        if moves_as_one(self.scene, hold):
+        if link != find_grasped_link(self.scene, hold):
+            return compute_hand_clearance(self.scene, hold, link, self.options)
+        if is_rigid_grasp(self.scene, hold):
             return -np.inf
-        return hand_clearance(self.scene, hold, link, self.options) or -CONTACT
+        return compute_hand_clearance(self.scene, hold, link, self.options) or -CONTACT_DEPTH
 
     def _allowed(
         self, phase: Phase, table: Floats, labels: Sequence[str], keys: Sequence[str]
@@ -221,7 +221,7 @@ class _Pairing:
         own = pairs.min(axis=1) * base + pairs.max(axis=1)
         rows = {}
         for one in self._allowances:
-            exempt = np.array(one.shape_pairs(labels, keys), int).reshape(-1, 2)
+            exempt = np.array(one.find_shape_pairs(labels, keys), int).reshape(-1, 2)
             rows[one] = np.flatnonzero(np.isin(own, exempt[:, 0] * base + exempt[:, 1]))
         for one in self._allowances:
             if not one.ranges:
@@ -251,7 +251,7 @@ class _Pairing:
                 continue
             owner, _, joint = name.partition(".")
             placed = self.scene.objects[owner]
-            value = phase.before.get(
+            value = phase.initial_values.get(
                 name, float(placed.state[placed.object.coordinates.index(joint)])
             )
             if not lower <= value <= upper:

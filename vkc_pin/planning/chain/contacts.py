@@ -26,7 +26,7 @@ from vkc_pin.utils.budget import spend
 from vkc_pin.world.collision.clearances import Clearances
 from vkc_pin.world.collision.placements import ShapePlacements
 from vkc_pin.world.collision.shapes import Shapes
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 
@@ -143,13 +143,13 @@ class ContactModel:
         Before, it stands where the task says, which is only nearly there where the motion chooses
         the place itself.
         """
-        if not any(phase.left for phase in self.task.phases):
+        if not any(phase.released_by for phase in self.task.phases):
             return self
         view = copy.copy(self)
         view.phases, view._clearances = list(self.phases), list(self._clearances)
         for number, phase in enumerate(self.task.phases):
             where: dict[int, pin.SE3] = {}
-            for name, (hold, before) in phase.left.items():
+            for name, (hold, before) in phase.released_by.items():
                 closure = self.chain.closures[hold]
                 rotations, translations = self.chain.joint_placements(
                     z[[self.first_waypoint[before + 1] - 1]]
@@ -158,7 +158,9 @@ class ContactModel:
                 placed = dataclasses.replace(
                     self.scene.objects[name], placement=carrier * closure.local
                 )
-                shapes = zip(self.phases[number].left[name], standing_geometry(placed), strict=True)
+                shapes = zip(
+                    self.phases[number].left[name], make_world_shapes(placed), strict=True
+                )
                 where |= {index: shape.placement for index, shape in shapes}
             if where:
                 view.phases[number] = self.phases[number].placed(where)
@@ -169,7 +171,7 @@ class ContactModel:
 
     def carried(self, phase: int) -> list[int]:
         """Return the geometries of what is held in a phase, and of what rides on that."""
-        held, riding = self.task.phases[phase].held, self.task.phases[phase].rides
+        held, riding = self.task.phases[phase].held, self.task.phases[phase].supported
         found = [self.chain.held_geometries[hold] for hold in held] + [
             self.chain.ride_geometries[ride] for ride in riding
         ]

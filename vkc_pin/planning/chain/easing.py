@@ -13,10 +13,10 @@ from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_local_name
-from vkc_pin.world.scene.contact_rules import CONTACT, EASED_TIME, hand_clearance, touching
-from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH, CONTACT_WINDOW, compute_hand_clearance, find_touch_links
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.scene.support import Ride
+from vkc_pin.world.scene.support import SupportedObject
 from vkc_pin.world.task.phases import Task
 
 __all__ = ["REDUCED_MARGIN_RATIO", "find_reduced_margins"]
@@ -54,7 +54,7 @@ def find_reduced_margins(
     """
     phase, before = task.phases[number], task.phases[number - 1] if number else None
     first = sum(earlier.segments for earlier in task.phases[:number])
-    last, steps = first + phase.segments, options.steps(EASED_TIME)
+    last, steps = first + phase.segments, options.steps(CONTACT_WINDOW)
     shapes, eased = part.shapes, Eased()
 
     def ease(
@@ -74,21 +74,21 @@ def find_reduced_margins(
             share = REDUCED_MARGIN_RATIO * max(distance, 0.0)
             if distance < part.margins[k]:
                 eased.setdefault(k, []).append(
-                    (begin, end, distance if inside and distance < -CONTACT else share)
+                    (begin, end, distance if inside and distance < -CONTACT_DEPTH else share)
                 )
 
     for holds, begin, end in (
-        (phase.leaves, first, first + steps),
+        (phase.released, first, first + steps),
         (phase.grasps, last - steps, last),
     ):
         for hold in holds:
-            hand = np.isin(part.labels, list(touching(scene, hold)))
+            hand = np.isin(part.labels, list(find_touch_links(scene, hold)))
             its = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
             for k in np.flatnonzero(hand[part.pairs[:, 0]] & its[part.pairs[:, 1]]).tolist():
-                margin = hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
+                margin = compute_hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
                 eased.setdefault(k, []).append((begin, end, margin))
     for geometries, placed, begins in _moments(scene, chain, task, number):
-        stands = {shape.name: shape.placement for shape in standing_geometry(placed)}
+        stands = {shape.name: shape.placement for shape in make_world_shapes(placed)}
         for i in geometries:
             begin, end = (first, first + steps) if begins else (last - steps, last)
             new = begins and placed.name not in {
@@ -134,17 +134,17 @@ def _moments(
                 continue
             placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
             yield chain.held_geometries[hold], placed, begins
-            for ride in phase.rides:
+            for ride in phase.supported:
                 if ride.hold == hold:
                     yield chain.ride_geometries[ride], _ridden(scene, ride, placed), begins
-    for ride in phase.rides:
+    for ride in phase.supported:
         carrier = scene.objects[ride.hold.object]
         if not carrier.object.free:
             goals = {
                 name: float(np.clip(value, *phase.ranges[name]))
                 for name, value in phase.values.items()
             }
-            for state, begins in ((phase.before, True), ({**phase.before, **goals}, False)):
+            for state, begins in ((phase.initial_values, True), ({**phase.initial_values, **goals}, False)):
                 yield (
                     chain.ride_geometries[ride],
                     _ridden(scene, ride, _with(carrier, state)),
@@ -152,10 +152,10 @@ def _moments(
                 )
 
 
-def _ridden(scene: Scene, ride: Ride, carrier: PlacedObject) -> PlacedObject:
+def _ridden(scene: Scene, ride: SupportedObject, carrier: PlacedObject) -> PlacedObject:
     """Return what rides, where it stands on a carrier."""
     return dataclasses.replace(
-        scene.objects[ride.object], placement=carrier.link_placement(ride.link) * ride.local
+        scene.objects[ride.object], placement=carrier.link_placement(ride.link) * ride.placement_in_link
     )
 
 

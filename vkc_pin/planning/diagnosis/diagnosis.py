@@ -12,7 +12,7 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
-from vkc_pin.world.scene.contact_rules import CONTACT
+from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 
 __all__ = ["Blocked", "blocked", "explain", "impossible"]
 
@@ -48,7 +48,7 @@ def impossible(problem: TrajectoryProblem) -> list[Violation]:
         contacts.pair, contacts.distance, contacts.margin, strict=True
     ):
         if distance >= (
-            margin if margin > CONTACT else margin - CONTACT
+            margin if margin > CONTACT_DEPTH else margin - CONTACT_DEPTH
         ):  # as the scene allows, or in contact where that may be
             continue
         labels = problem.contacts.phases[0].labels

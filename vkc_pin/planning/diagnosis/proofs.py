@@ -306,7 +306,7 @@ def _listed(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) -> s
             continue
         joints = placed.object.coordinates.names
         state = [
-            phase.before.get(f"{name}.{joint}", float(value))
+            phase.initial_values.get(f"{name}.{joint}", float(value))
             for joint, value in zip(joints, placed.state, strict=True)
         ]
         ajar = ", ".join(

@@ -8,7 +8,7 @@ import numpy as np
 
 from vkc_pin.planning.diagnosis.proofs import PROVEN
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.scene.clearance_exemptions import Standing, allowances
+from vkc_pin.world.scene.clearance_exemptions import PlacedShapes, find_clearance_exemptions
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.task.phases import Phase
 
@@ -39,16 +39,19 @@ def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
     if placed.object.free:
         return ""
     begin, end = (
-        phase.before[coordinate],
+        phase.initial_values[coordinate],
         float(np.clip(phase.values[coordinate], *problem.limits(coordinate))),
     )
     values = np.linspace(begin, end, _VALUES)
     fixed = {owner: one for owner, one in scene.objects.items() if not one.object.free}
-    standing, known = Standing(scene, fixed), allowances(scene, problem.options.dist_safe)
+    standing, known = (
+        PlacedShapes(scene, fixed),
+        find_clearance_exemptions(scene, problem.options.dist_safe),
+    )
     links = [
         label
         for label in (f"{name}.{link}" for link in placed.object.links)
-        if standing.joints(label) == [joint]
+        if standing.find_joints(label) == [joint]
     ]
     others = {
         f"{owner}.{link}"
@@ -56,21 +59,21 @@ def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
         if owner != name
         for link in one.object.links
     }
-    others = {label for label in others if not standing.joints(label)} | set(
+    others = {label for label in others if not standing.find_joints(label)} | set(
         scene.obstacle_labels
     ) - {FLOOR}
     deepest, text = -_SURE, ""
     index = placed.object.coordinates.index(joint)
     for label in links:
-        for other in sorted(others & standing.reached(label, index, values)):
-            own, hit = standing.of([label]), standing.of([other])
-            distances = standing.distances(label, index, values, hit, 0.0)
+        for other in sorted(others & standing.find_links_near_sweep(label, index, values)):
+            own, hit = standing.find_shapes([label]), standing.find_shapes([other])
+            distances = standing.compute_distances(label, index, values, hit, 0.0)
             for one in known:
-                if not one.between(label, other):
+                if not one.is_between(label, other):
                     continue
                 holds, pairs = (
-                    one.holds([coordinate], values[:, None]),
-                    set(one.shape_pairs(standing.labels, standing.keys)),
+                    one.is_active([coordinate], values[:, None]),
+                    set(one.find_shape_pairs(standing.labels, standing.keys)),
                 )
                 for k, j in itertools.product(range(len(own)), range(len(hit))):
                     if (min(own[k], hit[j]), max(own[k], hit[j])) in pairs:

@@ -52,7 +52,7 @@ class Approach:
 
     def after(self, z: Floats, phase: Phase, before: Phase | None) -> Floats:
         """Return where the path from `z`, shape (n,), a phase's start, leads: shape (K, n), K is 1 or 0."""
-        return self._leaving(z, phase.leaves, phase.lifted, before.frames if before else ())
+        return self._leaving(z, phase.released, phase.lifted, before.frames if before else ())
 
     def _leaving(
         self, z: Floats, holds: Sequence[Hold], lifted: Sized, frames: Sequence[FrameGoal]
@@ -73,9 +73,9 @@ class Approach:
         The hand goes back from what a phase lets go of at its start, or up with what is carried in
         it.
         """
-        if phase.leaves:
+        if phase.released:
             return self._retreat(
-                z, -self._ahead(z, self.chain.holder(phase.leaves[0])), drives=False
+                z, -self._ahead(z, self.chain.holder(phase.released[0])), drives=False
             )
         return self._retreat(z, _UP, drives=False) if phase.held else np.empty((0, len(z)))
 

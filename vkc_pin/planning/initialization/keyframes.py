@@ -352,7 +352,7 @@ def follow_objects(problem: TrajectoryProblem, z: Floats) -> Floats:
     """Let the objects' joints run to their goals phase by phase."""
     begin, current = 0, problem.start.copy()
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
-        for name in phase.before:
+        for name in phase.initial_values:
             column = problem.chain.index(name)
             goal = problem.lower[end - 1, column] if name in phase.values else current[column]
             z[begin:end, column] = current[column] + (goal - current[column]) * smooth(end - begin)

@@ -17,9 +17,9 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
-from vkc_pin.world.task.phases import stretches
+from vkc_pin.world.task.phases import summarize_phases
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.task.terms import Term, check_active, traced
+from vkc_pin.world.task.terms import Term, check_terms_active, trace_terms
 
 __all__ = ["Plane", "build", "patterns", "planes", "sizes"]
 
@@ -173,6 +173,6 @@ def build(
     options = Options() if options is None else instance(options, Options, "options")
     cache = None if cache is None else instance(cache, Cache, "cache")
     instance(scene, Scene, "scene")
-    task, terms = compile_task(scene, steps, options), traced(scene, terms)
-    check_active(terms, stretches(task))
+    task, terms = compile_task(scene, steps, options), trace_terms(scene, terms)
+    check_terms_active(terms, summarize_phases(task))
     return TrajectoryProblem(scene, task, options, terms, cache=cache)

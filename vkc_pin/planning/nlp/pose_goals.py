@@ -63,7 +63,7 @@ def make_pose_goals(
             if hold in phase.grasps and scene.objects[hold.object].object.free:
                 row = PoseRow(closure.joint, closure.local, (int(last),))
                 goals.append(
-                    PoseGoal(row, phase.standing[hold.object], "grasp", str(hold), hold.object)
+                    PoseGoal(row, phase.resting[hold.object], "grasp", str(hold), hold.object)
                 )
             elif hold in phase.grasps:
                 waypoints.append(last)
@@ -77,7 +77,7 @@ def make_pose_goals(
         for hold in phase.grasps:
             closure, target = (
                 chain.closures[hold],
-                phase.standing.get(hold.object, chain.closures[hold].target),
+                phase.resting.get(hold.object, chain.closures[hold].target),
             )
             joint, frame = chain.holder(hold)
             x, y, z = (options.approach * frame.rotation[:, 2]).tolist()
@@ -86,7 +86,7 @@ def make_pose_goals(
                 continue
             row = PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z)))
             goals.append(PoseGoal(row, target, "approach", str(hold), hold.object))
-        for hold, ride in {ride.hold: ride for ride in phase.rides}.items():
+        for hold, ride in {ride.hold: ride for ride in phase.supported}.items():
             carrier = scene.objects[hold.object].object
             if carrier.free:
                 row = PoseRow(
@@ -94,7 +94,7 @@ def make_pose_goals(
                     tuple(range(int(first) + 1, int(last) + 1)),
                     "level",
                 )
-                goals.append(PoseGoal(row, ride.carrier, "level", hold.object, hold.object))
+                goals.append(PoseGoal(row, ride.carrier_placement, "level", hold.object, hold.object))
         for goal in phase.frames:
             row = PoseRow(
                 *chain.frame(goal.frame, goal.hold, opening=phase.opening), (int(last),), goal.kind

@@ -75,7 +75,7 @@ class TrajectoryProblem:
     ) -> None:
         self.scene, self.task, self.options, self.cache = scene, task, options, cache or Cache()
         self.chain: VirtualKinematicChain = consolidate(
-            scene, task.holds, rides=task.rides, cache=self.cache
+            scene, task.holds, rides=task.supported, cache=self.cache
         )
         self.rolling = rolling_of(self.chain.robot)
         self.contacts = ContactModel(scene, self.chain, task, options)
@@ -183,7 +183,7 @@ class TrajectoryProblem:
                 lower[inside, robot_columns] = upper[inside, robot_columns] = self.start[
                     robot_columns
                 ]
-            for name, value in phase.before.items():
+            for name, value in phase.initial_values.items():
                 column = self.chain.index(name)
                 low, high = phase.ranges.get(name, (value, value))
                 lower[inside, column], upper[inside, column] = low, high

@@ -15,7 +15,7 @@ from vkc_pin.planning.nlp.term_rows import FrameLocation, TermLocation, TermRow,
 from vkc_pin.planning.nlp.transcription import Transcription
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.phases import Task, stretches
+from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.terms import Cost, Term
 
 __all__ = ["TermEvaluator", "locate_terms"]
@@ -44,8 +44,8 @@ def locate_terms(
     for term in terms:
         formula, at = term.formula, []
         values = tuple(locator.resolve_coordinate(name) for name in formula.coordinates)
-        for number, (name, held) in enumerate(stretches(task)):
-            if not term.active(name, held):
+        for number, (name, held) in enumerate(summarize_phases(task)):
+            if not term.is_active(name, held):
                 continue
             for waypoint in range(locator.starts[number] + 1, locator.ends[number] + 1):
                 earlier = number if waypoint - 1 > locator.starts[number] else max(number - 1, 0)
@@ -111,10 +111,10 @@ class _FrameLocator:
         hold = next((hold for hold in phase.held if hold.object == owner), None)
         if hold is not None:
             return self._locate_on_chain(self.chain.frame(link, hold), waypoint)
-        if owner in phase.left:  # the object is where the hand released it
-            hold, last = phase.left[owner]
+        if owner in phase.released_by:  # the object is where the hand released it
+            hold, last = phase.released_by[owner]
             return self._locate_on_chain(self.chain.frame(link, hold), self.ends[last])
-        stands = phase.standing.get(owner, placed.placement)
+        stands = phase.resting.get(owner, placed.placement)
         return FrameLocation(_flatten_placement(stands * item.link_placement(link, placed.state)))
 
     def _locate_on_chain(self, at: tuple[int, pin.SE3], waypoint: int) -> FrameLocation:
@@ -144,9 +144,9 @@ class TermEvaluator:
                 continue
             for own in at.values():
                 rows.append(own)
-                bounds.append(np.column_stack(term.box(len(own))))
+                bounds.append(np.column_stack(term.compute_bounds(len(own))))
                 scales.append(np.full(len(own), _TOLERANCE_SCALE / term.tolerance))
-                timed.append(np.full(len(own), term.formula.timed))
+                timed.append(np.full(len(own), term.formula.uses_time_step))
                 names += [term.name] * len(own)
         order = np.argsort(np.concatenate(rows))
         self.rows = np.concatenate(rows)[order]

@@ -97,10 +97,10 @@ class TermRow:
         and the position of the previous waypoint if the formula depends on it; terms with equal
         keys share a function.
         """
-        frames = (*at.now, *(at.before if self.formula.moving else ()))
+        frames = (*at.now, *(at.before if self.formula.uses_previous else ()))
         involved = {frame.waypoint for frame in frames if frame.waypoint >= 0}
         if any(value.column is not None for value in self.values):
-            involved |= {at.waypoint, at.waypoint - 1} if self.formula.moving else {at.waypoint}
+            involved |= {at.waypoint, at.waypoint - 1} if self.formula.uses_previous else {at.waypoint}
         waypoints = tuple(sorted(involved))
 
         def position(waypoint: int) -> int:
@@ -109,10 +109,10 @@ class TermRow:
         now = tuple(replace(frame, waypoint=position(frame.waypoint)) for frame in at.now)
         before = (
             tuple(replace(frame, waypoint=position(frame.waypoint)) for frame in at.before)
-            if self.formula.moving
+            if self.formula.uses_previous
             else now
         )
-        last = position(at.waypoint - 1) if self.formula.moving else position(at.waypoint)
+        last = position(at.waypoint - 1) if self.formula.uses_previous else position(at.waypoint)
         return waypoints, (TermLocation(position(at.waypoint), now, before), last)
 
 

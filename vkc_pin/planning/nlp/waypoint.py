@@ -63,7 +63,7 @@ class Structure:
     @property
     def timed(self) -> bool:
         """Whether any term depends on the step duration."""
-        return any(term.formula.timed for term in self.terms)
+        return any(term.formula.uses_time_step for term in self.terms)
 
     @cached_property
     def key(self) -> tuple[Any, ...]:

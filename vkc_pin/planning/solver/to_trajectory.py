@@ -27,7 +27,7 @@ def as_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajecto
     begin = 0
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         first = len(rows) - 1
-        if phase.leaves or (begin and problem.task.phases[len(phases) - 1].grasps):
+        if phase.released or (begin and problem.task.phases[len(phases) - 1].grasps):
             rows.append(rows[-1])
             times.append(times[-1] + wait)
         for row in range(begin + 1, int(end) + 1):

@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["COLOURS", "Article", "Link", "Point"]
+__all__ = ["COLOURS", "LinkBuilder", "ObjectBuilder", "Point"]
 
 Point = Sequence[float]
 
@@ -94,13 +94,13 @@ class _Shape:
 
 
 @dataclass
-class Link:
+class LinkBuilder:
     """A link that is being built; lengths in metres, in its own frame."""
 
     name: str
     shapes: list[_Shape] = field(default_factory=list)
 
-    def box(self, low: Point, high: Point, colour: str) -> None:
+    def add_box(self, low: Point, high: Point, colour: str) -> None:
         """Add a box between two corners."""
         size = tuple(b - a for a, b in zip(low, high, strict=True))
         self.shapes.append(
@@ -113,13 +113,15 @@ class Link:
             )
         )
 
-    def cylinder(self, centre: Point, radius: float, length: float, axis: str, colour: str) -> None:
+    def add_cylinder(
+        self, centre: Point, radius: float, length: float, axis: str, colour: str
+    ) -> None:
         """Add a cylinder along an axis of the link: "x", "y" or "z"."""
         self.shapes.append(
             _Shape("cylinder", (radius, length), tuple(centre), _TURNED[axis], colour)
         )
 
-    def rod(self, one: Point, other: Point, radius: float, colour: str) -> None:
+    def add_rod(self, one: Point, other: Point, radius: float, colour: str) -> None:
         """Add a cylinder between two points."""
         way = np.subtract(other, one)
         length = float(np.linalg.norm(way))
@@ -128,18 +130,18 @@ class Link:
             _Shape("cylinder", (radius, length), tuple(np.add(one, other) / 2.0), turned, colour)
         )
 
-    def ball(self, centre: Point, radius: float, colour: str) -> None:
+    def add_sphere(self, centre: Point, radius: float, colour: str) -> None:
         """Add a ball."""
         self.shapes.append(_Shape("sphere", (radius,), tuple(centre), _UPRIGHT, colour))
 
-    def case(self, low: Point, high: Point, wall: float, colour: str, inside: str) -> None:
+    def add_case(self, low: Point, high: Point, wall: float, colour: str, inside: str) -> None:
         """Add a box that is open towards -x: two sides, top, bottom and back."""
         (x0, y0, z0), (x1, y1, z1) = low, high
-        self.box((x0, y0, z0), (x1, y0 + wall, z1), colour)
-        self.box((x0, y1 - wall, z0), (x1, y1, z1), colour)
-        self.box((x0, y0 + wall, z1 - wall), (x1, y1 - wall, z1), colour)
-        self.box((x0, y0 + wall, z0), (x1, y1 - wall, z0 + wall), colour)
-        self.box((x1 - wall, y0 + wall, z0 + wall), (x1, y1 - wall, z1 - wall), inside)
+        self.add_box((x0, y0, z0), (x1, y0 + wall, z1), colour)
+        self.add_box((x0, y1 - wall, z0), (x1, y1, z1), colour)
+        self.add_box((x0, y0 + wall, z1 - wall), (x1, y1 - wall, z1), colour)
+        self.add_box((x0, y0 + wall, z0), (x1, y1 - wall, z0 + wall), colour)
+        self.add_box((x1 - wall, y0 + wall, z0 + wall), (x1, y1 - wall, z1 - wall), inside)
 
     def xml(self) -> str:
         """Return the element <link>, with mass and inertia of the shapes."""
@@ -171,7 +173,7 @@ class Link:
 
 
 @dataclass
-class Article:
+class ObjectBuilder:
     """An object that is being built.
 
     Its base link's frame lies on the floor (or on what it stands on) in the middle below its face:
@@ -185,13 +187,13 @@ class Article:
     """
 
     name: str
-    base: Link
-    links: list[tuple[Link, str]] = field(default_factory=list)
+    base: LinkBuilder
+    links: list[tuple[LinkBuilder, str]] = field(default_factory=list)
     accelerations: dict[str, float] = field(default_factory=dict)
     attachments: list[dict[str, Any]] = field(default_factory=list)
     latches: list[dict[str, Any]] = field(default_factory=list)
 
-    def joint(
+    def add_joint(
         self,
         name: str,
         kind: str,
@@ -203,7 +205,7 @@ class Article:
         link: str,
         parent: str | None = None,
         acceleration: float = 1.0,
-    ) -> Link:
+    ) -> LinkBuilder:
         """Add a joint, and return the link that it moves.
 
         Args:
@@ -217,7 +219,7 @@ class Article:
             parent: The link it hangs on; None: the base.
             acceleration: Its limit [rad/s²] or [m/s²].
         """
-        moved = Link(link)
+        moved = LinkBuilder(link)
         limits = f'lower="{_numbers([lower])}" upper="{_numbers([upper])}"'
         rates = f'velocity="{_numbers([_VELOCITY[kind]])}" effort="{_numbers([_EFFORT[kind]])}"'
         lines = [
@@ -231,10 +233,10 @@ class Article:
         self.accelerations[name] = acceleration
         return moved
 
-    def attach(
+    def add_attachment(
         self,
         name: str,
-        link: Link,
+        link: LinkBuilder,
         position: Point,
         approach: Point,
         closing: Point,

@@ -1,4 +1,4 @@
-"""The kinds of furniture and appliances that are made at random, and where each kind stands."""
+"""The kinds of furniture and appliances that are builder at random, and where each kind stands."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import yaml
 
 from vkc_pin.errors import InputError
 from vkc_pin.procedural.furniture import flaps, leaves, valves
-from vkc_pin.procedural.furniture.building import Article
-from vkc_pin.procedural.furniture.draws import Draws
+from vkc_pin.procedural.furniture.building import ObjectBuilder
+from vkc_pin.procedural.furniture.draws import Sampler
 from vkc_pin.utils.arguments import known, mapping, whole
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.writing import write_atomically
@@ -35,23 +35,23 @@ class Kind:
         beside: How far to either side of it the floor before it is needed, by robot and leaves [m].
     """
 
-    make: Callable[[Draws], Article]
+    make: Callable[[Sampler], ObjectBuilder]
     place: str
     beside: float
 
 
 KINDS: Mapping[str, Kind] = MappingProxyType(
     {
-        "cabinet": Kind(leaves.cabinet, "floor", 0.7),
-        "chest": Kind(flaps.chest, "floor", 0.5),
-        "dishwasher": Kind(flaps.dishwasher, "floor", 0.6),
-        "door": Kind(leaves.door, "wall", 0.5),
-        "drawers": Kind(flaps.drawers, "floor", 0.5),
-        "faucet": Kind(valves.faucet, "counter", 0.5),
-        "microwave": Kind(leaves.microwave, "counter", 0.6),
-        "oven": Kind(flaps.oven, "floor", 0.6),
-        "refrigerator": Kind(leaves.refrigerator, "floor", 0.7),
-        "valve": Kind(valves.valve, "floor", 0.7),
+        "cabinet": Kind(leaves.make_cabinet, "floor", 0.7),
+        "chest": Kind(flaps.make_chest, "floor", 0.5),
+        "dishwasher": Kind(flaps.make_dishwasher, "floor", 0.6),
+        "door": Kind(leaves.make_door, "wall", 0.5),
+        "drawers": Kind(flaps.make_drawers, "floor", 0.5),
+        "faucet": Kind(valves.make_faucet, "counter", 0.5),
+        "microwave": Kind(leaves.make_microwave, "counter", 0.6),
+        "oven": Kind(flaps.make_oven, "floor", 0.6),
+        "refrigerator": Kind(leaves.make_refrigerator, "floor", 0.7),
+        "valve": Kind(valves.make_valve, "floor", 0.7),
     }
 )
 """Kinds by name."""
@@ -76,7 +76,7 @@ def random_object(kind: str, seed: int = 0) -> dict[str, Any]:
     """
     own = KINDS[known(kind, KINDS, "kind of furniture", "kind")]
     rng = np.random.default_rng([4, zlib.crc32(kind.encode()), whole(seed, "seed", low=0)])
-    return own.make(Draws(rng)).description
+    return own.make(Sampler(rng)).description
 
 
 def write_object(description: Mapping[str, Any], path: str | Path) -> Path:

@@ -7,29 +7,29 @@ from typing import TypeVar
 
 import numpy as np
 
-__all__ = ["Draws"]
+__all__ = ["Sampler"]
 
 T = TypeVar("T")
 
 
-class Draws:
+class Sampler:
     """Random sizes and choices from a generator of random numbers."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
 
-    def size(self, low: float, high: float) -> float:
+    def sample_length(self, low: float, high: float) -> float:
         """Return a length or angle between two, to the millimetre or milliradian."""
         return round(float(self._rng.uniform(low, high)), 3)
 
-    def whole(self, low: int, high: int) -> int:
+    def sample_integer(self, low: int, high: int) -> int:
         """Return a whole number from the lowest to the highest."""
         return int(self._rng.integers(low, high + 1))
 
-    def chance(self, share: float) -> bool:
+    def sample_bool(self, share: float) -> bool:
         """Return True in a share of all draws."""
         return bool(self._rng.random() < share)
 
-    def one_of(self, choices: Sequence[T]) -> T:
+    def choose(self, choices: Sequence[T]) -> T:
         """Return one of some choices."""
         return choices[int(self._rng.integers(len(choices)))]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from vkc_pin.procedural.furniture.building import Article, Link
-from vkc_pin.procedural.furniture.draws import Draws
-from vkc_pin.procedural.furniture.handles import knob, level_bar
+from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder
+from vkc_pin.procedural.furniture.draws import Sampler
+from vkc_pin.procedural.furniture.handles import add_knob, add_level_bar
 
-__all__ = ["chest", "dishwasher", "drawers", "oven"]
+__all__ = ["make_chest", "make_dishwasher", "make_drawers", "make_oven"]
 
 _GAP = 0.006  # [m] of air between a leaf and its case
 _FRONTS = ("white", "shade", "sage", "sand", "slate", "oak", "walnut")
@@ -16,89 +16,112 @@ _DOWN, _UP = (
 )  # [rad] a hand turns about a bar that goes down or up with its leaf, and stays level
 
 
-def drawers(draws: Draws) -> Article:
+def make_drawers(sampler: Sampler) -> ObjectBuilder:
     """Return a chest of one to four drawers above each other."""
-    count, width, depth = draws.whole(1, 4), draws.size(0.4, 0.9), draws.size(0.42, 0.6)
-    foot, front = draws.size(0.06, 0.1), draws.size(0.17, 0.26)
+    count, width, depth = (
+        sampler.sample_integer(1, 4),
+        sampler.sample_length(0.4, 0.9),
+        sampler.sample_length(0.42, 0.6),
+    )
+    foot, front = sampler.sample_length(0.06, 0.1), sampler.sample_length(0.17, 0.26)
     low = (
-        foot if count > 2 else draws.size(0.35, 0.55)
+        foot if count > 2 else sampler.sample_length(0.35, 0.55)
     )  # a single drawer is under the top of a higher case
     height = round(low + count * front + 0.025, 3)
-    made = Article("drawers", Link("case"))
-    colour = draws.one_of(_FRONTS)
-    made.base.case((0, -width / 2, foot), (depth, width / 2, height), 0.02, colour, "shade")
-    made.base.box((0.04, -width / 2 + 0.02, 0), (depth - 0.02, width / 2 - 0.02, foot), "dark")
+    builder = ObjectBuilder("drawers", LinkBuilder("case"))
+    colour = sampler.choose(_FRONTS)
+    builder.base.add_case((0, -width / 2, foot), (depth, width / 2, height), 0.02, colour, "shade")
+    builder.base.add_box(
+        (0.04, -width / 2 + 0.02, 0), (depth - 0.02, width / 2 - 0.02, foot), "dark"
+    )
     if low > foot:
-        made.base.box(
+        builder.base.add_box(
             (0, -width / 2 + 0.02, foot + 0.02), (depth - 0.02, width / 2 - 0.02, low), colour
         )
     bars, length, out = (
-        draws.chance(0.7),
-        min(draws.size(0.14, 0.3), width - 0.12),
-        draws.size(0.055, 0.075),
+        sampler.sample_bool(0.7),
+        min(sampler.sample_length(0.14, 0.3), width - 0.12),
+        sampler.sample_length(0.055, 0.075),
     )
-    own, reach = draws.one_of(_FRONTS), round(draws.size(0.6, 0.8) * depth, 3)
+    own, reach = sampler.choose(_FRONTS), round(sampler.sample_length(0.6, 0.8) * depth, 3)
     for k in range(count):
         name = "" if count == 1 else f"_{k + 1}"
         middle = height - 0.025 - (k + 0.5) * front
-        tray = made.joint(
+        tray = builder.add_joint(
             f"slide{name}", "prismatic", (0, 0, middle), (-1, 0, 0), reach, link=f"drawer{name}"
         )
         half, side = front / 2 - 0.003, width / 2 - 0.03
-        tray.box((-_GAP - 0.018, -width / 2 + 0.002, -half), (-_GAP, width / 2 - 0.002, half), own)
+        tray.add_box(
+            (-_GAP - 0.018, -width / 2 + 0.002, -half), (-_GAP, width / 2 - 0.002, half), own
+        )
         bottom, top, back = -half + 0.02, half - 0.03, depth - 0.05
-        tray.box((-_GAP, -side, bottom), (back, -side + 0.012, top), "oak")
-        tray.box((-_GAP, side - 0.012, bottom), (back, side, top), "oak")
-        tray.box((back - 0.012, -side + 0.012, bottom), (back, side - 0.012, top), "oak")
-        tray.box(
+        tray.add_box((-_GAP, -side, bottom), (back, -side + 0.012, top), "oak")
+        tray.add_box((-_GAP, side - 0.012, bottom), (back, side, top), "oak")
+        tray.add_box((back - 0.012, -side + 0.012, bottom), (back, side - 0.012, top), "oak")
+        tray.add_box(
             (-_GAP, -side + 0.012, bottom), (back - 0.012, side - 0.012, bottom + 0.008), "oak"
         )
         at = (-_GAP - 0.018, 0.0, 0.0)
         if bars or middle < 0.55:  # a knob is taken level
-            level_bar(made, tray, at, length, out, height=middle, name=f"handle{name}")
+            add_level_bar(builder, tray, at, length, out, height=middle, name=f"handle{name}")
         else:
-            knob(made, tray, at, out, f"handle{name}")
-    return made
+            add_knob(builder, tray, at, out, f"handle{name}")
+    return builder
 
 
-def dishwasher(draws: Draws) -> Article:
+def make_dishwasher(sampler: Sampler) -> ObjectBuilder:
     """Return a dishwasher, 0.45 or 0.6 wide, whose leaf opens downwards."""
     width, height, depth = (
-        draws.one_of((0.448, 0.598)),
-        draws.size(0.82, 0.88),
-        draws.size(0.52, 0.58),
+        sampler.choose((0.448, 0.598)),
+        sampler.sample_length(0.82, 0.88),
+        sampler.sample_length(0.52, 0.58),
     )
-    made = Article("dishwasher", Link("body"))
-    colour, foot = draws.one_of(("white", "steel", "dark", "slate")), draws.size(0.09, 0.12)
-    made.base.case((0, -width / 2, foot), (depth, width / 2, height), 0.03, colour, "steel")
-    made.base.box((0.05, -width / 2 + 0.02, 0), (depth - 0.02, width / 2 - 0.02, foot), "dark")
-    _flap(made, width, (foot + 0.01, height), 0.03, colour, draws)
-    return made
+    builder = ObjectBuilder("dishwasher", LinkBuilder("body"))
+    colour, foot = (
+        sampler.choose(("white", "steel", "dark", "slate")),
+        sampler.sample_length(0.09, 0.12),
+    )
+    builder.base.add_case((0, -width / 2, foot), (depth, width / 2, height), 0.03, colour, "steel")
+    builder.base.add_box(
+        (0.05, -width / 2 + 0.02, 0), (depth - 0.02, width / 2 - 0.02, foot), "dark"
+    )
+    _flap(builder, width, (foot + 0.01, height), 0.03, colour, sampler)
+    return builder
 
 
-def oven(draws: Draws) -> Article:
+def make_oven(sampler: Sampler) -> ObjectBuilder:
     """Return an oven whose leaf opens downwards: under a hob, or in a high case."""
-    width, depth, high = draws.size(0.56, 0.62), draws.size(0.54, 0.6), draws.chance(0.5)
-    low = draws.size(0.6, 0.75) if high else draws.size(0.2, 0.28)
-    top = round(low + draws.size(0.42, 0.48), 3)
-    height = draws.size(1.9, 2.1) if high else round(top + 0.14, 3)
-    made = Article("oven", Link("body"))
-    colour, case = (
-        draws.one_of(("steel", "dark")),
-        draws.one_of(("white", "shade", "oak")) if high else "steel",
+    width, depth, high = (
+        sampler.sample_length(0.56, 0.62),
+        sampler.sample_length(0.54, 0.6),
+        sampler.sample_bool(0.5),
     )
-    made.base.case((0, -width / 2, low - 0.02), (depth, width / 2, top + 0.02), 0.03, case, "dark")
-    made.base.box((0.0, -width / 2, 0.0), (depth, width / 2, low - 0.02), case)
-    made.base.box((0.0, -width / 2, top + 0.02), (depth, width / 2, height), case)
-    _flap(made, width, (low, top), 0.035, colour, draws)
-    return made
+    low = sampler.sample_length(0.6, 0.75) if high else sampler.sample_length(0.2, 0.28)
+    top = round(low + sampler.sample_length(0.42, 0.48), 3)
+    height = sampler.sample_length(1.9, 2.1) if high else round(top + 0.14, 3)
+    builder = ObjectBuilder("oven", LinkBuilder("body"))
+    colour, case = (
+        sampler.choose(("steel", "dark")),
+        sampler.choose(("white", "shade", "oak")) if high else "steel",
+    )
+    builder.base.add_case(
+        (0, -width / 2, low - 0.02), (depth, width / 2, top + 0.02), 0.03, case, "dark"
+    )
+    builder.base.add_box((0.0, -width / 2, 0.0), (depth, width / 2, low - 0.02), case)
+    builder.base.add_box((0.0, -width / 2, top + 0.02), (depth, width / 2, height), case)
+    _flap(builder, width, (low, top), 0.035, colour, sampler)
+    return builder
 
 
-def chest(draws: Draws) -> Article:
+def make_chest(sampler: Sampler) -> ObjectBuilder:
     """Return a chest on the floor with a lid."""
-    width, depth, height = draws.size(0.6, 1.1), draws.size(0.42, 0.58), draws.size(0.45, 0.7)
-    made = Article("chest", Link("body"))
-    colour, wall, thick = draws.one_of(_FRONTS), 0.025, 0.035
+    width, depth, height = (
+        sampler.sample_length(0.6, 1.1),
+        sampler.sample_length(0.42, 0.58),
+        sampler.sample_length(0.45, 0.7),
+    )
+    builder = ObjectBuilder("chest", LinkBuilder("body"))
+    colour, wall, thick = sampler.choose(_FRONTS), 0.025, 0.035
     for low, high in (
         ((0, -width / 2, 0), (wall, width / 2, height)),
         ((depth - wall, -width / 2, 0), (depth, width / 2, height)),
@@ -106,35 +129,54 @@ def chest(draws: Draws) -> Article:
         ((wall, width / 2 - wall, 0), (depth - wall, width / 2, height)),
         ((wall, -width / 2 + wall, 0), (depth - wall, width / 2 - wall, wall)),
     ):
-        made.base.box(low, high, colour)
+        builder.base.add_box(low, high, colour)
     hinge = (
         depth - 0.06,
         0.0,
         height + _GAP + thick,
     )  # so that the lid, open, stays before the chest's back
-    lid = made.joint("lid", "revolute", hinge, (0, 1, 0), draws.size(1.2, 1.4), link="lid")
-    lid.box(
+    lid = builder.add_joint(
+        "lid", "revolute", hinge, (0, 1, 0), sampler.sample_length(1.2, 1.4), link="lid"
+    )
+    lid.add_box(
         (-hinge[0] - 0.02, -width / 2 - 0.005, -thick),
         (0.0, width / 2 + 0.005, 0.0),
-        draws.one_of(_FRONTS),
+        sampler.choose(_FRONTS),
     )
-    made.base.box(
+    builder.base.add_box(
         (depth - 0.055, -width / 2, height), (depth, width / 2, height + _GAP + thick), colour
     )
-    length = draws.size(0.14, 0.3)
+    length = sampler.sample_length(0.14, 0.3)
     at = (-hinge[0] - 0.02, 0.0, -thick / 2)
-    level_bar(made, lid, at, length, draws.size(0.055, 0.075), height=height, turn=_UP)
-    return made
+    add_level_bar(
+        builder, lid, at, length, sampler.sample_length(0.055, 0.075), height=height, turn=_UP
+    )
+    return builder
 
 
 def _flap(
-    made: Article, width: float, z: tuple[float, float], thick: float, colour: str, draws: Draws
+    builder: ObjectBuilder,
+    width: float,
+    z: tuple[float, float],
+    thick: float,
+    colour: str,
+    sampler: Sampler,
 ) -> None:
     """Add a leaf that opens downwards, with a bar near its upper edge."""
     low, high = z
     origin = (-_GAP - thick / 2, 0.0, low)
-    leaf = made.joint("door", "revolute", origin, (0, -1, 0), draws.size(1.45, 1.55), link="door")
-    leaf.box((-thick / 2, -width / 2, 0.0), (thick / 2, width / 2, high - low), colour)
-    at = (-thick / 2, 0.0, high - low - draws.size(0.05, 0.09))
-    length = min(draws.size(0.3, 0.5), width - 0.08)
-    level_bar(made, leaf, at, length, draws.size(0.055, 0.07), height=low + at[2], turn=_DOWN)
+    leaf = builder.add_joint(
+        "door", "revolute", origin, (0, -1, 0), sampler.sample_length(1.45, 1.55), link="door"
+    )
+    leaf.add_box((-thick / 2, -width / 2, 0.0), (thick / 2, width / 2, high - low), colour)
+    at = (-thick / 2, 0.0, high - low - sampler.sample_length(0.05, 0.09))
+    length = min(sampler.sample_length(0.3, 0.5), width - 0.08)
+    add_level_bar(
+        builder,
+        leaf,
+        at,
+        length,
+        sampler.sample_length(0.055, 0.07),
+        height=low + at[2],
+        turn=_DOWN,
+    )

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vkc_pin.procedural.furniture.building import Article, Link, Point
+from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder, Point
 
-__all__ = ["knob", "level_bar", "upright_bar"]
+__all__ = ["add_knob", "add_level_bar", "add_upright_bar"]
 
 _POST = 0.02  # [m] from a bar's ends to the posts that carry it
 _THUMB = 0.03  # [m] from a post to the middle of the hand
@@ -24,13 +24,18 @@ _LEVEL = 0.55
 _STEEPEST = 0.65  # [rad] to which it does so
 
 
-def upright_bar(
-    article: Article, link: Link, at: Point, length: float, out: float, name: str = "handle"
+def add_upright_bar(
+    builder: ObjectBuilder,
+    link: LinkBuilder,
+    at: Point,
+    length: float,
+    out: float,
+    name: str = "handle",
 ) -> None:
     """Add an upright bar before a face that looks along -x, and its attachments `name` and `<name>_free`.
 
     Args:
-        article: What is being built.
+        builder: What is being built.
         link: That the bar belongs to.
         at: Where on the face its middle is, in the link's frame [m].
         length: Of the bar, at least 0.1 [m].
@@ -38,17 +43,17 @@ def upright_bar(
         name: Of the attachment.
     """
     middle, reach = _bar(link, at, length, out, "z")
-    where: tuple[Link, Point, Point, Point] = (link, middle, (1, 0, 0), (0, 1, 0))
-    article.attach(name, *where)
+    where: tuple[LinkBuilder, Point, Point, Point] = (link, middle, (1, 0, 0), (0, 1, 0))
+    builder.add_attachment(name, *where)
     limits, turn = _interval(reach), _interval(_SWING)
-    article.attach(
+    builder.add_attachment(
         f"{name}_free", *where, joint="cylindrical", axis=[0, 1, 0], limits=limits, turn=turn
     )
 
 
-def level_bar(
-    article: Article,
-    link: Link,
+def add_level_bar(
+    builder: ObjectBuilder,
+    link: LinkBuilder,
     at: Point,
     length: float,
     out: float,
@@ -60,7 +65,7 @@ def level_bar(
     """Add a level bar before a face that looks along -x, and its attachments `name` and `<name>_free`.
 
     Args:
-        article: What is being built.
+        builder: What is being built.
         link: That the bar belongs to.
         at: Where on the face its middle is, in the link's frame [m].
         length: Of the bar, at least 0.1 [m].
@@ -75,10 +80,10 @@ def level_bar(
         (math.cos(down), 0.0, -math.sin(down)),
         (math.sin(down), 0.0, math.cos(down)),
     )
-    where: tuple[Link, Point, Point, Point] = (link, middle, approach, closing)
-    article.attach(name, *where)
+    where: tuple[LinkBuilder, Point, Point, Point] = (link, middle, approach, closing)
+    builder.add_attachment(name, *where)
     limits = list(turn) if turn is not None else _interval(_TILT)
-    article.attach(
+    builder.add_attachment(
         f"{name}_free",
         *where,
         joint="cylindrical",
@@ -88,32 +93,34 @@ def level_bar(
     )
 
 
-def knob(article: Article, link: Link, at: Point, out: float, name: str = "handle") -> None:
+def add_knob(
+    builder: ObjectBuilder, link: LinkBuilder, at: Point, out: float, name: str = "handle"
+) -> None:
     """Add a round knob before a face that looks along -x, and its attachments `name` and `<name>_free`.
 
     Args:
-        article: What is being built.
+        builder: What is being built.
         link: That the knob belongs to.
         at: Where on the face it is, in the link's frame [m].
         out: From the face to the knob's centre [m].
         name: Of the attachment.
     """
     x, y, z = at
-    link.ball((x - out, y, z), 0.016, "steel")
-    link.cylinder((x - out / 2.0, y, z), 0.007, out, "x", "steel")
-    where: tuple[Link, Point, Point, Point] = (link, (x - out, y, z), (1, 0, 0), (0, 1, 0))
-    article.attach(name, *where)
-    article.attach(f"{name}_free", *where, joint="spherical", limits=_interval(_SWING))
+    link.add_sphere((x - out, y, z), 0.016, "steel")
+    link.add_cylinder((x - out / 2.0, y, z), 0.007, out, "x", "steel")
+    where: tuple[LinkBuilder, Point, Point, Point] = (link, (x - out, y, z), (1, 0, 0), (0, 1, 0))
+    builder.add_attachment(name, *where)
+    builder.add_attachment(f"{name}_free", *where, joint="spherical", limits=_interval(_SWING))
 
 
-def _bar(link: Link, at: Point, length: float, out: float, axis: str) -> tuple[Point, float]:
+def _bar(link: LinkBuilder, at: Point, length: float, out: float, axis: str) -> tuple[Point, float]:
     """Add a bar along an axis on two posts; return its middle, and how far a hand may slide from there to either side [m]."""
     x, y, z = at
     middle, end = (x - out, y, z), length / 2.0 - _POST
-    link.cylinder(middle, 0.01, length, axis, "steel")
+    link.add_cylinder(middle, 0.01, length, axis, "steel")
     for shift in (-end, end):
         post = (x - out / 2.0, y, z + shift) if axis == "z" else (x - out / 2.0, y + shift, z)
-        link.cylinder(post, 0.006, out, "x", "steel")
+        link.add_cylinder(post, 0.006, out, "x", "steel")
     return middle, max(end - _THUMB, 0.0)
 
 

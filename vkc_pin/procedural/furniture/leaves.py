@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.procedural.furniture.building import Article, Link
-from vkc_pin.procedural.furniture.draws import Draws
-from vkc_pin.procedural.furniture.handles import knob, upright_bar
+from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder
+from vkc_pin.procedural.furniture.draws import Sampler
+from vkc_pin.procedural.furniture.handles import add_knob, add_upright_bar
 
-__all__ = ["cabinet", "door", "microwave", "refrigerator"]
+__all__ = ["make_cabinet", "make_door", "make_microwave", "make_refrigerator"]
 
 _GAP = 0.006  # [m] of air between a leaf and its case
 _POST = 0.05  # [m] width of a door's posts
@@ -16,51 +16,57 @@ _AIR = 0.025  # [m] between a door's panel and its frame: more than the clearanc
 _FRONTS = ("white", "shade", "sage", "sand", "slate", "oak", "walnut")
 
 
-def door(draws: Draws) -> Article:
+def make_door(sampler: Sampler) -> ObjectBuilder:
     """Return a door in its frame, which is pushed or pulled open: with levers and a latch, or with a bar on either side.
 
     The base link's frame is on the hinge line, in the middle of a wall about 0.1 thick. Measures
     are those of DIN 18101, with leaves from 0.735 to 0.985.
     """
-    width, height, thick = draws.size(0.735, 0.985), draws.size(1.95, 2.05), 0.04
-    to = draws.one_of((-1.0, 1.0))  # from the hinge to the lock, along y
-    away = draws.one_of((-1.0, 1.0))  # 1: pushed open; -1: pulled
-    frame = Article("door", Link("frame"))
+    width, height, thick = (
+        sampler.sample_length(0.735, 0.985),
+        sampler.sample_length(1.95, 2.05),
+        0.04,
+    )
+    to = sampler.choose((-1.0, 1.0))  # from the hinge to the lock, along y
+    away = sampler.choose((-1.0, 1.0))  # 1: pushed open; -1: pulled
+    builder = ObjectBuilder("door", LinkBuilder("frame"))
     top = 0.01 + height + _AIR
     for low, high in ((-_AIR - 0.02 - _POST, -_AIR - 0.02), (width + _AIR, width + _AIR + _POST)):
         ends = sorted((to * low, to * high))
-        frame.base.box((-0.06, ends[0], 0.0), (0.06, ends[1], top + _POST), "white")
+        builder.base.add_box((-0.06, ends[0], 0.0), (0.06, ends[1], top + _POST), "white")
     inside = sorted((to * (-_AIR - 0.02), to * (width + _AIR)))
-    frame.base.box((-0.06, inside[0], top), (0.06, inside[1], top + _POST), "white")
+    builder.base.add_box((-0.06, inside[0], top), (0.06, inside[1], top + _POST), "white")
     axis = (0, 0, -to * away)
-    panel = frame.joint("hinge", "revolute", (0, 0, 0), axis, draws.size(1.4, 1.55), link="panel")
+    panel = builder.add_joint(
+        "hinge", "revolute", (0, 0, 0), axis, sampler.sample_length(1.4, 1.55), link="panel"
+    )
     ends = sorted((0.0, to * width))
-    panel.box(
+    panel.add_box(
         (-thick / 2, ends[0], 0.01),
         (thick / 2, ends[1], 0.01 + height),
-        draws.one_of(("oak", "white", "walnut", "sand")),
+        sampler.choose(("oak", "white", "walnut", "sand")),
     )
-    grip = draws.size(0.95, 1.08)
-    if draws.chance(0.3):
-        length = draws.size(0.25, 0.5)
-        upright_bar(frame, panel, (-thick / 2, to * (width - 0.1), grip), length, 0.075)
-        return frame
-    turn = draws.size(0.35, 0.55)
+    grip = sampler.sample_length(0.95, 1.08)
+    if sampler.sample_bool(0.3):
+        length = sampler.sample_length(0.25, 0.5)
+        add_upright_bar(builder, panel, (-thick / 2, to * (width - 0.1), grip), length, 0.075)
+        return builder
+    turn = sampler.sample_length(0.35, 0.55)
     spindle = (0.0, to * (width - 0.08), grip)
-    lever = frame.joint(
+    lever = builder.add_joint(
         "knob", "revolute", spindle, (to, 0, 0), 0.8, link="lever", parent="panel", acceleration=4.0
     )
-    out, length = thick / 2 + 0.085, draws.size(0.125, 0.145)
-    lever.cylinder((0, 0, 0), 0.011, 2 * out, "x", "steel")
+    out, length = thick / 2 + 0.085, sampler.sample_length(0.125, 0.145)
+    lever.add_cylinder((0, 0, 0), 0.011, 2 * out, "x", "steel")
     for side in (-1, 1):
-        lever.cylinder((side * out, -to * (length / 2 - 0.01), 0), 0.012, length, "y", "steel")
+        lever.add_cylinder((side * out, -to * (length / 2 - 0.01), 0), 0.012, length, "y", "steel")
     held = (
         -out,
         -to * 0.085,
         0.0,
     )  # so far from the spindle the wrist passes the post with room to spare
-    frame.attach("handle", lever, held, (1, 0, 0), (0, 0, 1))
-    frame.attach(
+    builder.add_attachment("handle", lever, held, (1, 0, 0), (0, 0, 1))
+    builder.add_attachment(
         "handle_free",
         lever,
         held,
@@ -70,7 +76,7 @@ def door(draws: Draws) -> Article:
         axis=[0, 1, 0],
         limits=[-0.6, 0.6],
     )
-    frame.latches.append(
+    builder.latches.append(
         {
             "joint": "hinge",
             "held_at": 0.0,
@@ -79,32 +85,38 @@ def door(draws: Draws) -> Article:
             "engaged_within": 0.05,
         }
     )
-    return frame
+    return builder
 
 
-def cabinet(draws: Draws) -> Article:
+def make_cabinet(sampler: Sampler) -> ObjectBuilder:
     """Return a cabinet or wardrobe with one or two leaves, bars or knobs, and shelves in it."""
-    two = draws.chance(0.4)
-    width = draws.size(0.7, 1.1) if two else draws.size(0.4, 0.65)
-    height, depth, foot = draws.size(0.8, 1.9), draws.size(0.35, 0.6), draws.size(0.06, 0.12)
-    made = Article("cabinet", Link("case"))
-    made.base.case(
-        (0, -width / 2, foot), (depth, width / 2, height), 0.02, draws.one_of(_FRONTS), "shade"
+    two = sampler.sample_bool(0.4)
+    width = sampler.sample_length(0.7, 1.1) if two else sampler.sample_length(0.4, 0.65)
+    height, depth, foot = (
+        sampler.sample_length(0.8, 1.9),
+        sampler.sample_length(0.35, 0.6),
+        sampler.sample_length(0.06, 0.12),
     )
-    made.base.box((0.04, -width / 2 + 0.02, 0), (depth - 0.02, width / 2 - 0.02, foot), "dark")
+    builder = ObjectBuilder("cabinet", LinkBuilder("case"))
+    builder.base.add_case(
+        (0, -width / 2, foot), (depth, width / 2, height), 0.02, sampler.choose(_FRONTS), "shade"
+    )
+    builder.base.add_box(
+        (0.04, -width / 2 + 0.02, 0), (depth - 0.02, width / 2 - 0.02, foot), "dark"
+    )
     for z in np.linspace(foot, height, 2 + int((height - foot) / 0.4))[1:-1]:
-        made.base.box(
+        builder.base.add_box(
             (0.03, -width / 2 + 0.02, z - 0.01), (depth - 0.02, width / 2 - 0.02, z + 0.01), "oak"
         )
     front, bars, length, out = (
-        draws.one_of(_FRONTS),
-        draws.chance(0.7),
-        draws.size(0.14, 0.34),
-        draws.size(0.055, 0.075),
+        sampler.choose(_FRONTS),
+        sampler.sample_bool(0.7),
+        sampler.sample_length(0.14, 0.34),
+        sampler.sample_length(0.055, 0.075),
     )
-    grip = draws.size(0.85, 1.1)
-    names = ("left", "right") if two else (draws.one_of(("left", "right")),)
-    upper = draws.size(1.7, 1.9)
+    grip = sampler.sample_length(0.85, 1.1)
+    names = ("left", "right") if two else (sampler.choose(("left", "right")),)
+    upper = sampler.sample_length(1.7, 1.9)
     for name in names:
         y = (
             (0.002, width / 2)
@@ -114,10 +126,10 @@ def cabinet(draws: Draws) -> Article:
             else (-width / 2, width / 2)
         )
         leaf = _leaf(
-            made, (y[0], y[1], foot, height), 0.02, name, f"_{name}" if two else "", front, upper
+            builder, (y[0], y[1], foot, height), 0.02, name, f"_{name}" if two else "", front, upper
         )
         _handle(
-            made,
+            builder,
             leaf,
             (y[1] - y[0], foot, height),
             0.02,
@@ -126,34 +138,44 @@ def cabinet(draws: Draws) -> Article:
             (length if bars else 0.0, out),
             two,
         )
-    return made
+    return builder
 
 
-def refrigerator(draws: Draws) -> Article:
+def make_refrigerator(sampler: Sampler) -> ObjectBuilder:
     """Return a refrigerator: with one leaf, a freezer with its own above or below, or two leaves side by side."""
-    kind = draws.one_of(("single", "stacked", "stacked", "side_by_side"))
-    width = draws.size(0.8, 0.92) if kind == "side_by_side" else draws.size(0.55, 0.7)
-    height, depth = draws.size(1.5, 1.95), draws.size(0.52, 0.64)
-    made = Article("refrigerator", Link("body"))
-    colour = draws.one_of(("white", "steel", "slate", "sand"))
-    made.base.case((0, -width / 2, 0.05), (depth, width / 2, height), 0.04, colour, "white")
-    made.base.box((0.04, -width / 2 + 0.03, 0), (depth - 0.04, width / 2 - 0.03, 0.05), "dark")
-    length, out, grip, upper = (
-        draws.size(0.3, 0.55),
-        draws.size(0.06, 0.075),
-        draws.size(0.95, 1.1),
-        draws.size(1.7, 2.0),
+    kind = sampler.choose(("single", "stacked", "stacked", "side_by_side"))
+    width = (
+        sampler.sample_length(0.8, 0.92)
+        if kind == "side_by_side"
+        else sampler.sample_length(0.55, 0.7)
     )
-    side = draws.one_of(("left", "right"))
-    split = draws.size(0.62, 0.8) if draws.chance(0.5) else draws.size(1.1, 1.2)
+    height, depth = sampler.sample_length(1.5, 1.95), sampler.sample_length(0.52, 0.64)
+    builder = ObjectBuilder("refrigerator", LinkBuilder("body"))
+    colour = sampler.choose(("white", "steel", "slate", "sand"))
+    builder.base.add_case((0, -width / 2, 0.05), (depth, width / 2, height), 0.04, colour, "white")
+    builder.base.add_box(
+        (0.04, -width / 2 + 0.03, 0), (depth - 0.04, width / 2 - 0.03, 0.05), "dark"
+    )
+    length, out, grip, upper = (
+        sampler.sample_length(0.3, 0.55),
+        sampler.sample_length(0.06, 0.075),
+        sampler.sample_length(0.95, 1.1),
+        sampler.sample_length(1.7, 2.0),
+    )
+    side = sampler.choose(("left", "right"))
+    split = (
+        sampler.sample_length(0.62, 0.8)
+        if sampler.sample_bool(0.5)
+        else sampler.sample_length(1.1, 1.2)
+    )
     if kind == "stacked":
-        made.base.box(
+        builder.base.add_box(
             (0, -width / 2 + 0.04, split - 0.02),
             (depth - 0.04, width / 2 - 0.04, split + 0.02),
             "white",
         )
     for z in np.arange(split + 0.3, height - 0.2, 0.3):
-        made.base.box(
+        builder.base.add_box(
             (0.12, -width / 2 + 0.04, z - 0.006),
             (depth - 0.04, width / 2 - 0.04, z + 0.006),
             "glass",
@@ -171,10 +193,10 @@ def refrigerator(draws: Draws) -> Article:
         ],
     }[kind]
     for suffix, hinge, (y0, y1, z0, z1) in parts:
-        leaf = _leaf(made, (y0, y1, z0, z1), 0.05, hinge, suffix, colour, upper)
+        leaf = _leaf(builder, (y0, y1, z0, z1), 0.05, hinge, suffix, colour, upper)
         own = min(length, round(0.5 * (z1 - z0), 3))
         _handle(
-            made,
+            builder,
             leaf,
             (y1 - y0, z0, z1),
             0.05,
@@ -184,52 +206,56 @@ def refrigerator(draws: Draws) -> Article:
             bool(suffix),
             suffix.strip("_"),
         )
-    return made
+    return builder
 
 
-def microwave(draws: Draws) -> Article:
+def make_microwave(sampler: Sampler) -> ObjectBuilder:
     """Return a microwave oven, which stands on something: its leaf opens to the left, its panel with buttons is on the right."""
-    width, height, depth = draws.size(0.45, 0.56), draws.size(0.27, 0.34), draws.size(0.33, 0.42)
-    panel = draws.size(0.1, 0.13)
-    made = Article("microwave", Link("body"))
-    colour = draws.one_of(("white", "steel", "dark"))
+    width, height, depth = (
+        sampler.sample_length(0.45, 0.56),
+        sampler.sample_length(0.27, 0.34),
+        sampler.sample_length(0.33, 0.42),
+    )
+    panel = sampler.sample_length(0.1, 0.13)
+    builder = ObjectBuilder("microwave", LinkBuilder("body"))
+    colour = sampler.choose(("white", "steel", "dark"))
     edge = -width / 2 + panel
-    made.base.case((0, edge, 0.02), (depth, width / 2, height), 0.02, colour, "shade")
-    made.base.box((-0.03, -width / 2, 0.02), (depth, edge, height), colour)
+    builder.base.add_case((0, edge, 0.02), (depth, width / 2, height), 0.02, colour, "shade")
+    builder.base.add_box((-0.03, -width / 2, 0.02), (depth, edge, height), colour)
     for y in (-width / 2 + 0.04, width / 2 - 0.04):
-        made.base.box((0.03, y - 0.02, 0), (depth - 0.03, y + 0.02, 0.02), "dark")  # feet
+        builder.base.add_box((0.03, y - 0.02, 0), (depth - 0.03, y + 0.02, 0.02), "dark")  # feet
     leaf = _leaf(
-        made,
+        builder,
         (edge + 0.003, width / 2, 0.03, height - 0.005),
         0.03,
         "left",
         "",
         "glass",
-        draws.size(1.6, 1.9),
+        sampler.sample_length(1.6, 1.9),
     )
-    length = round(min(draws.size(0.14, 0.2), height - 0.12), 3)
+    length = round(min(sampler.sample_length(0.14, 0.2), height - 0.12), 3)
     _handle(
-        made,
+        builder,
         leaf,
         (width / 2 - edge, 0.03, height),
         0.03,
         "left",
         height / 2,
-        (length, draws.size(0.055, 0.065)),
+        (length, sampler.sample_length(0.055, 0.065)),
         False,
     )
-    return made
+    return builder
 
 
 def _leaf(
-    article: Article,
+    builder: ObjectBuilder,
     extent: tuple[float, float, float, float],
     thick: float,
     side: str,
     suffix: str,
     colour: str,
     upper: float,
-) -> Link:
+) -> LinkBuilder:
     """Add a leaf before a case's face, y and z from lowest to highest; its hinge is on the left or right of who looks at it.
 
     The leaf's frame is on the hinge line, half as high as the leaf.
@@ -240,16 +266,18 @@ def _leaf(
         (-_GAP - thick / 2, y0 if right else y1, (z0 + z1) / 2),
         (0, 0, 1 if right else -1),
     )
-    link = article.joint(f"hinge{suffix}", "revolute", origin, axis, upper, link=f"door{suffix}")
+    link = builder.add_joint(
+        f"hinge{suffix}", "revolute", origin, axis, upper, link=f"door{suffix}"
+    )
     ends = sorted((0.0, (y1 - y0) * (1 if right else -1)))
     half = (z1 - z0) / 2
-    link.box((-thick / 2, ends[0], -half), (thick / 2, ends[1], half), colour)
+    link.add_box((-thick / 2, ends[0], -half), (thick / 2, ends[1], half), colour)
     return link
 
 
 def _handle(
-    article: Article,
-    leaf: Link,
+    builder: ObjectBuilder,
+    leaf: LinkBuilder,
     extent: tuple[float, float, float],
     thick: float,
     side: str,
@@ -266,6 +294,6 @@ def _handle(
     at = (-thick / 2, (width - 0.05) * (1 if side == "right" else -1), z)
     own = f"handle_{name or side}" if named else "handle"
     if length:
-        upright_bar(article, leaf, at, length, out, own)
+        add_upright_bar(builder, leaf, at, length, out, own)
     else:
-        knob(article, leaf, at, out, own)
+        add_knob(builder, leaf, at, out, own)

@@ -15,10 +15,10 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import instance, whole
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import compute_world_box
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["cluttered"]
+__all__ = ["add_clutter"]
 
 _TRIES = 200  # places for one thing
 _GAP = 0.002  # [m] between a thing and what it does not stand on
@@ -49,7 +49,7 @@ class _Face:
     half: Floats
 
 
-def cluttered(
+def add_clutter(
     scene: Scene, things: int, *, seed: int = 0, clear: Sequence[tuple[Sequence[float], float]] = ()
 ) -> Scene:
     """Return a scene with small things on its tables, shelves and cupboards, and pictures on its walls, as homes have them.
@@ -81,7 +81,7 @@ class _Faces:
         objects = scene.objects.values()
         shapes = [
             *scene.obstacles,
-            *(shape for placed in objects for shape in standing_geometry(placed)),
+            *(shape for placed in objects for shape in make_world_shapes(placed)),
         ]
         self.boxes = [compute_world_box(shape.geometry, shape.placement) for shape in shapes]
         self.clear = [(np.array(place, float), float(radius)) for place, radius in clear]

@@ -19,11 +19,11 @@ from vkc_pin.world.files.resources import available
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.shapes import compute_world_box
-from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
-__all__ = ["OPENED", "RANDOM", "Counter", "Fixture", "fixture", "known_objects", "own_name"]
+__all__ = ["OPENABLE", "RANDOM", "Counter", "Fixture", "make_fixture", "list_openable_types", "make_fixture_name"]
 
-OPENED = {
+OPENABLE = {
     "door": 0.4,
     "narrow_door": 0.4,
     "wide_door": 0.4,
@@ -36,7 +36,7 @@ OPENED = {
 RANDOM = "random_"
 """What the names of objects begin with that are made at random: `random_oven`."""
 _IN_WALL = ("door", "narrow_door", "wide_door")
-_BESIDE = 0.7  # [m] as `OPENED`, for objects that only their file describes
+_BESIDE = 0.7  # [m] as `OPENABLE`, for objects that only their file describes
 _SLIT = 0.03  # [m] of air above a door's panel, where its frame has no lintel
 _ON = 0.001  # [m] of air below what stands on a counter
 
@@ -81,23 +81,23 @@ class Fixture:
     face: float = 0.0
 
 
-def known_objects() -> list[str]:
+def list_openable_types() -> list[str]:
     """Return the names of all objects that a room can be asked for."""
     return [
-        *OPENED,
+        *OPENABLE,
         *(RANDOM + kind for kind in KINDS),
-        *(name for name in available("scenes", "objects/*.yaml") if name not in OPENED),
+        *(name for name in available("scenes", "objects/*.yaml") if name not in OPENABLE),
     ]
 
 
-def own_name(kind: str | Mapping[str, Any]) -> str:
+def make_fixture_name(kind: str | Mapping[str, Any]) -> str:
     """Return what something that opens is called in a room: its type, the stem of its file, or the name in its URDF."""
     if isinstance(kind, Mapping):
         return load_object(kind).name.replace(".", "_")
     return Path(kind).stem.replace(".", "_") if _is_path(kind) else kind.removeprefix(RANDOM)
 
 
-def fixture(kind: str | Mapping[str, Any], seed: int = 0) -> Fixture:
+def make_fixture(kind: str | Mapping[str, Any], seed: int = 0) -> Fixture:
     """Return something that opens.
 
     Args:
@@ -110,7 +110,7 @@ def fixture(kind: str | Mapping[str, Any], seed: int = 0) -> Fixture:
     """
     if isinstance(kind, str) and kind.startswith(RANDOM):
         if kind.removeprefix(RANDOM) not in KINDS:
-            raise UnknownNameError("object that opens", kind, known_objects(), field="objects")
+            raise UnknownNameError("object that opens", kind, list_openable_types(), field="objects")
         return _random(kind.removeprefix(RANDOM), seed)
     if isinstance(kind, str) and not _is_path(kind):
         return _named(kind)
@@ -120,13 +120,13 @@ def fixture(kind: str | Mapping[str, Any], seed: int = 0) -> Fixture:
 
 @functools.cache
 def _named(kind: str) -> Fixture:
-    if kind not in known_objects():
-        raise UnknownNameError("object that opens", kind, known_objects(), field="objects")
+    if kind not in list_openable_types():
+        raise UnknownNameError("object that opens", kind, list_openable_types(), field="objects")
     own = load_object(kind)
-    if kind not in OPENED:
+    if kind not in OPENABLE:
         return _other(kind, own)
     low, high = _extent(own, in_wall=kind in _IN_WALL)
-    return Fixture(kind, low, high, kind in _IN_WALL, OPENED[kind])
+    return Fixture(kind, low, high, kind in _IN_WALL, OPENABLE[kind])
 
 
 def _other(kind: str | dict[str, Any], own: ArticulatedObject) -> Fixture:
@@ -181,7 +181,7 @@ def _extent(own: ArticulatedObject, *, in_wall: bool) -> tuple[Floats, Floats]:
     """Return lowest and highest corner, shape (3,) each [m]; see `Fixture`."""
     placed = PlacedObject("it", own, pin.SE3.Identity(), np.clip(0.0, own.lower, own.upper))
     boxes = np.array(
-        [compute_world_box(shape.geometry, shape.placement) for shape in standing_geometry(placed)]
+        [compute_world_box(shape.geometry, shape.placement) for shape in make_world_shapes(placed)]
     )
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     if in_wall:

@@ -47,7 +47,7 @@ class Rectangle:
             np.array([self.x, self.y]) + signs * (self.length / 2.0, self.width / 2.0) @ self.axes
         )
 
-    def gap(self, other: Rectangle) -> float:
+    def compute_gap(self, other: Rectangle) -> float:
         """Return how far two rectangles are apart along the axis that separates them most [m]; negative: they overlap."""
         gaps = []
         for axis in np.vstack([self.axes, other.axes]):
@@ -55,7 +55,7 @@ class Rectangle:
             gaps.append(max(one.min() - two.max(), two.min() - one.max()))
         return float(max(gaps))
 
-    def distance(self, points: ArrayLike) -> Floats:
+    def compute_distances(self, points: ArrayLike) -> Floats:
         """Return the distances [m] of points, shape (n, 2), to the rectangle, shape (n,); 0 inside."""
         local = np.abs((np.asarray(points, float) - (self.x, self.y)) @ self.axes.T)
         return np.linalg.norm(
@@ -71,14 +71,14 @@ class Frame:
     y: float
     yaw: float
 
-    def point(self, x: float, y: float) -> tuple[float, float]:
+    def transform_point(self, x: float, y: float) -> tuple[float, float]:
         """Return a point of this frame in the world frame [m], to the millimetre."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return round(self.x + c * x - s * y, 3), round(self.y + s * x + c * y, 3)
 
-    def rectangle(self, x: tuple[float, float], y: tuple[float, float]) -> Rectangle:
+    def make_rectangle(self, x: tuple[float, float], y: tuple[float, float]) -> Rectangle:
         """Return the rectangle between lowest and highest x and y of this frame [m]."""
-        centre = self.point((x[0] + x[1]) / 2.0, (y[0] + y[1]) / 2.0)
+        centre = self.transform_point((x[0] + x[1]) / 2.0, (y[0] + y[1]) / 2.0)
         return Rectangle(*centre, x[1] - x[0], y[1] - y[0], self.yaw)
 
 
@@ -94,11 +94,11 @@ class Floor:
     width: float
     depth: float
 
-    def half_length(self, side: int) -> float:
+    def compute_half_length(self, side: int) -> float:
         """Return half the length of the wall at a side [m]: 0 east, 1 north, 2 west, 3 south."""
         return (self.width if side % 2 else self.depth) / 2.0
 
-    def at_wall(self, side: int, along: float) -> Frame:
+    def make_wall_frame(self, side: int, along: float) -> Frame:
         """Return the frame on a wall's inner face, its x out of the room and its y along the wall.
 
         Args:
@@ -106,16 +106,16 @@ class Floor:
             along: How far from the wall's middle, towards the left of who looks at it [m].
         """
         c, s = _QUARTERS[side]
-        out = self.half_length(side + 1)
+        out = self.compute_half_length(side + 1)
         return Frame(round(c * out - s * along, 3), round(s * out + c * along, 3), math.atan2(s, c))
 
-    def holds(self, rectangle: Rectangle) -> bool:
+    def contains(self, rectangle: Rectangle) -> bool:
         """Return whether all of a rectangle lies between the walls."""
         return bool(
             (np.abs(rectangle.corners) <= np.array([self.width, self.depth]) / 2.0 + 1e-6).all()
         )
 
-    def free(
+    def find_free(
         self, standing: Sequence[Rectangle], radius: float, points: ArrayLike
     ) -> NDArray[np.bool_]:
         """Return at which points, shape (n, 2) [m], a disc of a radius [m] touches neither walls nor what stands there."""
@@ -124,10 +124,10 @@ class Floor:
             (np.array([self.width, self.depth]) / 2.0 - np.abs(points)).min(axis=1) >= radius
         )
         for rectangle in standing:
-            free &= rectangle.distance(points) >= radius
+            free &= rectangle.compute_distances(points) >= radius
         return free
 
-    def connected(
+    def is_connected(
         self, standing: Sequence[Rectangle], radius: float, places: Sequence[tuple[float, float]]
     ) -> bool:
         """Return whether a disc can get from each of some places to all others without touching anything.
@@ -143,7 +143,7 @@ class Floor:
             np.arange(-size / 2.0, size / 2.0 + _CELL, _CELL) for size in (self.width, self.depth)
         ]
         cells = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
-        free = self.free(standing, radius, cells.reshape(-1, 2)).reshape(cells.shape[:2])
+        free = self.find_free(standing, radius, cells.reshape(-1, 2)).reshape(cells.shape[:2])
         regions, _ = label(free)
         found = set()
         for place in places:

@@ -11,7 +11,16 @@ import numpy as np
 from vkc_pin.procedural.rooms.fixtures import Fixture
 from vkc_pin.procedural.rooms.footprints import Floor, Frame, Rectangle
 
-__all__ = ["CARRIED", "Part", "box", "carried", "opened", "shelf", "table", "walls"]
+__all__ = [
+    "CARRIED",
+    "Part",
+    "make_box",
+    "make_carried_object",
+    "make_openable",
+    "make_shelf",
+    "make_table",
+    "make_walls",
+]
 
 WALL = 0.1  # [m] thickness
 AIR = 0.02  # [m] between a wall and what stands against it
@@ -44,13 +53,13 @@ class Part:
     footprint: Rectangle
     obstacles: tuple[dict[str, Any], ...] = ()
     objects: tuple[dict[str, Any], ...] = ()
-    before: Rectangle | None = None
-    spot: tuple[float, float] | None = None
+    clear_floor: Rectangle | None = None
+    standing_place: tuple[float, float] | None = None
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
     side: int | None = None
 
 
-def box(name: str, frame: Frame, size: Sequence[float], colour: str) -> Part:
+def make_box(name: str, frame: Frame, size: Sequence[float], colour: str) -> Part:
     """Return a box on the floor, its middle at the frame's origin; edges along the frame's x, y, z [m]."""
     footprint = Rectangle(frame.x, frame.y, size[0], size[1], frame.yaw)
     return Part(
@@ -58,7 +67,7 @@ def box(name: str, frame: Frame, size: Sequence[float], colour: str) -> Part:
     )
 
 
-def table(name: str, frame: Frame, size: tuple[float, float, float]) -> Part:
+def make_table(name: str, frame: Frame, size: tuple[float, float, float]) -> Part:
     """Return a table with plate and four legs, its middle at the frame's origin; the floor before its side at −x stays free.
 
     Args:
@@ -76,13 +85,21 @@ def table(name: str, frame: Frame, size: tuple[float, float, float]) -> Part:
             _box(f"{name}_leg_{k}", frame, at, (0.0, height - PLATE), (LEG, LEG), "walnut")
         )
     half, side = depth / 2.0, max(width / 2.0, _LEAST)
-    before = frame.rectangle((-half - BEFORE_TABLE, -half), (-side, side))
-    spot = frame.point(-half - BEFORE_TABLE / 2.0, 0.0)
+    clear_floor = frame.make_rectangle((-half - BEFORE_TABLE, -half), (-side, side))
+    standing_place = frame.transform_point(-half - BEFORE_TABLE / 2.0, 0.0)
     footprint = Rectangle(frame.x, frame.y, depth, width, frame.yaw)
-    return Part(name, frame, footprint, tuple(items), before=before, spot=spot, size=size)
+    return Part(
+        name,
+        frame,
+        footprint,
+        tuple(items),
+        clear_floor=clear_floor,
+        standing_place=standing_place,
+        size=size,
+    )
 
 
-def shelf(name: str, frame: Frame, size: tuple[float, float, float], boards: int) -> Part:
+def make_shelf(name: str, frame: Frame, size: tuple[float, float, float], boards: int) -> Part:
     """Return an open shelf with two sides, a back and boards, its back against the wall on whose face the frame lies.
 
     Args:
@@ -114,11 +131,13 @@ def shelf(name: str, frame: Frame, size: tuple[float, float, float], boards: int
                 "oak",
             )
         )
-    footprint = frame.rectangle((-AIR - depth, -AIR), (-width / 2.0, width / 2.0))
+    footprint = frame.make_rectangle((-AIR - depth, -AIR), (-width / 2.0, width / 2.0))
     return Part(name, frame, footprint, tuple(items), size=size)
 
 
-def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front: float) -> Part:
+def make_openable(
+    name: str, own: Fixture, floor: Floor, side: int, along: float, front: float
+) -> Part:
     """Return an object that opens, in a wall, against it, or on a counter against it; the floor before it stays free.
 
     Args:
@@ -131,12 +150,12 @@ def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front
     """
     low, high, counter = own.low, own.high, own.counter
     middle = (low[1] + high[1]) / 2.0
-    wall = floor.at_wall(side, along - middle)
+    wall = floor.make_wall_frame(side, along - middle)
     edge = -AIR - counter.size[0] if counter else 0.0  # of the counter, along the wall's frame
     inwards = WALL / 2.0 if own.in_wall else edge + counter.setback if counter else -AIR - high[0]
-    frame = Frame(*wall.point(inwards, 0.0), wall.yaw)
+    frame = Frame(*wall.transform_point(inwards, 0.0), wall.yaw)
     sides, face = (low[1], high[1]), -WALL / 2.0 if own.in_wall else own.face
-    footprint, items, up = frame.rectangle((low[0], high[0]), sides), [], own.lift
+    footprint, items, up = frame.make_rectangle((low[0], high[0]), sides), [], own.lift
     if counter:
         depth, width, height = counter.size
         sides, face, up = (
@@ -144,21 +163,21 @@ def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front
             -counter.setback,
             height + own.lift,
         )
-        footprint = frame.rectangle((face, face + depth), sides)
+        footprint = frame.make_rectangle((face, face + depth), sides)
         centre = (face + depth / 2.0, middle)
         items = [
             _box(f"{name}_counter", frame, centre, (0.0, height - PLATE), (depth, width), "cream"),
             _box(f"{name}_worktop", frame, centre, (height - PLATE, height), (depth, width), "oak"),
         ]
     beside = (low[1] - own.beside, high[1] + own.beside)
-    before = frame.rectangle((face - front, face), beside)
+    clear_floor = frame.make_rectangle((face - front, face), beside)
     entry = {
         "name": name,
         "type": own.type,
         "position": [frame.x, frame.y, round(up, 4)],
         "yaw": frame.yaw,
     }
-    spot = frame.point(face - front / 2.0, middle)
+    standing_place = frame.transform_point(face - front / 2.0, middle)
     size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
     return Part(
         name,
@@ -166,14 +185,14 @@ def opened(name: str, own: Fixture, floor: Floor, side: int, along: float, front
         footprint,
         tuple(items),
         (entry,),
-        before,
-        spot,
+        clear_floor,
+        standing_place,
         size,
         side if own.in_wall else None,
     )
 
 
-def carried(name: str, kind: str, on: Part, x: float, y: float) -> Part:
+def make_carried_object(name: str, kind: str, on: Part, x: float, y: float) -> Part:
     """Return a free object on a table.
 
     Args:
@@ -183,7 +202,7 @@ def carried(name: str, kind: str, on: Part, x: float, y: float) -> Part:
         x: Where along the table's frame, away from its free side [m].
         y: Where across it [m].
     """
-    place = on.frame.point(x, y)
+    place = on.frame.transform_point(x, y)
     entry = {
         "name": name,
         "type": kind,
@@ -192,11 +211,11 @@ def carried(name: str, kind: str, on: Part, x: float, y: float) -> Part:
     return Part(name, Frame(*place, 0.0), on.footprint, (), (entry,))
 
 
-def walls(floor: Floor, height: float, parts: Sequence[Part]) -> list[dict[str, Any]]:
+def make_walls(floor: Floor, height: float, parts: Sequence[Part]) -> list[dict[str, Any]]:
     """Return the walls round a floor as entries of a scene's description, with openings for the doors among the parts."""
     items = []
     for side, name in enumerate(("east", "north", "west", "south")):
-        half, frame = floor.half_length(side), floor.at_wall(side, 0.0)
+        half, frame = floor.compute_half_length(side), floor.make_wall_frame(side, 0.0)
         end = (
             half + WALL if side % 2 else half
         )  # walls in the north and south reach round the corners
@@ -241,7 +260,7 @@ def _box(
 ) -> dict[str, Any]:
     """Return a box as an entry of a scene's description, its middle at a point of a frame, between two heights [m]."""
     edges = [round(float(edge), 3) for edge in (*size, z[1] - z[0])]
-    position = [*frame.point(*at), round((z[0] + z[1]) / 2.0, 4)]
+    position = [*frame.transform_point(*at), round((z[0] + z[1]) / 2.0, 4)]
     return {
         "name": name,
         "type": "box",

@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.procedural.rooms import parts
-from vkc_pin.procedural.rooms.fixtures import OPENED, Fixture, fixture, own_name
+from vkc_pin.procedural.rooms.fixtures import OPENABLE, Fixture, make_fixture, make_fixture_name
 from vkc_pin.procedural.rooms.footprints import Floor, Frame
 from vkc_pin.procedural.rooms.parts import Part
 from vkc_pin.procedural.rooms.settings import RoomSettings
@@ -24,7 +24,7 @@ from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
-__all__ = ["Layout", "random_layout", "random_room"]
+__all__ = ["Layout", "random_room", "sample_layout"]
 
 _TRIES = 60  # places for one thing
 _ROOMS = 60  # rooms that are begun anew since something finds no place
@@ -58,26 +58,26 @@ class Layout:
     start: tuple[float, float, float]
     radius: float
 
-    def part(self, name: str) -> Part:
+    def find_part(self, name: str) -> Part:
         """Return the part of a name. Raises `UnknownNameError` if there is none."""
         known = {part.name: part for part in self.parts}
         if name not in known:
             raise UnknownNameError("part", name, known)
         return known[name]
 
-    def scene(self) -> Scene:
+    def make_scene(self) -> Scene:
         """Return it as a scene, which is called `room_<number>`."""
-        reach = [self.floor.half_length(side + 1) for side in range(4)]
+        reach = [self.floor.compute_half_length(side + 1) for side in range(4)]
         for part in self.parts:
             if part.side is not None:
-                reach[part.side] = self.floor.half_length(part.side + 1) + _BEYOND
+                reach[part.side] = self.floor.compute_half_length(part.side + 1) + _BEYOND
         document = {
             "name": f"room_{self.number}",
             "robot": self.settings.robot,
             "start": {"base": list(self.start)},
             "arena": {"x": [-reach[2], reach[0]], "y": [-reach[3], reach[1]]},
             "obstacles": [
-                *parts.walls(self.floor, self.settings.height, self.parts),
+                *parts.make_walls(self.floor, self.settings.height, self.parts),
                 *(entry for part in self.parts for entry in part.obstacles),
             ],
             "objects": [entry for part in self.parts for entry in part.objects],
@@ -103,10 +103,10 @@ def random_room(number: int, settings: RoomSettings | None = None, **changes: An
             this size.
         UnknownNameError: There is no such field, or no such type of object.
     """
-    return random_layout(number, settings, **changes).scene()
+    return sample_layout(number, settings, **changes).make_scene()
 
 
-def random_layout(number: int, settings: RoomSettings | None = None, **changes: Any) -> Layout:
+def sample_layout(number: int, settings: RoomSettings | None = None, **changes: Any) -> Layout:
     """Return what a random room is made of; see `random_room`."""
     number = whole(number, "number", low=0)
     known = [item.name for item in dataclasses.fields(RoomSettings)]
@@ -136,13 +136,13 @@ def random_layout(number: int, settings: RoomSettings | None = None, **changes: 
 
 def _named(kinds: Sequence[str | Mapping[str, Any]], number: int) -> list[tuple[str, Fixture]]:
     """Return the things to open, each with its name in the room of a number."""
-    names = [own_name(kind) for kind in kinds]
+    names = [make_fixture_name(kind) for kind in kinds]
     names = [
         name if names.count(name) == 1 else f"{name}_{names[: k + 1].count(name)}"
         for k, name in enumerate(names)
     ]
     return [
-        (name, fixture(kind, 100 * number + k))
+        (name, make_fixture(kind, 100 * number + k))
         for k, (name, kind) in enumerate(zip(names, kinds, strict=True))
     ]
 
@@ -163,12 +163,12 @@ class _Room:
         """Return floor, parts and start, or None if something finds no place.
 
         Args:
-            named: What can be opened, by name; None: one or two of `OPENED`.
+            named: What can be opened, by name; None: one or two of `OPENABLE`.
         """
         if named is None:
             count = int(self.rng.integers(1, 3))
             named = _named(
-                [str(kind) for kind in self.rng.choice(list(OPENED), count, replace=False)], 0
+                [str(kind) for kind in self.rng.choice(list(OPENABLE), count, replace=False)], 0
             )
         fixed = [self._opened(name, own) for name, own in named]
         fixed += [self._table(f"table_{k + 1}") for k in range(self.settings.tables)]
@@ -202,35 +202,45 @@ class _Room:
     def _fits(self, part: Part) -> bool:
         """Return whether a part stands in the room, away from the others, and leaves free what has to be."""
         own, gap = part.footprint, self.settings.gap
-        if (part.side is None and not self.floor.holds(own)) or (
-            part.before and not self.floor.holds(part.before)
+        if (part.side is None and not self.floor.contains(own)) or (
+            part.clear_floor and not self.floor.contains(part.clear_floor)
         ):
             return False
         for other in self.parts:
-            pairs = [(own, other.footprint), (own, other.before), (part.before, other.footprint)]
+            pairs = [
+                (own, other.footprint),
+                (own, other.clear_floor),
+                (part.clear_floor, other.footprint),
+            ]
             if any(
-                one is not None and two is not None and one.gap(two) < gap for one, two in pairs
+                one is not None and two is not None and one.compute_gap(two) < gap
+                for one, two in pairs
             ):
                 return False
-        places = [one.spot for one in (*self.parts, part) if one.spot is not None]
+        places = [
+            one.standing_place for one in (*self.parts, part) if one.standing_place is not None
+        ]
         if self.start is not None:
             places.append(self.start[:2])
         standing = [one.footprint for one in (*self.parts, part)]
-        if self.start is not None and not self.floor.free([own], self.radius, [self.start[:2]])[0]:
+        if (
+            self.start is not None
+            and not self.floor.find_free([own], self.radius, [self.start[:2]])[0]
+        ):
             return False
-        return self.floor.connected(standing, self.radius, places)
+        return self.floor.is_connected(standing, self.radius, places)
 
     def _start(self) -> tuple[float, float, float] | None:
         """Return a place from which the robot gets wherever it has to stand; None if none was found."""
         standing = [part.footprint for part in self.parts]
-        places = [part.spot for part in self.parts if part.spot is not None]
+        places = [part.standing_place for part in self.parts if part.standing_place is not None]
         half = np.array([self.floor.width, self.floor.depth]) / 2.0
         for _ in range(_STARTS):
             x, y, yaw = (
                 round(float(value), 3)
                 for value in self.rng.uniform([*-half, -math.pi], [*half, math.pi])
             )
-            if self.floor.free(standing, self.radius, [[x, y]])[0] and self.floor.connected(
+            if self.floor.find_free(standing, self.radius, [[x, y]])[0] and self.floor.is_connected(
                 standing, self.radius, [*places, (x, y)]
             ):
                 return x, y, yaw
@@ -239,7 +249,7 @@ class _Room:
     def _wall(self, width: float) -> tuple[int, float]:
         """Return a side, and where along its wall the middle of something of a width [m] may be."""
         side = int(self.rng.integers(4))
-        reach = max(self.floor.half_length(side) - width / 2.0, 0.0)
+        reach = max(self.floor.compute_half_length(side) - width / 2.0, 0.0)
         return side, round(float(self.rng.uniform(-reach, reach)), 3)
 
     def _anywhere(self, yaw: float) -> Frame:
@@ -254,23 +264,23 @@ class _Room:
     def _opened(self, name: str, own: Fixture) -> Iterator[Part]:
         while True:
             side, along = self._wall(1.0)
-            yield parts.opened(name, own, self.floor, side, along, self.settings.front)
+            yield parts.make_openable(name, own, self.floor, side, along, self.settings.front)
 
     def _table(self, name: str) -> Iterator[Part]:
         while True:
             depth, width, height = self._size((0.6, 0.9), (0.8, 1.6), (0.70, 0.78))
             side, along = self._wall(width)
-            wall = self.floor.at_wall(side, along)
-            frame = Frame(*wall.point(-depth / 2.0 - parts.AIR, 0.0), wall.yaw)
+            wall = self.floor.make_wall_frame(side, along)
+            frame = Frame(*wall.transform_point(-depth / 2.0 - parts.AIR, 0.0), wall.yaw)
             frame = frame if self.rng.random() < 0.6 else self._anywhere(wall.yaw)
-            yield parts.table(name, frame, (depth, width, height))
+            yield parts.make_table(name, frame, (depth, width, height))
 
     def _shelf(self, name: str) -> Iterator[Part]:
         while True:
             depth, width, height = self._size((0.28, 0.4), (0.6, 1.2), (1.2, 2.0))
             boards = int(self.rng.integers(4, 6))
-            yield parts.shelf(
-                name, self.floor.at_wall(*self._wall(width)), (depth, width, height), boards
+            yield parts.make_shelf(
+                name, self.floor.make_wall_frame(*self._wall(width)), (depth, width, height), boards
             )
 
     def _box(self, name: str) -> Iterator[Part]:
@@ -280,7 +290,7 @@ class _Room:
                 self._size((0.25, 0.8), (0.25, 0.8), (0.3, 1.4)),
                 round(float(self.rng.uniform(-math.pi, math.pi)), 3),
             )
-            yield parts.box(name, self._anywhere(yaw), size, colour)
+            yield parts.make_box(name, self._anywhere(yaw), size, colour)
 
     def _carried(self, kind: str, number: int, on: Part) -> Part:
         """Return a free object on a table, near the side at which the robot can stand."""
@@ -291,7 +301,7 @@ class _Room:
         x = -depth / 2.0 + float(self.rng.uniform(_EDGE, 0.3))
         kinds = self.settings.carried
         name = kind if kinds.count(kind) == 1 else f"{kind}_{kinds[: number + 1].count(kind)}"
-        return parts.carried(name, kind, on, x, y)
+        return parts.make_carried_object(name, kind, on, x, y)
 
 
 def _turning_radius(robot: Robot) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vkc_pin.errors import InputError, shown
-from vkc_pin.procedural.rooms.fixtures import known_objects
+from vkc_pin.procedural.rooms.fixtures import list_openable_types
 from vkc_pin.procedural.rooms.parts import CARRIED
 from vkc_pin.utils.arguments import is_number, items, known, mapping, text, whole
 from vkc_pin.world.files.resources import file_path
@@ -102,7 +102,7 @@ def _opened(kind: Any) -> str | dict[str, Any]:
     return (
         str(file_path(kind, "objects"))
         if path
-        else known(kind, known_objects(), "object that opens", "objects")
+        else known(kind, list_openable_types(), "object that opens", "objects")
     )
 
 

@@ -14,7 +14,7 @@ from vkc_pin.simulation.model import PhysicalWorld
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.welds import Grip
 from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.world.scene.contact_rules import grasped, touching
+from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -99,7 +99,7 @@ class Squeezes:
         labels[physical.geoms] = world.collision_labels
         self._squeezes = []
         for hold, begin, end in spans:
-            hands, link = frozenset(touching(scene, hold)), grasped(scene, hold)
+            hands, link = frozenset(find_touch_links(scene, hold)), find_grasped_link(scene, hold)
             pairs = frozenset((min(hand, link), max(hand, link)) for hand in hands)
             own, grip = (
                 np.isin(labels, list(hands)),

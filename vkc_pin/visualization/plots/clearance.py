@@ -12,8 +12,8 @@ from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.distances import Solids
 from vkc_pin.validation.pairs import PairTable
-from vkc_pin.world.scene.clearance_exemptions import allowances
-from vkc_pin.world.scene.contact_rules import grasped, touching
+from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
+from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
@@ -61,13 +61,17 @@ def clearance_curves(
     table = PairTable(scene, solids, trajectory, 0.0)
     silent = {
         pair
-        for one in allowances(scene, Options().dist_safe)
-        for pair in one.shape_pairs(world.collision_labels, world.collision_keys)
+        for one in find_clearance_exemptions(scene, Options().dist_safe)
+        for pair in one.find_shape_pairs(world.collision_labels, world.collision_keys)
         if one.margin == -np.inf
     }
     moments = np.atleast_1d(np.asarray(times, float))
     holds = {hold for phase in trajectory.phases for hold in phase.holds} | set(scene.holds)
-    gripped = {(link, grasped(scene, hold)) for hold in holds for link in touching(scene, hold)}
+    gripped = {
+        (link, find_grasped_link(scene, hold))
+        for hold in holds
+        for link in find_touch_links(scene, hold)
+    }
     kinds = np.array([_kind(table, pair, gripped) for pair in table.pairs])
     asked = np.array([(min(pair), max(pair)) not in silent for pair in table.pairs.tolist()], bool)
     groups = {

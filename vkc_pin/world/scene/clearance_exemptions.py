@@ -25,24 +25,24 @@ from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_bo
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import (
     PlacedObject,
-    link_shapes,
-    moved_shapes,
-    standing_geometry,
+    find_link_shapes,
+    make_world_shapes,
+    sweep_link_shapes,
 )
 
 __all__ = [
-    "CONTACT",
-    "Allowance",
-    "Close",
-    "Standing",
-    "Surroundings",
-    "allowances",
-    "close_pairs",
-    "shape_keys",
+    "CONTACT_DEPTH",
+    "ClearanceExemption",
+    "ClosePair",
+    "PlacedShapes",
+    "SceneLike",
+    "find_clearance_exemptions",
+    "find_close_pairs",
+    "make_shape_keys",
     "warn_of_overlaps",
 ]
 
-CONTACT = 1e-4
+CONTACT_DEPTH = 1e-4
 """Overlap that is contact: what stands on a table overlaps it by rounding [m]."""
 _NEARLY = 1e-3  # [m] short of the margin that counts as having it: motions end as close
 _STEPS = 64  # in which the way of a joint to its limit is looked at, and each of them once more
@@ -54,7 +54,7 @@ _TOLD = 6  # pairs that a warning names
 _MOST = 4096  # things that a scene remembers
 
 
-class Surroundings(Protocol):
+class SceneLike(Protocol):
     """What of a scene is asked for here; see `Scene`."""
 
     @property
@@ -82,7 +82,7 @@ class Surroundings(Protocol):
         """What is known of it already."""
 
 
-class Close(NamedTuple):
+class ClosePair(NamedTuple):
     """Two links that stand close to each other.
 
     Attributes:
@@ -104,7 +104,7 @@ class Close(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Allowance:
+class ClearanceExemption:
     """Two links, or one shape of each, that are exempt from the clearance margin.
 
     Attributes:
@@ -115,7 +115,7 @@ class Allowance:
             scene's description allows.
         ranges: Coordinate "<object>.<joint>" → (lower, upper) between which the exemption holds,
             [rad] or [m]; none: always.
-        shapes: The exempt shape of each link, see `shape_keys`; None: all shapes of both links.
+        shapes: The exempt shape of each link, see `make_shape_keys`; None: all shapes of both links.
     """
 
     first: str
@@ -125,16 +125,16 @@ class Allowance:
     ranges: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     shapes: tuple[str, str] | None = None
 
-    def between(self, one: str, other: str) -> bool:
+    def is_between(self, one: str, other: str) -> bool:
         """Return whether it is about two links, by their labels."""
         return {one, other} == {self.first, self.second}
 
-    def shape_pairs(self, labels: Sequence[str], keys: Sequence[str]) -> list[tuple[int, int]]:
+    def find_shape_pairs(self, labels: Sequence[str], keys: Sequence[str]) -> list[tuple[int, int]]:
         """Return the pairs (i, j), i < j, of shapes that it exempts.
 
         Args:
             labels: The label of each shape.
-            keys: The key of each shape, see `shape_keys`.
+            keys: The key of each shape, see `make_shape_keys`.
         """
         wanted = (None, None) if self.shapes is None else self.shapes
         ones, others = (
@@ -143,7 +143,7 @@ class Allowance:
         )
         return [(min(i, j), max(i, j)) for i in ones for j in others]
 
-    def holds(self, names: Sequence[str], states: Floats) -> Bools:
+    def is_active(self, names: Sequence[str], states: Floats) -> Bools:
         """Return whether it holds at states, shape (S, n), of coordinates that are called like this: shape (S,)."""
         inside = np.ones(len(states), bool)
         for name, (lower, upper) in self.ranges.items():
@@ -155,7 +155,7 @@ class Allowance:
         return " – ".join(self.shapes or (self.first, self.second))
 
 
-def shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
+def make_shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
     """Return a key of each shape that is the same in every model of a scene.
 
     It is the shape's own name, with its object before it: "door.leaf_0", "wall_2".
@@ -172,12 +172,12 @@ def shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
     return keys
 
 
-def allowances(scene: Surroundings, dist_safe: float) -> tuple[Allowance, ...]:
+def find_clearance_exemptions(scene: SceneLike, dist_safe: float) -> tuple[ClearanceExemption, ...]:
     """Return all pairs that may be closer than `dist_safe` [m]: links that the scene allows, and neighbouring shapes."""
 
-    def found() -> tuple[Allowance, ...]:
+    def found() -> tuple[ClearanceExemption, ...]:
         listed = [
-            Allowance(min(pair), max(pair), margin, margin)
+            ClearanceExemption(min(pair), max(pair), margin, margin)
             for pair, margin in scene.allowed.items()
             if len(pair) == 2
         ]
@@ -185,32 +185,38 @@ def allowances(scene: Surroundings, dist_safe: float) -> tuple[Allowance, ...]:
 
     return _kept(
         scene,
-        ("allowances", dist_safe, *(_key(placed) for placed in scene.objects.values())),
+        (
+            "clearance_exemptions",
+            dist_safe,
+            *(_key(placed) for placed in scene.objects.values()),
+        ),
         found,
     )
 
 
-def close_pairs(scene: Surroundings, reach: float) -> list[Close]:
+def find_close_pairs(scene: SceneLike, reach: float) -> list[ClosePair]:
     """Return what can move and stands closer than `reach` [m] to something, but for what the hand holds.
 
     Links of one object, what a scene allows, and the floor below what is not free do not count; nor
     does what a free object stands on, unless it stands in it.
     """
-    standing, found = Standing(scene, scene.objects), []
-    for (first, second), distance in standing.nearest(reach).items():
+    standing, found = PlacedShapes(scene, scene.objects), []
+    for (first, second), distance in standing.find_near_links(reach).items():
         free = any(
             scene.objects[label.partition(".")[0]].object.free
             for label in (first, second)
             if "." in label
         )
-        if frozenset((first, second)) not in scene.allowed and (not free or distance < -CONTACT):
-            found.append(Close(first, second, distance))
+        if frozenset((first, second)) not in scene.allowed and (
+            not free or distance < -CONTACT_DEPTH
+        ):
+            found.append(ClosePair(first, second, distance))
     return sorted(found, key=lambda pair: pair.distance)
 
 
-def warn_of_overlaps(scene: Surroundings, name: str) -> None:
+def warn_of_overlaps(scene: SceneLike, name: str) -> None:
     """Warn of what stands inside something else and can move, if there is any, in a scene that is called so."""
-    found = [pair for pair in close_pairs(scene, 0.0) if pair.distance < -CONTACT]
+    found = [pair for pair in find_close_pairs(scene, 0.0) if pair.distance < -CONTACT_DEPTH]
     if found:
         told = "; ".join(map(str, found[:_TOLD])) + (
             f"; and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
@@ -219,7 +225,7 @@ def warn_of_overlaps(scene: Surroundings, name: str) -> None:
         warnings.warn(f"{name}: things that can move stand in others: {told}. {hint}", stacklevel=4)
 
 
-def _neighbours(scene: Surroundings, dist_safe: float) -> Iterator[Allowance]:
+def _neighbours(scene: SceneLike, dist_safe: float) -> Iterator[ClearanceExemption]:
     """Yield shapes of fixed objects that are closer than `dist_safe` to another, there or with all joints at zero."""
     jointed = {name: placed for name, placed in scene.objects.items() if not placed.object.free}
     neutral = {
@@ -235,23 +241,23 @@ def _neighbours(scene: Surroundings, dist_safe: float) -> Iterator[Allowance]:
     ]
     known = set[tuple[tuple[str, str], float, tuple[tuple[str, tuple[float, float]], ...]]]()
     for objects in states:
-        standing = Standing(scene, objects)
-        for (i, j), distance in standing.near(dist_safe - _NEARLY).items():
-            ranges, least = standing.ranges(i, j, dist_safe)
+        standing = PlacedShapes(scene, objects)
+        for (i, j), distance in standing.find_near_shapes(dist_safe - _NEARLY).items():
+            ranges, least = standing.find_exempt_ranges(i, j, dist_safe)
             # The distance is a function of one joint; with several, each alone shows how deep they
             # may be.
             deep = -np.inf if len(ranges) == 1 else min(least, distance)
-            margin = 0.0 if distance > -CONTACT else deep
+            margin = 0.0 if distance > -CONTACT_DEPTH else deep
             shapes = (standing.keys[i], standing.keys[j])
             key = (shapes, margin, tuple(ranges.items()))
             if key not in known:
                 known.add(key)
-                yield Allowance(
+                yield ClearanceExemption(
                     standing.labels[i], standing.labels[j], margin, distance, ranges, shapes
                 )
 
 
-class Standing:
+class PlacedShapes:
     """The shapes of objects and obstacles in the world, S of them.
 
     Args:
@@ -260,31 +266,31 @@ class Standing:
 
     Attributes:
         labels: Of each shape, its link or obstacle.
-        keys: Of each shape, see `shape_keys`.
+        keys: Of each shape, see `make_shape_keys`.
     """
 
-    def __init__(self, scene: Surroundings, objects: Mapping[str, PlacedObject]) -> None:
+    def __init__(self, scene: SceneLike, objects: Mapping[str, PlacedObject]) -> None:
         self.scene, self.objects = (
             scene,
             {n: p for n, p in objects.items() if not (p.object.free and n in scene.held)},
         )
         self._shapes, self.labels = list[pin.GeometryObject](), list[str]()
         for name, placed in self.objects.items():
-            shapes = standing_geometry(placed)
+            shapes = make_world_shapes(placed)
             self._shapes += shapes
             self.labels += [f"{name}.{get_link_name(shape.name)}" for shape in shapes]
         free = {name for name, placed in self.objects.items() if placed.object.free}
         self._moving = {
             label
             for label in set(self.labels)
-            if label.partition(".")[0] in free or self.joints(label)
+            if label.partition(".")[0] in free or self.find_joints(label)
         }
         if self._moving:
             self._shapes += scene.obstacles
             self.labels += scene.obstacle_labels
-        self.keys = shape_keys(self.labels, [shape.name for shape in self._shapes])
+        self.keys = make_shape_keys(self.labels, [shape.name for shape in self._shapes])
 
-    def near(self, reach: float) -> dict[tuple[int, int], float]:
+    def find_near_shapes(self, reach: float) -> dict[tuple[int, int], float]:
         """Return pairs of shapes, the first of which can move, that are closer than so much: their distance [m]."""
         if not self._moving:
             return {}
@@ -311,16 +317,18 @@ class Standing:
                     found[i, j] = distance
         return found
 
-    def nearest(self, reach: float) -> dict[tuple[str, str], float]:
+    def find_near_links(self, reach: float) -> dict[tuple[str, str], float]:
         """Return pairs of links, by their labels, that are closer than so much: the distance of their closest shapes [m]."""
         found: dict[tuple[str, str], float] = {}
-        for (i, j), distance in self.near(reach).items():
+        for (i, j), distance in self.find_near_shapes(reach).items():
             pair = (self.labels[i], self.labels[j])
             pair = pair[::-1] if pair[::-1] in found else pair
             found[pair] = min(distance, found.get(pair, np.inf))
         return found
 
-    def ranges(self, i: int, j: int, reach: float) -> tuple[dict[str, tuple[float, float]], float]:
+    def find_exempt_ranges(
+        self, i: int, j: int, reach: float
+    ) -> tuple[dict[str, tuple[float, float]], float]:
         """Return coordinate → (lower, upper): how far each joint alone can go until two shapes are `reach` [m] apart.
 
         A limit of the joint before that is infinite here. The second result is the least distance
@@ -329,7 +337,7 @@ class Standing:
         found, least = dict[str, tuple[float, float]](), np.inf
         for own, other in ((i, j), (j, i)):
             owner = self.labels[own].partition(".")[0]
-            for joint in self.joints(self.labels[own]):
+            for joint in self.find_joints(self.labels[own]):
                 names = (owner, self.labels[other].partition(".")[0])
                 where = [self.objects[name] for name in names if name in self.objects]
                 key = (
@@ -354,7 +362,7 @@ class Standing:
         at, ends, least = float(placed.state[index]), list[float](), np.inf
 
         def distance(values: Floats) -> Floats:
-            found: Floats = self.distances(self.labels[own], index, values, [other], reach)[
+            found: Floats = self.compute_distances(self.labels[own], index, values, [other], reach)[
                 :, self._number(own), 0
             ]
             return found
@@ -388,11 +396,11 @@ class Standing:
         """Return which of the shapes of its link a shape is."""
         return self.labels[:shape].count(self.labels[shape])
 
-    def of(self, labels: Collection[str]) -> list[int]:
+    def find_shapes(self, labels: Collection[str]) -> list[int]:
         """Return the shapes of links or obstacles, by their labels."""
         return [k for k, label in enumerate(self.labels) if label in labels]
 
-    def distances(
+    def compute_distances(
         self, label: str, index: int, values: Floats, others: Sequence[int], reach: float
     ) -> Floats:
         """Return the distances of a link's shapes from others while one of its coordinates takes values [m].
@@ -407,7 +415,7 @@ class Standing:
         Returns:
             Shape (V, K, O).
         """
-        own = link_shapes(self.objects[label.partition(".")[0]], label.partition(".")[2])
+        own = find_link_shapes(self.objects[label.partition(".")[0]], label.partition(".")[2])
         standing = [self._shapes[k] for k in others]
         shapes = Shapes(
             [shape.geometry for shape in (*own, *standing)], [shape.placement for shape in standing]
@@ -418,7 +426,7 @@ class Standing:
         found[row, k, j] = shapes.distances(where, row, np.column_stack([k, len(own) + j]))
         return found
 
-    def reached(self, label: str, index: int, values: Floats) -> set[str]:
+    def find_links_near_sweep(self, label: str, index: int, values: Floats) -> set[str]:
         """Return the labels of what the boxes of a link meet while one of its object's coordinates takes values, shape (V,)."""
         _, near = self._moved(label, index, values, self._shapes, 0.0)
         return {self.labels[j] for j in np.flatnonzero(near.any(axis=(0, 1)))}
@@ -433,7 +441,7 @@ class Standing:
     ) -> tuple[Floats, Bools]:
         """Return where a link's shapes are at values of a coordinate, (V, K, 12), and which are near `others`, (V, K, others)."""
         owner, _, link = label.partition(".")
-        where, lower, upper = moved_shapes(self.objects[owner], link, index, values)
+        where, lower, upper = sweep_link_shapes(self.objects[owner], link, index, values)
         lows, highs = (
             np.array(side)
             for side in zip(
@@ -443,7 +451,7 @@ class Standing:
         near = (lows < upper[:, :, None] + reach) & (highs > lower[:, :, None] - reach)
         return where, np.asarray(near.all(axis=3))
 
-    def joints(self, label: str) -> list[str]:
+    def find_joints(self, label: str) -> list[str]:
         """Return the joints that move a link of an object that stands fixed; none for any other."""
         owner, _, link = label.partition(".")
         if owner not in self.objects or self.objects[owner].object.free:
@@ -453,7 +461,7 @@ class Standing:
         return [str(thing.model.names[joint]) for joint in support if joint]
 
 
-def _kept(scene: Surroundings, key: Hashable, make: Callable[[], T]) -> T:
+def _kept(scene: SceneLike, key: Hashable, make: Callable[[], T]) -> T:
     """Return what a scene remembers under a key, made if it does not."""
     found: T | None = scene.memory.get(key)
     if found is None:

@@ -1,14 +1,14 @@
 """What may be close to what, and for how long: the rules that the program and its independent check keep, each in its own way.
 
 - A hand keeps the attachment's clearance from the whole object that it takes hold of, for
-  `EASED_TIME` before it is held, as long as it is held, and for `EASED_TIME` after. Without a
+  `CONTACT_WINDOW` before it is held, as long as it is held, and for `CONTACT_WINDOW` after. Without a
   clearance of its own that is `Options.grasp_clearance`. What is held through another link, and
   that link, need none.
 - The hand and the link that it holds move as one, unless the grasp leaves a freedom.
 - A hand that pushes touches the link with its foremost point. It needs no clearance from that link,
   overlaps it nowhere, and moves it ahead of it only.
 - What is lifted, put down, or begins or ends a ride, and what is next to it there, may be as near
-  as they are there for `EASED_TIME`. So may a link that touches something, and what is at that
+  as they are there for `CONTACT_WINDOW`. So may a link that touches something, and what is at that
   place.
 - What rides and what it stands on move as one.
 - Shapes of articulated objects that are closer than `Options.dist_safe` to other fixed shapes, at
@@ -16,9 +16,9 @@
   apart. They overlap only if they did there, and no deeper than one joint alone takes them; see
   `neighbours`.
 - What a free object stands in where it is lifted for the first time, it may leave within
-  `EASED_TIME`.
+  `CONTACT_WINDOW`.
 - What is in the hand at the start is lifted there: what it is next to, or in, it may leave within
-  `EASED_TIME`.
+  `CONTACT_WINDOW`.
 - What the scene allows keeps the margin that the scene says, or none; see `Scene.allowed`.
 
 The gripper is as far open as the attachment says that it holds, or comes to next; it opens and
@@ -34,38 +34,38 @@ import pinocchio as pin
 from vkc_pin.options import Options
 from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.scene.clearance_exemptions import CONTACT
+from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = [
-    "CONTACT",
-    "EASED_TIME",
-    "grasped",
-    "hand_clearance",
-    "hand_frame",
-    "in_gripper",
-    "moves_as_one",
-    "opening_at_start",
-    "opening_for",
-    "touching",
+    "CONTACT_DEPTH",
+    "CONTACT_WINDOW",
+    "compute_grasp_opening",
+    "compute_hand_clearance",
+    "compute_hand_frame",
+    "compute_start_opening",
+    "find_grasped_link",
+    "find_gripper_hold",
+    "find_touch_links",
+    "is_rigid_grasp",
 ]
 
-EASED_TIME = 1.0
+CONTACT_WINDOW = 1.0
 """For how long before and after a contact shapes may be close; at `Options.dt` a waypoint [s]."""
 
 
-def grasped(scene: Scene, hold: Hold) -> str:
+def find_grasped_link(scene: Scene, hold: Hold) -> str:
     """Return the label of the link that a hold takes hold of, "<object>.<link>"."""
     return f"{hold.object}.{scene.objects[hold.object].object.attachments[hold.attachment].link}"
 
 
-def touching(scene: Scene, hold: Hold) -> Collection[str]:
+def find_touch_links(scene: Scene, hold: Hold) -> Collection[str]:
     """Return the labels of the links that take hold: the robot's touch links, or the link that something is held through."""
     return scene.robot.touch_links if hold.frame is None else (hold.frame,)
 
 
-def hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> float:
+def compute_hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> float:
     """Return what the links that take hold keep from a link of what they take hold of, near the grasp and while it lasts [m].
 
     Args:
@@ -75,7 +75,7 @@ def hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> flo
         options: Clearances where the attachment has none of its own.
     """
     attachment = scene.objects[hold.object].object.attachments[hold.attachment]
-    if (hold.by or attachment.contact == "push") and link == grasped(scene, hold):
+    if (hold.by or attachment.contact == "push") and link == find_grasped_link(scene, hold):
         return 0.0
     return min(
         options.grasp_clearance if attachment.clearance is None else attachment.clearance,
@@ -83,7 +83,7 @@ def hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> flo
     )
 
 
-def hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
+def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
     """Return what of the hand is brought to an attachment, in the tool frame: that itself, or the foremost point that pushes."""
     return (
         robot.opened(robot.opening(attachment.opening)).front
@@ -92,25 +92,27 @@ def hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
     )
 
 
-def moves_as_one(scene: Scene, hold: Hold) -> bool:
+def is_rigid_grasp(scene: Scene, hold: Hold) -> bool:
     """Return whether what holds does not move relative to what is grasped while it is held."""
     attachment = scene.objects[hold.object].object.attachments[hold.attachment]
     return attachment.contact != "push" and (attachment.firm or not attachment.freedoms)
 
 
-def in_gripper(holds: Iterable[Hold]) -> Hold | None:
+def find_gripper_hold(holds: Iterable[Hold]) -> Hold | None:
     """Return what the gripper itself holds; what is held through that does not matter to it."""
     return next((hold for hold in holds if hold.by is None), None)
 
 
-def opening_for(scene: Scene, hold: Hold) -> float | None:
+def compute_grasp_opening(scene: Scene, hold: Hold) -> float | None:
     """Return how far the robot's gripper is open when it takes, or has, what it holds [m]; None: as at rest."""
     return scene.robot.opening(
         scene.objects[hold.object].object.attachments[hold.attachment].opening
     )
 
 
-def opening_at_start(scene: Scene) -> float | None:
+def compute_start_opening(scene: Scene) -> float | None:
     """Return how far the gripper is open at a scene's start [m]; None: as at rest."""
-    hold = in_gripper(scene.holds)
-    return scene.robot.opening(scene.opening) if hold is None else opening_for(scene, hold)
+    hold = find_gripper_hold(scene.holds)
+    return (
+        scene.robot.opening(scene.opening) if hold is None else compute_grasp_opening(scene, hold)
+    )

@@ -17,16 +17,16 @@ from vkc_pin.errors import InputError, UnknownNameError, shown
 from vkc_pin.utils.arguments import instance, items, mapping, numbers, text
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
-from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
 __all__ = [
     "Hold",
     "Solids",
-    "checked_holds",
-    "holds_of",
-    "in_hand",
-    "in_order",
-    "misdirected",
+    "resolve_holds",
+    "make_holds",
+    "place_held_objects",
+    "check_hold_order",
+    "find_reversed_approaches",
     "warn_of_openings",
 ]
 
@@ -36,7 +36,7 @@ Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
 _DEEP = 0.01  # [m] of a hand in an object, or in the floor, that is no matter of how far it is open
 _ROUNDING = 2e-4  # [m] of an opening, which is measured less exactly than it is written
 _WAY = (0.0, 0.04, 0.08)  # [m] before the grasp where a hand is looked at
-MOST_HELD = 50
+MAX_HELD = 50
 """So many things may be held at once: they are followed one through the other."""
 
 
@@ -82,7 +82,7 @@ class Hold:
         return f"{self.object}.{self.attachment}" + (f" by {self.frame}" if self.by else "")
 
 
-def holds_of(
+def make_holds(
     held: Mapping[str, str],
     by: Mapping[str, str] | None = None,
     at: Mapping[str, Sequence[float]] | None = None,
@@ -101,9 +101,9 @@ def holds_of(
     """
     held = mapping(held, "held", "object names, each with that of an attachment")
     by, at = mapping({} if by is None else by, "by"), mapping({} if at is None else at, "at")
-    if len(held) > MOST_HELD:
+    if len(held) > MAX_HELD:
         raise InputError(
-            "too many things are held", field="held", expected=f"at most {MOST_HELD}", got=len(held)
+            "too many things are held", field="held", expected=f"at most {MAX_HELD}", got=len(held)
         )
     for field_name, names in (("by", by), ("at", at)):
         for name in names:
@@ -141,7 +141,7 @@ def holds_of(
     return tuple(found.values())
 
 
-def in_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
+def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
     """Return holds as they are, if each comes after the one it depends on. Raises `InputError` if one does not."""
     holds = items(holds, "holds", "a list of Hold", Hold)
     for number, hold in enumerate(holds):
@@ -152,7 +152,7 @@ def in_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
     return holds
 
 
-def checked_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) -> tuple[Hold, ...]:
+def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) -> tuple[Hold, ...]:
     """Return holds that fit the objects, with the values of all freedoms: zero where nothing is said; see `Scene.with_held`.
 
     Raises:
@@ -161,7 +161,7 @@ def checked_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
             cannot hold it.
     """
     found: dict[Hold, Hold] = {}
-    for hold in in_order(holds):
+    for hold in check_hold_order(holds):
         if hold.object not in objects:
             raise UnknownNameError("object", hold.object, objects, field="held")
         where, freedoms = (
@@ -191,7 +191,7 @@ def checked_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
     return tuple(found.values())
 
 
-def in_hand(
+def place_held_objects(
     objects: Mapping[str, PlacedObject], tool: Callable[[], pin.SE3], holds: Iterable[Hold]
 ) -> Mapping[str, PlacedObject]:
     """Return the objects with every free one that is held placed where it is held.
@@ -212,7 +212,7 @@ def in_hand(
     return MappingProxyType(placed)
 
 
-def misdirected(
+def find_reversed_approaches(
     objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids
 ) -> list[Hold]:
     """Return those of some holds whose hand comes out of the object or from below the floor, and would not from the other side.
@@ -235,9 +235,9 @@ def misdirected(
             back = holder.link_placement(hold.link).inverse()
             hand = [
                 (shape, back * where)
-                for shape, where in list_placed_shapes(standing_geometry(holder))
+                for shape, where in list_placed_shapes(make_world_shapes(holder))
             ]
-        solids = [*list_placed_shapes(standing_geometry(placed)), *floor]
+        solids = [*list_placed_shapes(make_world_shapes(placed)), *floor]
         if hold.attachment in placed.reversed or _free(placed, hold.attachment, hand, solids):
             continue
         if _free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):

@@ -14,7 +14,7 @@ from vkc_pin.world.models.shapes import copy_shape
 if TYPE_CHECKING:
     from vkc_pin.world.scene import scene_schema as schema
 
-__all__ = ["FLOOR", "floor_shape", "obstacle_shapes"]
+__all__ = ["FLOOR", "make_floor_shape", "make_obstacle_shapes"]
 
 FLOOR = "floor"
 """Name of the floor among a scene's obstacles."""
@@ -24,7 +24,7 @@ _FLOOR_BORDER = (
 )
 
 
-def obstacle_shapes(
+def make_obstacle_shapes(
     item: schema.ObstacleSchema, pose: pin.SE3, folder: Path
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
     """Return what to draw of an obstacle and what collides, in the world frame.
@@ -62,7 +62,7 @@ def obstacle_shapes(
     return [drawn], [_shape(item.name, pose, solid, item.colour)]
 
 
-def floor_shape(arena: tuple[float, float, float, float]) -> pin.GeometryObject:
+def make_floor_shape(arena: tuple[float, float, float, float]) -> pin.GeometryObject:
     """Return the floor of an arena, (x_min, x_max, y_min, y_max) [m]: a box, as a half space has no size to draw or to bound."""
     x_min, x_max, y_min, y_max = arena
     size = (x_max - x_min + 2 * _FLOOR_BORDER, y_max - y_min + 2 * _FLOOR_BORDER, _FLOOR_THICKNESS)

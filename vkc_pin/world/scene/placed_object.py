@@ -22,7 +22,7 @@ from vkc_pin.world.models.shapes import (
     get_link_name,
 )
 
-__all__ = ["PlacedObject", "link_shapes", "moved_shapes", "standing_geometry"]
+__all__ = ["PlacedObject", "find_link_shapes", "make_world_shapes", "sweep_link_shapes"]
 
 _OTHER_SIDE = pin.SE3(
     np.diag([1.0, -1.0, -1.0]), np.zeros(3)
@@ -98,7 +98,7 @@ class PlacedObject:
         return self.placement * self.object.link_placement(link, self.state)
 
 
-def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin.GeometryObject]:
+def make_world_shapes(placed: PlacedObject, *, visual: bool = False) -> list[pin.GeometryObject]:
     """Return copies of an object's shapes where they stand: parent joint 0, placements in the world frame.
 
     Args:
@@ -122,7 +122,7 @@ def standing_geometry(placed: PlacedObject, *, visual: bool = False) -> list[pin
     ]
 
 
-def link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
+def find_link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
     """Return the convex shapes of a link of an object, in the frames of their joints."""
     return [
         shape
@@ -131,7 +131,7 @@ def link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
     ]
 
 
-def moved_shapes(
+def sweep_link_shapes(
     placed: PlacedObject, link: str, index: int, values: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Return where a link's shapes are in the world while one coordinate of the object takes values, shape (V,).
@@ -149,7 +149,7 @@ def moved_shapes(
     model, data, own, state = (
         placed.object.model,
         placed.object.model.createData(),
-        link_shapes(placed, link),
+        find_link_shapes(placed, link),
         placed.state.copy(),
     )
     boxes = [compute_bounding_box(shape) for shape in own]

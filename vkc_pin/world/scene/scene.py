@@ -24,14 +24,14 @@ from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
 from vkc_pin.world.scene.hold import (
     Hold,
-    checked_holds,
-    holds_of,
-    in_hand,
-    misdirected,
+    resolve_holds,
+    make_holds,
+    place_held_objects,
+    find_reversed_approaches,
     warn_of_openings,
 )
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.poses import as_placement
 
 if TYPE_CHECKING:
@@ -113,9 +113,9 @@ class Scene:
     @property
     def document(self) -> dict[str, Any]:
         """The scene as plain data, from which `from_document` builds it again; made when asked for."""
-        from vkc_pin.world.scene.scene_file import document_of
+        from vkc_pin.world.scene.scene_file import make_document
 
-        return document_of(vars(self))
+        return make_document(vars(self))
 
     @staticmethod
     def from_document(document: Mapping[str, Any], folder: str | Path = ".") -> Scene:
@@ -129,9 +129,9 @@ class Scene:
             InputError: It does not fit; `UnknownNameError` where a name does not exist.
         """
         from vkc_pin.world.files.documents import Document
-        from vkc_pin.world.scene.scene_file import scene_fields
+        from vkc_pin.world.scene.scene_file import make_scene_fields
 
-        fields = scene_fields(Document(mapping(document, "document")), file_path(folder, "folder"))
+        fields = make_scene_fields(Document(mapping(document, "document")), file_path(folder, "folder"))
         return _checked(Scene(**fields)._with())
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
@@ -218,8 +218,8 @@ class Scene:
             InputError: Values that do not fit the attachment's freedoms, or objects that hold each
                 other.
         """
-        holds = holds_of(held, by, at) if isinstance(held, Mapping) else held
-        return self._with(holds=checked_holds(self.objects, holds))
+        holds = make_holds(held, by, at) if isinstance(held, Mapping) else held
+        return self._with(holds=resolve_holds(self.objects, holds))
 
     def with_approaches(self, holds: Iterable[Hold], *, stacklevel: int = 2) -> Scene:
         """Return the scene with attachments reversed to which the hand would come out of the object or from below the floor.
@@ -237,7 +237,7 @@ class Scene:
             if label == FLOOR
         ]
         objects = dict(self.objects)
-        for hold in misdirected(self.objects, holds, self.robot, list_placed_shapes(floor)):
+        for hold in find_reversed_approaches(self.objects, holds, self.robot, list_placed_shapes(floor)):
             objects[hold.object] = objects[hold.object].with_reversed(hold.attachment)
             what = f"{hold.frame or 'the hand'} would come to {hold.object}.{hold.attachment}"
             text = f"{what} out of the object or from below the floor"
@@ -257,7 +257,7 @@ class Scene:
         """Return the scene with other attributes, and every free object that is held where the robot then holds it."""
         changed = dataclasses.replace(self, **fields)
         changed = dataclasses.replace(
-            changed, objects=in_hand(changed.objects, changed.tool_placement, changed.holds)
+            changed, objects=place_held_objects(changed.objects, changed.tool_placement, changed.holds)
         )
         object.__setattr__(
             changed, "memory", self.memory
@@ -303,9 +303,9 @@ class Scene:
         ]
         for name, placed in self.objects.items():
             if name not in self.held:
-                standing += standing_geometry(placed)
+                standing += make_world_shapes(placed)
             elif placed.object.free:
-                moving += list_placed_shapes(standing_geometry(placed))
+                moving += list_placed_shapes(make_world_shapes(placed))
         return compute_clearance(moving, list_placed_shapes(standing), reach=reach)
 
     def sample_start(self, rng: np.random.Generator) -> Scene:
@@ -361,10 +361,10 @@ def load_scene(name_or_path: str | Path) -> Scene:
             field.
     """
     from vkc_pin.world.files.documents import read_yaml
-    from vkc_pin.world.scene.scene_file import scene_fields
+    from vkc_pin.world.scene.scene_file import make_scene_fields
 
     file = located(name_or_path, "scenes", "*.yaml", what="scene")
-    return _checked(Scene(**scene_fields(read_yaml(file), file.parent))._with())
+    return _checked(Scene(**make_scene_fields(read_yaml(file), file.parent))._with())
 
 
 def _checked(scene: Scene) -> Scene:

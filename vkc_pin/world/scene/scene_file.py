@@ -24,14 +24,14 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import clamp_to_limits
 from vkc_pin.world.scene import scene_schema as schema
-from vkc_pin.world.scene.hold import Hold, checked_holds, holds_of
-from vkc_pin.world.scene.obstacles import FLOOR, floor_shape, obstacle_shapes
+from vkc_pin.world.scene.hold import Hold, make_holds, resolve_holds
+from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject
 
-__all__ = ["document_of", "scene_fields"]
+__all__ = ["make_document", "make_scene_fields"]
 
 
-def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
+def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     """Return what the scene that `document` describes consists of: the attributes of a `Scene`, by name.
 
     Args:
@@ -57,7 +57,7 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         obstacles += shapes
         labels += [item.name] * len(shapes)
     if description.floor:
-        obstacles.append(floor_shape(arena))
+        obstacles.append(make_floor_shape(arena))
         labels.append(FLOOR)
     _check_places(document, description, arena)
     return {
@@ -81,8 +81,8 @@ def scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     }
 
 
-def document_of(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return plain data from which `scene_fields` makes these parts of a scene again.
+def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain data from which `make_scene_fields` makes these parts of a scene again.
 
     What stands where it was described keeps the words of the description; what does not is
     described by position and rpy.
@@ -238,9 +238,9 @@ def _holds(
                 {name: by[name]} if name in by else {},
                 {name: at[name]} if name in at else {},
             )
-            checked_holds(objects, holds_of(both, through, values))
+            resolve_holds(objects, make_holds(both, through, values))
     with document.at(("start", "held")):
-        return checked_holds(objects, holds_of(attachments, by, at))
+        return resolve_holds(objects, make_holds(attachments, by, at))
 
 
 def _allowed(
@@ -349,4 +349,4 @@ def _obstacle(
     if isinstance(item, schema.UrdfSchema | schema.MeshSchema):
         _file(document, (*path, "file"), folder, item.file)
     with document.at((*path, "file")):
-        return obstacle_shapes(item, _pose(item), folder)
+        return make_obstacle_shapes(item, _pose(item), folder)

@@ -10,19 +10,19 @@ import pinocchio as pin
 
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_link_name
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.placed_object import PlacedObject, standing_geometry
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
-__all__ = ["LEVEL", "Ride", "borne", "supports", "tilt"]
+__all__ = ["MAX_TILT", "SupportedObject", "find_supported_objects", "find_supports", "compute_tilt"]
 
-RESTING = 5e-3
+RESTING_DISTANCE = 5e-3
 """An object stands on what it would overlap by more than half of this if it were lowered by this, but not if lifted [m]."""
-LEVEL = 0.1
+MAX_TILT = 0.1
 """A link may tilt by this while something stands on it [rad]: less than friction of dry things holds."""
-_DOWN = np.array([0.0, 0.0, -RESTING])
+_DOWN = np.array([0.0, 0.0, -RESTING_DISTANCE])
 
 
 @dataclass(frozen=True, eq=False)
-class Ride:
+class SupportedObject:
     """A free object that stands on a link and moves with it.
 
     Attributes:
@@ -36,23 +36,23 @@ class Ride:
     object: str
     hold: Hold
     link: str
-    local: pin.SE3
-    carrier: pin.SE3
+    placement_in_link: pin.SE3
+    carrier_placement: pin.SE3
 
     @property
-    def on(self) -> str:
+    def support(self) -> str:
         """What it stands on, "<object>.<link>"."""
         return f"{self.hold.object}.{self.link}"
 
 
-def supports(placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]) -> set[str]:
+def find_supports(placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]) -> set[str]:
     """Return the labels of what an object stands on.
 
     Args:
         placed: The object.
         shapes: Label and shape of all that stands there, placed in the world.
     """
-    own = standing_geometry(placed)
+    own = make_world_shapes(placed)
     boxes = [compute_world_box(shape.geometry, shape.placement) for shape in own]
     found: set[str] = set()
     for label, shape in shapes:
@@ -60,14 +60,14 @@ def supports(placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObjec
             continue
         lower, upper = compute_world_box(shape.geometry, shape.placement)
         near = (
-            (low < upper + RESTING).all() and (high > lower - RESTING).all() for low, high in boxes
+            (low < upper + RESTING_DISTANCE).all() and (high > lower - RESTING_DISTANCE).all() for low, high in boxes
         )
         if any(_bears(shape, one) for one, close in zip(own, near, strict=True) if close):
             found.add(label)
     return found
 
 
-def borne(
+def find_supported_objects(
     objects: Mapping[str, PlacedObject], moving: Mapping[str, Collection[str]], free: Iterable[str]
 ) -> dict[str, str]:
     """Return what rides on links that move: free object → "<object>.<link>" of these, also where others are between.
@@ -80,19 +80,19 @@ def borne(
     shapes = [
         (f"{name}.{link}", shape)
         for name, links in moving.items()
-        for shape in standing_geometry(objects[name])
+        for shape in make_world_shapes(objects[name])
         if (link := get_link_name(shape.name)) in links
     ]
     left, found = [name for name in free if name not in moving], dict[str, str]()
     while left and shapes:
-        on = {name: min(labels) for name in left if (labels := supports(objects[name], shapes))}
+        on = {name: min(labels) for name in left if (labels := find_supports(objects[name], shapes))}
         found |= {name: found.get(label, label) for name, label in on.items()}
         left = [name for name in left if name not in on]
-        shapes = [(name, shape) for name in on for shape in standing_geometry(objects[name])]
+        shapes = [(name, shape) for name in on for shape in make_world_shapes(objects[name])]
     return found
 
 
-def tilt(before: pin.SE3, after: pin.SE3) -> float:
+def compute_tilt(before: pin.SE3, after: pin.SE3) -> float:
     """Return by how much a link that was level at `before` tilts at `after` [rad]."""
     vertical = (after.rotation @ before.rotation.T)[2]
     return float(np.arctan2(np.hypot(vertical[0], vertical[1]), vertical[2]))
@@ -106,4 +106,4 @@ def _bears(shape: pin.GeometryObject, one: pin.GeometryObject) -> bool:
         return compute_shape_distance(one.geometry, moved, shape.geometry, shape.placement)
 
     lowered = distance(1.0)
-    return lowered < -RESTING / 2 and distance(-1.0) - lowered > RESTING
+    return lowered < -RESTING_DISTANCE / 2 and distance(-1.0) - lowered > RESTING_DISTANCE

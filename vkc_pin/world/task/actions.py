@@ -9,18 +9,23 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.options import Options
-from vkc_pin.world.scene.placed_object import standing_geometry
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.scene.support import supports
-from vkc_pin.world.task.actuation import driving
-from vkc_pin.world.task.compiler import compile_task, nothing_to_do
+from vkc_pin.world.scene.support import find_supports
+from vkc_pin.world.task.actuation import find_driving_attachments
+from vkc_pin.world.task.compiler import compile_task, make_nothing_to_do_error
 from vkc_pin.world.task.phases import Task
-from vkc_pin.world.task.steps import Actuate, Grasp, Place, Release, Step, as_list
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Release, Step, as_steps
 
-__all__ = ["actions_of", "alternatives", "foresee", "is_open"]
+__all__ = [
+    "compile_each_step",
+    "generate_alternatives",
+    "group_into_actions",
+    "has_open_attachment",
+]
 
 
-def actions_of(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
+def group_into_actions(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
     """Return steps by what is done together: a grasp with what comes of it, and letting go with what came before."""
     actions: list[tuple[Step, ...]] = []
     for step in steps:
@@ -36,14 +41,14 @@ def actions_of(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
     return actions
 
 
-def is_open(scene: Scene, step: Step) -> bool:
+def has_open_attachment(scene: Scene, step: Step) -> bool:
     """Return whether a step moves joints of what is not held yet, and leaves open by which of several attachments."""
     if not isinstance(step, Actuate) or step.attachment is not None or step.object in scene.held:
         return False
     return len(scene.objects[step.object].object.attachments) > 1
 
 
-def alternatives(
+def generate_alternatives(
     scene: Scene, task: Task, *, anew: bool = False
 ) -> Iterator[tuple[str, tuple[Step, ...]]]:
     """Yield the steps of a task by attachments that it does not use, each with "<object>.<attachment>".
@@ -63,12 +68,14 @@ def alternatives(
     own = [
         (number, step)
         for number, step in enumerate(task.steps)
-        if isinstance(step, Actuate) and is_open(scene, step)
+        if isinstance(step, Actuate) and has_open_attachment(scene, step)
     ]
     for number, step in own if len(own) == 1 else ():
         used = {hold.attachment for hold in task.holds if hold.object == step.object}
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
-        for name in driving(scene.objects[step.object], {}, values, f"steps[{number}]"):
+        for name in find_driving_attachments(
+            scene.objects[step.object], {}, values, f"steps[{number}]"
+        ):
             if name not in used:
                 changed = dataclasses.replace(step, attachment=name)
                 yield (
@@ -88,7 +95,7 @@ def _taken_anew(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | N
     if held is None or step.attachment not in (None, held):
         return None
     placed = scene.objects[step.object]
-    if placed.object.free and not supports(placed, _standing(scene)):
+    if placed.object.free and not find_supports(placed, _standing(scene)):
         return None
     return Release(step.object), dataclasses.replace(step, attachment=held)
 
@@ -96,22 +103,22 @@ def _taken_anew(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | N
 def _standing(scene: Scene) -> list[tuple[str, pin.GeometryObject]]:
     """Return label and shape of all that stands somewhere in a scene."""
     others = [(name, other) for name, other in scene.objects.items() if name not in scene.held]
-    shapes = [(name, shape) for name, other in others for shape in standing_geometry(other)]
+    shapes = [(name, shape) for name, other in others for shape in make_world_shapes(other)]
     return [*shapes, *zip(scene.obstacle_labels, scene.obstacles, strict=True)]
 
 
-def foresee(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:
+def compile_each_step(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:
     """Check that every step can be done at its place, as far as that does not depend on motions; return what each asks for.
 
     Raises:
         InputError: It cannot; the error names the first such step.
     """
     tasks: list[Task] = []
-    for number, step in enumerate(as_list(steps)):
+    for number, step in enumerate(as_steps(steps)):
         tasks.append(compile_task(scene, [step], options, nothing=True, first=number))
         scene = _ideally_after(scene, tasks[-1])
     if not any(task.phases for task in tasks):
-        raise nothing_to_do()
+        raise make_nothing_to_do_error()
     return tasks
 
 

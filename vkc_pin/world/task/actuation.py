@@ -17,17 +17,17 @@ from vkc_pin.world.models.articulated_object import Attachment, Latch
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.lookup import attachment_of, joint_limits, path_joints
+from vkc_pin.world.task.lookup import find_attachment, find_joint_limits, find_path_joints
 
 __all__ = [
-    "advance",
-    "check_drives",
-    "clash",
-    "driven",
-    "driver",
-    "driving",
-    "latched",
-    "pushed_ways",
+    "check_actuation",
+    "choose_attachment",
+    "compute_advance",
+    "find_driven_coordinates",
+    "find_driving_attachments",
+    "find_engaged_latches",
+    "find_push_directions",
+    "find_shared_coordinate",
 ]
 
 # values of a freedom that turns, about points elsewhere, at which the contact is looked at; a
@@ -36,7 +36,9 @@ _PARTS = 9
 _LEAST = 1e-3  # [m] a radian, or of a metre: what moves the contact less is not pushed
 
 
-def advance(placed: PlacedObject, attachment: Attachment, joint: str) -> tuple[float, float]:
+def compute_advance(
+    placed: PlacedObject, attachment: Attachment, joint: str
+) -> tuple[float, float]:
     """Return how far the contact moves into its face when a joint does, [m/rad] or 1: the least and the most over the region.
 
     The velocity of the link at the contact is linear in where that is, so a region of slides has
@@ -78,7 +80,7 @@ def _region(attachment: Attachment) -> list[Floats]:
     return points
 
 
-def pushed_ways(
+def find_push_directions(
     placed: PlacedObject,
     attachment: Attachment,
     state: Mapping[str, float],
@@ -109,7 +111,7 @@ def pushed_ways(
     at = f"'{placed.name}' at '{attachment.name}'"
     for coordinate, value in values.items():
         joint = coordinate.partition(".")[2]
-        least, most = advance(placed, attachment, joint)
+        least, most = compute_advance(placed, attachment, joint)
         if least * most <= 0.0 or min(abs(least), abs(most)) < _LEAST:
             problem = f"pushing {at} does not move '{joint}' one way"
             raise InputError(
@@ -119,7 +121,7 @@ def pushed_ways(
             )
         ways[coordinate] = way = 1 if least > 0.0 else -1
         begin = state[coordinate]
-        lower, upper = joint_limits(placed, coordinate)
+        lower, upper = find_joint_limits(placed, coordinate)
         if (min(max(value, lower), upper) - begin) * way < 0.0:
             problem = f"pushing {at} moves '{joint}' {'up' if way > 0 else 'down'} only: a hand that pushes cannot pull"
             other = [
@@ -131,7 +133,7 @@ def pushed_ways(
     return ways
 
 
-def latched(
+def find_engaged_latches(
     placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float]
 ) -> Iterator[Latch]:
     """Yield the latches of an object that hold joints which are to move from where they are.
@@ -153,7 +155,7 @@ def latched(
             yield latch
 
 
-def check_drives(
+def check_actuation(
     placed: PlacedObject,
     attachment: Attachment,
     state: Mapping[str, float],
@@ -174,7 +176,7 @@ def check_drives(
         InputError: A joint, or what releases its latch, does not move with the attachment, or a
             push cannot move it that way.
     """
-    name, path = placed.name, path_joints(placed, attachment)
+    name, path = placed.name, find_path_joints(placed, attachment)
     for joint in (coordinate.partition(".")[2] for coordinate in values):
         if joint not in path:
             problem = f"joint '{joint}' does not move when '{name}' is held at '{attachment.name}'"
@@ -185,7 +187,7 @@ def check_drives(
         {f"{name}.{joint}": value for joint, value in joints} | dict(state),
         dict(values),
     )
-    for latch in latched(placed, state, wanted):
+    for latch in find_engaged_latches(placed, state, wanted):
         release = f"{name}.{latch.released_by}"
         if latch.released_by in path:
             wanted.setdefault(release, max(latch.threshold, state[release]))
@@ -197,18 +199,18 @@ def check_drives(
                 field=f"{where}.attachment",
                 expected=f"an attachment that moves '{latch.released_by}'",
             )
-    pushed_ways(placed, attachment, state, values, f"{where}.joints")
+    find_push_directions(placed, attachment, state, values, f"{where}.joints")
 
 
-def driving(
+def find_driving_attachments(
     placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float], where: str
 ) -> list[str]:
     """Return the attachments at which a hand can bring joints of an object to values, in the object's order.
 
     Args:
         placed: The object.
-        state: As for `check_drives`.
-        values: As for `check_drives`.
+        state: As for `check_actuation`.
+        values: As for `check_actuation`.
         where: The step that asks for it, for errors.
 
     Raises:
@@ -217,7 +219,7 @@ def driving(
     found, errors = list[str](), list[InputError]()
     for name, attachment in placed.object.attachments.items():
         try:
-            check_drives(placed, attachment, state, values, where)
+            check_actuation(placed, attachment, state, values, where)
         except InputError as error:
             errors.append(error)
         else:
@@ -227,7 +229,7 @@ def driving(
     if not found:
         asked = " and ".join(f"'{coordinate.partition('.')[2]}'" for coordinate in values)
         moved = {
-            name: ", ".join(path_joints(placed, one)) or "nothing"
+            name: ", ".join(find_path_joints(placed, one)) or "nothing"
             for name, one in placed.object.attachments.items()
         }
         problem = f"no attachment of '{placed.name}' can bring {asked} there"
@@ -246,7 +248,7 @@ def driving(
     return found
 
 
-def driver(
+def choose_attachment(
     placed: PlacedObject,
     named: str | None,
     used: Iterable[str],
@@ -261,36 +263,36 @@ def driver(
         named: By the step; None leaves it open.
         used: Attachments that come before the others then: the one in the hand, and the one that
             was.
-        state: As for `check_drives`.
-        values: As for `check_drives`.
+        state: As for `check_actuation`.
+        values: As for `check_actuation`.
         where: The step that asks for it, for errors.
 
     Raises:
         UnknownNameError: There is none of that name.
         InputError: It cannot, or none can.
     """
-    attachment = attachment_of(placed, named, f"{where}.attachment")
+    attachment = find_attachment(placed, named, f"{where}.attachment")
     if named is not None:
-        check_drives(placed, attachment, state, values, where)
+        check_actuation(placed, attachment, state, values, where)
         return attachment.name
-    fit = driving(placed, state, values, where)
+    fit = find_driving_attachments(placed, state, values, where)
     return next((name for name in used if name in fit), fit[0])
 
 
-def driven(scene: Scene, hold: Hold) -> list[str]:
+def find_driven_coordinates(scene: Scene, hold: Hold) -> list[str]:
     """Return the coordinates "<object>.<joint>" that a hold can move, base first."""
     placed = scene.objects[hold.object]
     return [
         f"{placed.name}.{joint}"
-        for joint in path_joints(placed, placed.object.attachments[hold.attachment])
+        for joint in find_path_joints(placed, placed.object.attachments[hold.attachment])
     ]
 
 
-def clash(scene: Scene, holds: Iterable[Hold]) -> str | None:
+def find_shared_coordinate(scene: Scene, holds: Iterable[Hold]) -> str | None:
     """Return a coordinate that two of some holds move, which has no place in one chain then; None if there is none."""
     seen = set[str]()
     for hold in holds:
-        own = driven(scene, hold)
+        own = find_driven_coordinates(scene, hold)
         if not seen.isdisjoint(own):
             return next(name for name in own if name in seen)
         seen.update(own)

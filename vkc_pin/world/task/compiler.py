@@ -14,17 +14,23 @@ from vkc_pin.options import Options
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.actuation import clash, driven, driver, latched, pushed_ways
-from vkc_pin.world.task.lookup import (
-    attachment_of,
-    check_link,
-    joint_limits,
-    openings,
-    path_joints,
-    placed_object,
-    robot_frame,
+from vkc_pin.world.task.actuation import (
+    choose_attachment,
+    find_driven_coordinates,
+    find_engaged_latches,
+    find_push_directions,
+    find_shared_coordinate,
 )
-from vkc_pin.world.task.phases import FrameGoal, Mark, Phase, PhaseKind, Task
+from vkc_pin.world.task.lookup import (
+    check_link,
+    compute_openings,
+    find_attachment,
+    find_joint_limits,
+    find_object,
+    find_path_joints,
+    find_robot_frame,
+)
+from vkc_pin.world.task.phases import FrameGoal, Phase, PhaseKind, StepBoundary, Task
 from vkc_pin.world.task.steps import (
     Actuate,
     GoTo,
@@ -34,11 +40,11 @@ from vkc_pin.world.task.steps import (
     Release,
     Step,
     Touch,
-    as_list,
+    as_steps,
 )
-from vkc_pin.world.task.supported_objects import Riders
+from vkc_pin.world.task.supported_objects import SupportTracker
 
-__all__ = ["compile_task", "nothing_to_do"]
+__all__ = ["compile_task", "make_nothing_to_do_error"]
 
 LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch lets go
 
@@ -57,14 +63,14 @@ class _Compiler:
             if p.object.free and n not in scene.held
         }
         self.left: dict[str, tuple[Hold, int]] = {}
-        self.riders = Riders(scene, self.standing)
+        self.riders = SupportTracker(scene, self.standing)
         for hold in self.held:
             self._enter(scene.objects[hold.object], hold.attachment)
             self.riders.load(hold, self.state, "held")
 
     def _enter(self, placed: PlacedObject, attachment: str) -> None:
         """Make the joints that a grasp can move coordinates of the task, with the values they have at its start."""
-        for joint in path_joints(placed, placed.object.attachments[attachment]):
+        for joint in find_path_joints(placed, placed.object.attachments[attachment]):
             value = float(placed.state[placed.object.coordinates.index(joint)])
             self.initial.setdefault(f"{placed.name}.{joint}", value)
             self.state.setdefault(f"{placed.name}.{joint}", value)
@@ -83,7 +89,7 @@ class _Compiler:
         )
         segments = self.options.move_waypoints if kind == "move" else self.options.turn_waypoints
         placed = self.scene.objects[hold.object]
-        ways = pushed_ways(
+        ways = find_push_directions(
             placed,
             placed.object.attachments[hold.attachment],
             self.state,
@@ -98,13 +104,9 @@ class _Compiler:
     ) -> None:
         last = self.phases[-1] if self.phases else None
         before = (*last.held, *last.grasps) if last else self.scene.holds
-        leaves = tuple(hold for hold in before if hold not in self.held)
+        released = tuple(hold for hold in before if hold not in self.held)
         lifted = (
-            {
-                hold: last.standing[hold.object]
-                for hold in last.grasps
-                if hold.object in last.standing
-            }
+            {hold: last.resting[hold.object] for hold in last.grasps if hold.object in last.resting}
             if last
             else {}
         )
@@ -113,12 +115,14 @@ class _Compiler:
             about,
             segments,
             held=self.held,
-            leaves=leaves,
-            before=dict(self.state),
-            standing=dict(self.standing),
-            left={name: how for name, how in self.left.items() if name not in self.riders.moved},
+            released=released,
+            initial_values=dict(self.state),
+            resting=dict(self.standing),
+            released_by={
+                name: how for name, how in self.left.items() if name not in self.riders.moved
+            },
             lifted={hold: where for hold, where in lifted.items() if hold in self.held},
-            rides=self.riders.rides,
+            supported=self.riders.rides,
             **details,
         )
         self.phases.append(phase)
@@ -126,7 +130,9 @@ class _Compiler:
             coordinate,
             value,
         ) in phase.values.items():  # a goal beyond a limit is approached as far as it goes
-            lower, upper = joint_limits(self.scene.objects[coordinate.split(".", 1)[0]], coordinate)
+            lower, upper = find_joint_limits(
+                self.scene.objects[coordinate.split(".", 1)[0]], coordinate
+            )
             self.state[coordinate] = min(max(value, lower), upper)
 
     def _hold_of(self, name: str) -> Hold | None:
@@ -140,12 +146,12 @@ class _Compiler:
         self, name: str, attachment_name: str | None, where: str, by: str | None = None
     ) -> Hold:
         """Add the phase that takes hold of an object, unless it is held; return the hold."""
-        placed = placed_object(self.scene, name, f"{where}.object")
+        placed = find_object(self.scene, name, f"{where}.object")
         earlier = next(
             (hold.attachment for hold in self.holds if hold.object == name and hold.frame == by),
             None,
         )
-        attachment = attachment_of(placed, attachment_name or earlier, f"{where}.attachment")
+        attachment = find_attachment(placed, attachment_name or earlier, f"{where}.attachment")
         through = self._through(by, name, f"{where}.by") if by is not None else None
         hold = Hold(name, attachment.name, *(through or (None, None)))
         if hold in self.held:
@@ -194,9 +200,16 @@ class _Compiler:
     def _forget_for(self, hold: Hold) -> None:
         """Leave out what the start holds and no phase does, if a new hold moves the same joints: one chain has those once."""
         used = {*self.held, *(one for phase in self.phases for one in (*phase.held, *phase.grasps))}
-        kept = [one for one in self.holds if one in used or clash(self.scene, (one, hold)) is None]
+        kept = [
+            one
+            for one in self.holds
+            if one in used or find_shared_coordinate(self.scene, (one, hold)) is None
+        ]
         if len(kept) < len(self.holds):
-            self.holds, left = kept, {name for one in kept for name in driven(self.scene, one)}
+            self.holds, left = (
+                kept,
+                {name for one in kept for name in find_driven_coordinates(self.scene, one)},
+            )
             for values in (self.initial, self.state):
                 for name in values.keys() - left:
                     del values[name]
@@ -211,7 +224,7 @@ class _Compiler:
                 expected="<object>.<link>, e.g. stick.tip",
                 got=shown(frame),
             )
-        placed = placed_object(self.scene, owner, where)
+        placed = find_object(self.scene, owner, where)
         hold = self._hold_of(owner)
         if hold is None or not placed.object.free:
             held = (
@@ -231,7 +244,7 @@ class _Compiler:
         return hold, link
 
     def actuate(self, step: Actuate, where: str) -> None:
-        placed = placed_object(self.scene, step.object, f"{where}.object")
+        placed = find_object(self.scene, step.object, f"{where}.object")
         names = placed.object.coordinates.names
         for joint in step.joints:
             if joint not in names:
@@ -248,18 +261,20 @@ class _Compiler:
             if one.object == step.object
         ]
         hold = self.grasp(
-            step.object, driver(placed, step.attachment, used, self.state, values, where), where
+            step.object,
+            choose_attachment(placed, step.attachment, used, self.state, values, where),
+            where,
         )
-        ranges = {coordinate: joint_limits(placed, coordinate) for coordinate in values}
+        ranges = {coordinate: find_joint_limits(placed, coordinate) for coordinate in values}
         path, after = (
-            path_joints(placed, placed.object.attachments[hold.attachment]),
+            find_path_joints(placed, placed.object.attachments[hold.attachment]),
             dict[str, float](),
         )
-        for latch in latched(placed, self.state, values):
+        for latch in find_engaged_latches(placed, self.state, values):
             release = f"{step.object}.{latch.released_by}"
             if latch.released_by not in path:  # and is where it lets go
                 continue
-            lower, upper = joint_limits(placed, release)
+            lower, upper = find_joint_limits(placed, release)
             turned = min(latch.threshold + LATCH_MARGIN, upper)
             if self.state[release] < turned:
                 self._move("turn", hold, where, {release: turned}, {release: (lower, upper)})
@@ -274,7 +289,7 @@ class _Compiler:
                 hold,
                 where,
                 after,
-                {release: joint_limits(placed, release) for release in after},
+                {release: find_joint_limits(placed, release) for release in after},
             )
 
     def touch(self, step: Touch, where: str) -> None:
@@ -295,7 +310,7 @@ class _Compiler:
         elif dot and step.frame not in [f.name for f in self.scene.robot.model.frames]:
             raise UnknownNameError("object", owner, self.scene.objects, field=f"{where}.frame")
         else:
-            link = robot_frame(self.scene, step.frame, f"{where}.frame")
+            link = find_robot_frame(self.scene, step.frame, f"{where}.frame")
         self._let_go_of_fixed()
         point = not isinstance(step.target, pin.SE3)
         target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
@@ -304,7 +319,7 @@ class _Compiler:
 
     def place(self, step: Place, where: str) -> None:
         """Add the phases that bring an object to its place and leave it there."""
-        placed = placed_object(self.scene, step.object, f"{where}.object")
+        placed = find_object(self.scene, step.object, f"{where}.object")
         if not placed.object.free:
             raise InputError(
                 f"'{step.object}' stands fixed in the world",
@@ -374,7 +389,7 @@ class _Compiler:
         elif isinstance(step, Grasp):
             self.grasp(step.object, step.attachment, where, step.by)
         elif isinstance(step, Reach):
-            frame = robot_frame(self.scene, step.frame, f"{where}.frame")
+            frame = find_robot_frame(self.scene, step.frame, f"{where}.frame")
             self._let_go_of_fixed()
             self._append(
                 "reach",
@@ -403,32 +418,36 @@ def compile_task(
         InputError: No steps, an unknown object, joint, attachment or frame, a joint that cannot be
             moved that way, or a hand that is asked to hold a second thing.
     """
-    steps = as_list(steps)
-    compiler, marks = _Compiler(scene, options), list[Mark]()
+    steps = as_steps(steps)
+    compiler, marks = _Compiler(scene, options), list[StepBoundary]()
     for index, step in enumerate(steps, start=first):
         compiler.add(step, f"steps[{index}]")
         marks.append(
-            Mark(len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held)
+            StepBoundary(
+                len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held
+            )
         )
     if not compiler.phases and not nothing:
-        raise nothing_to_do()
+        raise make_nothing_to_do_error()
     # Objects that are grasped later stand as they are at the start until then.
     initial = compiler.initial
     phases = tuple(
         replace(
             phase,
-            before={
+            initial_values={
                 **initial,
-                **{name: value for name, value in phase.before.items() if name in initial},
+                **{name: value for name, value in phase.initial_values.items() if name in initial},
             },
             opening=opening,
         )
-        for phase, opening in zip(compiler.phases, openings(scene, compiler.phases), strict=True)
+        for phase, opening in zip(
+            compiler.phases, compute_openings(scene, compiler.phases), strict=True
+        )
     )
     return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held, tuple(marks))
 
 
-def nothing_to_do() -> InputError:
+def make_nothing_to_do_error() -> InputError:
     """Return the error for steps that change nothing."""
     expected, got = "a step that changes something", "only what holds already"
     return InputError("there is nothing to do", field="steps", expected=expected, got=got)

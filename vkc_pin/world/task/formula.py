@@ -62,7 +62,7 @@ class State:
         now, before = self._of("frame", frame)
         return (now[9:] - before[9:]) / self._dt
 
-    def know(self, formula: Formula) -> None:
+    def check_names(self, formula: Formula) -> None:
         """Check that everything exists that a formula depends on."""
         for kind, names in (("frame", formula.frames), ("coordinate", formula.coordinates)):
             for name in names:
@@ -80,7 +80,7 @@ class State:
             name, (ca.SX.sym("now", size), ca.SX.sym("before", size))
         )
 
-    def formula(self, value: Any) -> Formula:
+    def make_formula(self, value: Any) -> Formula:
         """Return an expression of this state's symbols, shape (rows, 1), as data."""
         columns = [
             [
@@ -128,7 +128,7 @@ class Formula:
     code: tuple[tuple[str, tuple[int, ...], int, float], ...]
 
     @property
-    def compares(self) -> bool:
+    def has_comparison(self) -> bool:
         """Whether a result is that of a comparison, which has no slope."""
         results: dict[int, str] = {}
         for name, read, written, _ in self.code:
@@ -138,30 +138,30 @@ class Formula:
         return False
 
     @property
-    def half(self) -> int:
+    def state_size(self) -> int:
         """How many of the inputs are about the present."""
         return 12 * len(self.frames) + len(self.coordinates)
 
     @cached_property
-    def inputs(self) -> frozenset[int]:
+    def input_indices(self) -> frozenset[int]:
         """Which of the inputs it depends on."""
         return frozenset(read[0] for name, read, _, _ in self.code if name == "input")
 
     @property
-    def moving(self) -> bool:
+    def uses_previous(self) -> bool:
         """Whether it depends on the waypoint before."""
-        return any(self.half <= index < 2 * self.half for index in self.inputs)
+        return any(self.state_size <= index < 2 * self.state_size for index in self.input_indices)
 
     @property
-    def timed(self) -> bool:
+    def uses_time_step(self) -> bool:
         """Whether it depends on the time of a step."""
-        return 2 * self.half in self.inputs
+        return 2 * self.state_size in self.input_indices
 
     @cached_property
     def function(self) -> ca.Function:
         """The CasADi function, inputs of shape (2·half + 1, 1) to shape (rows, 1); roots are rounded off at zero."""
         numbers = {name: number for number, name in _operations().items()}
-        inputs = ca.SX.sym("inputs", 2 * self.half + 1)
+        inputs = ca.SX.sym("inputs", 2 * self.state_size + 1)
         work: dict[int, Any] = {}
         results: list[Any] = [ca.SX(0)] * self.rows
         for name, read, written, constant in self.code:
@@ -180,7 +180,7 @@ class Formula:
                 work[written] = ca.SX.binary(numbers[name], *operands)
         return ca.Function("term", [inputs], [ca.vertcat(*results)])
 
-    def values(self, inputs: Floats) -> Floats:
+    def evaluate(self, inputs: Floats) -> Floats:
         """Return its values, shape (S, rows), at inputs of shape (S, 2·half + 1)."""
         return (
             np.asarray(self.function(np.ascontiguousarray(inputs.T)), float)

@@ -9,23 +9,27 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arguments import known
 from vkc_pin.world.models.articulated_object import Attachment
-from vkc_pin.world.scene.contact_rules import in_gripper, opening_at_start, opening_for
+from vkc_pin.world.scene.contact_rules import (
+    compute_grasp_opening,
+    compute_start_opening,
+    find_gripper_hold,
+)
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase
 
 __all__ = [
-    "attachment_of",
     "check_link",
-    "joint_limits",
-    "openings",
-    "path_joints",
-    "placed_object",
-    "robot_frame",
+    "compute_openings",
+    "find_attachment",
+    "find_joint_limits",
+    "find_object",
+    "find_path_joints",
+    "find_robot_frame",
 ]
 
 
-def placed_object(scene: Scene, name: str, where: str) -> PlacedObject:
+def find_object(scene: Scene, name: str, where: str) -> PlacedObject:
     """Return an object of a scene.
 
     Args:
@@ -39,7 +43,7 @@ def placed_object(scene: Scene, name: str, where: str) -> PlacedObject:
     return scene.objects[known(name, scene.objects, "object", where)]
 
 
-def attachment_of(placed: PlacedObject, name: str | None, where: str) -> Attachment:
+def find_attachment(placed: PlacedObject, name: str | None, where: str) -> Attachment:
     """Return an object's attachment `name`, or the default one, for the field `where`.
 
     Raises:
@@ -64,7 +68,7 @@ def check_link(placed: PlacedObject, link: str, where: str) -> None:
         raise UnknownNameError(f"link of '{placed.name}'", link, placed.object.links, field=where)
 
 
-def robot_frame(scene: Scene, name: str | None, where: str) -> str:
+def find_robot_frame(scene: Scene, name: str | None, where: str) -> str:
     """Return the robot's frame that the field `where` names, or its tool frame. Raises `UnknownNameError` if there is none."""
     frame = name or scene.robot.tool_frame
     frames = [f.name for f in scene.robot.model.frames]
@@ -73,7 +77,7 @@ def robot_frame(scene: Scene, name: str | None, where: str) -> str:
     return frame
 
 
-def path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
+def find_path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
     """Return the names of the object's joints between its base and the attachment's link, base first."""
     model = placed.object.model
     joint = model.frames[model.getFrameId(attachment.link, pin.FrameType.BODY)].parentJoint
@@ -84,24 +88,24 @@ def path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
     return names
 
 
-def joint_limits(placed: PlacedObject, coordinate: str) -> tuple[float, float]:
+def find_joint_limits(placed: PlacedObject, coordinate: str) -> tuple[float, float]:
     """Return the limits of an object's coordinate `<object>.<joint>`, [rad] or [m]."""
     index = placed.object.coordinates.names.index(coordinate.partition(".")[2])
     return float(placed.object.lower[index]), float(placed.object.upper[index])
 
 
-def openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None]:
+def compute_openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None]:
     """Return how far the gripper is open in each phase [m]; None: as the robot rests.
 
     That is what the attachment says which it holds or comes to next. After the last one it stays as
     it is.
     """
     taken, found = (
-        [in_gripper((*phase.held, *phase.grasps)) for phase in phases],
+        [find_gripper_hold((*phase.held, *phase.grasps)) for phase in phases],
         list[float | None](),
     )
     for number in range(len(phases)):
         hold = next((one for one in taken[number:] if one is not None), None)
-        before = found[-1] if found else opening_at_start(scene)
-        found.append(before if hold is None else opening_for(scene, hold))
+        before = found[-1] if found else compute_start_opening(scene)
+        found.append(before if hold is None else compute_grasp_opening(scene, hold))
     return found

@@ -10,10 +10,18 @@ from typing import Literal
 import pinocchio as pin
 
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.support import Ride
+from vkc_pin.world.scene.support import SupportedObject
 from vkc_pin.world.task.steps import Step
 
-__all__ = ["FrameGoal", "Mark", "Phase", "PhaseKey", "PhaseKind", "Task", "stretches"]
+__all__ = [
+    "FrameGoal",
+    "Phase",
+    "PhaseKey",
+    "PhaseKind",
+    "StepBoundary",
+    "Task",
+    "summarize_phases",
+]
 
 PhaseKind = Literal["grasp", "reach", "touch", "place", "turn", "move", "go", "stand"]
 PhaseKey = tuple[PhaseKind, tuple[str, ...]]
@@ -96,13 +104,13 @@ class Phase:
     frames: tuple[FrameGoal, ...] = ()
     base: tuple[float, float, float | None] | None = None
     grasps: tuple[Hold, ...] = ()
-    leaves: tuple[Hold, ...] = ()
-    before: Mapping[str, float] = field(default_factory=dict)
-    standing: Mapping[str, pin.SE3] = field(default_factory=dict)
-    left: Mapping[str, tuple[Hold, int]] = field(default_factory=dict)
+    released: tuple[Hold, ...] = ()
+    initial_values: Mapping[str, float] = field(default_factory=dict)
+    resting: Mapping[str, pin.SE3] = field(default_factory=dict)
+    released_by: Mapping[str, tuple[Hold, int]] = field(default_factory=dict)
     lifted: Mapping[Hold, pin.SE3] = field(default_factory=dict)
     lowered: Mapping[Hold, pin.SE3] = field(default_factory=dict)
-    rides: tuple[Ride, ...] = ()
+    supported: tuple[SupportedObject, ...] = ()
     opening: float | None = None
 
     @property
@@ -118,7 +126,7 @@ class Phase:
 
 
 @dataclass(frozen=True)
-class Mark:
+class StepBoundary:
     """How much of a task there is when a step is done.
 
     Attributes:
@@ -151,7 +159,7 @@ class Task:
     holds: tuple[Hold, ...]
     state: Mapping[str, float]
     after: tuple[Hold, ...] = ()
-    marks: tuple[Mark, ...] = ()
+    boundaries: tuple[StepBoundary, ...] = ()
 
     @property
     def segments(self) -> int:
@@ -159,17 +167,20 @@ class Task:
         return sum(phase.segments for phase in self.phases)
 
     @property
-    def rides(self) -> tuple[Ride, ...]:
+    def supported(self) -> tuple[SupportedObject, ...]:
         """All rides of its phases."""
-        return tuple(dict.fromkeys(ride for phase in self.phases for ride in phase.rides))
+        return tuple(dict.fromkeys(ride for phase in self.phases for ride in phase.supported))
 
-    def until(self, count: int) -> Task:
+    def truncate(self, count: int) -> Task:
         """Return the task of the first `count` steps, at least 1, as if there were no others."""
-        mark = self.marks[count - 1]
+        mark = self.boundaries[count - 1]
         state = dict(islice(self.state.items(), mark.state))
         phases = (
             replace(
-                phase, before={name: value for name, value in phase.before.items() if name in state}
+                phase,
+                initial_values={
+                    name: value for name, value in phase.initial_values.items() if name in state
+                },
             )
             for phase in self.phases[: mark.phases]
         )
@@ -179,10 +190,10 @@ class Task:
             self.holds[: mark.holds],
             state,
             mark.after,
-            self.marks[:count],
+            self.boundaries[:count],
         )
 
 
-def stretches(task: Task) -> list[tuple[str, tuple[str, ...]]]:
+def summarize_phases(task: Task) -> list[tuple[str, tuple[str, ...]]]:
     """Return the phases' names and the objects that are held in them."""
     return [(phase.name, tuple(hold.object for hold in phase.held)) for phase in task.phases]

@@ -22,7 +22,7 @@ __all__ = [
     "Release",
     "Step",
     "Touch",
-    "as_list",
+    "as_steps",
     "step_from_dict",
     "step_to_dict",
 ]
@@ -184,7 +184,7 @@ STEPS = (Reach, Grasp, Actuate, GoTo, Touch, Place, Release)
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in STEPS}
 
 
-def as_list(steps: Sequence[Step]) -> tuple[Step, ...]:
+def as_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
     """Return steps as a tuple.
 
     Raises:

@@ -28,12 +28,12 @@ __all__ = [
     "Cost",
     "State",
     "Term",
-    "as_data",
-    "check_active",
-    "renamed",
+    "check_terms_active",
+    "rename_term",
     "term_from_dict",
     "term_to_dict",
-    "traced",
+    "trace_terms",
+    "trace_terms_without_scene",
 ]
 
 Numbers = float | Sequence[float] | NDArray[np.float64]
@@ -58,7 +58,7 @@ class _Term:
             )
         if not callable(self.expression) and not isinstance(self.expression, Formula):
             expected = "a function of a State, e.g. lambda s: s.coordinate('elbow_joint')"
-            raise self.error("not a function", "expression", expected, shown(self.expression))
+            raise self.make_error("not a function", "expression", expected, shown(self.expression))
         if self.during is not None:
             names = (self.during,) if isinstance(self.during, str) else self.during
             if (
@@ -66,7 +66,7 @@ class _Term:
                 or not names
                 or not all(isinstance(name, str) for name in names)
             ):
-                raise self.error(
+                raise self.make_error(
                     "not phases",
                     "during",
                     "names of phases, e.g. ['place cup']",
@@ -74,9 +74,11 @@ class _Term:
                 )
             object.__setattr__(self, "during", tuple(names))
         if self.holding is not None and not isinstance(self.holding, str):
-            raise self.error("not an object", "holding", "an object's name", shown(self.holding))
+            raise self.make_error(
+                "not an object", "holding", "an object's name", shown(self.holding)
+            )
 
-    def error(
+    def make_error(
         self, problem: str, field: str, expected: object = None, got: object = None
     ) -> InputError:
         """Return (not raise) the error that says that one of its fields is wrong."""
@@ -84,14 +86,14 @@ class _Term:
             problem, field=f"terms[{self.name!r}].{field}", expected=expected, got=got
         )
 
-    def positive(self, field: str) -> None:
+    def _check_positive(self, field: str) -> None:
         """Check that a field is a positive number."""
         where, expected = f"terms[{self.name!r}].{field}", "a positive finite number"
         object.__setattr__(
             self, field, number(getattr(self, field), where, expected, low=0.0, above=True)
         )
 
-    def active(self, phase: str, held: Iterable[str]) -> bool:
+    def is_active(self, phase: str, held: Iterable[str]) -> bool:
         """Return whether it holds in a phase of this name, in which these objects are held."""
         return (self.during is None or phase in self.during) and (
             self.holding is None or self.holding in held
@@ -101,7 +103,7 @@ class _Term:
     def formula(self) -> Formula:
         """Its expression, once it is data."""
         if not isinstance(self.expression, Formula):
-            raise self.error("not traced yet", "expression")
+            raise self.make_error("not traced yet", "expression")
         return self.expression
 
 
@@ -127,12 +129,12 @@ class Constraint(_Term):
 
     def __post_init__(self) -> None:
         self._check()
-        self.positive("tolerance")
+        self._check_positive("tolerance")
         for field in ("lower", "upper"):
             value = getattr(self, field)
             if value is not None:
                 object.__setattr__(self, field, self._bound(field, value))
-        self.box(self.expression.rows if isinstance(self.expression, Formula) else None)
+        self.compute_bounds(self.expression.rows if isinstance(self.expression, Formula) else None)
 
     def _bound(self, field: str, value: Any) -> float | tuple[float, ...]:
         given = numbers(
@@ -143,10 +145,12 @@ class Constraint(_Term):
         )
         wrong = np.isnan(given) | (given == (np.inf if field == "lower" else -np.inf))
         if given.ndim > 1 or not given.size or wrong.any():
-            raise self.error("no such bound", field, "a number or a list of them", shown(value))
+            raise self.make_error(
+                "no such bound", field, "a number or a list of them", shown(value)
+            )
         return float(given) if given.ndim == 0 else tuple(given.tolist())
 
-    def box(self, rows: int | None) -> tuple[Floats, Floats]:
+    def compute_bounds(self, rows: int | None) -> tuple[Floats, Floats]:
         """Return both bounds, shape (rows,); None: as many as there are bounds.
 
         Raises:
@@ -167,18 +171,18 @@ class Constraint(_Term):
                 if rows is None
                 else f"one number, or {rows}, like the expression"
             )
-            raise self.error(
+            raise self.make_error(
                 "wrong number of bounds", "lower, upper", expected, shown((self.lower, self.upper))
             ) from None
         if not (np.isfinite(lower) | np.isfinite(upper)).all():
-            raise self.error(
+            raise self.make_error(
                 "no bound",
                 "lower, upper",
                 "at least one of them, finite",
                 shown((self.lower, self.upper)),
             )
         if (lower > upper).any():
-            raise self.error(
+            raise self.make_error(
                 "lower is more than upper",
                 "lower, upper",
                 "lower <= upper",
@@ -203,13 +207,13 @@ class Cost(_Term):
 
     def __post_init__(self) -> None:
         self._check()
-        self.positive("weight")
+        self._check_positive("weight")
 
 
 Term = Constraint | Cost
 
 
-def traced(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
+def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
     """Return terms with their expressions as data, checked against what a scene has.
 
     Raises:
@@ -231,7 +235,7 @@ def traced(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
     return _all_traced(terms, frames, [*scene.robot.coordinates.names, *joints])
 
 
-def as_data(terms: Sequence[Term]) -> tuple[Term, ...]:
+def trace_terms_without_scene(terms: Sequence[Term]) -> tuple[Term, ...]:
     """Return terms with their expressions as data, for scenes that are not there yet: frames and coordinates may have any name.
 
     Raises:
@@ -242,7 +246,7 @@ def as_data(terms: Sequence[Term]) -> tuple[Term, ...]:
     )
 
 
-def renamed(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -> Term:
+def rename_term(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -> Term:
     """Return a traced term about other frames, and another object that must be held for it.
 
     Args:
@@ -273,25 +277,25 @@ def _all_traced(
 
 def _traced(term: Term, state: State) -> Term:
     if isinstance(term.expression, Formula):
-        state.know(term.expression)
+        state.check_names(term.expression)
         return term
     try:
         value = term.expression(state)
     except UnknownNameError:
         raise
     except Exception as error:
-        raise term.error(
+        raise term.make_error(
             "it cannot be evaluated", "expression", "CasADi operations only", str(error)
         ) from error
     if isinstance(value, int | float | np.ndarray | np.number | ca.DM):
-        raise term.error(
+        raise term.make_error(
             "it does not depend on the state",
             "expression",
             "an expression of what a State returns",
             shown(value),
         )
     if not isinstance(value, ca.SX):
-        raise term.error(
+        raise term.make_error(
             "no CasADi expression",
             "expression",
             "a number or a column, e.g. of ca.vertcat",
@@ -303,28 +307,28 @@ def _traced(term: Term, state: State) -> Term:
         or (isinstance(term, Cost) and not value.is_scalar())
     ):
         expected = "a number" if isinstance(term, Cost) else "a number or a column"
-        raise term.error("wrong shape", "expression", expected, f"shape {value.shape}")
+        raise term.make_error("wrong shape", "expression", expected, f"shape {value.shape}")
     try:
-        formula = state.formula(ca.vec(value))
+        formula = state.make_formula(ca.vec(value))
     except RuntimeError as error:
-        raise term.error(
+        raise term.make_error(
             "it has symbols of its own", "expression", "only those of its State", str(error)
         ) from error
-    if not formula.inputs:
-        raise term.error(
+    if not formula.input_indices:
+        raise term.make_error(
             "it does not depend on the state",
             "expression",
             "an expression of what a State returns",
             str(value),
         )
-    if formula.compares:
-        raise term.error(
+    if formula.has_comparison:
+        raise term.make_error(
             "a comparison", "expression", "an expression that lower and upper bound", str(value)
         )
     return replace(term, expression=formula)
 
 
-def check_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str]]]) -> None:
+def check_terms_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str]]]) -> None:
     """Check that every term is about some phase of a task.
 
     Args:
@@ -340,11 +344,13 @@ def check_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str
         for name in term.during or ():
             if name not in names:
                 raise UnknownNameError("phase", name, names, field=f"terms[{term.name!r}].during")
-        if not any(term.active(name, held) for name, held in phases):
+        if not any(term.is_active(name, held) for name, held in phases):
             held = ", ".join(
                 f"{name!r} holds {', '.join(held) or 'nothing'}" for name, held in phases
             )
-            raise term.error("never held in these phases", "holding", held, shown(term.holding))
+            raise term.make_error(
+                "never held in these phases", "holding", held, shown(term.holding)
+            )
 
 
 def term_to_dict(term: Term) -> dict[str, Any]:

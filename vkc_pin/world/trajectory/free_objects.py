@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.scene.support import borne
+from vkc_pin.world.scene.support import find_supported_objects
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -200,7 +200,11 @@ class FreeObjects:
                 moving |= {name: set(placed.object.links)} if name in phase.held else {}
             elif driven:
                 moving[name] = placed.object.links_moved_by(driven)
-        return borne(objects, moving, where.keys() - phase.held.keys()) if moving else {}
+        return (
+            find_supported_objects(objects, moving, where.keys() - phase.held.keys())
+            if moving
+            else {}
+        )
 
 
 def as_numbers(placement: pin.SE3) -> Floats:

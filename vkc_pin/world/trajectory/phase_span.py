@@ -8,7 +8,7 @@ from typing import Any
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import mapping, number, text, whole
-from vkc_pin.world.scene.hold import Hold, holds_of, in_order
+from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
 
 __all__ = ["PhaseSpan", "part_of"]
 
@@ -38,7 +38,7 @@ class PhaseSpan:
         text(self.name, "PhaseSpan.name")
         for name in ("first", "last"):
             object.__setattr__(self, name, whole(getattr(self, name), f"PhaseSpan.{name}", low=0))
-        object.__setattr__(self, "holds", in_order(self.holds))
+        object.__setattr__(self, "holds", check_hold_order(self.holds))
         if self.opening is not None:
             object.__setattr__(
                 self,
@@ -75,7 +75,7 @@ class PhaseSpan:
             InputError: Something is missing from it or does not fit.
         """
         phase = mapping(data, where)
-        held = holds_of(part_of(phase, "held"), phase.get("by"))
+        held = make_holds(part_of(phase, "held"), phase.get("by"))
         name, first, last = (part_of(phase, key) for key in ("name", "first", "last"))
         return cls(name, first, last, held, phase.get("opening"))
 

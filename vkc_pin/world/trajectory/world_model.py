@@ -20,8 +20,8 @@ from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import graft, graft_geometry
 from vkc_pin.world.models.grippers.gripper import Gripper
 from vkc_pin.world.models.shapes import get_link_name
-from vkc_pin.world.scene.clearance_exemptions import shape_keys
-from vkc_pin.world.scene.contact_rules import opening_at_start
+from vkc_pin.world.scene.clearance_exemptions import make_shape_keys
+from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects, as_numbers
@@ -80,7 +80,7 @@ class World:
             *(get_link_name(shape.name) for shape in self.bodies.geometryObjects),
             *scene.obstacle_labels,
         ]
-        self.collision_keys = shape_keys(
+        self.collision_keys = make_shape_keys(
             self.collision_labels, [shape.name for shape in self.shapes]
         )
         self.coordinates = Coordinates(self.model)
@@ -93,7 +93,7 @@ class World:
         fingers = (
             np.zeros(0)
             if robot.gripper is None
-            else robot.gripper.positions(opening_at_start(scene))
+            else robot.gripper.positions(compute_start_opening(scene))
         )
         self.start: Floats = np.concatenate([np.asarray(scene.start), fingers, *states])
 
@@ -178,7 +178,7 @@ class World:
         if gripper is not None:
             first = len(self.scene.start)
             rows[:, first : first + len(gripper.names)] = _fingers(
-                gripper, opening_at_start(self.scene), trajectory, times
+                gripper, compute_start_opening(self.scene), trajectory, times
             )
         return rows
 

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.scene.contact_rules import hand_frame
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 
@@ -44,7 +44,7 @@ class Handle:
         self.name, self.placed = hold.object, scene.objects[hold.object]
         thing = self.placed.object
         self.attachment = thing.attachment(hold.attachment)
-        self.point = hand_frame(scene.robot, self.attachment)
+        self.point = compute_hand_frame(scene.robot, self.attachment)
         own, loaded = pin.Model(thing.model), pin.Model(thing.model)
         for joint, inertia in riders:
             loaded.inertias[joint] += inertia

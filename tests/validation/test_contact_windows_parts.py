@@ -54,7 +54,7 @@ def rests(
     )
     scene = SimpleNamespace(holds=held, robot=SimpleNamespace(gripper=gripper))
     if monkeypatch is not None:
-        monkeypatch.setattr(touching, "opening_for", lambda _, hold: (openings or {})[str(hold)])
+        monkeypatch.setattr(touching, "compute_grasp_opening", lambda _, hold: (openings or {})[str(hold)])
     samples: Any = SimpleNamespace(scene=scene, trajectory=trajectory)
     return list(check_gripper(samples, Options(grasp_time=2.0)))
 
@@ -212,7 +212,7 @@ def pushed(
         contact=contact, link="panel", placement=pin.SE3.Identity(), offset=pin.SE3.Identity()
     )
     objects = {"door": SimpleNamespace(object=SimpleNamespace(attachments={"handle": attachment}))}
-    monkeypatch.setattr(touching, "hand_frame", lambda robot, given: pin.SE3.Identity())
+    monkeypatch.setattr(touching, "compute_hand_frame", lambda robot, given: pin.SE3.Identity())
     samples: Any = SimpleNamespace(
         scene=SimpleNamespace(robot=SimpleNamespace(tool_frame="tool"), objects=objects),
         trajectory=SimpleNamespace(phases=[span(1, 2, DOOR)]),
@@ -321,7 +321,7 @@ class Allowed(ClearanceExemption):
         super().__init__("drawer.tray", "side", margin, margin)
         object.__setattr__(self, "at", holds)
 
-    def holds(self, names: Any, rows: np.ndarray) -> np.ndarray:
+    def is_active(self, names: Any, rows: np.ndarray) -> np.ndarray:
         at: Any = vars(self)["at"]
         assert len(rows) == len(at)
         return np.array(at)

@@ -30,7 +30,7 @@ def looked_at(
         times=np.arange(float(len(way))), phases=spans, positions=positions
     )
     samples: Any = SimpleNamespace(trajectory=trajectory, waypoint_rows=each * np.arange(len(way)))
-    term: Any = SimpleNamespace(active=lambda name, held: name == "True")
+    term: Any = SimpleNamespace(is_active=lambda name, held: name == "True")
     at, between = _rows(samples, term)
     assert not (at % each).any()
     return (at // each).tolist(), between.tolist()
@@ -171,13 +171,13 @@ def test_what_is_never_asked_about_is_not_worked_out(monkeypatch: pytest.MonkeyP
     motion = of_rows(scene, np.array([moved(scene.start, x=x) for x in (0.0, 0.5, 1.0)]))
     never = vkc.Constraint("never", lambda s: s.coordinate("base_x"), upper=0.5, during="another")
     always = vkc.Constraint("always", lambda s: s.coordinate("base_x"), upper=0.5)
-    terms, asked, values = trace_terms(scene, [never, always]), list[int](), Formula.values
+    terms, asked, values = trace_terms(scene, [never, always]), list[int](), Formula.evaluate
 
     def counted(formula: Formula, inputs: np.ndarray) -> np.ndarray:
         asked.append(len(inputs))
         return values(formula, inputs)
 
-    monkeypatch.setattr(Formula, "values", counted)
+    monkeypatch.setattr(Formula, "evaluate", counted)
     assert {one.subject for one in check_terms(Samples(scene, motion), terms)} == {"always"}
     assert len(asked) == 1
     assert asked[0] > 0

@@ -372,7 +372,7 @@ class Near(ClearanceExemption):
         super().__init__(first, second, margin, margin)
         object.__setattr__(self, "rows", rows)
 
-    def holds(self, names: Any, state: np.ndarray) -> np.ndarray:
+    def is_active(self, names: Any, state: np.ndarray) -> np.ndarray:
         return np.array([int(state[0, 0]) in vars(self)["rows"]])
 
 
@@ -387,7 +387,7 @@ def close(
     monkeypatch.setattr(module, "Solids", lambda world: None)
     monkeypatch.setattr(module, "windows", lambda *_: [])
     monkeypatch.setattr(module, "PairTable", lambda *_, **__: None)
-    monkeypatch.setattr(module, "allowances", lambda scene, safe: allowed)
+    monkeypatch.setattr(module, "find_clearance_exemptions", lambda scene, safe: allowed)
     monkeypatch.setattr(module, "sweep", lambda table, z, waypoints: iter(hits))
     nearest = made._clearance()
     return nearest.tolist(), [(*row[:4], pytest.approx(row[4]), row[5]) for row in told(made)]

@@ -48,10 +48,10 @@ def test_what_is_kept_from_what_is_held(
     expected: float,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "touching", lambda scene, hold: ("hand",))
-    monkeypatch.setattr(module, "grasped", lambda scene, hold: "lever")
-    monkeypatch.setattr(module, "moves_as_one", lambda scene, hold: as_one)
-    monkeypatch.setattr(module, "hand_clearance", lambda scene, hold, link, options: clearance)
+    monkeypatch.setattr(module, "find_touch_links", lambda scene, hold: ("hand",))
+    monkeypatch.setattr(module, "find_grasped_link", lambda scene, hold: "lever")
+    monkeypatch.setattr(module, "is_rigid_grasp", lambda scene, hold: as_one)
+    monkeypatch.setattr(module, "compute_hand_clearance", lambda scene, hold, link, options: clearance)
     assert pairing(scene=None)._held_margin(None, one, link) == expected
 
 

@@ -107,13 +107,13 @@ def test_what_rides_on_what_stands_fixed_begins_and_ends_with_the_phase(monkeypa
     now = phase(
         (PLATE,),
         (ride,),
-        before={"plate.slide": 0.0, "door.hinge": 1.0},
+        initial_values={"plate.slide": 0.0, "door.hinge": 1.0},
         values={"plate.slide": 0.5},
         ranges={"plate.slide": (0.0, 0.25)},
     )
     assert moments([phase(), now], 1, monkeypatch) == [
-        ("cup", f"on {now.before}", True),
-        ("cup", f"on { {**now.before, 'plate.slide': 0.25} }", False),
+        ("cup", f"on {now.initial_values}", True),
+        ("cup", f"on { {**now.initial_values, 'plate.slide': 0.25} }", False),
     ]
 
 

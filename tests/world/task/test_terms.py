@@ -65,9 +65,9 @@ def test_bounds() -> None:
     slow, within, _ = trace_terms(room(table()), three())
     assert isinstance(slow, vkc.Constraint)
     assert isinstance(within, vkc.Constraint)
-    np.testing.assert_array_equal(slow.box(1), [[-unbounded], [0.0]])
-    np.testing.assert_array_equal(within.box(3), [[-1, -2, 0], [1, 2, unbounded]])
-    np.testing.assert_array_equal(tilt(upper=1).box(2), [[0.98, 0.98], [1.0, 1.0]])
+    np.testing.assert_array_equal(slow.compute_bounds(1), [[-unbounded], [0.0]])
+    np.testing.assert_array_equal(within.compute_bounds(3), [[-1, -2, 0], [1, 2, unbounded]])
+    np.testing.assert_array_equal(tilt(upper=1).compute_bounds(2), [[0.98, 0.98], [1.0, 1.0]])
 
 
 def test_when_terms_are_active() -> None:

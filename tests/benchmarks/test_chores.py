@@ -19,7 +19,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.shapes import compute_clearance
 from vkc_pin.world.scene.clearance_exemptions import find_close_pairs
 from vkc_pin.world.scene.placed_object import make_world_shapes
-from vkc_pin.world.task.actions import group_into_actions, compile_each_step
+from vkc_pin.world.task.actions import compile_each_step, group_into_actions
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,9 @@ def test_the_cluttered_home_is_the_home_and_more() -> None:
 def gap(scene: vkc.Scene, first: str, second: str) -> float:
     """Return how far two links stand apart [m]."""
     (pair,) = [
-        pair for pair in find_close_pairs(scene, 0.02) if {pair.first, pair.second} == {first, second}
+        pair
+        for pair in find_close_pairs(scene, 0.02)
+        if {pair.first, pair.second} == {first, second}
     ]
     return pair.distance
 

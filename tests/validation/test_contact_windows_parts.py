@@ -54,7 +54,9 @@ def rests(
     )
     scene = SimpleNamespace(holds=held, robot=SimpleNamespace(gripper=gripper))
     if monkeypatch is not None:
-        monkeypatch.setattr(touching, "compute_grasp_opening", lambda _, hold: (openings or {})[str(hold)])
+        monkeypatch.setattr(
+            touching, "compute_grasp_opening", lambda _, hold: (openings or {})[str(hold)]
+        )
     samples: Any = SimpleNamespace(scene=scene, trajectory=trajectory)
     return list(check_gripper(samples, Options(grasp_time=2.0)))
 

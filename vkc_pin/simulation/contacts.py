@@ -18,7 +18,12 @@ from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Ints
 from vkc_pin.validation.distances import Solids
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
-from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH, CONTACT_WINDOW, find_grasped_link, find_touch_links
+from vkc_pin.world.scene.contact_rules import (
+    CONTACT_DEPTH,
+    CONTACT_WINDOW,
+    find_grasped_link,
+    find_touch_links,
+)
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
@@ -114,7 +119,10 @@ def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
         set[frozenset[str]](),
     )
     for hold in holds:
-        hands, link = frozenset(find_touch_links(world.scene, hold)), find_grasped_link(world.scene, hold)
+        hands, link = (
+            frozenset(find_touch_links(world.scene, hold)),
+            find_grasped_link(world.scene, hold),
+        )
         own = {frozenset((hand, link)) for hand in hands}
         bits[hold] = groups.get((hands, link), 0)
         if (hands, link) not in groups and not own & never and len(groups) < _GROUPS:

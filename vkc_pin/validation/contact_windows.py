@@ -19,13 +19,13 @@ from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption, find_cl
 from vkc_pin.world.scene.contact_rules import (
     CONTACT_DEPTH,
     CONTACT_WINDOW,
-    find_grasped_link,
+    compute_grasp_opening,
     compute_hand_clearance,
     compute_hand_frame,
+    find_grasped_link,
     find_gripper_hold,
-    is_rigid_grasp,
-    compute_grasp_opening,
     find_touch_links,
+    is_rigid_grasp,
 )
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -244,7 +244,9 @@ class _Windows:
             end if last is None else self._until(end),
         )
         yield from self._near(hold, since, until)
-        gripped = self._between(find_touch_links(self.scene, hold), {find_grasped_link(self.scene, hold)})
+        gripped = self._between(
+            find_touch_links(self.scene, hold), {find_grasped_link(self.scene, hold)}
+        )
         if is_rigid_grasp(self.scene, hold):
             yield Window(gripped, begin, end, 0.0, together=True)
         else:
@@ -252,7 +254,9 @@ class _Windows:
                 gripped,
                 begin,
                 end,
-                compute_hand_clearance(self.scene, hold, find_grasped_link(self.scene, hold), self.options),
+                compute_hand_clearance(
+                    self.scene, hold, find_grasped_link(self.scene, hold), self.options
+                ),
             )
 
     def _near(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
@@ -389,7 +393,7 @@ class _Windows:
         return np.array([(min(i, j), max(i, j)) for i in ones for j in others], int).reshape(-1, 2)
 
     def _until(self, at: int) -> int:
-        """Return the waypoint up to which what was in contact at one may be close: `CONTACT_WINDOW`, or as many steps that move."""
+        """Return the last exempt waypoint after a contact at `at`: `CONTACT_WINDOW`, or as many moving steps."""
         times, moved, last = self.trajectory.times, 0, at
         while last < len(self.steps):
             moved += int(self.steps[last])
@@ -405,9 +409,9 @@ class _Windows:
         times, moved, first = self.trajectory.times, 0, at
         while first > 0:
             moved += int(self.steps[first - 1])
-            if times[at] - times[first - 1] > CONTACT_WINDOW + _STILL and moved > self.options.steps(
-                CONTACT_WINDOW
-            ):
+            if times[at] - times[
+                first - 1
+            ] > CONTACT_WINDOW + _STILL and moved > self.options.steps(CONTACT_WINDOW):
                 break
             first -= 1
         return first

@@ -100,7 +100,9 @@ def test_poses_are_those_of_configurations_that_touch_nothing(
     assert scene.with_start(base=z[:3], arm=z[3:]).start_clearance() < poses.NEAR
     assert np.linalg.norm(z[:2] - layout.start[:2]) >= poses.FAR
     places = [layout.start[:2], (float(z[0]), float(z[1]))]
-    assert layout.floor.is_connected([part.footprint for part in layout.parts], layout.radius, places)
+    assert layout.floor.is_connected(
+        [part.footprint for part in layout.parts], layout.radius, places
+    )
 
 
 def test_poses_that_cannot_be_are_said(monkeypatch: pytest.MonkeyPatch) -> None:

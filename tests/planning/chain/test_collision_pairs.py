@@ -51,7 +51,9 @@ def test_what_is_kept_from_what_is_held(
     monkeypatch.setattr(module, "find_touch_links", lambda scene, hold: ("hand",))
     monkeypatch.setattr(module, "find_grasped_link", lambda scene, hold: "lever")
     monkeypatch.setattr(module, "is_rigid_grasp", lambda scene, hold: as_one)
-    monkeypatch.setattr(module, "compute_hand_clearance", lambda scene, hold, link, options: clearance)
+    monkeypatch.setattr(
+        module, "compute_hand_clearance", lambda scene, hold, link, options: clearance
+    )
     assert pairing(scene=None)._held_margin(None, one, link) == expected
 
 
@@ -91,7 +93,9 @@ def test_what_a_scene_allows_keeps_what_it_says() -> None:
         ]
         kept, _ = allowed(ClearanceExemption(*pair, 0.015, 0.015))
         assert [row[2] for row in kept] == [0.02, 0.015, 0.01, 0.02, 0.02, 0.02]
-    assert allowed(ClearanceExemption("side", "cup", 0.0, 0.0), ClearanceExemption("cup", "tray", 0.0, 0.0)) == (
+    assert allowed(
+        ClearanceExemption("side", "cup", 0.0, 0.0), ClearanceExemption("cup", "tray", 0.0, 0.0)
+    ) == (
         rows,
         [],
     )
@@ -115,8 +119,12 @@ def test_neighbours_keep_half_of_what_they_have_where_they_are(
     kept, near = allowed(gone, ClearanceExemption("tray", "lid", margin, distance, SLIDE))
     assert len(kept) == 4
     assert near == [([2], expected)]
-    assert allowed(ClearanceExemption("side", "tray", margin, distance, SLIDE))[1] == [([1, 2], expected)]
-    assert allowed(ClearanceExemption("arm", "side", margin, distance, SLIDE))[1] == []  # they are no pair
+    assert allowed(ClearanceExemption("side", "tray", margin, distance, SLIDE))[1] == [
+        ([1, 2], expected)
+    ]
+    assert (
+        allowed(ClearanceExemption("arm", "side", margin, distance, SLIDE))[1] == []
+    )  # they are no pair
     assert allowed(gone, ClearanceExemption("tray", "side", margin, distance, SLIDE))[1] == []
     assert (
         allowed(ClearanceExemption("tray", "lid", margin, distance, SLIDE), within=None)[1] == []
@@ -133,7 +141,7 @@ def within(ranges: dict[str, tuple[float, float]], before: dict[str, float]) -> 
         object=SimpleNamespace(coordinates=SimpleNamespace(index=("left", "right").index)),
     )
     made = pairing(chain=chain, scene=SimpleNamespace(objects={"cupboard": placed}))
-    return made._within(SimpleNamespace(before=before), ranges)
+    return made._within(SimpleNamespace(initial_values=before), ranges)
 
 
 def test_where_neighbours_are_such() -> None:

@@ -129,7 +129,9 @@ def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> 
                 for begin, end, _ in moments
             }
         )
-    assert spans[0] == spans[1] == {(0.0, CONTACT_WINDOW), (N * LONG.dt - CONTACT_WINDOW, N * LONG.dt)}
+    assert (
+        spans[0] == spans[1] == {(0.0, CONTACT_WINDOW), (N * LONG.dt - CONTACT_WINDOW, N * LONG.dt)}
+    )
 
 
 @pytest.mark.parametrize("gap", [0.0, -1e-3])

@@ -79,6 +79,8 @@ def test_there_is_an_end_to_it() -> None:
     with pytest.raises(InputError, match="no place"):
         add_clutter(home(), 5000)
     with pytest.raises(InputError, match="no place"):
-        add_clutter(vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}), 1)
+        add_clutter(
+            vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}), 1
+        )
     with pytest.raises(InputError, match="things"):
         add_clutter(home(), -1)

@@ -65,7 +65,9 @@ def test_what_a_floor_holds() -> None:
         False,
         False,
     ]
-    assert floor.find_free([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [[0.9, 0.0], [1.1, 0.0]]).tolist() == [
+    assert floor.find_free(
+        [Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [[0.9, 0.0], [1.1, 0.0]]
+    ).tolist() == [
         False,
         True,
     ]

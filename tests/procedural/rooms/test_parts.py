@@ -36,7 +36,9 @@ def extent(found: vkc.Scene) -> np.ndarray:
 @pytest.mark.parametrize("side", range(4))
 def test_a_table_stands_on_its_footprint_and_has_a_free_side(side: int) -> None:
     wall = FLOOR.make_wall_frame(side, 0.4)
-    table = parts.make_table("table", Frame(*wall.transform_point(-0.5, 0.0), wall.yaw), (0.8, 1.4, 0.74))
+    table = parts.make_table(
+        "table", Frame(*wall.transform_point(-0.5, 0.0), wall.yaw), (0.8, 1.4, 0.74)
+    )
     low, high = extent(scene(table))
     assert [*low[:2], *high[:2]] == pytest.approx(
         [*table.footprint.corners.min(axis=0), *table.footprint.corners.max(axis=0)]
@@ -46,7 +48,9 @@ def test_a_table_stands_on_its_footprint_and_has_a_free_side(side: int) -> None:
     assert table.clear_floor is not None
     assert table.clear_floor.compute_gap(table.footprint) == pytest.approx(0.0, abs=1e-3)
     assert table.standing_place is not None
-    assert np.linalg.norm(table.standing_place) < np.hypot(wall.x, wall.y)  # on the side of the room
+    assert np.linalg.norm(table.standing_place) < np.hypot(
+        wall.x, wall.y
+    )  # on the side of the room
 
 
 def test_a_shelf_stands_against_its_wall() -> None:

@@ -18,7 +18,11 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
 from vkc_pin.world.scene import clearance_exemptions as neighbours
-from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption, find_clearance_exemptions, find_close_pairs
+from vkc_pin.world.scene.clearance_exemptions import (
+    ClearanceExemption,
+    find_clearance_exemptions,
+    find_close_pairs,
+)
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -389,7 +393,8 @@ def test_what_a_link_does_not_reach_is_never_near() -> None:
     met = {
         one
         for one in others
-        if standing.compute_distances(label, 0, values, standing.find_shapes([one]), 0.0).min() < 0.0
+        if standing.compute_distances(label, 0, values, standing.find_shapes([one]), 0.0).min()
+        < 0.0
     }
     assert met <= reached
     assert len(reached & others) < len(others) / 5

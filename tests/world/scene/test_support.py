@@ -11,7 +11,12 @@ from helpers.riding import TOP, cup, folder, plates, scene_of
 from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.scene.support import RESTING_DISTANCE, find_supported_objects, find_supports, compute_tilt
+from vkc_pin.world.scene.support import (
+    RESTING_DISTANCE,
+    compute_tilt,
+    find_supported_objects,
+    find_supports,
+)
 
 
 def on(scene: Scene, name: str = "cup") -> set[str]:
@@ -59,7 +64,9 @@ def test_what_stands_on_what_stands_on_what_moves() -> None:
         "cup": "plate.plate",
         "upper": "plate.plate",
     }
-    assert find_supported_objects(stacked.objects, {"cup": {"cup"}}, ["cup", "upper"]) == {"upper": "cup.cup"}
+    assert find_supported_objects(stacked.objects, {"cup": {"cup"}}, ["cup", "upper"]) == {
+        "upper": "cup.cup"
+    }
     assert find_supported_objects(stacked.objects, {"plate": {"post"}}, ["cup", "upper"]) == {}
     assert (
         find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}

@@ -21,10 +21,10 @@ from vkc_pin.world.models.shapes import compute_bounding_box, get_link_name, get
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions, make_shape_keys
 from vkc_pin.world.scene.contact_rules import (
     CONTACT_DEPTH,
-    find_grasped_link,
     compute_hand_clearance,
-    is_rigid_grasp,
+    find_grasped_link,
     find_touch_links,
+    is_rigid_grasp,
 )
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR

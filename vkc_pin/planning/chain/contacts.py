@@ -158,9 +158,7 @@ class ContactModel:
                 placed = dataclasses.replace(
                     self.scene.objects[name], placement=carrier * closure.local
                 )
-                shapes = zip(
-                    self.phases[number].left[name], make_world_shapes(placed), strict=True
-                )
+                shapes = zip(self.phases[number].left[name], make_world_shapes(placed), strict=True)
                 where |= {index: shape.placement for index, shape in shapes}
             if where:
                 view.phases[number] = self.phases[number].placed(where)

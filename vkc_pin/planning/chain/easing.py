@@ -13,7 +13,12 @@ from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_local_name
-from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH, CONTACT_WINDOW, compute_hand_clearance, find_touch_links
+from vkc_pin.world.scene.contact_rules import (
+    CONTACT_DEPTH,
+    CONTACT_WINDOW,
+    compute_hand_clearance,
+    find_touch_links,
+)
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import SupportedObject
@@ -144,7 +149,10 @@ def _moments(
                 name: float(np.clip(value, *phase.ranges[name]))
                 for name, value in phase.values.items()
             }
-            for state, begins in ((phase.initial_values, True), ({**phase.initial_values, **goals}, False)):
+            for state, begins in (
+                (phase.initial_values, True),
+                ({**phase.initial_values, **goals}, False),
+            ):
                 yield (
                     chain.ride_geometries[ride],
                     _ridden(scene, ride, _with(carrier, state)),
@@ -155,7 +163,8 @@ def _moments(
 def _ridden(scene: Scene, ride: SupportedObject, carrier: PlacedObject) -> PlacedObject:
     """Return what rides, where it stands on a carrier."""
     return dataclasses.replace(
-        scene.objects[ride.object], placement=carrier.link_placement(ride.link) * ride.placement_in_link
+        scene.objects[ride.object],
+        placement=carrier.link_placement(ride.link) * ride.placement_in_link,
     )
 
 

@@ -94,7 +94,9 @@ def make_pose_goals(
                     tuple(range(int(first) + 1, int(last) + 1)),
                     "level",
                 )
-                goals.append(PoseGoal(row, ride.carrier_placement, "level", hold.object, hold.object))
+                goals.append(
+                    PoseGoal(row, ride.carrier_placement, "level", hold.object, hold.object)
+                )
         for goal in phase.frames:
             row = PoseRow(
                 *chain.frame(goal.frame, goal.hold, opening=phase.opening), (int(last),), goal.kind

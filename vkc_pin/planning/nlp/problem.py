@@ -124,7 +124,7 @@ class TrajectoryProblem:
         )
         # The robot is at rest while its gripper closes or opens.
         phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
-        stops = tuple(int(end) for end, phase, after in phases if phase.grasps or after.leaves)
+        stops = tuple(int(end) for end, phase, after in phases if phase.grasps or after.released)
         return Structure(
             model=self.chain.model,
             segments=self.segments,

@@ -100,7 +100,9 @@ class TermRow:
         frames = (*at.now, *(at.before if self.formula.uses_previous else ()))
         involved = {frame.waypoint for frame in frames if frame.waypoint >= 0}
         if any(value.column is not None for value in self.values):
-            involved |= {at.waypoint, at.waypoint - 1} if self.formula.uses_previous else {at.waypoint}
+            involved |= (
+                {at.waypoint, at.waypoint - 1} if self.formula.uses_previous else {at.waypoint}
+            )
         waypoints = tuple(sorted(involved))
 
         def position(waypoint: int) -> int:

@@ -21,7 +21,15 @@ from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
-__all__ = ["OPENABLE", "RANDOM", "Counter", "Fixture", "make_fixture", "list_openable_types", "make_fixture_name"]
+__all__ = [
+    "OPENABLE",
+    "RANDOM",
+    "Counter",
+    "Fixture",
+    "list_openable_types",
+    "make_fixture",
+    "make_fixture_name",
+]
 
 OPENABLE = {
     "door": 0.4,
@@ -110,7 +118,9 @@ def make_fixture(kind: str | Mapping[str, Any], seed: int = 0) -> Fixture:
     """
     if isinstance(kind, str) and kind.startswith(RANDOM):
         if kind.removeprefix(RANDOM) not in KINDS:
-            raise UnknownNameError("object that opens", kind, list_openable_types(), field="objects")
+            raise UnknownNameError(
+                "object that opens", kind, list_openable_types(), field="objects"
+            )
         return _random(kind.removeprefix(RANDOM), seed)
     if isinstance(kind, str) and not _is_path(kind):
         return _named(kind)

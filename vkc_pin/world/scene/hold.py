@@ -22,11 +22,11 @@ from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 __all__ = [
     "Hold",
     "Solids",
-    "resolve_holds",
-    "make_holds",
-    "place_held_objects",
     "check_hold_order",
     "find_reversed_approaches",
+    "make_holds",
+    "place_held_objects",
+    "resolve_holds",
     "warn_of_openings",
 ]
 

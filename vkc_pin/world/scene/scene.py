@@ -24,10 +24,10 @@ from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
 from vkc_pin.world.scene.hold import (
     Hold,
-    resolve_holds,
+    find_reversed_approaches,
     make_holds,
     place_held_objects,
-    find_reversed_approaches,
+    resolve_holds,
     warn_of_openings,
 )
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -131,7 +131,9 @@ class Scene:
         from vkc_pin.world.files.documents import Document
         from vkc_pin.world.scene.scene_file import make_scene_fields
 
-        fields = make_scene_fields(Document(mapping(document, "document")), file_path(folder, "folder"))
+        fields = make_scene_fields(
+            Document(mapping(document, "document")), file_path(folder, "folder")
+        )
         return _checked(Scene(**fields)._with())
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
@@ -237,7 +239,9 @@ class Scene:
             if label == FLOOR
         ]
         objects = dict(self.objects)
-        for hold in find_reversed_approaches(self.objects, holds, self.robot, list_placed_shapes(floor)):
+        for hold in find_reversed_approaches(
+            self.objects, holds, self.robot, list_placed_shapes(floor)
+        ):
             objects[hold.object] = objects[hold.object].with_reversed(hold.attachment)
             what = f"{hold.frame or 'the hand'} would come to {hold.object}.{hold.attachment}"
             text = f"{what} out of the object or from below the floor"
@@ -257,7 +261,8 @@ class Scene:
         """Return the scene with other attributes, and every free object that is held where the robot then holds it."""
         changed = dataclasses.replace(self, **fields)
         changed = dataclasses.replace(
-            changed, objects=place_held_objects(changed.objects, changed.tool_placement, changed.holds)
+            changed,
+            objects=place_held_objects(changed.objects, changed.tool_placement, changed.holds),
         )
         object.__setattr__(
             changed, "memory", self.memory

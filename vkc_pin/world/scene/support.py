@@ -12,7 +12,7 @@ from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_bo
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
-__all__ = ["MAX_TILT", "SupportedObject", "find_supported_objects", "find_supports", "compute_tilt"]
+__all__ = ["MAX_TILT", "SupportedObject", "compute_tilt", "find_supported_objects", "find_supports"]
 
 RESTING_DISTANCE = 5e-3
 """An object stands on what it would overlap by more than half of this if it were lowered by this, but not if lifted [m]."""
@@ -45,7 +45,9 @@ class SupportedObject:
         return f"{self.hold.object}.{self.link}"
 
 
-def find_supports(placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]) -> set[str]:
+def find_supports(
+    placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]
+) -> set[str]:
     """Return the labels of what an object stands on.
 
     Args:
@@ -60,7 +62,8 @@ def find_supports(placed: PlacedObject, shapes: Iterable[tuple[str, pin.Geometry
             continue
         lower, upper = compute_world_box(shape.geometry, shape.placement)
         near = (
-            (low < upper + RESTING_DISTANCE).all() and (high > lower - RESTING_DISTANCE).all() for low, high in boxes
+            (low < upper + RESTING_DISTANCE).all() and (high > lower - RESTING_DISTANCE).all()
+            for low, high in boxes
         )
         if any(_bears(shape, one) for one, close in zip(own, near, strict=True) if close):
             found.add(label)
@@ -85,7 +88,9 @@ def find_supported_objects(
     ]
     left, found = [name for name in free if name not in moving], dict[str, str]()
     while left and shapes:
-        on = {name: min(labels) for name in left if (labels := find_supports(objects[name], shapes))}
+        on = {
+            name: min(labels) for name in left if (labels := find_supports(objects[name], shapes))
+        }
         found |= {name: found.get(label, label) for name, label in on.items()}
         left = [name for name in left if name not in on]
         shapes = [(name, shape) for name in on for shape in make_world_shapes(objects[name])]

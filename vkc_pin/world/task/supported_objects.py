@@ -12,9 +12,20 @@ from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.scene.support import MAX_TILT, SupportedObject, find_supported_objects, find_supports, compute_tilt
+from vkc_pin.world.scene.support import (
+    MAX_TILT,
+    SupportedObject,
+    compute_tilt,
+    find_supported_objects,
+    find_supports,
+)
 
-__all__ = ["SupportTracker", "compute_placement_after_motion", "find_objects_supported_by", "place_objects"]
+__all__ = [
+    "SupportTracker",
+    "compute_placement_after_motion",
+    "find_objects_supported_by",
+    "place_objects",
+]
 
 
 class SupportTracker:
@@ -66,7 +77,9 @@ class SupportTracker:
         """Let stand what rode since `begin`; see `compute_placement_after_motion`."""
         for ride in self._rides:
             name, after = ride.hold.object, place_objects(self.scene, state, self.standing)
-            self.standing[ride.object] = compute_placement_after_motion(ride, self._before[name], after[name], where)
+            self.standing[ride.object] = compute_placement_after_motion(
+                ride, self._before[name], after[name], where
+            )
         self._rides = ()
 
     @property
@@ -152,7 +165,9 @@ def find_objects_supported_by(
     return tuple(found)
 
 
-def compute_placement_after_motion(ride: SupportedObject, before: PlacedObject, after: PlacedObject, where: str) -> pin.SE3:
+def compute_placement_after_motion(
+    ride: SupportedObject, before: PlacedObject, after: PlacedObject, where: str
+) -> pin.SE3:
     """Return where an object stands after a ride on a joint of what stands fixed, which moves from `before` to `after`.
 
     Raises:
@@ -160,7 +175,10 @@ def compute_placement_after_motion(ride: SupportedObject, before: PlacedObject, 
     """
     link = after.link_placement(ride.link)
     if (angle := compute_tilt(before.link_placement(ride.link), link)) > MAX_TILT:
-        problem, got = f"'{ride.object}' stands on '{ride.support}', which would tip", f"{angle:.2f} rad"
+        problem, got = (
+            f"'{ride.object}' stands on '{ride.support}', which would tip",
+            f"{angle:.2f} rad",
+        )
         raise InputError(
             problem,
             field=where,

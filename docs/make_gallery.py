@@ -19,8 +19,8 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_robot
 from vkc_pin.benchmarks.robot_object_matrix.pairs import pair
-from vkc_pin.visualization.plots.style import new_figure, save_figure, styled
-from vkc_pin.visualization.room import drawn_parts
+from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
+from vkc_pin.visualization.room import load_drawn_parts
 from vkc_pin.world.trajectory.world_model import World
 
 ROOT = Path(__file__).parent.parent
@@ -76,7 +76,7 @@ def triangles_of(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     data = world.model.createData()
     pin.forwardKinematics(world.model, data, world.coordinates.q(world.start))
     for shape in world.visual.geometryObjects:
-        for solid, colour in drawn_parts(shape):
+        for solid, colour in load_drawn_parts(shape):
             placed = data.oMi[shape.parentJoint] * shape.placement
             corners = (solid.vertices @ placed.rotation.T + placed.translation)[
                 solid.faces.astype(int)
@@ -194,7 +194,7 @@ def main() -> int:
         for one in parsed(list(ROBOTS), "robots", ())
     }
     target = ROOT / "docs" / "images" / "gallery.png"
-    with styled():
+    with use_style():
         figure = new_figure(2.0 * len(OBJECTS) + 0.3, 2.0 * len(ROBOTS) + 0.3)
         axes = figure.subplots(
             len(ROBOTS), len(OBJECTS), gridspec_kw={"wspace": 0.02, "hspace": 0.02}

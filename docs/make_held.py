@@ -15,7 +15,7 @@ from vkc_pin.planning.initialization import constrained_rrt as held
 from vkc_pin.planning.initialization import interpolation as joining
 from vkc_pin.planning.initialization.keyframes import depth
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.obstacles import FLOOR
 
@@ -49,7 +49,7 @@ def main() -> int:
     sys.stdout.write(plan.report() + "\n")
     problem, ways = seen[-1]
     phase = len(problem.task.phases) - 1
-    with styled():
+    with use_style():
         figure = new_figure(8.0, 3.9)
         for number, (way, title) in enumerate(
             zip(ways, ("straight between knots", "as trees lead it"), strict=True)

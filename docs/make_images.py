@@ -17,7 +17,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks import chores, gap
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.placed_object import make_world_shapes
@@ -119,7 +119,7 @@ def room_picture() -> None:
         vkc.random_room(number, clutter=clutter)
         for number, clutter in ((3, 0.2), (1, 0.5), (2, 0.9))
     ]
-    with styled():
+    with use_style():
         figure = new_figure(12.0, 4.4)
         for own, room in zip(figure.subfigures(1, len(rooms)), rooms, strict=True):
             draw_top_view(own, World(room), None)
@@ -131,7 +131,7 @@ def furniture_picture() -> None:
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     light = np.array([-0.6, -0.35, 0.72])
-    with styled():
+    with use_style():
         figure = new_figure(12.0, 5.6)
         for place, (kind, seed) in enumerate(FURNITURE.items(), start=1):
             thing = vkc.load_object(vkc.random_object(kind, seed))
@@ -189,7 +189,7 @@ def finer(face: np.ndarray, longest: float = 0.06) -> list[np.ndarray]:
 
 def task_picture() -> None:
     """Write tasks in random rooms from above, with the motions that were planned for them."""
-    with styled():
+    with use_style():
         figure = new_figure(12.0, 8.4)
         for own, seed in zip(figure.subfigures(2, 2).ravel(), TASKS, strict=True):
             room, steps = vkc.random_task(seed)
@@ -211,7 +211,7 @@ def import_picture() -> None:
         scene = vkc.import_home(file, Path(folder) / "out").scene
         plan = vkc.plan(scene, [vkc.Actuate("refrigerator_body", {"refrigerator_hinge": 0.94})])
         sys.stdout.write(plan.report() + "\n")
-        with styled():
+        with use_style():
             figure = new_figure(8.0, 6.6)
             draw_top_view(figure, World(scene), plan.trajectory)
             save_figure(figure, IMAGES / "import_home.png")
@@ -257,7 +257,7 @@ def bases_picture() -> None:
         vkc.load_scene("door"),
         ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8}),
     )
-    with styled():
+    with use_style():
         figure = new_figure(11.0, 3.5)
         parts = figure.subfigures(1, 2)
         for part, robot in zip(parts, shown, strict=True):
@@ -275,12 +275,12 @@ def opening_picture() -> None:
     """Write a picture of fingers between two cheeks, from above: fully open, and as far as the attachment says."""
     from scipy.spatial import ConvexHull
 
-    with tempfile.TemporaryDirectory() as folder, styled():
+    with tempfile.TemporaryDirectory() as folder, use_style():
         scene = between_cheeks(write_gripper(Path(folder)), opening=FINGERS)
         plan = vkc.plan(scene, [vkc.Grasp("drawer")])
         sys.stdout.write(plan.report() + "\n")
         world, figure = World(scene), new_figure(8.0, 3.4)
-        row = world.positions(plan.trajectory)[-1]
+        row = world.compute_positions(plan.trajectory)[-1]
         first = world.coordinates.index("finger_a_joint")
         for number, opening in enumerate((None, FINGERS)):
             row[first : first + 2] = scene.robot.gripper.positions(opening)
@@ -320,7 +320,7 @@ def torque_picture() -> None:
     """Write what the motors do while a door with a closer is opened, against what they have, over time."""
     scenes = vkc.load_scene("door"), closer(damping=400.0, stiffness=5.0, springref=-2.0)
     plans = [vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2}, "handle")]) for scene in scenes]
-    with styled():
+    with use_style():
         figure = new_figure(9.0, 3.4)
         panels = figure.subplots(1, 2, sharey=True)
         for axes, plan, title in zip(

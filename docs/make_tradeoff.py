@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.options import Options
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 
 DOCS = Path(__file__).resolve().parent
 FIELD = "velocity_weight_base"
@@ -47,7 +47,7 @@ def main() -> None:
     drawn = points(
         json.loads((DOCS / "results" / "tradeoff.json").read_text(encoding="utf-8"))["trials"]
     )
-    with styled():
+    with use_style():
         figure = new_figure(5.6, 3.8)
         axes = figure.subplots()
         axes.plot(

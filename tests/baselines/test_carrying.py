@@ -80,7 +80,7 @@ def rows(found: vkc.Plan, phase: int) -> np.ndarray:
 def stands(found: vkc.Plan, waypoint: int, name: str = "cup") -> pin.SE3:
     """Return where an object is at a waypoint, by validation's own tree."""
     world = World(found.scene)
-    return world.placement(name, world.positions(found.trajectory)[waypoint])
+    return world.get_placement(name, world.compute_positions(found.trajectory)[waypoint])
 
 
 # --- carrying

@@ -418,7 +418,9 @@ def test_household(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert validate(found.scene, found.steps, found.trajectory, found.options).ok
         if t["scene"] == "cup":
             world = World(found.scene)
-            at, *_, end = (world.placement("cup", row) for row in world.positions(found.trajectory))
+            at, *_, end = (
+                world.get_placement("cup", row) for row in world.compute_positions(found.trajectory)
+            )
             np.testing.assert_allclose(at.translation, t["placed"]["cup"][:3], atol=1e-6)
             np.testing.assert_allclose(end.translation, [-0.6, -1.6, 0.751], atol=2e-3)
             assert end.rotation[2, 2] > np.cos(2e-3)

@@ -36,7 +36,7 @@ class Relaxed:
             "penalty": CLEARANCE,
             "dt": self.timing.dt,
         }
-        given["gears"] = p.rolling.gears(p.waypoints(self.z))
+        given["gears"] = p.rolling.compute_gears(p.waypoints(self.z))
         if not relaxed:
             vector = p.transcription.parameter_vector(
                 p.start, *self._planes, p.target_matrix(), **given

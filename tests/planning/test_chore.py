@@ -18,7 +18,7 @@ from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.window import SlidingWindow
-from vkc_pin.world.trajectory.splicing import cut
+from vkc_pin.world.trajectory.splicing import extract_phases
 from vkc_pin.world.trajectory.world_model import World
 
 A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
@@ -120,7 +120,7 @@ class Problems:
             self.asked.append((one.task.steps, seed is not None))
             if not fails(one.task.steps):
                 return plan
-            trajectory = cut(plan.trajectory, plan.trajectory.names, 0, 1)
+            trajectory = extract_phases(plan.trajectory, plan.trajectory.names, 0, 1)
             return dataclasses.replace(plan, status="not converged", trajectory=trajectory)
 
         patch.setattr(SlidingWindow, "_solved", solve)
@@ -267,11 +267,11 @@ def test_a_chore_of_four_steps() -> None:
         "move",
     ]
     world = World(home())
-    rows = world.positions(plan.trajectory)
+    rows = world.compute_positions(plan.trajectory)
     hinge = rows[:, world.coordinates.index("refrigerator.hinge")]
     ends = [phase.last for phase in plan.trajectory.phases]
     assert hinge[ends] == pytest.approx([0, 1.57, 1.57, 1.57, 1.57, 0], abs=1e-3)
-    cup = world.placement("cold_cup", rows[-1])
+    cup = world.get_placement("cold_cup", rows[-1])
     assert cup.translation == pytest.approx(TABLE, abs=1e-3)
     assert cup.rotation[:, 2] == pytest.approx([0, 0, 1], abs=5e-3)
     assert vkc.validate(home(), plan.steps, plan.trajectory).ok

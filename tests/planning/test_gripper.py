@@ -164,7 +164,11 @@ def test_program_and_validation_put_the_fingers_in_the_same_places(robot: Path) 
     )
     placed, shapes = world.model.createData(), world.bodies.createData()
     pin.updateGeometryPlacements(
-        world.model, placed, world.bodies, shapes, world.coordinates.q(world.positions(motion)[1])
+        world.model,
+        placed,
+        world.bodies,
+        shapes,
+        world.coordinates.q(world.compute_positions(motion)[1]),
     )
     for k, shape in enumerate(
         contacts.phases[0].shapes[: len(scene.robot.collision.geometryObjects)]
@@ -190,7 +194,7 @@ def test_the_gripper_changes_where_it_lets_go_and_takes_hold(robot: Path) -> Non
     assert [span.opening for span in spans] == [NARROW, NARROW, None, None, None]
     world = World(scene)
     columns = [world.coordinates.index(f"finger_{name}_joint") for name in "ab"]
-    fingers = world.positions(found.trajectory)[:, columns]
+    fingers = world.compute_positions(found.trajectory)[:, columns]
     np.testing.assert_allclose(fingers[: spans[1].last + 1], NARROW / 2.0, atol=1e-5)
     np.testing.assert_allclose(fingers[spans[2].first + 1 :], WIDEST / 2.0)
     drawn = sample_motion(world, found.trajectory)

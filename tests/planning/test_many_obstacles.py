@@ -25,11 +25,11 @@ from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.validation.distances import Placed, Solids, travelled
+from vkc_pin.validation.distances import CollisionShapes, PlacedShapes, bound_displacements
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import _Sweep, sweep
-from vkc_pin.visualization.plots.clearance import clearance_curves
+from vkc_pin.visualization.plots.clearance import compute_clearance_curves
 from vkc_pin.world.collision.clearances import Clearances, ClosePairs
 from vkc_pin.world.collision.shapes import count_distance_queries
 from vkc_pin.world.models import shapes as geometry
@@ -110,7 +110,7 @@ def test_pictures_of_clearance_ask_for_few(plans: dict[int, tuple[Plan, int]]) -
     for result, _ in plans.values():
         counter, times = Counter(), result.trajectory.times
         with counter.counting(pytest.MonkeyPatch()):
-            found.append(clearance_curves(result.scene, result.trajectory, times))
+            found.append(compute_clearance_curves(result.scene, result.trajectory, times))
         counts.append(counter.asked / len(times))
     assert [curve.name for curve in found[0]] == [curve.name for curve in found[1]]
     assert max(counts) < 200  # at every moment, of 26,000 pairs
@@ -247,7 +247,7 @@ def test_validation_sees_what_brute_force_sees_of_what_is_carried(
 def check_sweep(scene: Scene, motion: Trajectory) -> None:
     """The smallest distance of all, whatever overlaps at a sample, and whatever falls short of its margin at a waypoint."""
     samples = Samples(scene, motion)
-    table = PairTable(scene, Solids(samples.world), motion, 0.02)
+    table = PairTable(scene, CollisionShapes(samples.world), motion, 0.02)
     hits = list(sweep(table, samples.z, samples.waypoint_rows))
     moves = table._moves[
         table._phase[np.searchsorted(samples.waypoint_rows, np.arange(len(samples.z)))]
@@ -273,7 +273,7 @@ def check_sweep(scene: Scene, motion: Trajectory) -> None:
 def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     scene = cluttered(seed, count)
     samples = Samples(scene, wander(scene, seed, size=size))
-    table = PairTable(scene, Solids(samples.world), samples.trajectory, 0.02)
+    table = PairTable(scene, CollisionShapes(samples.world), samples.trajectory, 0.02)
     z = samples.z[samples.waypoint_rows]
     distances = brute_force(table, z)
     moves = table._moves[table._phase][:, table.pairs].any(axis=2)
@@ -301,7 +301,7 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     np.testing.assert_allclose(
         distances[np.arange(len(z)), nearest], distances.min(axis=1), rtol=0.0, atol=COAL
     )
-    moved = np.diff(travelled(table.solids, samples.z)[samples.waypoint_rows], axis=0)
+    moved = np.diff(bound_displacements(table.solids, samples.z)[samples.waypoint_rows], axis=0)
     floor = (distances[:-1] + distances[1:] - moved[:, table.pairs].sum(axis=2)) / 2
     for smallest in (1e-3, 0.1):
         active = set(
@@ -358,12 +358,12 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
         found = all_of_them(near, q, z, np.full(len(q), waypoint), reach=reach)
         return int(min(found.row[found.margin - found.distance > allowed], default=len(q)))
 
-    def nowhere(placed: Placed, states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    def nowhere(placed: PlacedShapes, states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         return np.full(len(pairs), -np.inf)
 
     def all_of(
         table: PairTable,
-        _: Placed,
+        _: PlacedShapes,
         first: np.ndarray,
         last: np.ndarray,
         moved: np.ndarray,
@@ -378,7 +378,7 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(Clearances, "nearest", all_of_them)
     patch.setattr(Clearances, "first_blocked", one_by_one)
-    patch.setattr(Placed, "bounds", nowhere)
+    patch.setattr(PlacedShapes, "bounds", nowhere)
     patch.setattr(PairTable, "near", all_of)
     patch.setattr(Body, "_close", lambda body, along: np.arange(len(body.moving)))
     for module in (geometry, easing):

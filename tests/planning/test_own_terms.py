@@ -71,7 +71,7 @@ def placements(plan: vkc.Plan, frame: str, times: np.ndarray | None = None) -> l
     """Return where a frame is at the waypoints, or at some times, by numeric Pinocchio."""
     world = World(plan.scene)
     data, index, found = world.model.createData(), world.model.getFrameId(frame), []
-    for q in world.coordinates.q(world.positions(plan.trajectory, times)):
+    for q in world.coordinates.q(world.compute_positions(plan.trajectory, times)):
         pin.forwardKinematics(world.model, data, q)
         found.append(pin.updateFramePlacement(world.model, data, index).copy())
     return found

@@ -21,7 +21,7 @@ from helpers.drives import hall
 import vkc_pin as vkc
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.resources import folder
-from vkc_pin.world.trajectory.wheels import rolling_of
+from vkc_pin.world.trajectory.wheels import make_rolling_limits
 from vkc_pin.world.trajectory.world_model import World
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -216,7 +216,7 @@ def at_a_distance(scene: vkc.Scene) -> vkc.Scene:
 def left_at(plan: vkc.Plan, name: str) -> pin.SE3:
     """Return where a free object is at the end."""
     world = World(plan.scene)
-    return world.placement(name, world.positions(plan.trajectory)[-1])
+    return world.get_placement(name, world.compute_positions(plan.trajectory)[-1])
 
 
 @pytest.mark.parametrize("joint", [True, False], ids=["jointly", "step by step"])
@@ -466,7 +466,7 @@ def test_a_differential_base_does_not_slip(step: Any) -> None:
 def test_a_steered_base_drives_as_a_car(step: Any) -> None:
     plan = vkc.plan(hall(base="ackermann", turning_radius=0.8), [step])
     confirm(plan)
-    along, aside, turn = rolling_of(plan.scene.robot).steps(plan.trajectory.positions)
+    along, aside, turn = make_rolling_limits(plan.scene.robot).steps(plan.trajectory.positions)
     assert np.abs(aside).max() < 1e-4
     assert (0.8 * np.abs(turn) - np.abs(along)).max() < 1e-4
     assert plan.metrics["base_effort"] > 0.3
@@ -488,7 +488,7 @@ def test_wheels_make_a_motion_slow(tmp_path: Path) -> None:
     for scene in (quick, slow):
         plan = vkc.plan(scene, [vkc.GoTo(4.0, 1.0, 1.0)])
         confirm(plan)
-        along, _, turn = rolling_of(scene.robot).steps(plan.trajectory.positions)
+        along, _, turn = make_rolling_limits(scene.robot).steps(plan.trajectory.positions)
         rims.append(
             (np.abs(along) + scene.robot.wheels.track / 2 * np.abs(turn))
             / np.diff(plan.trajectory.times)

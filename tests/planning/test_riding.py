@@ -14,12 +14,12 @@ import vkc_pin as vkc
 from vkc_pin.options import Options
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.trajectory.free_objects import FreeObjects
-from vkc_pin.world.trajectory.world_model import World, scene_after
+from vkc_pin.world.trajectory.world_model import World, compute_final_scene
 
 
 def where(plan: vkc.Plan, name: str = "cup") -> list[pin.SE3]:
     world = World(plan.scene)
-    return [world.placement(name, row) for row in world.positions(plan.trajectory)]
+    return [world.get_placement(name, row) for row in world.compute_positions(plan.trajectory)]
 
 
 def test_a_cup_on_a_plate_comes_along_and_is_taken_off() -> None:
@@ -40,7 +40,7 @@ def test_a_cup_on_a_plate_comes_along_and_is_taken_off() -> None:
 
 def test_it_is_where_it_came_to_in_the_scene_after() -> None:
     scene = plates()
-    after = scene_after(scene, slid(scene, 0.3), ())
+    after = compute_final_scene(scene, slid(scene, 0.3), ())
     np.testing.assert_allclose(
         after.objects["cup"].placement.translation, [0.5, 0.05, TOP], rtol=0.0, atol=1e-12
     )
@@ -61,7 +61,7 @@ def test_a_tray_is_carried_level() -> None:
 def test_what_stands_on_what_is_in_the_hand_from_the_start_comes_along() -> None:
     first = vkc.plan(trays(), [vkc.Grasp("tray"), vkc.GoTo(-1.0, 0.3)])
     assert first.success, first.report()
-    after = scene_after(first.scene, first.trajectory, first.trajectory.phases[-1].holds)
+    after = compute_final_scene(first.scene, first.trajectory, first.trajectory.phases[-1].holds)
     second = vkc.plan(after, [vkc.Place("tray", [-0.5, -1.5, 0.7])])
     assert second.success, second.report()
     apart = where(second, "tray")[-1].actInv(where(second)[-1]).translation

@@ -36,7 +36,7 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import scene_after
+from vkc_pin.world.trajectory.world_model import compute_final_scene
 
 
 def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -> Trajectory:
@@ -52,7 +52,7 @@ def ending(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -
 def test_robot_and_joints_are_where_the_motion_ends() -> None:
     scene = full_scene().with_state("door", {"knob": 0.2})
     arm = np.linspace(-0.5, 0.5, len(scene.start) - 3)
-    after = scene_after(scene, ending(scene, [0.1, -0.2, 4.0], arm, door__hinge=0.4), [])
+    after = compute_final_scene(scene, ending(scene, [0.1, -0.2, 4.0], arm, door__hinge=0.4), [])
     np.testing.assert_array_equal(after.start, [0.1, -0.2, 4.0, *arm])
     np.testing.assert_array_equal(after.objects["door"].state, [0.4, 0.2])
     for name in ("drawer", "cabinet"):
@@ -74,7 +74,7 @@ def test_what_ends_a_little_outside_its_limits_is_at_them() -> None:
         cabinet__sleeve_slide=sleeve.freedoms[0].lower - off,
         cabinet__sleeve_turn=sleeve.freedoms[1].upper + off,
     )
-    after = scene_after(scene, motion, [Hold("cabinet", "sleeve")])
+    after = compute_final_scene(scene, motion, [Hold("cabinet", "sleeve")])
     np.testing.assert_array_equal(
         after.start, [scene.arena[1], scene.arena[2], 0.0, *robot.upper[3:]]
     )
@@ -93,7 +93,7 @@ def test_what_is_carried_is_in_the_hand() -> None:
     script = (
         Script(scene).go(down).take("stick", values=values).go(moved_base(down, x=-0.4, yaw=0.5))
     )
-    after = scene_after(scene, script.motion(), [Hold("stick", "grip")])
+    after = compute_final_scene(scene, script.motion(), [Hold("stick", "grip")])
     assert [(hold, hold.at) for hold in after.holds] == [(Hold("stick", "grip"), values)]
     data = scene.robot.model.createData()
     pin.framesForwardKinematics(scene.robot.model, data, scene.robot.coordinates.q(script.rows[-1]))
@@ -107,7 +107,7 @@ def test_what_is_carried_is_in_the_hand() -> None:
 def test_what_was_let_go_of_stands_where_it_was_left() -> None:
     scene = room(table())
     script = carried_over(scene, values=(0.03, 0.2))
-    after = scene_after(scene, script.motion(), [])
+    after = compute_final_scene(scene, script.motion(), [])
     assert dict(after.held) == {}
     np.testing.assert_allclose(
         after.objects["stick"].placement.homogeneous,
@@ -125,8 +125,10 @@ def test_what_was_held_at_the_start_can_be_let_go_of() -> None:
     """And does not follow the hand from there on."""
     scene = room(table()).with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
     script = Script(scene).go(moved_base(scene.start, y=0.3))
-    kept = scene_after(scene, script.motion(), [Hold("stick", "grip")])
-    left = scene_after(scene, script.let_go().go(moved_base(scene.start, x=-0.5)).motion(), [])
+    kept = compute_final_scene(scene, script.motion(), [Hold("stick", "grip")])
+    left = compute_final_scene(
+        scene, script.let_go().go(moved_base(scene.start, x=-0.5)).motion(), []
+    )
     assert [(hold, hold.at) for hold in kept.holds] == [(Hold("stick", "grip"), (0.02, -0.1))]
     assert dict(left.held) == {}
     there = lifted(scene.objects["stick"].placement, [0.0, 0.3, 0.0]).homogeneous
@@ -145,7 +147,7 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
     )
     stick = Hold("stick", "grip")
     holds = (stick, Hold("ball", "pull", stick, "tip"))
-    after = scene_after(scene, script.motion(), holds)
+    after = compute_final_scene(scene, script.motion(), holds)
     assert after.holds == holds
     assert after.holds[1].at == tuple(values)
 
@@ -295,7 +297,7 @@ def test_what_cannot_be_put_down_as_it_is_held_is_taken_anew() -> None:
     shelved = littered(shelf(*AT[:2]))
     taken = vkc.plan(shelved, [vkc.Grasp("litter", "grip")])
     assert taken.success
-    free = scene_after(littered(), taken.trajectory, taken.end_scene().holds)
+    free = compute_final_scene(littered(), taken.trajectory, taken.end_scene().holds)
     plan = vkc.plan(free, [vkc.Place("litter", BIN)])
     assert plan.success
     assert plan.steps == (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))

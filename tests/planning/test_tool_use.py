@@ -16,7 +16,7 @@ from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.stepwise import stages
 from vkc_pin.world.task.compiler import compile_task
-from vkc_pin.world.trajectory.world_model import World, scene_after
+from vkc_pin.world.trajectory.world_model import World, compute_final_scene
 
 
 @cache
@@ -135,7 +135,7 @@ def test_each_step_begins_where_the_one_before_it_ends() -> None:
     assert len(parts) == 2  # grasping what is held changes nothing
     (_, first, grasped), (_, second, _) = parts
     end = grasped.trajectory
-    after = scene_after(start(), end, first.task.after)
+    after = compute_final_scene(start(), end, first.task.after)
     np.testing.assert_allclose(after.start, end.positions[-1, : end.robot_size], atol=1e-9)
     assert dict(after.held) == {"stick": "grip"}
     np.testing.assert_allclose(second.scene.start, after.start, atol=1e-12)
@@ -144,7 +144,9 @@ def test_each_step_begins_where_the_one_before_it_ends() -> None:
     assert np.linalg.norm(lay.actInv(lies).translation) < 1e-4
     world = World(start())
     np.testing.assert_allclose(
-        world.placement("stick", world.positions(end)[-1]).homogeneous, lay.homogeneous, atol=1e-9
+        world.get_placement("stick", world.compute_positions(end)[-1]).homogeneous,
+        lay.homogeneous,
+        atol=1e-9,
     )
 
 

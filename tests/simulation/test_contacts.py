@@ -8,7 +8,7 @@ from helpers.executions import door_plan, holding
 import vkc_pin as vkc
 from vkc_pin.options import Options
 from vkc_pin.simulation.contacts import find_contact_pairs, find_unplanned_contacts
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
@@ -28,7 +28,7 @@ def test_contact_pairs_include_all_pairs_of_the_planner(grip: bool) -> None:
         colliding |= {
             frozenset((i, j)) for j, other in enumerate(pairs.affinities.tolist()) if kind & other
         }
-    table = PairTable(plan.scene, Solids(world), plan.trajectory, 0.01)
+    table = PairTable(plan.scene, CollisionShapes(world), plan.trajectory, 0.01)
     exempt = {
         frozenset((one.first, one.second))
         for one in find_clearance_exemptions(plan.scene, Options().dist_safe)

@@ -28,7 +28,7 @@ from vkc_pin.world.trajectory.world_model import World
 def build_model(scene: Scene, *, has_notes: bool = False) -> PhysicalWorld:
     physics, world, holds = Physics(), World(scene), scene.holds
     assert bool(complete_inertias(world, physics)) == has_notes
-    driven = make_servos(world, world.positions(still(scene)), physics)
+    driven = make_servos(world, world.compute_positions(still(scene)), physics)
     latches = [(joint, at) for joint, at, _, _ in find_latches(scene)]
     return Builder(world, physics).build(find_contact_pairs(world, holds), driven, holds, latches)
 
@@ -39,7 +39,7 @@ def random_rows(world: World, count: int) -> np.ndarray:
     )
     for name, placed in world.scene.objects.items():
         if placed.object.free:
-            columns = world.placement_columns(name)
+            columns = world.get_placement_columns(name)
             turns = rows[:, columns.start + 3 : columns.stop]
             turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     return rows

@@ -16,7 +16,7 @@ def test_replay_reproduces_executed_coordinates() -> None:
     scene = holding()
     result = simulate(scene, [vkc.Grasp("stick")], still(scene))
     world = Replay(scene, result.trajectory.times, result.rows)
-    rows = world.positions(result.trajectory, result.trajectory.times)
+    rows = world.compute_positions(result.trajectory, result.trajectory.times)
     np.testing.assert_allclose(np.abs(rows), np.abs(result.rows), atol=1e-12)
     assert np.abs(np.diff(rows, axis=0)).max() < 0.1  # quaternions keep their sign
 

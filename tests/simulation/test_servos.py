@@ -27,7 +27,7 @@ from vkc_pin.world.trajectory.world_model import World
 def test_servos_are_designed_for_their_load_inertia() -> None:
     plan = door_plan()
     world = World(plan.scene)
-    own = make_servos(world, world.positions(plan.trajectory), Physics())
+    own = make_servos(world, world.compute_positions(plan.trajectory), Physics())
     assert [servo.coordinate for servo in own] == list(plan.scene.robot.coordinates.names)
     assert own[0].stiffness == pytest.approx(
         20.0**2 * sum(i.mass for i in plan.scene.robot.model.inertias[1:]), rel=1e-6
@@ -60,7 +60,7 @@ def test_reference_contains_positions_velocities_and_accelerations() -> None:
 def test_hand_without_finger_joints_has_no_finger_reference() -> None:
     plan = door_plan()
     world = World(plan.scene)
-    rows = world.positions(plan.trajectory)
+    rows = world.compute_positions(plan.trajectory)
     assert sample_fingers(world, rows, plan.trajectory.times, np.zeros(4)).shape == (4, 0)
 
 
@@ -70,7 +70,7 @@ def test_feedforward_agrees_with_inverse_dynamics_of_mujoco(name: str, tmp_path:
     scene = coupled_scene(tmp_path) if name == "coupled" else vkc.load_scene(name)
     world, physics, robot = World(scene), Physics(), scene.robot.coordinates
     complete_inertias(world, physics)
-    driven = make_servos(world, world.positions(still(scene)), physics)
+    driven = make_servos(world, world.compute_positions(still(scene)), physics)
     physical = Builder(world, physics).build(find_contact_pairs(world, ()), driven, (), ())
     rng, count = np.random.default_rng(3), 6
     rows = np.tile(world.start, (count, 1))

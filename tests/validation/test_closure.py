@@ -49,7 +49,7 @@ def bent(trajectory: Trajectory, column: int, by: float) -> Trajectory:
     held = next(phase for phase in trajectory.phases if phase.held)
     begin, end = (float(trajectory.times[k]) for k in (held.first, held.last))
     inside = (curve.times[:-1] > begin + 1e-6) & (curve.times[1:] < end - 1e-6)
-    lengths = curve.speeds()[0].max(axis=1) * np.diff(curve.times)
+    lengths = curve.compute_max_rates()[0].max(axis=1) * np.diff(curve.times)
     k = int(np.flatnonzero(inside)[np.argmin(lengths[inside])])
     span = curve.times[k + 1] - curve.times[k]
     times = curve.times[k] + span * np.array([0.25, 0.75])
@@ -132,7 +132,7 @@ def test_second_derivatives_stay_below_their_bounds(plan: Plan, seed: int, speed
 
 def placements(samples: Samples, hold: vkc.Hold, times: Floats) -> Floats:
     """Return the offset of the tool from the handle and the axial vector of their relative rotation, shape (K, 6)."""
-    z = samples.world.positions(samples.trajectory, times, samples.free)
+    z = samples.world.compute_positions(samples.trajectory, times, samples.free)
     attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
     turns, origins = samples._frames(
         z, samples.scene.robot.tool_frame, f"{hold.object}.{attachment.link}"

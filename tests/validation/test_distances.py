@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 from helpers.small_problems import door_scene, full_scene, random_configurations
 
-from vkc_pin.validation.distances import POINT, Solids
+from vkc_pin.validation.distances import POINT, CollisionShapes
 from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
@@ -19,8 +19,8 @@ COAL = 1e-5  # [m]
 
 
 @cache
-def solids() -> Solids:
-    return Solids(World(full_scene()))
+def solids() -> CollisionShapes:
+    return CollisionShapes(World(full_scene()))
 
 
 def configuration(seed: int) -> np.ndarray:
@@ -100,7 +100,7 @@ def test_many_configurations_are_as_one_by_one() -> None:
 
 def test_only_what_may_be_nearest_is_asked_of_coal(monkeypatch: pytest.MonkeyPatch) -> None:
     """What bounds show to be further away than another is not looked at, even where they are wrong."""
-    mine = Solids(World(door_scene()))
+    mine = CollisionShapes(World(door_scene()))
     pairs = np.array(
         [(a, b) for a in range(mine.bodies) for b in range(mine.bodies, len(mine.world.shapes))]
     )

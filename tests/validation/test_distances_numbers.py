@@ -12,14 +12,20 @@ import pytest
 from helpers.motions import whirl
 from helpers.small_problems import full_scene
 
-from vkc_pin.validation.distances import POINT, Placed, Solids, _free, travelled
+from vkc_pin.validation.distances import (
+    POINT,
+    CollisionShapes,
+    PlacedShapes,
+    _free,
+    bound_displacements,
+)
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.world_model import World
 
 
 @cache
-def solids() -> Solids:
-    return Solids(World(full_scene()))
+def solids() -> CollisionShapes:
+    return CollisionShapes(World(full_scene()))
 
 
 def test_boxes_are_those_around_the_corners_of_turned_boxes() -> None:
@@ -46,7 +52,7 @@ def test_boxes_are_those_around_the_corners_of_turned_boxes() -> None:
 def between(one: tuple[list[float], list[float]], other: tuple[list[float], list[float]]) -> float:
     """Return the bound for two boxes, in either order."""
     solid: Any = SimpleNamespace()
-    placed = Placed(solid, np.zeros((2, 0, 12)))
+    placed = PlacedShapes(solid, np.zeros((2, 0, 12)))
     far = ([9.0] * 3, [9.5] * 3)
     corners = tuple(np.array([[far[side], far[side]], [one[side], other[side]]]) for side in (0, 1))
     placed.__dict__["corners"] = corners
@@ -74,7 +80,7 @@ def test_how_far_shapes_move_is_the_sum_over_their_joints() -> None:
     world, rng = mine.world, np.random.default_rng(5)
     names, model = world.coordinates.names, world.model
     z = rng.uniform(-1.0, 1.0, (4, world.coordinates.size))
-    found = travelled(mine, z)
+    found = bound_displacements(mine, z)
     assert found.shape == (4, len(world.shapes))
     np.testing.assert_array_equal(found[0], 0.0)
     np.testing.assert_array_equal(found[:, mine.bodies :], 0.0)
@@ -123,15 +129,15 @@ def test_how_far_a_point_at_a_free_joint_moves(angle: float) -> None:
 def test_what_is_carried_moves_as_its_free_joint_does() -> None:
     scene, motion = whirl(1, size=0.5)
     samples = Samples(scene, motion)
-    mine, world = Solids(samples.world), samples.world
-    found = travelled(mine, samples.z)
+    mine, world = CollisionShapes(samples.world), samples.world
+    found = bound_displacements(mine, samples.z)
     for g, label in enumerate(world.collision_labels[: mine.bodies]):
         owner = label.partition(".")[0]
         if owner not in ("stick", "ball"):
             continue
         shape = world.shapes[g]
         far = np.linalg.norm(mine.half[g]) + np.linalg.norm(shape.placement.act(mine.center[g]))
-        columns = world.placement_columns(owner)
+        columns = world.get_placement_columns(owner)
         expected = np.append(0.0, np.cumsum(_free(samples.z[:, columns], float(far))))
         np.testing.assert_allclose(found[:, g], expected, atol=1e-6)
 

@@ -268,7 +268,7 @@ def test_how_far_what_is_carried_goes() -> None:
         [9.0, 9.0, 9.0],
     ]
     z[:, 4] = [0.0, 5.0, 6.0, 7.0, 8.0]
-    world = SimpleNamespace(placement_columns=lambda owner: [1, 2, 3, 4, 5, 6, 7])
+    world = SimpleNamespace(get_placement_columns=lambda owner: [1, 2, 3, 4, 5, 6, 7])
     phases = [SimpleNamespace(held={"stick": "grip", "door": "handle"})]
     samples: Any = SimpleNamespace(
         z=z, world=world, rows=lambda phase: np.arange(4), trajectory=SimpleNamespace(phases=phases)

@@ -12,7 +12,7 @@ from helpers.small_problems import door_scene, full_scene, program_of
 
 from vkc_pin.options import Options
 from vkc_pin.validation.contact_windows import Window
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.scene.hold import Hold
@@ -31,7 +31,7 @@ def door() -> Scene:
 
 def test_which_pairs_count(door: Scene) -> None:
     motion = wander(door, 0, size=0.1)
-    table = PairTable(door, Solids(World(door)), motion, 0.02)
+    table = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
     walls = [label for label in door.obstacle_labels if label != FLOOR]
     arm = [shape for shape in robot.geometryObjects if shape.parentJoint > 1]
@@ -50,11 +50,11 @@ def test_which_pairs_count(door: Scene) -> None:
 def test_some_may_be_closer_for_a_while(door: Scene) -> None:
     """Only the pairs that were said to, then alone, and each with its own overlap that counts as contact."""
     motion = wander(door, 0, size=0.1)
-    plain = PairTable(door, Solids(World(door)), motion, 0.02)
+    plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     every = np.arange(len(plain.pairs))
     first, second = plain.pairs[[3]], plain.pairs[[3, 70]]
     near = [Window(first, 0, 1, 0.005, 1e-4, together=True), Window(second, 1, 3, 0.01, 0.0)]
-    table = PairTable(door, Solids(World(door)), motion, 0.02, windows=near)
+    table = PairTable(door, CollisionShapes(World(door)), motion, 0.02, windows=near)
     np.testing.assert_array_equal(table.pairs, plain.pairs)
     for waypoint, margins in enumerate(
         [{3: 0.005}, {3: 0.005, 70: 0.01}, {3: 0.01, 70: 0.01}, {3: 0.01, 70: 0.01}]
@@ -75,7 +75,7 @@ def test_some_may_be_closer_for_a_while(door: Scene) -> None:
 def test_a_window_of_pairs_that_are_not_looked_at_is_nobody_elses(door: Scene) -> None:
     """Neighbouring links, or two walls: what is said of them must not end up with another pair."""
     motion = wander(door, 0, size=0.1)
-    plain = PairTable(door, Solids(World(door)), motion, 0.02)
+    plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     known, count = {(min(pair), max(pair)) for pair in plain.pairs.tolist()}, len(plain.group)
     absent = np.array(
         [(i, j) for i in range(count) for j in range(i + 1, count) if (i, j) not in known]
@@ -83,7 +83,7 @@ def test_a_window_of_pairs_that_are_not_looked_at_is_nobody_elses(door: Scene) -
     assert len(absent) > 10
     table = PairTable(
         door,
-        Solids(World(door)),
+        CollisionShapes(World(door)),
         motion,
         0.02,
         windows=[Window(absent, 0, 3, -1.0, 1.0, together=True)],
@@ -103,7 +103,7 @@ def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
     motion = Trajectory(
         names, np.arange(2.0), positions, (PhaseSpan("all", 0, 1, (Hold("cabinet", "grip"),)),), 9
     )
-    table = PairTable(scene, Solids(Samples(scene, motion).world), motion, 0.02)
+    table = PairTable(scene, CollisionShapes(Samples(scene, motion).world), motion, 0.02)
     paired = {
         frozenset(table.world.collision_labels[k] for k in pair) for pair in table.pairs.tolist()
     }
@@ -124,7 +124,7 @@ def test_which_pairs_of_free_objects_count() -> None:
     carried = Script(scene).take("stick").go(moved_base(scene.start, y=0.1)).motion()
 
     def paired(motion: Trajectory) -> dict[str, set[str]]:
-        found = PairTable(scene, Solids(World(scene)), motion, 0.02)
+        found = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02)
         names: dict[str, set[str]] = {}
         for first, second in (pair_names(found, k) for k in range(len(found.pairs))):
             for one, other in ((first, second), (second, first)):
@@ -153,7 +153,7 @@ def test_what_does_not_move_in_a_phase_is_not_looked_at_in_it() -> None:
     )
     motion = script.go(moved_base(scene.start, y=0.5)).motion()
     samples = Samples(scene, motion)
-    solids = Solids(samples.world)
+    solids = CollisionShapes(samples.world)
     found = PairTable(scene, solids, motion, 0.02)
     lies = [
         k
@@ -187,7 +187,7 @@ def test_links_of_an_object_that_can_meet() -> None:
     motion = Trajectory(
         names, np.arange(2.0), rows, (PhaseSpan("pull", 0, 1, (Hold("dishwasher", "handle"),)),), 9
     )
-    table = PairTable(scene, Solids(World(scene)), motion, 0.02)
+    table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02)
     own = {
         pair
         for pair in (pair_names(table, k) for k in range(len(table.pairs)))
@@ -204,7 +204,7 @@ def test_links_of_the_robot_have_a_clearance_of_their_own(door: Scene) -> None:
         door, robot=dataclasses.replace(door.robot, tight={(one, other): 0.006})
     )
     motion = wander(scene, 0, size=0.1)
-    table = PairTable(scene, Solids(World(scene)), motion, 0.02, 0.01)
+    table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02, 0.01)
     margins = table.margins_at(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))
     by_pair = {
         frozenset(pair): float(margin)

@@ -12,7 +12,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.validation.report import Bound, Report, Violation
-from vkc_pin.visualization.plots.clearance import clearance_curves
+from vkc_pin.visualization.plots.clearance import compute_clearance_curves
 
 ONE = Violation(
     "limit",
@@ -145,7 +145,7 @@ def test_each_phase_has_the_clearance_of_its_own_motion(door_plan: vkc.Plan) -> 
     fine = door_plan.trajectory
     for phase, close in zip(fine.phases, door_plan.validation.clearances, strict=True):
         times = fine.times[phase.first + 1 : phase.last + 1]
-        curves = clearance_curves(door_plan.scene, fine, times)
+        curves = compute_clearance_curves(door_plan.scene, fine, times)
         least = min(
             float(curve.distances.min()) for curve in curves if not curve.name.startswith("gripper")
         )

@@ -108,7 +108,7 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
     assert (LENGTH_STEP, ANGLE_STEP) == (5e-3, 1e-2)
     np.testing.assert_allclose(samples.times[samples.waypoint_rows], trajectory.times, atol=1e-12)
     np.testing.assert_allclose(
-        samples.z[samples.waypoint_rows], samples.world.positions(trajectory), atol=1e-9
+        samples.z[samples.waypoint_rows], samples.world.compute_positions(trajectory), atol=1e-9
     )
     assert (np.diff(samples.times) > 0).all()
     assert [samples.waypoint(int(row)) for row in samples.waypoint_rows] == list(

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.validation import sweep as validation_sweep
 from vkc_pin.validation.contact_windows import Window
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import Hit, sweep
@@ -27,7 +27,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 def swept(scene: Scene, motion: Trajectory) -> tuple[PairTable, Samples, list[Hit]]:
     samples = Samples(scene, motion)
-    table = PairTable(scene, Solids(samples.world), motion, 0.02)
+    table = PairTable(scene, CollisionShapes(samples.world), motion, 0.02)
     return table, samples, list(sweep(table, samples.z, samples.waypoint_rows))
 
 
@@ -61,7 +61,10 @@ def test_the_closest_pair_of_every_waypoint_is_told() -> None:
     phases = (replace(one.phases[0], last=len(rows) - 1),)
     motion = replace(one, times=np.arange(len(rows)), positions=rows, phases=phases)
     world = World(door)
-    table, z = PairTable(door, Solids(world), motion, 0.02), world.positions(motion, motion.times)
+    table, z = (
+        PairTable(door, CollisionShapes(world), motion, 0.02),
+        world.compute_positions(motion, motion.times),
+    )
     robots = np.array([group == "robot" for group in table.group])
     with_others = np.flatnonzero(
         robots[table.pairs].sum(axis=1) == 1
@@ -85,7 +88,7 @@ def test_nothing_slips_through_between_two_samples(seed: int, size: float) -> No
     fine = np.unique(
         np.concatenate([np.linspace(a, b, 11) for a, b in itertools.pairwise(samples.times)])
     )
-    distances = brute_force(table, samples.world.positions(motion, fine))
+    distances = brute_force(table, samples.world.compute_positions(motion, fine))
     found = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     deep = {pair_names(table, k) for k in np.flatnonzero(distances.min(axis=0) < -1.001e-3)}
     assert deep <= found
@@ -99,7 +102,7 @@ def test_nothing_slips_through_even_without_samples(seed: int, size: float) -> N
     door = door_scene()
     motion = wander(door, seed, size=size)
     samples = Samples(door, motion)
-    table = PairTable(door, Solids(samples.world), motion, 0.02)
+    table = PairTable(door, CollisionShapes(samples.world), motion, 0.02)
     found = {
         (hit.row, hit.first, hit.second)
         for hit in sweep(table, samples.z[samples.waypoint_rows], np.arange(4))
@@ -124,7 +127,7 @@ def test_a_wire_that_is_passed_between_two_samples() -> None:
     scene = hall(obstacles=[wire])
     motion = of_rows(scene, np.vstack([scene.start, moved(scene.start, x=4.0)]), dt=20.0)
     samples = Samples(scene, motion)
-    table = PairTable(scene, Solids(samples.world), motion, 0.02)
+    table = PairTable(scene, CollisionShapes(samples.world), motion, 0.02)
     hits = list(sweep(table, samples.z[[0, -1]], np.array([0, 1])))
     assert ("base_link", "wire") in {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     assert all(hit.distance > 1.0 for hit in hits if hit.at_waypoint and hit.second == "wire")
@@ -139,7 +142,7 @@ def test_nothing_carried_that_comes_close_is_left_out(seed: int, size: float) ->
     fine = np.unique(
         np.concatenate([np.linspace(a, b, 6) for a, b in itertools.pairwise(samples.times)])
     )
-    distances = brute_force(table, samples.world.positions(motion, fine))
+    distances = brute_force(table, samples.world.compute_positions(motion, fine))
     found = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     deep = {pair_names(table, k) for k in np.flatnonzero(distances.min(axis=0) < -1.001e-3)}
     assert deep <= found
@@ -169,8 +172,8 @@ def test_what_may_touch_is_not_passed_through_between_two_samples(
         if overlap is None
         else [Window(pairs, 0, len(motion.times) - 1 - before, 0.0, overlap, together)]
     )
-    table = PairTable(scene, Solids(world), motion, 0.02, windows=near)
-    hits = list(sweep(table, world.positions(motion), np.arange(len(motion.times))))
+    table = PairTable(scene, CollisionShapes(world), motion, 0.02, windows=near)
+    hits = list(sweep(table, world.compute_positions(motion), np.arange(len(motion.times))))
     assert all(hit.distance > 0.0 for hit in hits if hit.at_waypoint and hit.second == "fence")
     through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}
     if together and not before:  # as for a hand and what it grasps, until it lets go

@@ -13,7 +13,7 @@ from vkc_pin.validation.sweep import RESOLUTION, Hit, _least, sweep
 
 
 class Line:
-    """Stands for `PairTable` and its `Solids`: a point at z[:, 0], another at z[:, 1], and balls that stand at some places.
+    """Fake of `PairTable` and `CollisionShapes`: points at z[:, 0] and z[:, 1], and fixed balls.
 
     Attributes:
         asked: At which states distances were asked for, in turn, and of which pairs.
@@ -46,10 +46,10 @@ class Line:
             balls = np.array(self.balls)
             return np.abs(where - balls[ball, 0]) - balls[ball, 1]
 
-        class Placed:
+        class PlacedShapes:
             __len__ = staticmethod(lambda: len(q))
 
-        placed: Any = Placed()
+        placed: Any = PlacedShapes()
         placed.distances = distances
         return placed
 
@@ -83,11 +83,11 @@ class Line:
 def _as_far_as_they_go(monkeypatch: pytest.MonkeyPatch) -> None:
     """How far shapes move at most: the points as far as they do, balls not at all."""
 
-    def travelled(line: Line, z: np.ndarray) -> np.ndarray:
+    def bound_displacements(line: Line, z: np.ndarray) -> np.ndarray:
         way = np.cumsum(np.abs(np.diff(z, axis=0, prepend=z[:1])), axis=0)
         return np.column_stack([way, np.zeros((len(z), len(line.balls)))])
 
-    monkeypatch.setattr(module, "travelled", travelled)
+    monkeypatch.setattr(module, "bound_displacements", bound_displacements)
 
 
 def swept(line: Line, z: Any, waypoints: list[int], aside: float = 50.0) -> list[Hit]:

@@ -94,7 +94,7 @@ def test_formulas_are_given_frames_coordinates_and_the_last_steps(moving: bool) 
     model, data = samples.world.model, samples.world.model.createData()
 
     def expected(time: float) -> np.ndarray:
-        z = samples.world.positions(motion, np.array([time]))
+        z = samples.world.compute_positions(motion, np.array([time]))
         pin.framesForwardKinematics(model, data, samples.world.coordinates.q(z)[0])
         parts = [
             np.append(data.oMf[f].rotation.T.ravel(), data.oMf[f].translation)

@@ -14,7 +14,7 @@ from helpers.telescopes import coupled_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.validation.distances import Solids, travelled
+from vkc_pin.validation.distances import CollisionShapes, bound_displacements
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.world_model import World
@@ -27,11 +27,11 @@ def test_no_point_moves_further_than_the_bound(seed: int, size: float) -> None:
     scene, rng = full_scene(), np.random.default_rng(seed)
     motion = wander(door_scene(), seed, size=size)
     world = World(scene)
-    table = PairTable(scene, Solids(world), motion, 0.02)
-    z = world.positions(motion)
+    table = PairTable(scene, CollisionShapes(world), motion, 0.02)
+    z = world.compute_positions(motion)
     z[:, 11:] += rng.uniform(0.0, 2.0, z.shape[1] - 11)
     z[1:, 11:] += size * rng.uniform(-1.0, 1.0, (len(z) - 1, z.shape[1] - 11))
-    bounds = np.diff(travelled(table.solids, z), axis=0)
+    bounds = np.diff(bound_displacements(table.solids, z), axis=0)
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]
     for t in range(len(z) - 1):
@@ -66,7 +66,7 @@ def test_no_point_of_a_robot_whose_joints_follow_others_moves_further(
     )
     z = rng.uniform(low, high, (4, world.coordinates.size))
     z[:, :2] = rng.uniform(-1.0, 1.0, (4, 2))
-    bounds = np.diff(travelled(Solids(world), z), axis=0)
+    bounds = np.diff(bound_displacements(CollisionShapes(world), z), axis=0)
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]
     for t in range(len(z) - 1):
@@ -100,8 +100,10 @@ def box_corners(shape: pin.GeometryObject) -> list[list[float]]:
 def test_no_point_of_what_is_carried_moves_further_than_the_bound(seed: int, size: float) -> None:
     scene, motion = whirl(seed, size=size)
     samples = Samples(scene, motion)
-    table_of_pairs = PairTable(scene, Solids(samples.world), motion, 0.02)
-    bounds = np.diff(travelled(table_of_pairs.solids, samples.z)[samples.waypoint_rows], axis=0)
+    table_of_pairs = PairTable(scene, CollisionShapes(samples.world), motion, 0.02)
+    bounds = np.diff(
+        bound_displacements(table_of_pairs.solids, samples.z)[samples.waypoint_rows], axis=0
+    )
     world = samples.world
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = [np.array(box_corners(shape)) for shape in world.shapes]

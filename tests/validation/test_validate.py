@@ -15,7 +15,7 @@ import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.validation.validate import validate
-from vkc_pin.visualization.plots.clearance import clearance_curves
+from vkc_pin.visualization.plots.clearance import compute_clearance_curves
 from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
@@ -48,7 +48,7 @@ def test_the_planned_motion_is_accepted(door_plan: vkc.Plan) -> None:
     assert report.ok, "\n".join(report.lines())
     assert report.clearance > 0.0
     times, safe = door_plan.trajectory.times[1:], door_plan.options.dist_safe
-    curves = clearance_curves(door_plan.scene, door_plan.trajectory, times)
+    curves = compute_clearance_curves(door_plan.scene, door_plan.trajectory, times)
     at_waypoints = {curve.name: curve.distances.min() for curve in curves}
     assert at_waypoints.pop("gripper – what it grasps") > 0.0
     assert min(at_waypoints.values()) >= safe - 1e-3
@@ -217,7 +217,7 @@ def test_an_object_has_limits_and_rates_too(door_plan: vkc.Plan) -> None:
     assert (found.constraint, found.subject, found.unit) == ("limit", "door.hinge", "rad")
     assert found.amount == pytest.approx(0.1, abs=1e-4)
     assert door_plan.trajectory.curve is not None
-    fastest = door_plan.trajectory.curve.speeds()[0][
+    fastest = door_plan.trajectory.curve.compute_max_rates()[0][
         :, door_plan.trajectory.names.index("door.hinge")
     ].max()
     scene = with_object(door_plan.scene, velocity=np.array([0.5 * fastest, door.velocity[1]]))
@@ -586,7 +586,7 @@ def fatter_lever(scene: Scene, by: float) -> Scene:
 def test_the_hand_may_come_near_what_it_grasps_but_not_into_it(door_plan: vkc.Plan) -> None:
     """With a thicker lever the fingers are closer to it than dist_safe, then in it."""
     hand, times = door_plan.scene.robot.touch_links, door_plan.trajectory.times
-    curves = clearance_curves(door_plan.scene, door_plan.trajectory, times)
+    curves = compute_clearance_curves(door_plan.scene, door_plan.trajectory, times)
     gap = next(
         curve for curve in curves if curve.name == "gripper – what it grasps"
     ).distances.min()

@@ -384,7 +384,7 @@ def close(
     shapes: Any = {"collision_labels": ["a", "b"], "collision_keys": ["a", "b"]}
     made.samples.world = SimpleNamespace(coordinates=SimpleNamespace(names=()), **shapes)
     made.samples.z = np.arange(7.0)[:, None]
-    monkeypatch.setattr(module, "Solids", lambda world: None)
+    monkeypatch.setattr(module, "CollisionShapes", lambda world: None)
     monkeypatch.setattr(module, "windows", lambda *_: [])
     monkeypatch.setattr(module, "PairTable", lambda *_, **__: None)
     monkeypatch.setattr(module, "find_clearance_exemptions", lambda scene, safe: allowed)

@@ -230,7 +230,7 @@ def test_interpolated_frames_are_the_motion_itself(
     )
     shift = pin.SE3(np.array(still["/meshcat"]).reshape(4, 4).T)
     for moment in (0.0, 0.33, 2.9, 3.05, 4.4, 5.9, 6.0):
-        (row,) = world.positions(plan.trajectory, [moment])
+        (row,) = world.compute_positions(plan.trajectory, [moment])
         pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
         for path in (
             p
@@ -533,7 +533,7 @@ def test_browser_shows_each_thing_where_it_is_at_that_time(page: Path, plan: Pla
     assert told["sun"]
     world = World(plan.scene)
     data = world.model.createData()
-    (row,) = world.positions(plan.trajectory, [moment])
+    (row,) = world.compute_positions(plan.trajectory, [moment])
     pin.forwardKinematics(world.model, data, world.coordinates.q(row))
     for name, joint in (
         ("wrist_3_joint", "wrist_3_joint"),

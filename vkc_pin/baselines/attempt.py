@@ -30,9 +30,9 @@ from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
-from vkc_pin.world.trajectory.splicing import join
+from vkc_pin.world.trajectory.splicing import concatenate_trajectories
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import scene_after
+from vkc_pin.world.trajectory.world_model import compute_final_scene
 
 __all__ = ["FINER", "Attempt", "Doable"]
 
@@ -100,11 +100,11 @@ class Attempt:
             failure = error if isinstance(error, FailedError) else FailedError(str(error))
             parts = [*self.parts, *failure.parts] or [still(self.scene, self.options)]
             return (
-                join(parts, pause=self.options.grasp_time),
+                concatenate_trajectories(parts, pause=self.options.grasp_time),
                 len(self.parts) + failure.came,
                 failure.cause,
             )
-        return join(self.parts, pause=self.options.grasp_time), np.inf, ""
+        return concatenate_trajectories(self.parts, pause=self.options.grasp_time), np.inf, ""
 
     def _actuate(self, step: Actuate) -> None:
         """Move joints of an object: drive to its handle and reach for it, unless it is held, and move it."""
@@ -289,7 +289,7 @@ class Attempt:
     def _take(self, problem: TrajectoryProblem, z: Floats, dt: Floats) -> None:
         """Append a motion, and go on from where it ends."""
         self.parts.append(as_trajectory(problem, z, dt))
-        self.scene = scene_after(self.scene, self.parts[-1], problem.task.after)
+        self.scene = compute_final_scene(self.scene, self.parts[-1], problem.task.after)
 
     def _seed(self) -> int:
         return int(self.rng.integers(2**32))

@@ -18,7 +18,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate
@@ -291,7 +291,7 @@ def scale_chart(
     parts = {name: medians(field) for field, name in TIMES.items()} | {
         "setting up": medians("planning_time", *TIMES)
     }
-    with styled():
+    with use_style():
         figure = new_figure(6.4, 4.0)
         axes = figure.subplots()
         colours = [*COLOURS[: len(TIMES)], "0.7"]

@@ -19,7 +19,7 @@ from vkc_pin.cli.importing import add_importing
 from vkc_pin.cli.simulating import add_simulate
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.world.files.writing import check_outputs, write_atomically
-from vkc_pin.world.trajectory.formats.rosbag import bag_library
+from vkc_pin.world.trajectory.formats.rosbag import import_rosbags
 from vkc_pin.world.trajectory.formats.tables import GROUPS
 
 __all__ = ["EXIT_MISUSE", "make_parser", "parse_settings", "run"]
@@ -126,7 +126,7 @@ def _new_folders(arguments: argparse.Namespace) -> dict[str, str | Path]:
             raise InputError(
                 "this is there already", file=path, field=f"--{option}", expected="a new folder"
             )
-        bag_library()
+        import_rosbags()
     return {f"--{option}": Path(path, "metadata.yaml") for option, path in folders.items()}
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from vkc_pin.datasets.diversity import spread
 from vkc_pin.datasets.episode import Episode
 from vkc_pin.datasets.recipes.recipe import Recipe
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, use_style
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.trajectory.world_model import World
 
@@ -179,7 +179,7 @@ def _failures(failures: Sequence[Mapping[str, str]]) -> str:
 def _histograms(records: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw how durations, ways, clearances, goals and starts are spread."""
     tasks = sorted({str(record["task"]) for record in records})
-    with styled():
+    with use_style():
         figure = new_figure(10.0, 5.6)
         axes = figure.subplots(2, 3).ravel()
         fields = (
@@ -225,7 +225,7 @@ def _svg(figure: Figure) -> str:
 def _picture(episode: Episode) -> str:
     """Return an episode from above, with what it does."""
     scene = episode.scene()
-    with styled():
+    with use_style():
         figure = new_figure(5.2, 4.6)
         draw_top_view(figure, World(scene), episode.trajectory)
         drawn = _svg(figure)

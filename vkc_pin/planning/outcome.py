@@ -19,7 +19,7 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.task.terms import Term
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.splicing import join
+from vkc_pin.world.trajectory.splicing import concatenate_trajectories
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["FINAL", "TIMES", "charged", "joined", "outcome", "spent", "still", "summed"]
@@ -142,7 +142,9 @@ def joined(
     if parts:
         settings.progress.doing("checking all of it")
         status = settings.budget.ended or ("rejected" if parts[-1].success else parts[-1].status)
-        trajectory = join([part.trajectory for part in parts], pause=settings.options.grasp_time)
+        trajectory = concatenate_trajectories(
+            [part.trajectory for part in parts], pause=settings.options.grasp_time
+        )
         checked = time.perf_counter()
         report = validate(scene, steps, trajectory, settings.options, settings.terms)
         for key in ("planning_time", "time_validation"):

@@ -14,7 +14,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
-from vkc_pin.validation.validate import check_fits, validate
+from vkc_pin.validation.validate import check_arguments, validate
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene
@@ -22,13 +22,13 @@ from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.world.trajectory.formats.archives import (
-    folder_from_data,
-    folder_to_data,
     read_archive,
+    resolve_folder,
+    serialize_folder,
     write_archive,
 )
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import scene_after, units_of
+from vkc_pin.world.trajectory.world_model import compute_final_scene, find_coordinate_units
 
 if TYPE_CHECKING:
     import meshcat
@@ -96,7 +96,7 @@ class Plan:
                 got=self.status,
             )
         after = compile_each_step(self.scene, self.steps, self.options)[-1].after
-        return scene_after(self.scene, self.trajectory, after)
+        return compute_final_scene(self.scene, self.trajectory, after)
 
     def simulate(self, **options: Any) -> SimulationResult:
         """Execute the motion in physics, with masses and servos; see `simulation.simulate`. Needs the extra `sim`."""
@@ -158,7 +158,9 @@ class Plan:
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
         """Write the motion as a table with a line a waypoint, and a unit to every column; see `tables.write_csv`."""
-        return self.trajectory.to_csv(path, **{"units": units_of(self.scene), **options})
+        return self.trajectory.to_csv(
+            path, **{"units": find_coordinate_units(self.scene), **options}
+        )
 
     def to_ros(self, **options: Any) -> dict[str, Any]:
         """Return the motion as plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
@@ -211,7 +213,7 @@ class Plan:
         """
         about = {
             "scene": self.scene.document,
-            "folder": folder_to_data(self.scene.folder, file_path(path, "path")),
+            "folder": serialize_folder(self.scene.folder, file_path(path, "path")),
             "steps": [step_to_dict(step) for step in self.steps],
             "options": asdict(self.options),
             "trajectory": self.trajectory.to_dict(),
@@ -248,7 +250,7 @@ class Plan:
         about, arrays = read_archive(path)
         try:
             plan = cls._made_of(about, arrays, path, _checked if check else _recalled)
-            check_fits(plan.scene, plan.steps, plan.trajectory, plan.terms)
+            check_arguments(plan.scene, plan.steps, plan.trajectory, plan.terms)
             if check:
                 plan.validation  # noqa: B018 - makes it
         except InputError as error:
@@ -301,7 +303,7 @@ class Plan:
             if name not in (options := [item.name for item in fields(Options)]):
                 raise UnknownNameError("option", name, options, field=f"options.{name}")
         return cls(
-            scene=Scene.from_document(about["scene"], folder_from_data(about["folder"], path)),
+            scene=Scene.from_document(about["scene"], resolve_folder(about["folder"], path)),
             steps=tuple(step_from_dict(step) for step in about["steps"]),
             options=_saved(about["options"]),
             trajectory=trajectory,

@@ -17,7 +17,7 @@ from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.trajectory.world_model import scene_after
+from vkc_pin.world.trajectory.world_model import compute_final_scene
 
 __all__ = ["Stage", "all_at_once", "by_any_attachment", "stages", "step_by_step"]
 
@@ -140,5 +140,5 @@ def stages(scene: Scene, task: Task, settings: Settings) -> list[Stage]:
         if not plan.success or settings.budget.ended:
             break
         settings.budget.decided += one.checking
-        current = scene_after(current, plan.trajectory, one.task.after)
+        current = compute_final_scene(current, plan.trajectory, one.task.after)
     return parts

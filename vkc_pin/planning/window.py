@@ -22,8 +22,8 @@ from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.trajectory.splicing import cut
-from vkc_pin.world.trajectory.world_model import scene_after
+from vkc_pin.world.trajectory.splicing import extract_phases
+from vkc_pin.world.trajectory.world_model import compute_final_scene
 
 __all__ = ["SlidingWindow"]
 
@@ -224,7 +224,7 @@ class SlidingWindow:
             ]
             part, piece, rests = None, _NOTHING, True
             if end > begin:
-                trajectory = cut(
+                trajectory = extract_phases(
                     plan.trajectory, names, begin, end if end < len(one.task.phases) else None
                 )
                 steps = self._steps(number, number + 1)
@@ -241,7 +241,7 @@ class SlidingWindow:
                 rests = (
                     end == len(ends) or ends[end - 1] in one.problem.transcription.structure.stops
                 )
-                scene = scene_after(scene, trajectory, task.after)
+                scene = compute_final_scene(scene, trajectory, task.after)
             parts.append(_Part(part, piece, scene, rests, one.checking / (last - first)))
             begin = end
         return parts

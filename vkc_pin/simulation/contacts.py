@@ -16,7 +16,7 @@ import numpy as np
 
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Ints
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import (
     CONTACT_DEPTH,
@@ -106,7 +106,7 @@ def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
     }
     excluded = np.array([(min(pair), max(pair)) in exempt for pair in pairs.tolist()], bool)
     named = [frozenset((labels[i], labels[j])) for i, j in pairs.tolist()]
-    placed = Solids(world).at(world.coordinates.q(world.start[None]))
+    placed = CollisionShapes(world).at(world.coordinates.q(world.start[None]))
     near = np.flatnonzero(placed.bounds(np.zeros(len(pairs), int), pairs) < 0.0)
     deep = near[placed.distances(np.zeros(len(near), int), pairs[near]) < -CONTACT_DEPTH]
     overlapping = {named[k] for k in deep.tolist() if not excluded[k]}
@@ -176,7 +176,7 @@ def find_unplanned_contacts(
     if not samples_by_pair:
         return ()
     world = World(scene)
-    placed = Solids(world).at(world.coordinates.q(world.positions(trajectory)))
+    placed = CollisionShapes(world).at(world.coordinates.q(world.compute_positions(trajectory)))
     found = []
     for (first, second), samples in samples_by_pair.items():
         ones, others = (

@@ -149,7 +149,7 @@ class _Run:
                 find_hold_spans(self.scene, self.trajectory), float(self.trajectory.times[0])
             )
         trajectory, welded = self.trajectory, list(dict.fromkeys(hold for hold, _, _ in schedule))
-        self.planned = self.tree.positions(trajectory)
+        self.planned = self.tree.compute_positions(trajectory)
         self.servos: tuple[Servo, ...] = make_servos(self.tree, self.planned, physics)
         self.fingers = find_fingers(self.tree, physics) if friction_spans else None
         if self.fingers is not None:

@@ -71,7 +71,11 @@ def measure_goal_errors(
     """
     planned = World(scene)
     edges = [0, *(phase.last for phase in trajectory.phases)]
-    ends, start, errors = planned.positions(trajectory, trajectory.times[edges]), 0, list[Miss]()
+    ends, start, errors = (
+        planned.compute_positions(trajectory, trajectory.times[edges]),
+        0,
+        list[Miss](),
+    )
 
     def is_completed(step: Step, k: int) -> bool:
         if isinstance(step, Grasp | Release):

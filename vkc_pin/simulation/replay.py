@@ -54,7 +54,7 @@ class Replay(World):
         super().__init__(scene)
         self._times, self._rows = times, rows.copy()
         for name in (name for name, placed in scene.objects.items() if placed.object.free):
-            quaternions = self._rows[:, self.placement_columns(name)][:, 3:]
+            quaternions = self._rows[:, self.get_placement_columns(name)][:, 3:]
             signs = np.cumprod(
                 np.concatenate(
                     [
@@ -67,7 +67,7 @@ class Replay(World):
                     ]
                 )
             )
-            self._rows[:, self.placement_columns(name)][:, 3:] *= signs[:, None]
+            self._rows[:, self.get_placement_columns(name)][:, 3:] *= signs[:, None]
 
     def positions(
         self, trajectory: Trajectory, times: Any = None, free: FreeObjects | None = None

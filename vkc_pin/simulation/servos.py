@@ -12,9 +12,9 @@ import pinocchio as pin
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.trajectory.dynamics.torques import in_base_axes
+from vkc_pin.world.trajectory.dynamics.torques import transform_to_base_axes
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.wheels import seen
+from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 from vkc_pin.world.trajectory.world_model import World
 
 __all__ = [
@@ -194,7 +194,7 @@ def compute_feedforward(
         np.pad(part, ((0, 0), (0, rows.shape[1] - size))) for part in motion[1:]
     )
     rotor_torques = accelerations * [servo.armature for servo in servos]
-    v, a = in_base_axes(rows[:, 2], velocities, accelerations)
+    v, a = transform_to_base_axes(rows[:, 2], velocities, accelerations)
     data = model.createData()
     torques = np.array(
         [
@@ -203,7 +203,7 @@ def compute_feedforward(
         ]
     )
     # The servos act along the world's axes.
-    torques[:, :2] = np.transpose(seen(torques[:, 0], torques[:, 1], -rows[:, 2]))
+    torques[:, :2] = np.transpose(rotate_into_base_frame(torques[:, 0], torques[:, 1], -rows[:, 2]))
     return rotor_torques + torques
 
 

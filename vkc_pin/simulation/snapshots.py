@@ -104,7 +104,7 @@ class RenderedScene:
 
     def sample(self, times: Floats) -> Floats:
         """Return the world coordinates at times [s], shape (K,): shape (K, n)."""
-        return self._world.positions(self._executed.trajectory, times)
+        return self._world.compute_positions(self._executed.trajectory, times)
 
     def to_qpos(self, row: Floats) -> Floats:
         """Return MuJoCo's configuration for world coordinates, shape (n,)."""

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Ints
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
@@ -62,7 +62,7 @@ class Window(NamedTuple):
 
 
 def windows(
-    samples: Samples, solids: Solids, steps: Sequence[Step], options: Options
+    samples: Samples, solids: CollisionShapes, steps: Sequence[Step], options: Options
 ) -> list[Window]:
     """Return all pairs of a motion that may be close, and when.
 
@@ -177,7 +177,7 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
 
 
 class _Windows:
-    def __init__(self, samples: Samples, solids: Solids, options: Options) -> None:
+    def __init__(self, samples: Samples, solids: CollisionShapes, options: Options) -> None:
         self.samples, self.solids, self.options = samples, solids, options
         self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
         self.labels, self.keys = np.array(world.collision_labels), world.collision_keys

@@ -20,12 +20,12 @@ from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Placed", "Solids", "travelled"]
+__all__ = ["CollisionShapes", "PlacedShapes", "bound_displacements"]
 
 POINT = 1e-4  # [m], radius of a point
 
 
-class Solids:
+class CollisionShapes:
     """The collision shapes of a world.
 
     Attributes:
@@ -49,9 +49,9 @@ class Solids:
         self.obstacle_corners = self.corners(flatten_placements(where), obstacles)
         self._placements = ShapePlacements(world.model, world.bodies)
 
-    def at(self, q: Floats) -> Placed:
+    def at(self, q: Floats) -> PlacedShapes:
         """Return the shapes as they are placed at Pinocchio's configurations of the world, shape (W, nq)."""
-        return Placed(self, self._placements.at(q))
+        return PlacedShapes(self, self._placements.at(q))
 
     def corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
         """Return lower and upper corners of boxes along the world's axes around some shapes, shape (..., k, 3) each [m].
@@ -66,7 +66,7 @@ class Solids:
         return middle - extent, middle + extent
 
 
-class Placed:
+class PlacedShapes:
     """The shapes at W configurations.
 
     Args:
@@ -74,7 +74,7 @@ class Placed:
         where: Where those of robot and objects are in the world, shape (W, M, 12).
     """
 
-    def __init__(self, solids: Solids, where: Floats) -> None:
+    def __init__(self, solids: CollisionShapes, where: Floats) -> None:
         self._solids, self._where = solids, where
 
     @cached_property
@@ -171,7 +171,7 @@ class Placed:
         return pin.SE3(numbers[:9].reshape(3, 3).T, numbers[9:])
 
 
-def travelled(solids: Solids, samples: Floats) -> Floats:
+def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
     """Return how far any point of each shape can have moved since the first sample, shape (S, G) [m].
 
     A joint's rotation moves a point by at most the angle times its distance from the axis, and that

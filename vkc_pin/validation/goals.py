@@ -208,7 +208,7 @@ def _carried(samples: Samples, number: int, named: set[str]) -> dict[str, tuple[
     carried = {}
     for owner in phase.held:
         if owner in named:
-            moves = np.diff(rows[:, world.placement_columns(owner)][:, :3], axis=0)
+            moves = np.diff(rows[:, world.get_placement_columns(owner)][:, :3], axis=0)
             carried[owner] = (float(np.linalg.norm(moves, axis=1).sum()), "m")
     return carried
 

@@ -9,7 +9,7 @@ import numpy as np
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.validation.contact_windows import Window
-from vkc_pin.validation.distances import Placed, Solids
+from vkc_pin.validation.distances import CollisionShapes, PlacedShapes
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
@@ -41,7 +41,7 @@ class PairTable:
     def __init__(
         self,
         scene: Scene,
-        solids: Solids,
+        solids: CollisionShapes,
         trajectory: Trajectory,
         dist_safe: float,
         self_distance: float | None = None,
@@ -158,7 +158,7 @@ class PairTable:
         return np.concatenate(found).astype(int)
 
     def near(
-        self, placed: Placed, first: Ints, last: Ints, moved: Floats, limit: float
+        self, placed: PlacedShapes, first: Ints, last: Ints, moved: Floats, limit: float
     ) -> tuple[Ints, Ints]:
         """Return (k, pair) of all pairs but those that boxes prove to stay `limit` [m] apart in a stretch k.
 

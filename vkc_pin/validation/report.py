@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from vkc_pin.world.scene.scene import Scene
     from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Bound", "Exemption", "Judged", "Report", "Violation"]
+__all__ = ["Bound", "CheckedMotion", "Exemption", "Report", "Violation"]
 
 SAME = 1e-5  # [m] or [rad] that two checks of the same motion may differ by, on two machines, say
 TOLD = 4  # bounds that the text names
@@ -309,7 +309,7 @@ def _bound(data: Any, field: str) -> Bound:
 
 
 @runtime_checkable
-class Judged(Protocol):
+class CheckedMotion(Protocol):
     """A motion in a scene that was checked, such as a `Plan`: what pictures show."""
 
     @property

@@ -10,7 +10,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.trajectory.curve import moments_at
+from vkc_pin.world.trajectory.curve import sample_intervals
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["check_rolling"]
@@ -94,7 +94,7 @@ def _steps(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
 def _along(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
     """Return moments of a curve, how fast the base goes along and aside then [m/s], and turns [rad/s]."""
     assert motion.curve is not None
-    moments = moments_at(motion.curve.times, np.arange(_LOOKS) / _LOOKS, last=True)
+    moments = sample_intervals(motion.curve.times, np.arange(_LOOKS) / _LOOKS, last=True)
     return moments, *_seen(motion.curve.velocity(moments)[:, :3], motion.curve.at(moments)[:, 2])
 
 

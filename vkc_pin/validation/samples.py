@@ -68,7 +68,7 @@ class Samples:
         self._check_size()
         self.times, self.waypoint_rows = self._sample()
         self.free = FreeObjects(scene, trajectory)
-        self.z = self.world.positions(trajectory, self.times, self.free)
+        self.z = self.world.compute_positions(trajectory, self.times, self.free)
 
     def _check_size(self) -> None:
         far = np.argwhere(np.abs(self.trajectory.positions) > _LARGEST)
@@ -154,7 +154,7 @@ class Samples:
             bends = np.zeros_like(steps)
         else:  # as far as it would go at the largest speed on each cubic, and leave its chord at the largest acceleration
             edges, spans = curve.times, np.diff(curve.times)[:, None]
-            speeds, accelerations = curve.speeds()
+            speeds, accelerations = curve.compute_max_rates()
             steps, bends = speeds * spans, accelerations * spans**2 / 8.0
         known = dict(
             zip(
@@ -282,7 +282,7 @@ class Samples:
         self, owner: str, name: str, times: Floats, by: str | None = None
     ) -> Floats:
         """Return the same at any moments, increasing, shape (K,) [s]."""
-        z = self.world.positions(self.trajectory, times, self.free)
+        z = self.world.compute_positions(self.trajectory, times, self.free)
         return self._grasp_errors(owner, name, times, z, by)
 
     def _grasp_errors(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.validation.distances import Placed, travelled
+from vkc_pin.validation.distances import PlacedShapes, bound_displacements
 from vkc_pin.validation.pairs import PairTable
 
 __all__ = ["Hit", "sweep"]
@@ -75,7 +75,7 @@ class _Sweep:
         smallest = max(
             RESOLUTION, float(distances[closest].min(initial=np.inf))
         )  # what cannot come closer than that changes nothing
-        moved = travelled(self._solids, z)
+        moved = bound_displacements(self._solids, z)
         stretch, pairs = self._active(placed, np.diff(moved[waypoints], axis=0), smallest)
         ends = placed.distances(
             np.concatenate([stretch, stretch + 1]), np.tile(self._table.pairs[pairs], (2, 1))
@@ -99,7 +99,7 @@ class _Sweep:
             z: Sampled configurations of the world, shape (S, n).
             todo: Where to look, of all stretches at once; those of the same samples are next to
                 each other.
-            moved: See `travelled`.
+            moved: See `bound_displacements`.
             smallest: [m].
         """
         while len(todo.pair):
@@ -139,7 +139,7 @@ class _Sweep:
         Args:
             z: Sampled configurations of the world, shape (S, n).
             todo: Stretches from one sample to the next.
-            moved: See `travelled`.
+            moved: See `bound_displacements`.
         """
         first, motion = self._stretch(todo.low), self._motion(todo, moved)
         overlap = self._table.contact_at(todo.pair, first, first + 1)
@@ -167,7 +167,7 @@ class _Sweep:
                     break
                 stack += [(low, middle, before, between), (middle, high, between, after)]
 
-    def _nearest(self, placed: Placed) -> tuple[Ints, Ints, Floats]:
+    def _nearest(self, placed: PlacedShapes) -> tuple[Ints, Ints, Floats]:
         """Return (state, pair), the closest and all that fall short of their margins among them, and their distances [m]."""
         found, todo = list[tuple[Ints, Ints, Floats]](), np.arange(len(placed))
         reach = max(self._table.margins.max(), RESOLUTION)
@@ -190,7 +190,7 @@ class _Sweep:
         order = np.lexsort((pairs, states))
         return states[order], pairs[order], distances[order]
 
-    def _active(self, placed: Placed, moved: Floats, smallest: float) -> tuple[Ints, Ints]:
+    def _active(self, placed: PlacedShapes, moved: Floats, smallest: float) -> tuple[Ints, Ints]:
         """Return (t, pair) of all but those that boxes prove to stay `smallest` apart between waypoints t and t + 1 [m].
 
         Where d(s) of `_between` is less, one of both distances is less than `smallest` and half the

@@ -108,7 +108,7 @@ def _inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
         times = samples.times[rows] - dt
         order = np.argsort(times, kind="stable")
         earlier = np.empty((len(rows), samples.z.shape[1]))
-        earlier[order] = samples.world.positions(
+        earlier[order] = samples.world.compute_positions(
             samples.trajectory, np.maximum(times[order], samples.trajectory.times[0])
         )
         before = _half(samples, formula, earlier)

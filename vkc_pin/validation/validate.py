@@ -16,7 +16,7 @@ from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.closure import find_drift
 from vkc_pin.validation.contact_windows import check_gripper, check_pushes, windows
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.dynamics.rates import check_rates
 from vkc_pin.validation.dynamics.torques import Motors
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
@@ -38,7 +38,7 @@ from vkc_pin.world.task.terms import Term, trace_terms
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["check_fits", "validate"]
+__all__ = ["check_arguments", "validate"]
 
 START_TOLERANCE = 1e-9  # [m] or [rad]
 LIMIT_TOLERANCE = 1e-5  # [m] or [rad]
@@ -79,10 +79,10 @@ def validate(
             names what is not there.
     """
     options = Options() if options is None else instance(options, Options, "options")
-    return _Check(*check_fits(scene, steps, trajectory, terms), options).report()
+    return _Check(*check_arguments(scene, steps, trajectory, terms), options).report()
 
 
-def check_fits(
+def check_arguments(
     scene: Scene, steps: Sequence[Step], trajectory: Trajectory, terms: Sequence[Term] = ()
 ) -> tuple[Samples, tuple[Step, ...], tuple[Term, ...]]:
     """Return what `validate` checks, for its arguments; raise what it raises. That takes a few milliseconds."""
@@ -364,7 +364,7 @@ class _Check:
         """
         samples, solids, lasts = (
             self.samples,
-            Solids(self.samples.world),
+            CollisionShapes(self.samples.world),
             [phase.last for phase in self.trajectory.phases],
         )
         near = windows(samples, solids, self.steps, self.options)

@@ -22,7 +22,7 @@ from meshcat.commands import SetAnimation
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
-from vkc_pin.visualization.room import Part, Room, drawn_parts
+from vkc_pin.visualization.room import Part, Room, load_drawn_parts
 from vkc_pin.visualization.threejs import (
     Ghost,
     Sun,
@@ -205,7 +205,7 @@ class Drawing:
         for shape, label in zip(shapes[first:end], labels[first:end], strict=True):
             owner, _, link = label.partition(".")
             root = self.nodes[shape.parentJoint] if shape.parentJoint else f"objects/{owner}"
-            for k, (solid, colour) in enumerate(drawn_parts(shape)):
+            for k, (solid, colour) in enumerate(load_drawn_parts(shape)):
                 name = shape.name.partition(".")[2] + (f"_{k}" if k else "")
                 path = add_node(self.taken, root, link, name)
                 items.append(

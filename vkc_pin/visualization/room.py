@@ -15,7 +15,7 @@ from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["Part", "Room", "drawn_parts", "is_wall"]
+__all__ = ["Part", "Room", "is_wall", "load_drawn_parts"]
 
 _THIN, _HIGH = (
     0.25,
@@ -71,7 +71,7 @@ class Room:
             floor = box_solid(np.array([x_min, y_min, -0.03]), np.array([x_max, y_max, 0.0]))
             parts.append(Part("floor", floor, _FLOOR_COLOUR, shadow=False))
         for shape in self._furniture:
-            drawn = drawn_parts(shape)
+            drawn = load_drawn_parts(shape)
             for k, (solid, colour) in enumerate(drawn):
                 name = f"{shape.name}/{k}" if len(drawn) > 1 else str(shape.name)
                 opacity = colour[3] if len(colour) > 3 else 1.0
@@ -143,7 +143,7 @@ class Room:
         ]
 
 
-def drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
+def load_drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
     """Return the solids, in the shape's own frame, and colours that a shape is drawn as: from its mesh file, if it has one."""
     colour = tuple(float(c) for c in shape.meshColor)
     if shape.meshPath and Path(shape.meshPath).is_file():

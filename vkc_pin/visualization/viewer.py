@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, cast
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.utils.arguments import flag, instance, mapping, whole
 from vkc_pin.utils.notebook import in_notebook
-from vkc_pin.validation.report import Judged
+from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.scene.scene import Scene
@@ -38,7 +38,7 @@ _server: tuple[subprocess.Popen[bytes], str, str] | None = (
 
 
 def show(
-    plan_or_scene: Judged | Scene,
+    plan_or_scene: CheckedMotion | Scene,
     *,
     open_browser: bool | None = None,
     height: int = 560,
@@ -91,7 +91,7 @@ def show(
     return viewer
 
 
-def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.Visualizer:
+def animate(plan: CheckedMotion, viewer: meshcat.Visualizer | None = None) -> meshcat.Visualizer:
     """Put a motion into a meshcat viewer, whose controls have play, pause and a time slider in seconds.
 
     Args:
@@ -118,7 +118,10 @@ def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.V
 
 
 def to_html(
-    plan_or_scene: Judged | Scene, path: str | Path, *, frames: Mapping[str, pin.SE3] | None = None
+    plan_or_scene: CheckedMotion | Scene,
+    path: str | Path,
+    *,
+    frames: Mapping[str, pin.SE3] | None = None,
 ) -> Path:
     """Write one self-contained web page with the motion, or the scene; it loads nothing from elsewhere.
 
@@ -178,10 +181,10 @@ def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
     return process, addresses[0], addresses[1]
 
 
-def _parts(plan_or_scene: Any) -> tuple[Scene, Judged | None]:
+def _parts(plan_or_scene: Any) -> tuple[Scene, CheckedMotion | None]:
     if isinstance(plan_or_scene, Scene):
         return plan_or_scene, None
-    if isinstance(plan_or_scene, Judged):
+    if isinstance(plan_or_scene, CheckedMotion):
         return plan_or_scene.scene, plan_or_scene
     got = type(plan_or_scene).__name__
     raise InputError(
@@ -192,7 +195,7 @@ def _parts(plan_or_scene: Any) -> tuple[Scene, Judged | None]:
 def _draw(
     viewer: Any,
     scene: Scene,
-    plan: Judged | None,
+    plan: CheckedMotion | None,
     *,
     play: bool = True,
     frames: Mapping[str, pin.SE3] | None = None,
@@ -205,7 +208,9 @@ def _draw(
     Drawing(viewer, scene, *motion).draw(play=play, frames=placed)
 
 
-def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | None = None) -> str:
+def _page(
+    scene: Scene, plan: CheckedMotion | None, frames: Mapping[str, pin.SE3] | None = None
+) -> str:
     import meshcat
 
     recorder = Recorder()
@@ -213,7 +218,7 @@ def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | Non
     return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_film(scene, plan))
 
 
-def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
+def _film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
     if plan is None:
         return {"duration": 0.0, "phases": [], "notes": [], "headline": scene.name}
     times = plan.trajectory.times - plan.trajectory.times[0]

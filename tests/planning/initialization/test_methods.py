@@ -75,7 +75,7 @@ def test_seeds_of_bases_on_wheels_can_be_driven(
     for _ in range(2):
         p = program_of(scene.sample_start(rng), [vkc.Actuate(name, goal)], options=vkc.Options())
         seed = next(initialize(p, method, 0))
-        along, aside, turn = p.rolling.steps(p.waypoints(seed.z))
+        along, aside, turn = p.rolling.compute_steps(p.waypoints(seed.z))
         end = int(p.ends[0])
         allowed = np.full(len(aside), 1e-4)
         allowed[end - p.options.steps(p.options.approach_time) : end] = 0.01

@@ -66,9 +66,10 @@ def test_amounts_are_what_is_missing(seed: int) -> None:
     """Each kind worked out in another way."""
     p, z = problem("drive"), wild("drive", seed)
     found, timing = look("drive", z), p.timing_for(p.still)
-    _, aside, _ = p.rolling.steps(p.waypoints(z))
+    _, aside, _ = p.rolling.compute_steps(p.waypoints(z))
     fast = (
-        np.maximum(p.rolling.times(p.waypoints(z)) - timing.dt, 0.0) * p.rolling.rim
+        np.maximum(p.rolling.compute_min_times(p.waypoints(z)) - timing.dt, 0.0)
+        * p.rolling.wheel_speed
     )  # of the faster wheel
     assert (found.amounts["rolling"] >= np.abs(aside) + fast - 1e-9).all()
     still = look("drive", z, rates=False).amounts["rolling"]

@@ -20,7 +20,7 @@ from vkc_pin.planning.nlp.waypoint import Structure, WaypointFunctions, get_wayp
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
-from vkc_pin.world.trajectory.wheels import Rolling
+from vkc_pin.world.trajectory.wheels import RollingLimits
 
 SLOTS = 3
 
@@ -207,9 +207,9 @@ def test_programs_are_shared_by_structures_that_are_equal(chain: VirtualKinemati
         {"slots": 2},
         {"poses": some_poses(chain)[:2]},
         {"stops": (2,)},
-        {"rolling": Rolling()},
-        {"rolling": Rolling(radius=0.8)},
-        {"rolling": Rolling(track=0.5, rim=1.0)},
+        {"rolling": RollingLimits()},
+        {"rolling": RollingLimits(turning_radius=0.8)},
+        {"rolling": RollingLimits(track=0.5, wheel_speed=1.0)},
         {"clamped": ((3, 1, 4),)},
         {"pushed": ((3, 1, 4, 1),)},
         {"pushed": ((3, 1, 4, -1),)},

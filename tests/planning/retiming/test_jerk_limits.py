@@ -33,8 +33,8 @@ def test_limits_are_kept_exactly_and_nothing_jumps(seed: int, count: int, jerk: 
     points = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 3))
     path, pace, limits = made(points, jerk)
     curve = eased(path, pace, count - 1, limits)
-    fastest, strongest = curve.speeds()
-    jerks, jumps = curve.jerks()
+    fastest, strongest = curve.compute_max_rates()
+    jerks, jumps = curve.compute_jerks()
     assert max(fastest.max() / 1.0, strongest.max() / 2.0, jerks.max() / jerk) <= 1.0 + 1e-6
     assert max(fastest.max() / 1.0, strongest.max() / 2.0, jerks.max() / jerk) >= 0.999
     assert jumps.max() < 1e-5
@@ -69,11 +69,11 @@ def test_jerks_and_jumps_of_a_curve_are_those_of_its_cubics() -> None:
         np.random.default_rng(1).uniform(-1.0, 1.0, (4, 2)),
     )
     smooth = CubicSpline(knots, rows, bc_type="clamped")
-    jerks, jumps = Curve(knots, rows, smooth(knots, 1)).jerks()
+    jerks, jumps = Curve(knots, rows, smooth(knots, 1)).compute_jerks()
     np.testing.assert_allclose(jerks, np.abs(smooth(knots[:-1], 3)), rtol=1e-9)
     np.testing.assert_allclose(jumps[1:-1], 0.0, atol=1e-9)
     np.testing.assert_allclose(jumps[[0, -1]], np.abs(smooth(knots[[0, -1]], 2)), rtol=1e-9)
     bent = smooth(knots, 1)
     bent[1] += 0.1
-    changed = Curve(knots, rows, bent).jerks()[1][1]
+    changed = Curve(knots, rows, bent).compute_jerks()[1][1]
     assert changed == pytest.approx(np.abs(0.1 * (-4.0 / 0.8 - 4.0 / 0.5)), rel=1e-9)

@@ -8,7 +8,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.planning.retiming.limits import Limits
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.wheels import Rolling
+from vkc_pin.world.trajectory.wheels import RollingLimits
 
 SCENE = vkc.load_scene("drawer")
 NAMES = (*SCENE.robot.coordinates.names, "drawer.slide", "drawer.handle")
@@ -27,7 +27,7 @@ def test_limits_are_those_of_robot_and_objects() -> None:
 
 
 def test_wheels_have_a_velocity_of_their_own() -> None:
-    limits = Limits.of(SCENE, NAMES, 0.2).with_wheels(Rolling(track=0.8, rim=0.9))
+    limits = Limits.of(SCENE, NAMES, 0.2).with_wheels(RollingLimits(track=0.8, wheel_speed=0.9))
     assert limits.velocity[-2:].tolist() == [0.9, 0.9]
     assert np.isinf(limits.jerk[-2:]).all()
 

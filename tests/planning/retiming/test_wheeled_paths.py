@@ -14,11 +14,11 @@ from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.planning.retiming.wheeled_paths import fit_rolling_paths
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.wheels import Rolling
+from vkc_pin.world.trajectory.wheels import RollingLimits
 
 FAR = np.full(4, -np.inf), np.full(4, np.inf)
 STEPS = st.lists(st.tuples(st.floats(-0.3, 0.3), st.floats(-0.4, 0.4)), min_size=1, max_size=8)
-TANK = Rolling(track=1.0, rim=1.0)
+TANK = RollingLimits(track=1.0, wheel_speed=1.0)
 
 
 def arcs(steps: list[tuple[float, float]]) -> np.ndarray:
@@ -82,7 +82,7 @@ def test_a_steered_base_stops_where_it_would_have_to_turn_too_tightly() -> None:
     scale = np.array([1.0, 1.0, 0.5, 0.3])
     for before, after, stops in ((-1.0, 1.0, 1), (np.inf, 1.0, 0), (-1.8, 1.8, 0)):
         points = arcs([(0.2, 0.2 / (1.001 * before))] * 5 + [(0.2, 0.2 / (1.001 * after))] * 5)
-        paths = fit_rolling_paths(points, scale, FAR, Rolling(radius=1.0))
+        paths = fit_rolling_paths(points, scale, FAR, RollingLimits(turning_radius=1.0))
         assert len(paths) == 1 + stops
         for path, _ in paths:
             dense = np.linspace(0.0, path.x[-1], 3000)
@@ -146,7 +146,7 @@ def test_rounding_of_places_is_no_reason_to_stop() -> None:
         [[1.0, -1.0], [-1.0, 0.5], [0.7, 1.0], [-1.0, -1.0], [0.3, 1.0]]
     )
     ((path, own),) = fit_rolling_paths(
-        points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, Rolling(radius=radius)
+        points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, RollingLimits(turning_radius=radius)
     )
     assert len(own) == 7
     dense = np.linspace(0.0, path.x[-1], 3000)
@@ -165,10 +165,10 @@ def test_on_its_smallest_circle_a_steered_base_needs_no_stop() -> None:
                 arcs([(length, length / 0.8) for length in lengths]),
                 scale,
                 FAR,
-                Rolling(radius=0.8),
+                RollingLimits(turning_radius=0.8),
             )
         )
         == 1
     )
     straight = arcs([(0.1, 0.0)] * 4 + [(0.1, 0.1 / 0.81)] * 4)
-    assert len(fit_rolling_paths(straight, scale, FAR, Rolling(radius=0.8))) == 1
+    assert len(fit_rolling_paths(straight, scale, FAR, RollingLimits(turning_radius=0.8))) == 1

@@ -65,7 +65,7 @@ def test_depth_of_floor_pixels_is_consistent(images: Images, executed: Simulatio
     """Floor pixels, projected back along their rays, lie at height 0 and all others above."""
     world = Replay(executed.scene, executed.trajectory.times, executed.rows)
     data = world.model.createData()
-    row = world.positions(executed.trajectory, np.array([executed.planned.times[-1]]))[0]
+    row = world.compute_positions(executed.trajectory, np.array([executed.planned.times[-1]]))[0]
     pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
     for camera, least in ((HEAD, 300), (WRIST, 5)):
         camera_placement = (

@@ -11,7 +11,7 @@ from helpers.executions import door_plan, drawer_plan
 import vkc_pin as vkc
 from vkc_pin.validation.dynamics.bounds import bounds
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.trajectory.dynamics.torques import moments_of
+from vkc_pin.world.trajectory.dynamics.torques import sample_curve
 
 
 @pytest.mark.parametrize("made", [door_plan, drawer_plan])
@@ -42,7 +42,7 @@ def test_torques_count_as_any_other_limit() -> None:
     plan = door_plan()
     samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
     assert curve is not None
-    moments = moments_of(curve)
+    moments = sample_curve(curve)
     torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
     torques[moments.pieces < len(curve.times) // 2, 4] = 1.5
     (first, *_) = bounds(samples, moments, torques, 0.0)
@@ -55,7 +55,7 @@ def test_of_several_stretches_the_longest_is_named() -> None:
     plan = door_plan()
     samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
     assert curve is not None
-    moments, pieces = moments_of(curve), len(curve.times) - 1
+    moments, pieces = sample_curve(curve), len(curve.times) - 1
     for long in ((0, 30), (20, 50), (pieces - 30, pieces)):
         parts = [(0, 5), long, (pieces - 5, pieces)]
         torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
@@ -75,7 +75,7 @@ def test_what_bounds_a_two_hundredth_of_the_duration_is_told_of() -> None:
     plan = door_plan()
     samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
     assert curve is not None
-    moments, shares = moments_of(curve), np.diff(curve.times) / curve.times[-1]
+    moments, shares = sample_curve(curve), np.diff(curve.times) / curve.times[-1]
     number = {
         told: int(np.argmin(np.abs(shares - share)))
         for told, share in ((True, 0.0075), (False, 0.002))
@@ -94,6 +94,8 @@ def test_without_a_curve_nothing_is_said() -> None:
     plan = drawer_plan()
     bare = dataclasses.replace(plan.trajectory, curve=None)
     assert (
-        bounds(Samples(plan.scene, bare), moments_of(plan.trajectory.curve), np.zeros((0, 0)), 0.0)
+        bounds(
+            Samples(plan.scene, bare), sample_curve(plan.trajectory.curve), np.zeros((0, 0)), 0.0
+        )
         == ()
     )  # type: ignore[arg-type]

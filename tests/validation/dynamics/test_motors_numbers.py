@@ -63,8 +63,11 @@ def told(
     curve = SimpleNamespace(
         times=KNOTS,
         rates=rates,
-        speeds=lambda: (np.abs(velocity), np.abs(acceleration)),
-        jerks=lambda: (column(4) if jerk is None else jerk, column(5) if jumps is None else jumps),
+        compute_max_rates=lambda: (np.abs(velocity), np.abs(acceleration)),
+        compute_jerks=lambda: (
+            column(4) if jerk is None else jerk,
+            column(5) if jumps is None else jumps,
+        ),
     )
     motion = SimpleNamespace(
         times=TIMES,
@@ -176,7 +179,9 @@ def bounding(
         for part, limit in ((velocity, 2.0), (acceleration, 4.0))
     ]
     jerks = np.column_stack([np.zeros(4) if jerk is None else np.array(jerk), np.zeros(4)])
-    curve = SimpleNamespace(times=KNOTS, speeds=lambda: rates, jerks=lambda: (jerks, None))
+    curve = SimpleNamespace(
+        times=KNOTS, compute_max_rates=lambda: rates, compute_jerks=lambda: (jerks, None)
+    )
     samples: Any = SimpleNamespace(
         trajectory=SimpleNamespace(curve=curve, names=("one", "two")),
         bounds=lambda name: (0.0, 0.0, 2.0, 4.0),
@@ -236,7 +241,7 @@ def motors(
     limits: Any = (10.0, 20.0),
     *,
     known: bool = True,
-    weightless: tuple[str, ...] = (),
+    massless_objects: tuple[str, ...] = (),
     smooth: bool = True,
 ) -> Any:
     """Return motors that have these torques at four moments; a tenth of that at rest."""
@@ -264,12 +269,15 @@ def motors(
         assert phases.tolist() == [10 * made.waypoints[row] for row in rows]
         return np.asarray(numbers[rows] * (1.0 if full else 0.1))
 
-    efforts = SimpleNamespace(
+    torque_limits = SimpleNamespace(
         known=known, limits=np.array(limits), notes=("nothing is stated",) if not known else ()
     )
-    made._torques = SimpleNamespace(
-        efforts=efforts, weightless=weightless, at=at, phases_of=lambda at: 10 * at
-    )  # type: ignore
+    made._torques = SimpleNamespace(  # type: ignore[assignment]
+        torque_limits=torque_limits,
+        massless_objects=massless_objects,
+        at=at,
+        phases_of=lambda at: 10 * at,
+    )
     return made
 
 
@@ -298,7 +306,7 @@ def test_half_a_hundredth_more_is_all_right(share: float, wrong: bool) -> None:
 
 
 def test_what_nobody_knows_is_no_share() -> None:
-    made = motors([[99.0, 99.0]] * 4, known=False, weightless=("stick", "cup"))
+    made = motors([[99.0, 99.0]] * 4, known=False, massless_objects=("stick", "cup"))
     assert made.shares.tolist() == [[0.0, 0.0]] * 4
     assert made.violations() == []
 
@@ -312,7 +320,7 @@ def test_what_is_said_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
         "bounds": ("bounds", 0.0),
         "remarks": (),
     }
-    found = motors([[9.0, 9.0]] * 4, known=False, weightless=("stick", "cup")).facts(0.25)
+    found = motors([[9.0, 9.0]] * 4, known=False, massless_objects=("stick", "cup")).facts(0.25)
     assert found == {
         "torque": 0.0,
         "bounds": ("bounds", 0.25),

@@ -35,7 +35,7 @@ def test_jerks_are_looked_at_where_they_are_limited() -> None:
     (kind,) = found(motion, jerk_time=0.5)
     assert kind == ("jerk", "rad/s³")
     assert motion.curve is not None
-    strongest = motion.curve.jerks()[0][:, motion.names.index("elbow_joint")].max()
+    strongest = motion.curve.compute_jerks()[0][:, motion.names.index("elbow_joint")].max()
     assert found(motion, jerk_time=0.5)[kind].amount == pytest.approx(strongest - 1.4 / 0.5)
 
 
@@ -77,7 +77,7 @@ def test_a_motion_begins_and_ends_at_rest(speed: float, rests: bool, end: int) -
 def test_accelerations_that_jump_are_named() -> None:
     motion = drawer_plan().trajectory
     assert motion.curve is not None
-    jumps = motion.curve.jerks()[1][:, motion.names.index("elbow_joint")]
+    jumps = motion.curve.compute_jerks()[1][:, motion.names.index("elbow_joint")]
     violation = found(motion, jerk_time=1e-3)["jerk", "rad/s² at once"]
     assert violation.amount == pytest.approx(jumps.max() - 1.4e-3)
     at = motion.curve.times[int(np.argmax(jumps))]

@@ -7,7 +7,7 @@ import pytest
 from helpers.fake_plan import fake_plan
 
 from vkc_pin.planning.plan import Plan
-from vkc_pin.visualization.plots.clearance import ClearanceCurve, clearance_curves
+from vkc_pin.visualization.plots.clearance import ClearanceCurve, compute_clearance_curves
 from vkc_pin.world.trajectory.world_model import World
 
 TIMES = np.linspace(0.0, 6.0, 13)
@@ -20,7 +20,7 @@ def plan() -> Plan:
 
 @pytest.fixture(scope="module")
 def curves(plan: Plan) -> dict[str, ClearanceCurve]:
-    found = clearance_curves(plan.scene, plan.trajectory, TIMES)
+    found = compute_clearance_curves(plan.scene, plan.trajectory, TIMES)
     return {curve.name: curve for curve in found}
 
 
@@ -47,7 +47,7 @@ def test_distance_to_obstacles_is_coals(curves: dict[str, ClearanceCurve], plan:
     labels, objects = world.collision_labels, world.collision.geometryObjects
     obstacles = [i for i in range(len(arm), len(labels)) if "." not in labels[i]]
     for k in (0, 6, 12):
-        q = world.coordinates.q(world.positions(plan.trajectory, [TIMES[k]])[0])
+        q = world.coordinates.q(world.compute_positions(plan.trajectory, [TIMES[k]])[0])
         pin.updateGeometryPlacements(world.model, data, world.collision, shapes, q)
         nearest = (np.inf, ("", ""))
         for i in arm:

@@ -13,7 +13,7 @@ from helpers.fake_plan import fake_plan
 from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.validation.report import Judged
+from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.visualization.plots import joints
 from vkc_pin.visualization.plots import plots as plotting
 from vkc_pin.visualization.plots.joints import Quantity
@@ -84,7 +84,7 @@ def test_rates_are_the_curve_s(plan: Plan) -> None:
     )
     smooth = dataclasses.replace(plan, trajectory=dataclasses.replace(motion, curve=curve))
     for number, (shown, peaks) in enumerate(
-        zip(plotting.plot_joints(smooth).axes[1:3], curve.speeds(), strict=True), 1
+        zip(plotting.plot_joints(smooth).axes[1:3], curve.compute_max_rates(), strict=True), 1
     ):
         line = shown.get_lines()[2]
         read = (curve.velocity, curve.acceleration)[number - 1]
@@ -97,7 +97,7 @@ def test_a_quantity_that_only_some_have_leaves_the_others_free(
 ) -> None:
     """Torques, say: a column more, without axes where there is none."""
 
-    def torques(plan: Judged, times: Floats) -> tuple[Floats, Floats]:
+    def torques(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
         values = np.full((len(times), len(plan.trajectory.names)), np.nan)
         values[:, 3:9] = 20.0
         return times, values

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.curve import Curve, joined, moments_at
+from vkc_pin.world.trajectory.curve import Curve, concatenate_curves, sample_intervals
 
 
 def some(seed: int, knots: int = 7, size: int = 3) -> Curve:
@@ -31,8 +31,10 @@ def test_it_is_scipys(seed: int, knots: int) -> None:
 
 def test_moments_are_at_shares_of_every_span() -> None:
     knots, shares = np.array([0.0, 1.0, 4.0]), np.array([0.0, 0.5, 1.0])
-    np.testing.assert_allclose(moments_at(knots, shares), [0.0, 0.5, 1.0, 1.0, 2.5, 4.0])
-    np.testing.assert_allclose(moments_at(knots, shares[:2], last=True), [0.0, 0.5, 1.0, 2.5, 4.0])
+    np.testing.assert_allclose(sample_intervals(knots, shares), [0.0, 0.5, 1.0, 1.0, 2.5, 4.0])
+    np.testing.assert_allclose(
+        sample_intervals(knots, shares[:2], last=True), [0.0, 0.5, 1.0, 2.5, 4.0]
+    )
 
 
 def test_outside_all_stands_still() -> None:
@@ -49,8 +51,8 @@ def test_extremes_and_speeds_are_those_of_many_moments(seed: int, even: bool) ->
     if even:  # parabolas and straight lines among them
         chords = np.diff(curve.positions, axis=0) / np.diff(curve.times)[:, None]
         curve = Curve(curve.times, curve.positions, np.vstack([chords, chords[-1:]]))
-    low, high = curve.extremes()
-    fastest, strongest = curve.speeds()
+    low, high = curve.compute_extrema()
+    fastest, strongest = curve.compute_max_rates()
     for k, (begin, end) in enumerate(zip(curve.times, curve.times[1:], strict=False)):
         moments = np.linspace(begin, end, 2001)[:-1]
         places, velocities, changes = (
@@ -75,8 +77,8 @@ def test_extremes_and_speeds_are_those_of_many_moments(seed: int, even: bool) ->
 def test_parts_put_together_are_the_whole() -> None:
     curve = some(3)
     middle = float(curve.times[3])
-    whole = joined(
-        [curve.part(curve.times[0], middle), curve.part(middle, curve.times[-1]).shifted(5.0)]
+    whole = concatenate_curves(
+        [curve.part(curve.times[0], middle), curve.part(middle, curve.times[-1]).shift_time(5.0)]
     )
     np.testing.assert_allclose(whole.times, curve.times, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(whole.positions, curve.positions)

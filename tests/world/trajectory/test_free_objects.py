@@ -29,7 +29,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.trajectory.free_objects import as_numbers
+from vkc_pin.world.trajectory.free_objects import to_free_joint_positions
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
@@ -42,7 +42,7 @@ def placements(scene: Scene, motion: Trajectory, name: str, times: np.ndarray) -
     world = World(scene)
     return [
         pin.XYZQUATToSE3(row)
-        for row in world.positions(motion, times)[:, world.placement_columns(name)]
+        for row in world.compute_positions(motion, times)[:, world.get_placement_columns(name)]
     ]
 
 
@@ -226,7 +226,9 @@ def test_what_is_held_at_the_start_is_where_the_hand_has_it() -> None:
     world = World(scene)
     tool = scene.tool_placement()
     expected = tool * tool_at(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse()
-    assert_same(pin.XYZQUATToSE3(world.start[world.placement_columns("stick")]), expected, 1e-12)
+    assert_same(
+        pin.XYZQUATToSE3(world.start[world.get_placement_columns("stick")]), expected, 1e-12
+    )
     motion = Script(scene).go(moved_base(scene.start, x=-1.0, yaw=2.0)).motion()
     times = inside(motion, 0)
     for at, tool in zip(
@@ -262,15 +264,15 @@ def test_the_numbers_of_an_orientation_do_not_jump_either() -> None:
     """Of its two quaternions always the nearer one, so that rows can be interpolated: through two whole turns."""
     scene, motion = turned()
     world, times = World(scene), np.linspace(0.0, motion.times[-1], 3000)
-    rows = world.positions(motion, times)[:, world.placement_columns("stick")]
+    rows = world.compute_positions(motion, times)[:, world.get_placement_columns("stick")]
     np.testing.assert_allclose(np.linalg.norm(rows[:, 3:], axis=1), 1.0, atol=1e-12)
     assert np.einsum("kc,kc->k", rows[1:, 3:], rows[:-1, 3:]).min() > 0.999
     assert np.abs(np.diff(rows, axis=0)).max() < 0.02
     assert (
         rows[:, 3:].min(axis=0) < -0.3
     ).sum() >= 2  # it does come round to where the first choice would flip
-    half = World(scene).positions(motion, (times[1:] + times[:-1]) / 2)[
-        :, world.placement_columns("stick")
+    half = World(scene).compute_positions(motion, (times[1:] + times[:-1]) / 2)[
+        :, world.get_placement_columns("stick")
     ]
     for between, before, after in zip(half[::50], rows[:-1:50], rows[1::50], strict=True):
         middle = pin.XYZQUATToSE3(
@@ -295,8 +297,8 @@ def test_the_answer_does_not_depend_on_what_else_is_asked(seed: int) -> None:
     assert placements(scene, motion, "stick", np.zeros(0)) == []
     waypoints = placements(scene, motion, "stick", motion.times)
     world = World(scene)
-    for row, at in zip(world.positions(motion), waypoints, strict=True):
-        assert_same(pin.XYZQUATToSE3(row[world.placement_columns("stick")]), at, 1e-12)
+    for row, at in zip(world.compute_positions(motion), waypoints, strict=True):
+        assert_same(pin.XYZQUATToSE3(row[world.get_placement_columns("stick")]), at, 1e-12)
 
 
 def test_beyond_its_ends_a_motion_is_at_its_ends() -> None:
@@ -316,12 +318,14 @@ def test_coordinates_frames_and_shapes_of_what_is_free() -> None:
         *(f"{n}.placement_{part}" for n in ("stick", "ball") for part in parts),
     )
     for name in ("stick", "ball"):
-        columns = world.placement_columns(name)
+        columns = world.get_placement_columns(name)
         assert world.coordinates.names[columns] == tuple(
             f"{name}.placement_{part}" for part in parts
         )
-        np.testing.assert_allclose(world.start[columns], as_numbers(scene.objects[name].placement))
-        (joint,) = world.joints_of(name)
+        np.testing.assert_allclose(
+            world.start[columns], to_free_joint_positions(scene.objects[name].placement)
+        )
+        (joint,) = world.get_joints(name)
         assert world.model.names[joint] == f"{name}.placement"
     rng = np.random.default_rng(0)
     z = np.array(world.start)
@@ -329,7 +333,7 @@ def test_coordinates_frames_and_shapes_of_what_is_free() -> None:
     data, shapes = world.model.createData(), world.collision.createData()
     pin.updateGeometryPlacements(world.model, data, world.collision, shapes, world.coordinates.q(z))
     pin.updateFramePlacements(world.model, data)
-    columns = world.placement_columns("stick")
+    columns = world.get_placement_columns("stick")
     unit = z[columns] / np.r_[1.0, 1.0, 1.0, np.full(4, np.linalg.norm(z[columns][3:]))]
     assert_same(data.oMf[world.model.getFrameId("stick.tip")], pin.XYZQUATToSE3(unit) * TIP)
     own = {

@@ -8,7 +8,7 @@ import pytest
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.trajectory.phase_span import PhaseSpan, part_of
+from vkc_pin.world.trajectory.phase_span import PhaseSpan, get_required
 
 STICK = Hold("stick", "grip")
 
@@ -47,4 +47,4 @@ def test_what_is_missing_is_named() -> None:
         PhaseSpan.from_dict({"name": "go", "first": 0, "last": 1}, "phases[0]")
     with pytest.raises(InputError, match=r"phases\[3\]"):
         PhaseSpan.from_dict("go", "phases[3]")
-    assert part_of({"a": 1}, "a") == 1
+    assert get_required({"a": 1}, "a") == 1

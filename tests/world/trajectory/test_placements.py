@@ -42,7 +42,7 @@ def test_where_joints_are_faster_than_what_moves_them_there_are_more(plan: Plan)
 
 def test_placements_are_those_of_the_world(motion: Motion, world: World, plan: Plan) -> None:
     data, k = world.model.createData(), 5
-    (row,) = world.positions(plan.trajectory, [motion.times[k]])
+    (row,) = world.compute_positions(plan.trajectory, [motion.times[k]])
     pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
     tool = data.oMf[world.model.getFrameId(plan.scene.robot.tool_frame)].translation
     assert np.allclose(motion.tool[k], tool)

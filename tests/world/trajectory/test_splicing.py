@@ -1,4 +1,4 @@
-"""Motions are joined, cut, and known where they were not."""
+"""Motions are joined, extract_phases, and known where they were not."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import Hold, make_holds
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.splicing import cut, filled, join
+from vkc_pin.world.trajectory.splicing import (
+    concatenate_trajectories,
+    extract_phases,
+    fill_missing_values,
+)
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
@@ -19,7 +23,7 @@ def test_what_is_not_known_is_as_it_was_or_as_it_will_be() -> None:
         [[nan, 1.0, nan], [2.0, nan, nan], [nan, nan, nan], [3.0, 4.0, nan], [nan, nan, nan]]
     )
     expected = [[2.0, 1.0, nan], [2.0, 1.0, nan], [2.0, 1.0, nan], [3.0, 4.0, nan], [3.0, 4.0, nan]]
-    np.testing.assert_array_equal(filled(table), expected)
+    np.testing.assert_array_equal(fill_missing_values(table), expected)
     assert np.isnan(table[0, 0])  # what was given is left alone
 
 
@@ -43,7 +47,7 @@ def parts() -> tuple[Trajectory, Trajectory, Trajectory]:
 
 def test_motions_are_joined() -> None:
     """The hand closes between the first two, so the robot waits there; between the others it does not."""
-    whole = join(parts(), pause=0.25)
+    whole = concatenate_trajectories(parts(), pause=0.25)
     assert whole.names == NAMES
     np.testing.assert_allclose(whole.times, [0.0, 1.0, 3.0, 3.25, 4.25, 4.75])
     np.testing.assert_array_equal(whole.positions[:, :5], ROWS[[0, 1, 2, 2, 3, 0], :5])
@@ -70,11 +74,13 @@ def test_what_is_held_through_another_thing_makes_a_pause_too() -> None:
     ]
     spans = [PhaseSpan(name, 0, 1, held) for name, held in zip("abc", holds, strict=True)]
     motions = [Trajectory(NAMES, np.array([0.0, 1.0]), ROWS[[1, 2]], (span,), 5) for span in spans]
-    np.testing.assert_allclose(join(motions, pause=0.5).times, [0.0, 1.0, 1.5, 2.5, 3.0, 4.0])
+    np.testing.assert_allclose(
+        concatenate_trajectories(motions, pause=0.5).times, [0.0, 1.0, 1.5, 2.5, 3.0, 4.0]
+    )
 
 
 def test_one_motion_alone_stays_as_it_is() -> None:
-    whole = join([example()], pause=1.0)
+    whole = concatenate_trajectories([example()], pause=1.0)
     np.testing.assert_array_equal(whole.positions, ROWS)
     np.testing.assert_array_equal(whole.times, TIMES)
     assert whole.phases == PHASES
@@ -83,23 +89,23 @@ def test_one_motion_alone_stays_as_it_is() -> None:
 def test_only_motions_that_follow_one_another_can_be_joined() -> None:
     reach, opens, _ = parts()
     with pytest.raises(InputError) as raised:
-        join([reach, reach], pause=0.1)
+        concatenate_trajectories([reach, reach], pause=0.1)
     assert raised.value.field == "parts[1]"
     moved = Trajectory(NAMES, opens.times, opens.positions + 2e-6, opens.phases, 5)
     with pytest.raises(InputError):
-        join([reach, moved], pause=0.1)
+        concatenate_trajectories([reach, moved], pause=0.1)
     closer = Trajectory(NAMES, opens.times, opens.positions + 5e-7, opens.phases, 5)
-    assert len(join([reach, closer], pause=0.1).times) == 5
-    with pytest.raises(InputError, match="nothing to join"):
-        join([], pause=0.1)
+    assert len(concatenate_trajectories([reach, closer], pause=0.1).times) == 5
+    with pytest.raises(InputError, match="nothing to concatenate"):
+        concatenate_trajectories([], pause=0.1)
 
 
 def test_what_was_joined_can_be_cut_apart() -> None:
     first, last = 0, 0
-    whole = join(parts(), pause=0.25)
+    whole = concatenate_trajectories(parts(), pause=0.25)
     for part in parts():
         last = first + len(part.phases)
-        found = cut(whole, part.names, first, last)
+        found = extract_phases(whole, part.names, first, last)
         count = len(part.times)
         np.testing.assert_array_equal(found.positions[-count:], part.positions)
         np.testing.assert_allclose(np.diff(found.times[-count:]), np.diff(part.times))

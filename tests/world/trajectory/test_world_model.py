@@ -14,7 +14,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World, units_of
+from vkc_pin.world.trajectory.world_model import World, find_coordinate_units
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_positions_along_a_motion(world: World) -> None:
     motion = Trajectory(
         names, np.array([0.0, 1.0, 3.0]), values, (PhaseSpan("all", 0, 2),), len(robot)
     )
-    rows, half = world.positions(motion), world.positions(motion, [0.5])
+    rows, half = world.compute_positions(motion), world.compute_positions(motion, [0.5])
     for k, name in enumerate(world.coordinates.names):
         if name in names:
             np.testing.assert_array_equal(rows[:, k], values[:, names.index(name)])
@@ -161,7 +161,7 @@ def test_positions_along_a_motion(world: World) -> None:
         else:
             assert (rows[:, k] == world.start[k]).all()
             assert half[0, k] == world.start[k]
-    assert world.positions(motion, np.zeros(0)).shape == (0, world.coordinates.size)
+    assert world.compute_positions(motion, np.zeros(0)).shape == (0, world.coordinates.size)
 
 
 def test_the_robots_meshes_are_read_only_to_be_drawn() -> None:
@@ -169,12 +169,12 @@ def test_the_robots_meshes_are_read_only_to_be_drawn() -> None:
 
 
 def test_units_of_joints_that_slide_and_of_grasps() -> None:
-    units = units_of(vkc.load_scene("drawer"))
+    units = find_coordinate_units(vkc.load_scene("drawer"))
     assert (units["drawer.slide"], units["base_x"], units["base_yaw"]) == ("m", "m", "rad")
-    stick = units_of(vkc.load_scene("init_3"))
+    stick = find_coordinate_units(vkc.load_scene("init_3"))
     assert {stick[name] for name in stick if name.endswith("_slide")} == {"m"}
     assert {stick[name] for name in stick if name.endswith("_turn")} == {"rad"}
 
 
 def test_every_coordinate_of_a_plan_has_a_unit(door_plan: Plan) -> None:
-    assert set(door_plan.trajectory.names) <= set(units_of(door_plan.scene))
+    assert set(door_plan.trajectory.names) <= set(find_coordinate_units(door_plan.scene))

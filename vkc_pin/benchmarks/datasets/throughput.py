@@ -23,7 +23,7 @@ from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipes.recipe import TASKS, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.utils.parallel.journal import Kept
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.world.files.writing import write_atomically
 
 if TYPE_CHECKING:
@@ -285,7 +285,7 @@ def workers_chart(result: Mapping[str, Any], path: str | Path | None) -> Figure:
     Returns:
         The figure.
     """
-    with styled():
+    with use_style():
         figure = new_figure(6.4, 3.6)
         axes = figure.subplots()
         for task, colour in zip(TASKS, COLOURS, strict=False):

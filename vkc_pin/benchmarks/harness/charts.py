@@ -12,7 +12,13 @@ from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.benchmarks.harness.record import values as numbers
 from vkc_pin.benchmarks.harness.tables import common, mean_and_deviation, quartiles, wilson
 from vkc_pin.planning.plan import Plan
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, shade_phases, styled
+from vkc_pin.visualization.plots.style import (
+    COLOURS,
+    new_figure,
+    save_figure,
+    shade_phases,
+    use_style,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -147,7 +153,7 @@ def criteria_chart(
         ("arm_effort", "arm effort [rad]", shared, ".2f"),
         ("planning_time", "planning time [s]", "median and quartiles\nover all trials", ".2f"),
     )
-    with styled():
+    with use_style():
         figure = new_figure(11.0, 3.4)
         for axes, (field, name, about, form) in zip(
             figure.subplots(1, len(panels)), panels, strict=True
@@ -194,7 +200,7 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
     Returns:
         The figure.
     """
-    with styled():
+    with use_style():
         figure = new_figure(1.2 + 4.0 * len(plans), 7.0)
         columns: Any = figure.subplots(3, len(plans), sharex=True, sharey="row", squeeze=False).T
         for (position, velocity, base), (name, plan) in zip(columns, plans.items(), strict=True):
@@ -259,7 +265,7 @@ def _grouped(
     title: str,
 ) -> Figure:
     """Draw bars grouped by scene, one for each method: `bar` returns lower end, height and upper end, or None for no bar."""
-    with styled():
+    with use_style():
         figure = new_figure(max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1)), 3.8)
         axes = figure.subplots()
         width = _WIDTH / len(methods)

@@ -94,7 +94,9 @@ def peaks(trajectory: Trajectory) -> dict[str, float]:
     """Return the largest velocity [rad/s] and acceleration [rad/s²] of an arm joint: peak_velocity, peak_acceleration."""
     arm, curve = slice(3, trajectory.robot_size), trajectory.curve
     rates = (
-        (trajectory.velocities(), trajectory.accelerations()) if curve is None else curve.speeds()
+        (trajectory.velocities(), trajectory.accelerations())
+        if curve is None
+        else curve.compute_max_rates()
     )
     largest = [float(np.abs(rate[:, arm]).max(initial=0.0)) for rate in rates]
     return dict(zip(("peak_velocity", "peak_acceleration"), largest, strict=True))

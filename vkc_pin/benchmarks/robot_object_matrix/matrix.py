@@ -13,7 +13,7 @@ from vkc_pin.benchmarks.harness.limits import allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
 from vkc_pin.benchmarks.robot_object_matrix.pairs import kind_of
-from vkc_pin.visualization.plots.style import new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,7 +72,7 @@ def chart(records: Sequence[Record], path: str | Path | None) -> Figure:
     groups = _groups(records)
     robots, objects = (list(dict.fromkeys(key[k] for key in groups)) for k in (0, 1))
     share = np.full((len(objects), len(robots)), np.nan)
-    with styled():
+    with use_style():
         figure = new_figure(4.5 + 0.6 * len(robots), 2.4 + 0.24 * len(objects))
         axes = figure.subplots()
         for i, name in enumerate(objects):

@@ -14,7 +14,7 @@ import pinocchio as pin
 from vkc_pin.importing.proposals.proposal import Proposal, Proposals
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.world.models.shapes import get_link_name, triangulate
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
     panels = max(1, len(shown) + bool(proposals.because))
     columns = min(panels, _COLUMNS)
     rows = -(-panels // columns)
-    with styled():
+    with use_style():
         figure = new_figure(_WIDTH * columns, _WIDTH * rows + 0.3)
         for number, proposal in enumerate(shown):
             axes: Any = figure.add_subplot(rows, columns, number + 1, projection="3d")

@@ -153,11 +153,11 @@ class Routes:
     def _poses(self, grid: BaseGrid, path: BasePath, steps: int, turning: float) -> Floats:
         """Return poses along a path; those of a base on wheels at its corners, too, so that it rolls from each to the next."""
         rolling = self.problem.rolling
-        if rolling.aside:
+        if rolling.is_omnidirectional:
             return poses_along(path, steps, turning=turning)
         corners = path.poses
-        if rolling.radius > 0.0:
-            corners = Curves(rolling.radius, turning).through(
+        if rolling.turning_radius > 0.0:
+            corners = Curves(rolling.turning_radius, turning).through(
                 corners, lambda pose: grid.clear(*pose, reaching=True)
             )
         return spread_along(corners, steps, turning=turning)

@@ -10,7 +10,7 @@ import numpy as np
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import PhaseKey
-from vkc_pin.world.trajectory.splicing import filled
+from vkc_pin.world.trajectory.splicing import fill_missing_values
 
 __all__ = ["PhaseWaypoints", "Seed", "perturbed", "seed_of"]
 
@@ -76,7 +76,7 @@ def seed_of(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> Seed
                 waypoints[:, known], phase.segments
             )
             begin += phase.segments
-    z = filled(z)
+    z = fill_missing_values(z)
     z = np.where(np.isnan(z), problem.start, z)  # no part moves it
     name = ", ".join(part.seed for part in parts) + ", then all at once"
     return Seed(name, z, radius=np.full(problem.segments, _WARM_RADIUS))

@@ -84,8 +84,8 @@ class Knots:
         )
         self.curves = (
             None
-            if problem.rolling.aside
-            else Curves(problem.rolling.radius, self.chain.robot.lever)
+            if problem.rolling.is_omnidirectional
+            else Curves(problem.rolling.turning_radius, self.chain.robot.lever)
         )
         self.driven = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.objects = follow_objects(problem, np.tile(problem.start, (problem.segments, 1)))
@@ -162,7 +162,9 @@ class Knots:
         """Return configurations with the base where an arc leads from what they come from, as far as arms reach from there."""
         rolling, turning = self.problem.rolling, self.chain.robot.lever
         there, (solver, target) = z.copy(), self.solver(pose)
-        there[:, :3] = nearest_arc(before[:, :3], z[:, :3], radius=rolling.radius, turning=turning)
+        there[:, :3] = nearest_arc(
+            before[:, :3], z[:, :3], radius=rolling.turning_radius, turning=turning
+        )
         lower, upper = self.limits(before, waypoint)
         lower[:, :3] = upper[:, :3] = np.clip(there[:, :3], lower[:, :3], upper[:, :3])
         there, reached = solver.solve(

@@ -241,7 +241,7 @@ class _SeedSearch:
     def _searched(self, **how: bool) -> Found:
         """Return what a search finds; if it is no good, and the base is steered, with headings kept apart."""
         found = self.beam.search(**how)
-        if self.problem.rolling.radius > 0.0 and not self.beam.tolerable(found):
+        if self.problem.rolling.turning_radius > 0.0 and not self.beam.tolerable(found):
             found = min(
                 found, self.beam.search(**how, apart=True), key=lambda one: float(one.cost.min())
             )

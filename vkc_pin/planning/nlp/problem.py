@@ -31,7 +31,7 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase, Task
 from vkc_pin.world.task.terms import Term
-from vkc_pin.world.trajectory.wheels import rolling_of
+from vkc_pin.world.trajectory.wheels import make_rolling_limits
 
 __all__ = ["TrajectoryProblem"]
 
@@ -77,7 +77,7 @@ class TrajectoryProblem:
         self.chain: VirtualKinematicChain = consolidate(
             scene, task.holds, rides=task.supported, cache=self.cache
         )
-        self.rolling = rolling_of(self.chain.robot)
+        self.rolling = make_rolling_limits(self.chain.robot)
         self.contacts = ContactModel(scene, self.chain, task, options)
         self.ends = np.cumsum([phase.segments for phase in task.phases])
         self.pose_goals = make_pose_goals(scene, self.chain, task, options)
@@ -226,7 +226,9 @@ class TrajectoryProblem:
         )
         runs = split_at_stops(structure.stops, self.segments)
         path = self.waypoints(z)
-        dt = compute_step_times(path, self.options.dt, runs, limits, self.rolling.times(path))
+        dt = compute_step_times(
+            path, self.options.dt, runs, limits, self.rolling.compute_min_times(path)
+        )
         if structure.timed:
             dt = self.term_evaluator.lengthen_steps(z, dt, runs)
         return Timing(dt, dt, runs, limits)
@@ -283,7 +285,7 @@ class TrajectoryProblem:
 
     def pace(self, z: Floats) -> tuple[Floats, Floats, Floats]:
         """Return `rates` and the minimum step durations for the wheels, shape (N,) [s]."""
-        return *self.rates(z), self.rolling.times(self.waypoints(z))
+        return *self.rates(z), self.rolling.compute_min_times(self.waypoints(z))
 
     def objective(self, z: Floats, dt: Floats) -> float:
         """Return the cost of z_1..z_N, shape (N, n), including user-defined costs.
@@ -301,7 +303,7 @@ class TrajectoryProblem:
             if goal.row.waypoints:
                 residual, _ = solver.evaluate(z[np.array(goal.row.waypoints) - 1], goal.target)
                 errors.append(float(np.abs(residual).max()))
-        return max(*errors, self.rolling.error(self.waypoints(z)))
+        return max(*errors, self.rolling.compute_error(self.waypoints(z)))
 
     def row_error(self, z: Floats, dt: Floats) -> float:
         """Return the larger of `pose_error` and the violation of user-defined constraints."""
@@ -320,7 +322,7 @@ class TrajectoryProblem:
             return np.zeros(0)
         values = np.asarray(
             t.relaxed_row_values(
-                t.pack(z), self.start, timing.dt, self.rolling.gears(self.waypoints(z))
+                t.pack(z), self.start, timing.dt, self.rolling.compute_gears(self.waypoints(z))
             )
         ).ravel()
         lower, upper = (
@@ -369,7 +371,7 @@ class TrajectoryProblem:
             for rows in at.values():
                 lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
         lower[terms.rows], upper[terms.rows] = terms.lower, terms.upper
-        if not self.rolling.aside:
+        if not self.rolling.is_omnidirectional:
             lower[t.base_rows], upper[t.base_rows] = t.steps.bounds(
                 None if timing is None else timing.dt
             )

@@ -29,7 +29,7 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import spend
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.trajectory.wheels import Rolling
+from vkc_pin.world.trajectory.wheels import RollingLimits
 
 __all__ = ["Transcription", "transcribe"]
 
@@ -44,7 +44,7 @@ class Transcription:
         rows: Number of constraint rows without the rate rows.
         slot_rows: Rows of the witness planes, shape (N, K).
         pose_rows: For each pose, waypoint → its rows; see `pose.pose_rows`.
-        base_rows: Rolling rows of a wheeled base, see `StepRows`, shape (N·rows per step,); empty
+        base_rows: RollingLimits rows of a wheeled base, see `StepRows`, shape (N·rows per step,); empty
             for other bases.
         term_rows: For each user-defined term, waypoint → its rows; empty for costs. These are the
             last rows.
@@ -154,7 +154,7 @@ class Transcription:
         times = dt if self.structure.timed and dt is not None else np.zeros(0)
         gears = (
             np.zeros(0)
-            if self.structure.rolling.aside
+            if self.structure.rolling.is_omnidirectional
             else np.ones(self.segments)
             if gears is None
             else gears
@@ -264,7 +264,7 @@ class Transcription:
         # the rows that follow do not come from waypoint functions
         self.first_relaxed_row = self.rows
         self.row_waypoints, self.remaining_rows = np.zeros(0, int), ca.MX(0, 1)
-        if not self.structure.rolling.aside:
+        if not self.structure.rolling.is_omnidirectional:
             self._append_rolling_rows(self.structure.rolling)
         self._append_clamping_rows()
         self.term_rows: list[dict[int, Ints]] = []
@@ -286,7 +286,7 @@ class Transcription:
         self.multipliers = multipliers
         return multipliers[rows:]
 
-    def _append_rolling_rows(self, rolling: Rolling) -> None:
+    def _append_rolling_rows(self, rolling: RollingLimits) -> None:
         """Append the rolling rows of a wheeled base, step by step."""
         self.steps = StepRows(rolling, ca.horzcat(self.start, self.z), self.gears, width=self.width)
         self.base_rows = self.rows + np.arange(len(self.steps.waypoints))
@@ -369,7 +369,7 @@ class Transcription:
             self.penalty,
         ]
         parameters += [self.pose_offsets, self.relaxation_weights, self.excess]
-        parameters += [] if self.structure.rolling.aside else [self.gears]
+        parameters += [] if self.structure.rolling.is_omnidirectional else [self.gears]
         self.parameters = ca.veccat(*parameters, *([self.dt] if self.structure.timed else []))
 
     def _subtract_relaxation(

@@ -23,7 +23,7 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import spend
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.trajectory.wheels import ANYWHERE, Rolling
+from vkc_pin.world.trajectory.wheels import OMNIDIRECTIONAL, RollingLimits
 
 __all__ = ["StepRows", "Structure", "WaypointFunctions", "get_waypoint_functions"]
 
@@ -55,7 +55,7 @@ class Structure:
     poses: tuple[PoseRow, ...]
     slots: int
     stops: tuple[int, ...] = ()
-    rolling: Rolling = ANYWHERE
+    rolling: RollingLimits = OMNIDIRECTIONAL
     clamped: tuple[tuple[int, int, int], ...] = ()
     pushed: tuple[tuple[int, int, int, int], ...] = ()
     terms: tuple[TermRow, ...] = ()
@@ -158,7 +158,7 @@ class StepRows:
     """Constraint rows of all steps of a wheeled base, from one pose (x, y, yaw) to the next.
 
     The rows of one step, all in metres, use its longitudinal displacement c, lateral displacement s
-    and rotation δθ (see `Rolling.steps`): s, which must be zero; for steered bases, gear·c ∓
+    and rotation δθ (see `RollingLimits.compute_steps`): s, which must be zero; for steered bases, gear·c ∓
     radius·δθ, which must not be negative; and, if the wheel speed is limited, the wheel travel c ∓
     track/2·δθ.
 
@@ -173,7 +173,7 @@ class StepRows:
         waypoints: Waypoint at which the step of each row ends, counted from 0.
     """
 
-    def __init__(self, rolling: Rolling, path: ca.MX, gears: ca.MX, *, width: int) -> None:
+    def __init__(self, rolling: RollingLimits, path: ca.MX, gears: ca.MX, *, width: int) -> None:
         self.rolling, self.segments, self.size = (
             rolling,
             path.shape[1] - 1,
@@ -219,15 +219,15 @@ class StepRows:
 
     def bounds(self, dt: Floats | None) -> tuple[Floats, Floats]:
         """Return the bounds of the rows; `dt`, shape (N,) [s], limits wheel travel if given."""
-        travel = np.full(self.segments, np.inf) if dt is None else self.rolling.rim * dt
+        travel = np.full(self.segments, np.inf) if dt is None else self.rolling.wheel_speed * dt
         lower, upper = np.zeros((self.segments, self.rows)), np.zeros((self.segments, self.rows))
         upper[:, 1:] = np.inf
-        if self.rolling.timed:
+        if self.rolling.has_wheel_limit:
             lower[:, -2:], upper[:, -2:] = -travel[:, None], travel[:, None]
         return lower.ravel(), upper.ravel()
 
 
-def _make_step_functions(rolling: Rolling) -> tuple[ca.Function, ca.Function, ca.Function]:
+def _make_step_functions(rolling: RollingLimits) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Return the SX functions of one step: rows, Jacobian, and upper triangle of the Hessian."""
     poses, gear = ca.SX.sym("b", 6), ca.SX.sym("g")
     dx, dy, turn = ca.vertsplit(poses[3:] - poses[:3])
@@ -237,13 +237,13 @@ def _make_step_functions(rolling: Rolling) -> tuple[ca.Function, ca.Function, ca
         ca.cos(heading) * dy - ca.sin(heading) * dx,
     )
     steered = (
-        [gear * longitudinal + side * rolling.radius * turn for side in (-1, 1)]
-        if rolling.radius
+        [gear * longitudinal + side * rolling.turning_radius * turn for side in (-1, 1)]
+        if rolling.turning_radius
         else []
     )
     wheels = (
         [longitudinal + side * rolling.track / 2 * turn for side in (-1, 1)]
-        if rolling.timed
+        if rolling.has_wheel_limit
         else []
     )
     rows = ca.vertcat(lateral, *steered, *wheels)

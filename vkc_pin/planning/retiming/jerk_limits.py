@@ -8,7 +8,7 @@ import numpy as np
 
 from vkc_pin.planning.retiming.limits import Limits
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.curve import Curve, moments_at
+from vkc_pin.world.trajectory.curve import Curve, sample_intervals
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
@@ -74,7 +74,7 @@ def _averaged(path: CubicHermiteSpline, pace: Curve, steps: int, span: float) ->
         )[1:-1]
     stops[0], stops[-1] = 0.0, last + span
     parts = max(_LEAST, int(np.ceil(np.diff(stops).max() / (_SHARE * span))))
-    times = moments_at(stops, np.arange(parts) / parts, last=True)
+    times = sample_intervals(stops, np.arange(parts) / parts, last=True)
     rows = path(np.clip(gone(times), 0.0, length))
     rows[::parts] = path(places)
     known = np.delete(np.arange(len(times)), [1, -2])

@@ -10,7 +10,7 @@ import numpy as np
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.wheels import Rolling
+from vkc_pin.world.trajectory.wheels import RollingLimits
 
 __all__ = ["Limits"]
 
@@ -62,13 +62,13 @@ class Limits(NamedTuple):
         jerk = acceleration / jerk_time if jerk_time > 0.0 else np.full(len(names), np.inf)
         return cls(lower, upper, velocity, acceleration, jerk)
 
-    def with_wheels(self, rolling: Rolling) -> Limits:
+    def with_wheels(self, rolling: RollingLimits) -> Limits:
         """Return the limits of the wheels of a base, left and right, after the others.
 
         Nothing is said of their accelerations: what those of the base come to.
         """
         strongest = self.acceleration[:2].sum() + rolling.track / 2 * self.acceleration[2]
-        wheel = (-np.inf, np.inf, rolling.rim, strongest, np.inf)
+        wheel = (-np.inf, np.inf, rolling.wheel_speed, strongest, np.inf)
         return Limits(
             *(np.append(side, [value, value]) for side, value in zip(self, wheel, strict=True))
         )
@@ -80,14 +80,14 @@ class Limits(NamedTuple):
 
     def factor(self, curve: Curve) -> float:
         """Return how many times as long, at least 1, a curve must take to keep the limits of its rates of change."""
-        fastest, strongest = curve.speeds()
+        fastest, strongest = curve.compute_max_rates()
         needed = [
             1.0,
             float((fastest / self.velocity).max()),
             float(np.sqrt((strongest / self.acceleration).max())),
         ]
         if not self.jerky:
-            needed.append(float(np.cbrt((curve.jerks()[0] / self.jerk).max())))
+            needed.append(float(np.cbrt((curve.compute_jerks()[0] / self.jerk).max())))
         return max(needed) * (1.0 + _ROUNDING)
 
     def slowed(self, curve: Curve) -> Curve:

@@ -19,10 +19,10 @@ from vkc_pin.planning.retiming.torque_bounds import Load
 from vkc_pin.planning.retiming.wheeled_paths import fit_rolling_paths, slip
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.trajectory.curve import SHORTEST, Curve, joined, moments_at
+from vkc_pin.world.trajectory.curve import MIN_INTERVAL, Curve, concatenate_curves, sample_intervals
 from vkc_pin.world.trajectory.dynamics.torques import Torques
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.wheels import Rolling, rolling_of
+from vkc_pin.world.trajectory.wheels import RollingLimits, make_rolling_limits
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
@@ -70,7 +70,7 @@ def retime_trajectory(
         Limits.of(scene, trajectory.names, jerk_time),
         np.ones(len(trajectory.times) - 1, int) if parts is None else parts,
     )
-    rolling = rolling_of(scene.robot)
+    rolling = make_rolling_limits(scene.robot)
     places = np.concatenate(
         [[0], np.cumsum(parts)]
     )  # of the waypoints, among all points that the path passes
@@ -96,16 +96,16 @@ def retime_trajectory(
                 limits,
                 scale,
                 rolling,
-                Load(torques, phases[steps]) if torques.efforts.known else None,
+                Load(torques, phases[steps]) if torques.torque_limits.known else None,
             )
         for piece, at in found:
             ends += (ends[-1] + at).tolist()
             pieces.append(piece)
-    curve = joined(pieces).shifted(float(trajectory.times[0]))
+    curve = concatenate_curves(pieces).shift_time(float(trajectory.times[0]))
     return replace(trajectory, times=curve.times[np.array(ends)[places]], curve=curve)
 
 
-def _divided(positions: Floats, places: Ints, rolling: Rolling) -> Floats:
+def _divided(positions: Floats, places: Ints, rolling: RollingLimits) -> Floats:
     """Return waypoints, shape (T, n), and points on the straight lines between them, or, of a base on wheels, on the arcs.
 
     Args:
@@ -117,7 +117,7 @@ def _divided(positions: Floats, places: Ints, rolling: Rolling) -> Floats:
     points = np.stack(
         [np.interp(np.arange(places[-1] + 1), places, column) for column in positions.T], axis=-1
     )
-    if rolling.aside or len(points) == len(positions):
+    if rolling.is_omnidirectional or len(points) == len(positions):
         return points
     step = np.minimum(at.astype(int), len(positions) - 2)
     points[:, :3] = between(positions[step, :3], positions[step + 1, :3], at - step)
@@ -137,11 +137,11 @@ def _runs(still: Bools, moves: Bools) -> Iterator[list[int]]:
 
 
 def _along(
-    points: Floats, limits: Limits, scale: Floats, rolling: Rolling, load: Load | None
+    points: Floats, limits: Limits, scale: Floats, rolling: RollingLimits, load: Load | None
 ) -> list[tuple[Curve, Ints]]:
     """Return curves through waypoints, shape (m, n), from stop to stop, and which of their knots these are but for the first."""
     bounds = limits.lower, limits.upper
-    if not rolling.aside:
+    if not rolling.is_omnidirectional:
         return list(_rolling(points, limits.with_wheels(rolling), scale, rolling, load))
     found = _smooth(fit_path(points, scale, bounds), points, limits, load)
     if found is not None:
@@ -163,7 +163,7 @@ def _rolling(
     points: Floats,
     limits: Limits,
     scale: Floats,
-    rolling: Rolling,
+    rolling: RollingLimits,
     load: Load | None,
     finer: int = 1,
 ) -> Iterator[tuple[Curve, Ints]]:
@@ -195,7 +195,7 @@ def _smooth(
     """
     knots = (len(path.x) - 1) // (len(points) - 1)  # a step
     parts = knots * max(_PARTS // knots, 1)
-    places = moments_at(path.x, np.arange(parts // knots) / (parts // knots), last=True)
+    places = sample_intervals(path.x, np.arange(parts // knots) / (parts // knots), last=True)
     speeds = compute_speeds(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None
@@ -270,5 +270,5 @@ def _straight(points: Floats, limits: Limits, least: Floats) -> Curve:
             np.cbrt(12.0 * (ways / limits.jerk).max(axis=1)),
         ]
     )
-    times = np.concatenate([[0.0], np.cumsum(np.maximum(least, SHORTEST) * (1.0 + _ROUNDING))])
+    times = np.concatenate([[0.0], np.cumsum(np.maximum(least, MIN_INTERVAL) * (1.0 + _ROUNDING))])
     return Curve(times, points, np.zeros_like(points))

@@ -50,7 +50,7 @@ def _leaves(
     points: Floats, slopes: Floats, lengths: Floats, limits: tuple[Floats, Floats]
 ) -> Bools:
     """Return which coordinates of cubics lie outside limits between two points that do not, shape (n,)."""
-    low, high = Curve(np.concatenate([[0.0], np.cumsum(lengths)]), points, slopes).extremes()
+    low, high = Curve(np.concatenate([[0.0], np.cumsum(lengths)]), points, slopes).compute_extrema()
     lower, upper = np.minimum(points[:-1], points[1:]), np.maximum(points[:-1], points[1:])
     return np.asarray(
         ((low < np.minimum(limits[0], lower)) | (high > np.maximum(limits[1], upper))).any(axis=0)

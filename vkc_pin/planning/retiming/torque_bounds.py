@@ -8,7 +8,7 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.dynamics.torques import Torques, moments_of
+from vkc_pin.world.trajectory.dynamics.torques import Torques, sample_curve
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
@@ -55,7 +55,7 @@ class Load:
     def __init__(self, torques: Torques, phases: Ints) -> None:
         self._torques, self._phases = torques, phases
         self._rows: dict[bytes, Rows] = {}
-        self._limited = np.flatnonzero(np.isfinite(torques.efforts.limits))
+        self._limited = np.flatnonzero(np.isfinite(torques.torque_limits.limits))
 
     def part(self, first: int, count: int) -> Load:
         """Return those of some of its steps."""
@@ -68,7 +68,7 @@ class Load:
         found = self._torques.at(
             self._phases[pieces // (of // len(self._phases))], positions, velocities, accelerations
         )
-        return found[:, self._limited] / self._torques.efforts.limits[self._limited]
+        return found[:, self._limited] / self._torques.torque_limits.limits[self._limited]
 
     def linear(
         self, path: CubicHermiteSpline, known: Floats, speeds: Floats, places: Floats
@@ -100,7 +100,7 @@ class Load:
 
     def of(self, curve: Curve) -> Floats:
         """Return the torques at the ends and in the middle of every cubic of a curve, shape (K, m)."""
-        moments = moments_of(curve)
+        moments = sample_curve(curve)
         motion = moments.positions, moments.velocities, moments.accelerations
         return self._shares(moments.pieces, len(curve.times) - 1, *motion)
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.world.trajectory.curve import Curve, moments_at
-from vkc_pin.world.trajectory.wheels import Rolling, seen
+from vkc_pin.world.trajectory.curve import Curve, sample_intervals
+from vkc_pin.world.trajectory.wheels import RollingLimits, rotate_into_base_frame
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
@@ -32,7 +32,11 @@ _TIGHT = 3e-4  # share by which a turn may be tighter than the least radius, to 
 
 
 def fit_rolling_paths(
-    points: Floats, scale: Floats, limits: tuple[Floats, Floats], rolling: Rolling, finer: int = 1
+    points: Floats,
+    scale: Floats,
+    limits: tuple[Floats, Floats],
+    rolling: RollingLimits,
+    finer: int = 1,
 ) -> list[tuple[CubicHermiteSpline, Floats]]:
     """Return paths through waypoints, one from each stop to the next, on which a base rolls, each with its waypoints.
 
@@ -58,7 +62,7 @@ def fit_rolling_paths(
         how far left and right wheels have gone [m], which are none of the motion's, but have a
         limit of their own.
     """
-    if rolling.radius > 0.0 and (backs := _backs(points, rolling)):
+    if rolling.turning_radius > 0.0 and (backs := _backs(points, rolling)):
         pieces = [
             points[first : last + 1]
             for first, last in itertools.pairwise([0, *backs, len(points) - 1])
@@ -78,34 +82,34 @@ def fit_rolling_paths(
 
 def slip(curve: Curve) -> float:
     """Return how fast the base moves aside at most [m/s]."""
-    moments = moments_at(curve.times, np.arange(_LOOKS) / _LOOKS)
+    moments = sample_intervals(curve.times, np.arange(_LOOKS) / _LOOKS)
     (vx, vy), yaw = curve.velocity(moments)[:, :2].T, curve.at(moments)[:, 2]
-    _, aside = seen(vx, vy, yaw)
+    _, aside = rotate_into_base_frame(vx, vy, yaw)
     return float(np.abs(aside).max())
 
 
-def _backs(points: Floats, rolling: Rolling) -> list[int]:
+def _backs(points: Floats, rolling: RollingLimits) -> list[int]:
     """Return the waypoints at which the base changes between ahead and back, where one that is steered always stops."""
-    ahead = rolling.steps(points)[0] > 0.0
+    ahead = rolling.compute_steps(points)[0] > 0.0
     return (1 + np.flatnonzero(ahead[1:] != ahead[:-1])).tolist()
 
 
-def _corner(points: Floats, wrong: Bools, rolling: Rolling) -> int:
+def _corner(points: Floats, wrong: Bools, rolling: RollingLimits) -> int:
     """Return the waypoint to stop at: of the ends of wrong steps the one at which the base changes most how it drives."""
-    along, _, turn = rolling.steps(points)
-    ways = np.column_stack([along, max(rolling.radius, rolling.track / 2) * turn])
+    along, _, turn = rolling.compute_steps(points)
+    ways = np.column_stack([along, max(rolling.turning_radius, rolling.track / 2) * turn])
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
     bends = np.linalg.norm(np.diff(ways, axis=0), axis=1)
     return 1 + int(np.argmax(np.where(wrong[1:] | wrong[:-1], bends, -1.0)))
 
 
 def _rolled(
-    points: Floats, scale: Floats, limits: tuple[Floats, Floats], rolling: Rolling, finer: int
+    points: Floats, scale: Floats, limits: tuple[Floats, Floats], rolling: RollingLimits, finer: int
 ) -> tuple[CubicHermiteSpline, Bools]:
     """Return the path, see `fit_rolling_paths`, without a stop, and in which steps it is none that the base can drive."""
     from scipy.interpolate import CubicHermiteSpline
 
-    along, _, turn = rolling.steps(points)
+    along, _, turn = rolling.compute_steps(points)
     driven = np.concatenate([[0.0], np.cumsum(along / np.sinc(turn / (2 * np.pi)))])
     bounds = (
         np.append(limits[0], np.inf),
@@ -114,15 +118,15 @@ def _rolled(
     path = fit_path(np.column_stack([points, driven]), np.append(scale, 0.0), bounds)
     parts = finer * max(_PARTS, int(np.ceil(np.abs(turn).max() / _TURN)))
     slopes = path(path.x, 1)[:, [2, -1]]
-    if rolling.radius > 0.0:
-        slopes[:, 0] = _bends(turn, np.diff(driven), rolling.radius) * slopes[:, 1]
+    if rolling.turning_radius > 0.0:
+        slopes[:, 0] = _bends(turn, np.diff(driven), rolling.turning_radius) * slopes[:, 1]
     steps = _Steps(points[:, :3], slopes, np.diff(path.x), np.diff(driven), parts)
     # An arc is where it should be but for rounding, of which bumps would make tight turns where a
     # step is short.
     left = steps.missing() if len(points) == 2 else steps.fit()
-    if rolling.radius > 0.0 and (bent := steps.tight(rolling.radius)).any():
+    if rolling.turning_radius > 0.0 and (bent := steps.tight(rolling.turning_radius)).any():
         left = steps.plain(bent)
-    at = moments_at(path.x, np.arange(parts) / parts, last=True)
+    at = sample_intervals(path.x, np.arange(parts) / parts, last=True)
     base, slopes, wheels = steps.at_knots(left)
     half = rolling.track / 2 * np.array([-1.0, 1.0])
     values = np.column_stack([base, path(at)[:, 3:-1], wheels[0][:, None] + half * base[:, 2:]])
@@ -130,7 +134,7 @@ def _rolled(
         [slopes, path(at, 1)[:, 3:-1], wheels[1][:, None] + half * slopes[:, 2:]]
     )
     return CubicHermiteSpline(at, values, rates), (np.abs(left) > _OFF) | steps.tight(
-        rolling.radius
+        rolling.turning_radius
     )
 
 

@@ -149,7 +149,7 @@ class Subproblem:
             pose_offsets=found.pose_offsets,
             excess=found.excess,
             relaxation_weights=penalties,
-            gears=problem.rolling.gears(problem.waypoints(z)),
+            gears=problem.rolling.compute_gears(problem.waypoints(z)),
         )
         short = compute_shortfalls(at, t.segments, t.slots)
         room = np.where(short > 0.0, np.inf, 0.0)  # what keeps its margin now must go on keeping it

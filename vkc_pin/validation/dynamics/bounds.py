@@ -32,8 +32,8 @@ def bounds(
     if curve is None:
         return ()
     limits = np.array([samples.bounds(name)[2:] for name in names]).T
-    shares = [rates / limit for rates, limit in zip(curve.speeds(), limits, strict=True)]
-    shares.append(jerk_time * curve.jerks()[0] / limits[1])
+    shares = [rates / limit for rates, limit in zip(curve.compute_max_rates(), limits, strict=True)]
+    shares.append(jerk_time * curve.compute_jerks()[0] / limits[1])
     shares.append(np.zeros((len(curve.times) - 1, torques.shape[1])))
     np.maximum.at(shares[-1], moments.pieces, torques)
     every = np.hstack(shares)

@@ -38,10 +38,10 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
     else:
         moments, (velocities, accelerations), rests = (
             curve.times,
-            curve.speeds(),
+            curve.compute_max_rates(),
             np.abs(curve.rates[[0, -1]]),
         )
-        jerks = curve.jerks() if options.jerk_time > 0.0 else None
+        jerks = curve.compute_jerks() if options.jerk_time > 0.0 else None
     for i, name in enumerate(motion.names):
         _, _, fastest, strongest = samples.bounds(name)
         looks = [

@@ -11,7 +11,7 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.dynamics.bounds import bounds
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.trajectory.dynamics.torques import Moments, Torques, moments_of
+from vkc_pin.world.trajectory.dynamics.torques import Moments, Torques, sample_curve
 
 __all__ = ["TORQUE_TOLERANCE", "Motors"]
 
@@ -31,7 +31,7 @@ class Motors:
         """When it is looked at, and how it moves then."""
         trajectory, curve = self.trajectory, self.trajectory.curve
         if curve is not None:
-            return moments_of(curve)
+            return sample_curve(curve)
         speeds = np.pad(trajectory.velocities(), ((1, 1), (0, 0)))
         pieces = np.minimum(np.arange(len(trajectory.times)), len(trajectory.times) - 2)
         return Moments(
@@ -59,9 +59,9 @@ class Motors:
     @cached_property
     def shares(self) -> Floats:
         """The same without sign, as shares of what the motors have, shape (K, robot's); 0 where that is not known."""
-        if not self._torques.efforts.known:
+        if not self._torques.torque_limits.known:
             return np.zeros((len(self.moments.times), self.trajectory.robot_size))
-        return np.asarray(np.abs(self.torques) / self._torques.efforts.limits)
+        return np.asarray(np.abs(self.torques) / self._torques.torque_limits.limits)
 
     def _at(self, rows: Ints, speed: float = 1.0) -> Floats:
         now, phases = self.moments, self._torques.phases_of(self.waypoints[rows])
@@ -79,7 +79,7 @@ class Motors:
             row = int(np.argmax(self.shares[:, k]))
             name, limit, torque = (
                 self.trajectory.names[k],
-                float(self._torques.efforts.limits[k]),
+                float(self._torques.torque_limits.limits[k]),
                 abs(self.torques[row, k]),
             )
             unit = "N" if self.samples.unit(name) == "m" else "N·m"
@@ -104,10 +104,10 @@ class Motors:
 
     def facts(self, jerk_time: float = 0.0) -> dict[str, Any]:
         """Return what a report says of it; `jerk_time` is that of `Options`."""
-        notes = [f"torques not checked: {note}" for note in self._torques.efforts.notes]
-        if self._torques.weightless:
+        notes = [f"torques not checked: {note}" for note in self._torques.torque_limits.notes]
+        if self._torques.massless_objects:
             notes.append(
-                f"carried as if it weighed nothing, as no mass is stated: {', '.join(self._torques.weightless)}"
+                f"carried as if it weighed nothing, as no mass is stated: {', '.join(self._torques.massless_objects)}"
             )
         found = bounds(self.samples, self.moments, self.shares, jerk_time)
         return {

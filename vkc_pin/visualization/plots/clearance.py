@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
@@ -18,7 +18,7 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["ClearanceCurve", "clearance_curves"]
+__all__ = ["ClearanceCurve", "compute_clearance_curves"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class ClearanceCurve:
         return float(self.distances[k]), float(self.times[k]), " – ".join(self.pairs[k])
 
 
-def clearance_curves(
+def compute_clearance_curves(
     scene: Scene, trajectory: Trajectory, times: ArrayLike
 ) -> list[ClearanceCurve]:
     """Return how close shapes come along a motion, for each kind of pair that there is.
@@ -57,7 +57,7 @@ def clearance_curves(
         times: When to look, shape (K,) [s].
     """
     world = World(scene)
-    solids = Solids(world)
+    solids = CollisionShapes(world)
     table = PairTable(scene, solids, trajectory, 0.0)
     silent = {
         pair
@@ -79,7 +79,10 @@ def clearance_curves(
         for kind in _KINDS
         if ((kinds == kind) & asked).any()
     }
-    placed, curves = table.solids.at(world.coordinates.q(world.positions(trajectory, moments))), []
+    placed, curves = (
+        table.solids.at(world.coordinates.q(world.compute_positions(trajectory, moments))),
+        [],
+    )
     for kind, pairs in groups.items():
         which, distances = placed.nearest(pairs)
         names = tuple(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.validation.report import Judged
+from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.visualization.plots.style import COLOURS, shade_phases
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -40,15 +40,15 @@ class Quantity:
 
     name: str
     units: Mapping[str, str]
-    values: Callable[[Judged, Floats], tuple[Floats, Floats]]
-    limit: Callable[[Judged, str], float]
+    values: Callable[[CheckedMotion, Floats], tuple[Floats, Floats]]
+    limit: Callable[[CheckedMotion, str], float]
     style: Callable[[Trajectory], Mapping[str, Any]]
 
 
-def _limit(kind: str) -> Callable[[Judged, str], float]:
+def _limit(kind: str) -> Callable[[CheckedMotion, str], float]:
     """Return what finds a limit, "velocity" or "acceleration"; the virtual joints of grasps have none."""
 
-    def limit(plan: Judged, name: str) -> float:
+    def limit(plan: CheckedMotion, name: str) -> float:
         robot, (owner, _, joint) = plan.scene.robot, name.partition(".")
         if name in robot.coordinates.names:
             return float(getattr(robot, kind)[robot.coordinates.names.index(name)])
@@ -60,7 +60,7 @@ def _limit(kind: str) -> Callable[[Judged, str], float]:
     return limit
 
 
-def _accelerations(plan: Judged, times: Floats) -> tuple[Floats, Floats]:
+def _accelerations(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
     motion = plan.trajectory
     return (
         (times, motion.acceleration(times))
@@ -98,7 +98,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 def _jerk() -> Quantity:
     """Return what is drawn as well where jerks are limited; they are the same all along each of a curve's cubics."""
 
-    def values(plan: Judged, times: Floats) -> tuple[Floats, Floats]:
+    def values(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
         curve = plan.trajectory.curve
         assert curve is not None
         edges = curve.acceleration(
@@ -107,7 +107,7 @@ def _jerk() -> Quantity:
         jerks = 2.0 * edges / np.diff(curve.times)[:, None]
         return curve.times, np.concatenate([jerks, jerks[-1:]])
 
-    def limit(plan: Judged, name: str) -> float:
+    def limit(plan: CheckedMotion, name: str) -> float:
         return _limit("acceleration")(plan, name) / plan.options.jerk_time
 
     return Quantity(
@@ -130,7 +130,7 @@ def groups_of(trajectory: Trajectory) -> dict[str, list[int]]:
     return {name: columns for name, columns in groups.items() if columns}
 
 
-def draw_joints(figure: FigureBase, plan: Judged) -> None:
+def draw_joints(figure: FigureBase, plan: CheckedMotion) -> None:
     """Draw all quantities, a row each for base, arm and objects."""
     groups, motion = groups_of(plan.trajectory), plan.trajectory
     eased = motion.curve is not None and plan.options.jerk_time > 0.0
@@ -169,7 +169,7 @@ def draw_joints(figure: FigureBase, plan: Judged) -> None:
 
 def _draw(
     place: Axes,
-    plan: Judged,
+    plan: CheckedMotion,
     quantity: Quantity,
     group: str,
     columns: list[int],
@@ -198,7 +198,7 @@ def _draw(
     place.set_ylabel(f"{group} {quantity.name} [{', '.join(quantity.units[unit] for unit in own)}]")
 
 
-def name_phases(axes: Axes, plan: Judged) -> None:
+def name_phases(axes: Axes, plan: CheckedMotion) -> None:
     """Write the phases' names above, as far as they have room; on two levels, so that neighbours do not meet."""
     times = plan.trajectory.times
     for k, phase in enumerate(plan.trajectory.phases):

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from vkc_pin.utils.notebook import card
-from vkc_pin.validation.report import Judged
+from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.visualization.plots.style import STYLE
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.scene.scene import Scene
@@ -51,7 +51,7 @@ def scene_html(scene: Scene) -> str:
     )
 
 
-def motion_html(plan: Judged) -> str:
+def motion_html(plan: CheckedMotion) -> str:
     """Return what came out of planning as HTML, and the motion from above; it needs no screen, and nothing from elsewhere."""
     m = plan.metrics
     good = plan.success

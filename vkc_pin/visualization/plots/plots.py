@@ -11,10 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.validation.report import Judged
-from vkc_pin.visualization.plots.clearance import clearance_curves
+from vkc_pin.validation.report import CheckedMotion
+from vkc_pin.visualization.plots.clearance import compute_clearance_curves
 from vkc_pin.visualization.plots.joints import SAMPLES, draw_joints, groups_of, name_phases
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, shade_phases, styled
+from vkc_pin.visualization.plots.style import (
+    COLOURS,
+    new_figure,
+    save_figure,
+    shade_phases,
+    use_style,
+)
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.trajectory.world_model import World
@@ -29,7 +35,7 @@ PICTURES = (".png", ".svg", ".pdf")
 _SHOWN = 0.30  # [m]: clearance above this is of no interest
 
 
-def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Figure]:
+def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[str, Figure]:
     """Draw joint positions, velocities and accelerations, clearance, and a top view.
 
     Args:
@@ -61,29 +67,29 @@ def plot(plan: Judged, path: str | Path | None = None) -> Figure | dict[str, Fig
     return figures
 
 
-def plot_joints(plan: Judged) -> Figure:
+def plot_joints(plan: CheckedMotion) -> Figure:
     """Return a figure of positions, velocities and accelerations over time, each against its limits; see `joints`."""
     _check(plan)
-    with styled():
+    with use_style():
         figure = new_figure(16.0, 2.5 * len(groups_of(plan.trajectory)) + 0.4)
         draw_joints(figure, plan)
     return figure
 
 
-def plot_clearance(plan: Judged) -> Figure:
+def plot_clearance(plan: CheckedMotion) -> Figure:
     """Return a figure of the smallest distances over time; the legend names the closest pairs."""
     _check(plan)
-    with styled():
+    with use_style():
         figure = new_figure(9.0, 4.2)
         _draw_clearance(figure, plan)
     return figure
 
 
-def plot_top_view(plan: Judged) -> Figure:
+def plot_top_view(plan: CheckedMotion) -> Figure:
     """Return a figure of the motion from above: obstacles, objects, the base at several times, paths of base and tool."""
     _check(plan)
     x_min, x_max, y_min, y_max = plan.scene.arena
-    with styled():
+    with use_style():
         figure = new_figure(
             9.0, float(np.clip(9.0 * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0))
         )
@@ -91,15 +97,15 @@ def plot_top_view(plan: Judged) -> Figure:
     return figure
 
 
-def _check(plan: Judged) -> None:
-    if not isinstance(plan, Judged):
+def _check(plan: CheckedMotion) -> None:
+    if not isinstance(plan, CheckedMotion):
         raise InputError(
             "this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__
         )
 
 
-def _combined(plan: Judged) -> Figure:
-    with styled():
+def _combined(plan: CheckedMotion) -> Figure:
+    with use_style():
         figure = new_figure(16.0, 11.0)
         parts: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1.0))
         upper, lower = parts
@@ -114,7 +120,7 @@ def _combined(plan: Judged) -> Figure:
     return figure
 
 
-def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
+def _draw_clearance(figure: FigureBase, plan: CheckedMotion) -> None:
     axes, trajectory = figure.subplots(), plan.trajectory
     times = np.unique(
         np.concatenate(
@@ -123,7 +129,7 @@ def _draw_clearance(figure: FigureBase, plan: Judged) -> None:
     )
     safe = plan.options.dist_safe
     lowest = 0.0
-    for k, curve in enumerate(clearance_curves(plan.scene, trajectory, times)):
+    for k, curve in enumerate(compute_clearance_curves(plan.scene, trajectory, times)):
         distance, when, pair = curve.closest()
         touching = "grasps" in curve.name
         colour = "0.6" if touching else COLOURS[k % len(COLOURS)]

@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.plots.plots import PICTURES
-from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.visualization.plots.top_view import draw_top_view, outline
 from vkc_pin.world.files.resources import file_path
 from vkc_pin.world.models.shapes import triangulate
@@ -74,7 +74,7 @@ def plot_scene(
             got=path,
         )
     world, (blue, red) = World(scene), COLOURS[:2]
-    with styled():
+    with use_style():
         figure = new_figure(8.0, 8.0)
         draw_top_view(figure, world, None)
         axes = figure.axes[0]

@@ -13,9 +13,9 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import numbers
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["SHORTEST", "Curve", "evenly", "joined", "moments_at"]
+__all__ = ["MIN_INTERVAL", "Curve", "concatenate_curves", "sample_evenly", "sample_intervals"]
 
-SHORTEST = 1e-9
+MIN_INTERVAL = 1e-9
 """Least time from knot to knot [s]."""
 _OFF = 1e-9  # [m] or [rad] beside a waypoint
 _LARGEST = 1e12  # [m] or [rad] of a coordinate, and of its rate [m/s], [rad/s]
@@ -47,8 +47,8 @@ class Curve:
             numbers(getattr(self, name), f"curve.{name}")
             for name in ("times", "positions", "rates")
         )
-        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) >= SHORTEST):
-            expected = f"at least 2 numbers, each {SHORTEST:g} s after the one before or more"
+        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) >= MIN_INTERVAL):
+            expected = f"at least 2 numbers, each {MIN_INTERVAL:g} s after the one before or more"
             raise InputError("times do not increase", field="curve.times", expected=expected)
         if positions.ndim != 2 or len(positions) != len(times):
             expected = f"({len(times)}, n)"
@@ -110,7 +110,7 @@ class Curve:
         before, after = self.positions[k], self.positions[k + 1]
         return before, before + third * self.rates[k], after - third * self.rates[k + 1], after
 
-    def extremes(self) -> tuple[Floats, Floats]:
+    def compute_extrema(self) -> tuple[Floats, Floats]:
         """Return the exact least and largest position on each cubic, shape (K − 1, n) each."""
         p, c, d, q = self._control(np.arange(len(self.times) - 1))
         first, middle, last = c - p, d - c, q - d
@@ -133,7 +133,7 @@ class Curve:
             sides.append(_bernstein(np.clip(at, 0.0, 1.0), p, c, d, q))
         return np.asarray(np.min(sides, axis=0)), np.asarray(np.max(sides, axis=0))
 
-    def speeds(self) -> tuple[Floats, Floats]:
+    def compute_max_rates(self) -> tuple[Floats, Floats]:
         """Return the exact largest |velocity| and |acceleration| on each cubic, shape (K − 1, n) each."""
         h = np.diff(self.times)[:, None]
         p, c, d, q = self._control(np.arange(len(h)))
@@ -150,7 +150,7 @@ class Curve:
         strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)
         return np.asarray(fastest), np.asarray(strongest)
 
-    def jerks(self) -> tuple[Floats, Floats]:
+    def compute_jerks(self) -> tuple[Floats, Floats]:
         """Return the |jerk| of each cubic, shape (K − 1, n), and by how much accelerations jump at each knot, shape (K, n).
 
         Before the first and after the last one, all stands still.
@@ -205,7 +205,7 @@ class Curve:
                 got=got,
             )
 
-    def shifted(self, time: float) -> Curve:
+    def shift_time(self, time: float) -> Curve:
         """Return the same, later by some time [s]."""
         return Curve(self.times + time, self.positions, self.rates)
 
@@ -224,13 +224,13 @@ def _bernstein(s: Floats, p: Floats, c: Floats, d: Floats, q: Floats) -> Floats:
     return np.asarray(r**3 * p + 3.0 * s * r**2 * c + 3.0 * s**2 * r * d + s**3 * q)
 
 
-def evenly(times: Floats, rate: float) -> Floats:
+def sample_evenly(times: Floats, rate: float) -> Floats:
     """Return so many moments a second between the first and the last of some times [s], and the last."""
     duration = times[-1] - times[0]
     return np.append(times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, times[-1])
 
 
-def moments_at(knots: Floats, shares: Floats, *, last: bool = False) -> Floats:
+def sample_intervals(knots: Floats, shares: Floats, *, last: bool = False) -> Floats:
     """Return moments at some shares of every span between knots, shape (k,), one span after the other, and the last knot.
 
     Args:
@@ -242,7 +242,7 @@ def moments_at(knots: Floats, shares: Floats, *, last: bool = False) -> Floats:
     return np.append(inside, knots[-1]) if last else inside
 
 
-def joined(pieces: Sequence[Curve]) -> Curve:
+def concatenate_curves(pieces: Sequence[Curve]) -> Curve:
     """Return curves as one, the first where it is in time; each begins where, and as fast as, the one before it ends."""
     times, first = [pieces[0].times], pieces[0]
     for piece in pieces[1:]:

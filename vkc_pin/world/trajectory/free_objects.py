@@ -16,7 +16,7 @@ from vkc_pin.world.scene.support import find_supported_objects
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["FreeObjects", "as_numbers"]
+__all__ = ["FreeObjects", "to_free_joint_positions"]
 
 # [m] and [rad] by which a grasp that is kept differs between samples: what interpolation rounds
 _STILL = 1e-12
@@ -57,9 +57,9 @@ class FreeObjects:
             )
             for name, placement in where.items():
                 rows[name][now] = (
-                    [as_numbers(p) for p in moving[name][1:]]
+                    [to_free_joint_positions(p) for p in moving[name][1:]]
                     if name in moving
-                    else as_numbers(placement)
+                    else to_free_joint_positions(placement)
                 )
         for row in rows.values():
             flips = np.concatenate(
@@ -207,6 +207,6 @@ class FreeObjects:
         )
 
 
-def as_numbers(placement: pin.SE3) -> Floats:
+def to_free_joint_positions(placement: pin.SE3) -> Floats:
     """Return a placement as a free joint's seven coordinates."""
     return np.asarray(pin.SE3ToXYZQUAT(placement), float)

@@ -10,7 +10,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import mapping, number, text, whole
 from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
 
-__all__ = ["PhaseSpan", "part_of"]
+__all__ = ["PhaseSpan", "get_required"]
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,12 @@ class PhaseSpan:
             InputError: Something is missing from it or does not fit.
         """
         phase = mapping(data, where)
-        held = make_holds(part_of(phase, "held"), phase.get("by"))
-        name, first, last = (part_of(phase, key) for key in ("name", "first", "last"))
+        held = make_holds(get_required(phase, "held"), phase.get("by"))
+        name, first, last = (get_required(phase, key) for key in ("name", "first", "last"))
         return cls(name, first, last, held, phase.get("opening"))
 
 
-def part_of(data: Mapping[str, Any], name: str) -> Any:
+def get_required(data: Mapping[str, Any], name: str) -> Any:
     """Return an entry of a motion's data. Raises `InputError` if it is not there."""
     if name not in data:
         raise InputError("this is missing from a trajectory", field=name)

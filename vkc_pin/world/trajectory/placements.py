@@ -85,7 +85,7 @@ def sample_motion(
             )
         )
         times = key_times(trajectory, strides) if times is None else np.asarray(times, float)
-        rows = world.positions(trajectory, times)
+        rows = world.compute_positions(trajectory, times)
     model, data = world.model, world.model.createData()
     tool = model.getFrameId(world.scene.robot.tool_frame)
     local: list[list[pin.SE3]] = [[] for _ in range(model.njoints)]

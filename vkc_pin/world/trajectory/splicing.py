@@ -13,10 +13,10 @@ from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["cut", "filled", "join"]
+__all__ = ["concatenate_trajectories", "extract_phases", "fill_missing_values"]
 
 
-def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
+def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
     """Return motions one after the other as one.
 
     Args:
@@ -28,7 +28,9 @@ def join(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
         InputError: There is none, or one does not begin where the one before it ends.
     """
     if not parts:
-        raise InputError("nothing to join", field="parts", expected="at least one trajectory")
+        raise InputError(
+            "nothing to concatenate", field="parts", expected="at least one trajectory"
+        )
     robot = parts[0].robot_size
     names = list(dict.fromkeys(name for part in parts for name in part.names))
     curves = [_curve_of(part) for part in parts]
@@ -110,7 +112,7 @@ class _Rows:
         return np.array(self.times)
 
     def filled(self) -> Floats:
-        return filled(np.array(self.rows))
+        return fill_missing_values(np.array(self.rows))
 
     def curve(self) -> Curve:
         return Curve(self.at(), self.filled(), np.array(self.rates))
@@ -123,7 +125,7 @@ def _curve_of(part: Trajectory) -> Curve | None:
     return part.curve
 
 
-def filled(table: Floats) -> Floats:
+def fill_missing_values(table: Floats) -> Floats:
     """Return waypoints, shape (T, n), with what is not known (NaN) as it was last, or else as it will be next.
 
     A coordinate that is known nowhere stays so.
@@ -140,7 +142,9 @@ def filled(table: Floats) -> Floats:
     return table
 
 
-def cut(trajectory: Trajectory, names: Sequence[str], begin: int, end: int | None) -> Trajectory:
+def extract_phases(
+    trajectory: Trajectory, names: Sequence[str], begin: int, end: int | None
+) -> Trajectory:
     """Return a part of a motion, of some of its coordinates.
 
     Args:

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import finite, instance, items, known, mapping, number, text, whole
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.curve import Curve, evenly
+from vkc_pin.world.trajectory.curve import Curve, sample_evenly
 from vkc_pin.world.trajectory.formats import ros, rosbag, tables
-from vkc_pin.world.trajectory.phase_span import PhaseSpan, part_of
+from vkc_pin.world.trajectory.phase_span import PhaseSpan, get_required
 
 __all__ = ["Trajectory"]
 
@@ -156,7 +156,7 @@ class Trajectory:
                 expected=f"at most {MOST_SAMPLES / duration:.4g}",
                 got=rate,
             )
-        times = evenly(self.times, rate)
+        times = sample_evenly(self.times, rate)
         return times, self.at(times)
 
     def column(self, name: str) -> Floats:
@@ -174,7 +174,7 @@ class Trajectory:
                 self.positions[:-1], self.positions[1:]
             )
         begins = np.searchsorted(self.curve.times, self.times[:-1])
-        low, high = self.curve.extremes()
+        low, high = self.curve.compute_extrema()
         return np.asarray(np.minimum.reduceat(low, begins)), np.asarray(
             np.maximum.reduceat(high, begins)
         )
@@ -262,15 +262,18 @@ class Trajectory:
         """
         if not isinstance(data, Mapping):
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
-        listed: tuple[Any, ...] = items(part_of(data, "phases"), "phases", "a list of phases")
+        listed: tuple[Any, ...] = items(get_required(data, "phases"), "phases", "a list of phases")
         phases = [PhaseSpan.from_dict(item, f"phases[{k}]") for k, item in enumerate(listed)]
         names, times, positions, size = (
-            part_of(data, key) for key in ("names", "times", "positions", "robot_size")
+            get_required(data, key) for key in ("names", "times", "positions", "robot_size")
         )
         curve = data.get("curve")
         if curve is not None:
             curve = Curve(
-                *(part_of(mapping(curve, "curve"), key) for key in ("times", "positions", "rates"))
+                *(
+                    get_required(mapping(curve, "curve"), key)
+                    for key in ("times", "positions", "rates")
+                )
             )
         return cls(names, times, positions, tuple(phases), size, curve)
 

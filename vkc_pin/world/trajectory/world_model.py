@@ -24,10 +24,10 @@ from vkc_pin.world.scene.clearance_exemptions import make_shape_keys
 from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.trajectory.free_objects import FreeObjects, as_numbers
+from vkc_pin.world.trajectory.free_objects import FreeObjects, to_free_joint_positions
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["FREE_JOINT", "World", "scene_after", "units_of"]
+__all__ = ["FREE_JOINT", "World", "compute_final_scene", "find_coordinate_units"]
 
 FREE_JOINT = "placement"
 """A free object's placement in the world is the joint `<object>.placement`."""
@@ -86,7 +86,10 @@ class World:
         self.coordinates = Coordinates(self.model)
         states = [
             np.concatenate(
-                [as_numbers(placed.placement) if placed.object.free else [], placed.state]
+                [
+                    to_free_joint_positions(placed.placement) if placed.object.free else [],
+                    placed.state,
+                ]
             )
             for placed in scene.objects.values()
         ]
@@ -150,7 +153,7 @@ class World:
             )
         return geometry
 
-    def positions(
+    def compute_positions(
         self,
         trajectory: Trajectory,
         times: ArrayLike | None = None,
@@ -173,7 +176,7 @@ class World:
                 rows[:, index[name]] = values[:, column]
         free = FreeObjects(self.scene, trajectory) if free is None else free
         for name, placements in free.at(times).items():
-            rows[:, self.placement_columns(name)] = placements
+            rows[:, self.get_placement_columns(name)] = placements
         gripper = self.scene.robot.gripper
         if gripper is not None:
             first = len(self.scene.start)
@@ -182,17 +185,17 @@ class World:
             )
         return rows
 
-    def joints_of(self, name: str) -> list[int]:
+    def get_joints(self, name: str) -> list[int]:
         """Return the joints of the model that are an object's, with its free joint."""
         return [joint for joint in self._joints[name] if joint]
 
-    def placement(self, name: str, row: Floats) -> pin.SE3:
+    def get_placement(self, name: str, row: Floats) -> pin.SE3:
         """Return where the base link of a free object is, of the world's coordinates, shape (n,)."""
-        numbers = row[self.placement_columns(name)].copy()
+        numbers = row[self.get_placement_columns(name)].copy()
         numbers[3:] /= np.linalg.norm(numbers[3:])
         return pin.XYZQUATToSE3(numbers)
 
-    def placement_columns(self, name: str) -> slice:
+    def get_placement_columns(self, name: str) -> slice:
         """Return which of the coordinates are the placement of a free object."""
         first = self.coordinates.index(f"{name}.{FREE_JOINT}_x")
         return slice(first, first + 7)
@@ -220,7 +223,7 @@ def _fingers(
     return np.column_stack([np.interp(times, moments, column) for column in np.array(values).T])
 
 
-def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
+def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
     """Return the scene at the end of a motion: where robot and objects are, and what is held.
 
     Args:
@@ -239,11 +242,11 @@ def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> 
     robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
     after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
     world = World(scene)
-    (row,) = world.positions(trajectory, trajectory.times[-1:])
+    (row,) = world.compute_positions(trajectory, trajectory.times[-1:])
     for name, placed in scene.objects.items():
         thing = placed.object
         if thing.free:
-            after = after.with_placement(name, world.placement(name, row))
+            after = after.with_placement(name, world.get_placement(name, row))
         joints = zip(thing.coordinates.names, thing.lower, thing.upper, strict=True)
         state = {
             joint: end(f"{name}.{joint}", low, high)
@@ -263,7 +266,7 @@ def scene_after(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> 
     return dataclasses.replace(after.with_held(held), opening=trajectory.phases[-1].opening)
 
 
-def units_of(scene: Scene) -> dict[str, str]:
+def find_coordinate_units(scene: Scene) -> dict[str, str]:
     """Return coordinate → "m" or "rad" of everything that can move in a scene: robot, objects, and the freedoms of grasps."""
     units = dict(zip(scene.robot.coordinates.names, scene.robot.coordinates.units, strict=True))
     for owner, placed in scene.objects.items():

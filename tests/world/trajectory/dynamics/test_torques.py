@@ -41,7 +41,9 @@ def swung(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
 def energy(world: World, motion: Trajectory, moment: float) -> float:
     """Return what robot and stick have, of where their bodies are a moment before and after [J]."""
     h = 1e-5
-    rows = world.coordinates.q(world.positions(motion, np.array([moment - h, moment, moment + h])))
+    rows = world.coordinates.q(
+        world.compute_positions(motion, np.array([moment - h, moment, moment + h]))
+    )
     found, places = 0.0, []
     for q in rows:
         data = world.model.createData()
@@ -80,7 +82,7 @@ def test_a_payload_at_rest_weighs_by_its_lever() -> None:
             Torques(scene, motion).at(np.zeros(1, int), motion.positions[:1], still, still)[0]
         )
     world = World(scene)
-    (q,) = world.coordinates.q(world.positions(motion, motion.times[:1]))
+    (q,) = world.coordinates.q(world.compute_positions(motion, motion.times[:1]))
     data = world.model.createData()
     jacobian = pin.computeJointJacobians(world.model, data, q)[:, : motion.robot_size]
     pin.forwardKinematics(world.model, data, q)
@@ -125,7 +127,7 @@ def test_and_with_a_tray_and_what_stands_on_it(tmp_path: Path) -> None:
     alone = Torques(
         changed(changed(plan.scene, "tray", mass=0.0), "cup", mass=0.0), plan.trajectory
     )
-    assert "tray" in alone.weightless
+    assert "tray" in alone.massless_objects
 
 
 def test_acceleration_of_the_base_pulls_at_the_arm() -> None:

@@ -12,13 +12,13 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.dynamics.torque_limits import TorqueLimits
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.trajectory.curve import Curve, moments_at
+from vkc_pin.world.trajectory.curve import Curve, sample_intervals
 from vkc_pin.world.trajectory.dynamics.handles import Handle, Motion
 from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.wheels import seen
+from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 
-__all__ = ["Moments", "Torques", "in_base_axes", "moments_of"]
+__all__ = ["Moments", "Torques", "sample_curve", "transform_to_base_axes"]
 
 _SHARES = np.array(
     [0.0, 0.5, 1.0]
@@ -43,10 +43,10 @@ class Moments:
     accelerations: Floats
 
 
-def moments_of(curve: Curve) -> Moments:
+def sample_curve(curve: Curve) -> Moments:
     """Return the ends and the middle of every cubic of a curve, with its own accelerations at its ends."""
     spans, count = np.diff(curve.times), len(curve.times) - 1
-    times = moments_at(curve.times, _SHARES)
+    times = sample_intervals(curve.times, _SHARES)
     begin, middle = (
         curve.acceleration(curve.times[:-1]),
         curve.acceleration(curve.times[:-1] + 0.5 * spans),
@@ -88,7 +88,7 @@ class Torques:
     ) -> None:
         self.scene, self.trajectory = scene, trajectory
         self._free = FreeObjects(scene, trajectory) if free is None else free
-        self.efforts: TorqueLimits = scene.robot.efforts
+        self.torque_limits: TorqueLimits = scene.robot.efforts
         self._loads: dict[int, _Load] = {}
 
     def at(
@@ -128,7 +128,7 @@ class Torques:
         )
 
     @cached_property
-    def weightless(self) -> tuple[str, ...]:
+    def massless_objects(self) -> tuple[str, ...]:
         """What is carried in some phase though nobody says what it weighs."""
         phases = zip(self.trajectory.phases, self._free.rides, strict=True)
         carried = dict.fromkeys(name for phase, rides in phases for name in (*phase.held, *rides))
@@ -139,7 +139,9 @@ class Torques:
         self, load: _Load, positions: Floats, velocities: Floats, accelerations: Floats
     ) -> Floats:
         robot, size = self.scene.robot, self.trajectory.robot_size
-        v, a = in_base_axes(positions[:, 2], velocities[:, :size], accelerations[:, :size])
+        v, a = transform_to_base_axes(
+            positions[:, 2], velocities[:, :size], accelerations[:, :size]
+        )
         data, found = load.model.createData(), np.empty((len(positions), size))
         configurations = robot.coordinates.q(positions[:, :size])
         for k, q in enumerate(configurations):
@@ -229,7 +231,9 @@ def _whole(thing: ArticulatedObject, state: Floats) -> pin.Inertia:
     )
 
 
-def in_base_axes(yaws: Floats, velocities: Floats, accelerations: Floats) -> tuple[Floats, Floats]:
+def transform_to_base_axes(
+    yaws: Floats, velocities: Floats, accelerations: Floats
+) -> tuple[Floats, Floats]:
     """Return velocities and accelerations of the base in the world, shape (K, n), as those of Pinocchio's planar joint.
 
     Its velocity is that in its own axes, which turn; its acceleration is the derivative of these
@@ -237,7 +241,7 @@ def in_base_axes(yaws: Floats, velocities: Floats, accelerations: Floats) -> tup
     """
     v, a = velocities.copy(), accelerations.copy()
     for rows in (v, a):
-        rows[:, :2] = np.transpose(seen(rows[:, 0], rows[:, 1], yaws))
+        rows[:, :2] = np.transpose(rotate_into_base_frame(rows[:, 0], rows[:, 1], yaws))
     a[:, 0] += v[:, 2] * v[:, 1]
     a[:, 1] -= v[:, 2] * v[:, 0]
     return v, a

@@ -27,9 +27,9 @@ __all__ = [
     "FORMAT",
     "METRICS",
     "STATUSES",
-    "folder_from_data",
-    "folder_to_data",
     "read_archive",
+    "resolve_folder",
+    "serialize_folder",
     "write_archive",
 ]
 
@@ -314,7 +314,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
     )
 
 
-def folder_to_data(scene_folder: Path, plan: Path) -> dict[str, str]:
+def serialize_folder(scene_folder: Path, plan: Path) -> dict[str, str]:
     """Return where a scene's folder is: in the package, or seen from the plan's file and absolutely."""
     there = scene_folder.resolve()
     if there == folder("scenes").resolve():
@@ -322,8 +322,8 @@ def folder_to_data(scene_folder: Path, plan: Path) -> dict[str, str]:
     return {"relative": os.path.relpath(there, plan.resolve().parent), "absolute": str(there)}
 
 
-def folder_from_data(data: Mapping[str, str], plan: Path) -> Path:
-    """Return the scene's folder that `folder_to_data` describes."""
+def resolve_folder(data: Mapping[str, str], plan: Path) -> Path:
+    """Return the scene's folder that `serialize_folder` describes."""
     if "package" in data:
         return folder(data["package"])
     beside = plan.resolve().parent / data["relative"]

@@ -16,12 +16,12 @@ from vkc_pin.errors import InputError, shown
 from vkc_pin.utils.arguments import flag, is_number, number, text, whole
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.trajectory.curve import Curve, evenly
+from vkc_pin.world.trajectory.curve import Curve, sample_evenly
 from vkc_pin.world.trajectory.formats.tables import (
-    chosen_columns,
-    one_phase,
+    infer_robot_size,
+    make_single_phase,
     read_json,
-    size_of_robot,
+    select_columns,
 )
 
 __all__ = ["along", "from_ros", "rates", "to_ros"]
@@ -86,7 +86,7 @@ def to_ros(
         raise InputError(
             "out of range", field="stamp", expected="seconds, less than 2^31", got=stamp
         )
-    columns = chosen_columns(motion, joints)
+    columns = select_columns(motion, joints)
     source = motion if curve is None else curve
     times, positions = (
         np.array(source["times"], float),
@@ -107,7 +107,7 @@ def to_ros(
     moments = (
         times
         if rate is None
-        else _with_rests(evenly(times, rate), times, np.array(source["positions"], float))
+        else _with_rests(sample_evenly(times, rate), times, np.array(source["positions"], float))
     )
     if cubics is not None:
         positions, velocities, accelerations = (
@@ -202,8 +202,8 @@ def from_ros(
             number(sec, f"{where}time_from_start.sec")
             + number(nanosec, f"{where}time_from_start.nanosec") / _NANO
         )
-    size = size_of_robot(names) if robot_size is None else whole(robot_size, "robot_size", low=3)
-    phases = [one_phase(len(rows))] if len(rows) > 1 else []
+    size = infer_robot_size(names) if robot_size is None else whole(robot_size, "robot_size", low=3)
+    phases = [make_single_phase(len(rows))] if len(rows) > 1 else []
     if like is not None:
         size, began = like["robot_size"], np.array(like["times"], float)
         edges = (began - began[0])[[0, *(phase["last"] for phase in like["phases"])]]

@@ -20,7 +20,7 @@ from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.files.writing import folder_at_once
 from vkc_pin.world.trajectory.formats.ros import to_ros
 
-__all__ = ["TOPICS", "bag_library", "write_rosbag"]
+__all__ = ["TOPICS", "import_rosbags", "write_rosbag"]
 
 TOPICS: Mapping[str, str] = {
     "arm/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
@@ -71,7 +71,7 @@ def write_rosbag(
         InputError: The package `rosbags` is not installed, the folder cannot be made or is there
             already, `namespace` is no name of topics, or a rate or `stamp` is out of range.
     """
-    bag_library()
+    import_rosbags()
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -99,7 +99,7 @@ def write_rosbag(
     return Path(path)
 
 
-def bag_library() -> Any:
+def import_rosbags() -> Any:
     """Return the package `rosbags`.
 
     Raises:

@@ -27,11 +27,11 @@ __all__ = [
     "LARGEST_MOTION",
     "MOST_COLUMNS",
     "MOST_LINES",
-    "chosen_columns",
-    "one_phase",
+    "infer_robot_size",
+    "make_single_phase",
     "read_csv",
     "read_json",
-    "size_of_robot",
+    "select_columns",
     "write_csv",
     "write_json",
 ]
@@ -78,7 +78,7 @@ def write_csv(
     Raises:
         UnknownNameError: There is no such group or coordinate.
     """
-    columns, phases = chosen_columns(motion, joints), motion["phases"]
+    columns, phases = select_columns(motion, joints), motion["phases"]
     x, y, yaw = motion["names"][:3]
     known = {x: "m", y: "m", yaw: "rad"}
     for name, unit in mapping(
@@ -226,7 +226,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
             opening = _number(cells[-1], path, number, _OPENING) if opens and cells[-1] else None
             _add_phase(phases, cells[last : last + 3], opening, len(rows) - 1, path, number)
     if not told and len(rows) > 1:
-        phases = [one_phase(len(rows))]
+        phases = [make_single_phase(len(rows))]
     own = slice(1, len(names) + 1)
     curve = {
         "times": [knot[0] for knot in knots],
@@ -238,7 +238,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         "names": names,
         "times": [row[0] for row in rows],
         "positions": [row[1:] for row in rows],
-        "robot_size": size_of_robot(names)
+        "robot_size": infer_robot_size(names)
         if robot_size is None
         else whole(robot_size, "robot_size", low=3),
         "phases": phases,
@@ -261,7 +261,7 @@ def read_json(path: str | Path) -> Any:
     return parse_json(read_text(path, "JSON", LARGEST_MOTION), path)
 
 
-def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> list[int]:
+def select_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> list[int]:
     """Return which of a motion's coordinates are meant by one of `GROUPS`, or by names in the order wanted.
 
     Raises:
@@ -296,12 +296,12 @@ def chosen_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> li
     return [known.index(name) for name in names]
 
 
-def size_of_robot(names: Sequence[str]) -> int:
+def infer_robot_size(names: Sequence[str]) -> int:
     """Return how many coordinates are the robot's, if nobody says so: those before the first with a dot in its name."""
     return next((k for k, name in enumerate(names) if "." in str(name)), len(names))
 
 
-def one_phase(waypoints: int) -> dict[str, Any]:
+def make_single_phase(waypoints: int) -> dict[str, Any]:
     """Return the phase that all of a motion is in if nobody says otherwise; nothing is held in it."""
     return {"name": "motion", "first": 0, "last": waypoints - 1, "held": {}, "by": {}}
 

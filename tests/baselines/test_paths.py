@@ -186,7 +186,7 @@ def test_the_arm_counts_if_it_is_to() -> None:
     z = np.tile(problem.start, (len(path), 1))
     z[:, :3] = path
     contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=MARGIN)
-    assert contacts.violation() < 0.01 + BLINK, (
+    assert contacts.compute_violation() < 0.01 + BLINK, (
         "but for the corners that are cut between two waypoints"
     )
 

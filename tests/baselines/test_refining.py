@@ -174,7 +174,7 @@ def test_gradients_are_those_of_coals_distances(held: bool) -> None:
     contacts = problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=0.12)
     chain, geometry = (
         problem.chain,
-        all_pairs(problem.contacts.phases[problem.contacts.phase_of(waypoint)]),
+        all_pairs(problem.contacts.phases[problem.contacts.find_phase(waypoint)]),
     )
     data, shapes = chain.model.createData(), pin.GeometryData(geometry)
     request = coal.DistanceRequest()
@@ -197,7 +197,7 @@ def test_gradients_are_those_of_coals_distances(held: bool) -> None:
 
     apart = distances(z)
     np.testing.assert_allclose(contacts.distance, apart, atol=1e-6)
-    gradients = problem.contacts.gradients(z, contacts)
+    gradients = problem.contacts.compute_gradients(z, contacts)
     assert gradients.shape == (len(apart), chain.size)
     assert len(apart) > 40
     numeric = np.empty_like(gradients)

@@ -24,7 +24,7 @@ class Relaxed:
         self.found = measure_infeasibility(p, z, self.timing, contacts, rates=True)
         self.merit = Merit(REST)
         self.merit.weights["clearance"] = CLEARANCE
-        self._planes = p.contacts.planes(z, contacts, slots=t.slots)
+        self._planes = p.contacts.compute_planes(z, contacts, slots=t.slots)
         solver = t.solver(rates=True, options=QUIET).function
         self._cost, self._rows = (solver.get_function(name) for name in ("nlp_grad_f", "nlp_jac_g"))
         self.lower, self.upper = p.row_bounds(self.timing)

@@ -28,7 +28,7 @@ def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, in
         dict[int, tuple[Any, ...]](),
         list[float](),
         retime.compute_speeds,
-        retime._straight,
+        retime._make_straight_curve,
     )
 
     def noted(path: Any, places: Any, *limits: Any) -> Any:
@@ -45,7 +45,7 @@ def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, in
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(retime, "compute_speeds", noted)
-        patch.setattr(retime, "_straight", rested)
+        patch.setattr(retime, "_make_straight_curve", rested)
         again = retime.retime_trajectory(scene, motion, _parts(motion))
     assert abs(again.times[-1] - motion.times[-1]) <= _SAME, (
         "the motion that was timed anew is another one"

@@ -203,7 +203,7 @@ def test_contacts_of_what_is_carried_are_those_among_all_pairs(
     problem = program_of(cluttered_room(seed, count), steps, options=SHORT)
     rng = np.random.default_rng(seed)
     z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
-    model = problem.contacts.settled(z)
+    model = problem.contacts.with_released_objects(z)
     assert [len(phase.held) for phase in problem.task.phases] == [0, 1, 2, 1]
     for phase in range(4):
         check_contacts(problem, model, phase, rng, reach=reach, nearest=nearest)

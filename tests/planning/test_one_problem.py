@@ -218,7 +218,7 @@ def test_what_clearly_misses_is_checked_only_if_nothing_else_is_left(
     assert len(checked) == max(1, len(solved) - len(astray))
     problem = vkc.build(plan.scene, plan.steps)
     for solution in solved:
-        short = problem.evaluate_contacts(solution.z, reach=0.1).violation()
+        short = problem.evaluate_contacts(solution.z, reach=0.1).compute_violation()
         assert solution.astray == (pytest.approx(short) if short > 0.01 else 0.0)
     for solution in astray:
         motion = as_trajectory(problem, solution.z, solution.dt)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.inverse_kinematics import LONGEST_STEP
+from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP
 from vkc_pin.planning.initialization.keyframes import Knots
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -97,6 +97,6 @@ class _Box:
         """Return G and h of G·δz ≤ h, shapes (2n, n) and (2n,)."""
         most, least = np.zeros(len(self.z)), np.zeros(len(self.z))
         at = self.columns
-        most[at] = np.clip(self.upper[at] - self.z[at], 0.0, LONGEST_STEP)
-        least[at] = np.clip(self.lower[at] - self.z[at], -LONGEST_STEP, 0.0)
+        most[at] = np.clip(self.upper[at] - self.z[at], 0.0, MAX_STEP)
+        least[at] = np.clip(self.lower[at] - self.z[at], -MAX_STEP, 0.0)
         return self._rows, np.concatenate([most, -least])

@@ -244,7 +244,7 @@ class Attempt:
             timing = problem.timing_for(followed.z).stretch(*pace)
             self.times["following"] += time.perf_counter() - began
             cause = followed.cause
-            if not cause and timing.violation(*pace) > TOLERANCE:
+            if not cause and timing.compute_violation(*pace) > TOLERANCE:
                 cause = "too fast"
             if not cause and problem.drift(followed.z) > 1.0:
                 cause = "closure"

@@ -65,9 +65,9 @@ def refined(
         contacts = problem.contacts.evaluate(
             z[None], np.array([waypoint]), reach=reach, nearest=None
         )
-        if np.abs(residual).max() < TOLERANCE and contacts.violation() <= CLEAR:
+        if np.abs(residual).max() < TOLERANCE and contacts.compute_violation() <= CLEAR:
             return z, True
-        gradients = problem.contacts.gradients(z[None], contacts)[:, free]
+        gradients = problem.contacts.compute_gradients(z[None], contacts)[:, free]
         room = contacts.distance - contacts.margin
         bounds = [np.clip(limit[free] - z[free], -_LONGEST, _LONGEST) for limit in (lower, upper)]
         # The step of the free coordinates, then one slack for all pairs.

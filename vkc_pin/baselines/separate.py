@@ -46,7 +46,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.outcome import outcome, spent
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, borrowed
-from vkc_pin.planning.retiming.repair import accepted
+from vkc_pin.planning.retiming.repair import retime_and_repair
 from vkc_pin.planning.settings import budget_for, check_arguments
 from vkc_pin.utils.arguments import known, whole
 from vkc_pin.validation.report import Report
@@ -193,7 +193,7 @@ def _timed(
         return report
 
     if not failed:
-        timed, report = accepted(scene, trajectory, check, jerk_time=options.jerk_time)
+        timed, report = retime_and_repair(scene, trajectory, check, jerk_time=options.jerk_time)
         if report.ok:
             return timed, report
     return trajectory, check(trajectory)

@@ -21,7 +21,7 @@ from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.outcome import TIMES, outcome, spent, still
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.retiming.repair import accepted
+from vkc_pin.planning.retiming.repair import retime_and_repair
 from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.solution import Iteration, Solution
@@ -282,7 +282,7 @@ class OneProblem:
                 {} if solution.converged else {"repairs": 0}
             )  # what is wrong with others is not the curve's fault
             jerk_time = self.settings.options.jerk_time
-            trajectory, report = accepted(
+            trajectory, report = retime_and_repair(
                 self.scene, waypoints, self._check, jerk_time=jerk_time, **repairs
             )
         self.times["retiming"] += time.perf_counter() - began - (self.times["validation"] - checked)
@@ -342,7 +342,7 @@ def _ends_free(problem: TrajectoryProblem, seed: Seed) -> bool:
     """Return whether a seed's configurations at the ends of the phases are free and what they should be."""
     ends = problem.ends - 1
     free = (
-        problem.evaluate_contacts(seed.z, reach=problem.options.largest_margin).shortfall(
+        problem.evaluate_contacts(seed.z, reach=problem.options.largest_margin).compute_shortfall(
             problem.segments
         )[ends]
         <= 0.0

@@ -240,7 +240,7 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
         clearance = np.full(len(z), _FAR)
         full = contacts.margin >= safe
         np.minimum.at(clearance, contacts.waypoint[full], contacts.distance[full])
-        clearance[contacts.shortfall(len(z)) > 0.0] = -np.inf
+        clearance[contacts.compute_shortfall(len(z)) > 0.0] = -np.inf
         best = int(np.argmax(clearance))
         if clearance[best] > -np.inf:
             robot = problem.chain.robot.coordinates.size

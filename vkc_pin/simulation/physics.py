@@ -28,7 +28,7 @@ _NONNEGATIVE = (
     "friction",
     "latch_play",
 )
-_LONGEST_STEP = 0.01  # [s]; longer steps miss contacts
+_MAX_STEP = 0.01  # [s]; longer steps miss contacts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,7 @@ class Physics:
             if name == "balanced":
                 flag(self.balanced, "Physics.balanced")
                 continue
-            high = _LONGEST_STEP if name == "timestep" else float("inf")
+            high = _MAX_STEP if name == "timestep" else float("inf")
             value = number(
                 getattr(self, name),
                 f"Physics.{name}",

@@ -20,8 +20,8 @@ from helpers.small_problems import (
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.chain.chain import (
-    VIRTUAL_ACCELERATION,
-    VIRTUAL_VELOCITY,
+    FREEDOM_ACCELERATION,
+    FREEDOM_VELOCITY,
     VirtualKinematicChain,
     consolidate,
 )
@@ -226,8 +226,8 @@ def test_the_closures_target_is_the_base_link_in_the_world() -> None:
             {"cabinet": "sleeve"},
             ["cabinet.sleeve_turn", "cabinet.sleeve_slide", "cabinet.slide", "cabinet.swing"],
             [
-                (-0.5, 0.9, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION),
-                (-0.05, 0.08, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION),
+                (-0.5, 0.9, FREEDOM_VELOCITY, FREEDOM_ACCELERATION),
+                (-0.05, 0.08, FREEDOM_VELOCITY, FREEDOM_ACCELERATION),
                 (0.0, 0.3, 0.4, 0.7),
                 (-1.0, 2.0, 1.5, 3.0),
             ],
@@ -241,7 +241,7 @@ def test_the_closures_target_is_the_base_link_in_the_world() -> None:
             {"door": "handle_free"},
             ["door.handle_free", "door.knob", "door.hinge"],
             [
-                (-0.6, 0.6, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION),
+                (-0.6, 0.6, FREEDOM_VELOCITY, FREEDOM_ACCELERATION),
                 (0.0, 0.8, 2.0, 4.0),
                 (-1.57, 1.57, 1.0, 1.0),
             ],
@@ -256,7 +256,7 @@ def test_the_closures_target_is_the_base_link_in_the_world() -> None:
                 "cabinet.slide",
                 "cabinet.swing",
             ],
-            [(-0.7, 0.6, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION)] * 3
+            [(-0.7, 0.6, FREEDOM_VELOCITY, FREEDOM_ACCELERATION)] * 3
             + [(0.0, 0.3, 0.4, 0.7), (-1.0, 2.0, 1.5, 3.0)],
         ),
         (
@@ -264,7 +264,7 @@ def test_the_closures_target_is_the_base_link_in_the_world() -> None:
             ["drawer.slide", "cabinet.rail", "cabinet.slide", "cabinet.swing"],
             [
                 (0.0, 0.4, 0.5, 1.0),
-                (-0.05, 0.08, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION),
+                (-0.05, 0.08, FREEDOM_VELOCITY, FREEDOM_ACCELERATION),
                 (0.0, 0.3, 0.4, 0.7),
                 (-1.0, 2.0, 1.5, 3.0),
             ],
@@ -557,7 +557,7 @@ def test_every_hold_has_its_own_shapes_joints_and_names() -> None:
 
 def test_one_attachment_held_in_two_ways_is_refused() -> None:
     """Its freedom would have one name for two coordinates; without a freedom there is nothing to mix up."""
-    with pytest.raises(InputError, match="share a name") as caught:
+    with pytest.raises(InputError, match="two coordinates share this name") as caught:
         consolidate(carried_scene(), [STICK, PULLED, Hold("ball", "pull")])
     assert str(caught.value.field).startswith("ball.pull_")
     chain = consolidate(carried_scene(), [STICK, Hold("cabinet", "spike", STICK, "tip")])

@@ -12,16 +12,16 @@ import pytest
 
 from vkc_pin.options import Options
 from vkc_pin.planning.chain import collision_pairs as module
-from vkc_pin.planning.chain.collision_pairs import _boxes, _Pairing
+from vkc_pin.planning.chain.collision_pairs import _compute_boxes, _PairBuilder
 from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
 from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.scene.obstacles import FLOOR
 
 
-def pairing(*allowances: ClearanceExemption, **fields: Any) -> Any:
-    made = object.__new__(_Pairing)
-    made._allowances = allowances
+def pairing(*find_clearance_exemptions: ClearanceExemption, **fields: Any) -> Any:
+    made = object.__new__(_PairBuilder)
+    made._allowances = find_clearance_exemptions
     made.options = Options(dist_safe=0.02)
     for name, value in fields.items():
         setattr(made, name, value)
@@ -54,7 +54,7 @@ def test_what_is_kept_from_what_is_held(
     monkeypatch.setattr(
         module, "compute_hand_clearance", lambda scene, hold, link, options: clearance
     )
-    assert pairing(scene=None)._held_margin(None, one, link) == expected
+    assert pairing(scene=None)._find_attached_margin(None, one, link) == expected
 
 
 LABELS = ["arm", "tray", "side", "tray", "lid"]  # a link may have several shapes
@@ -65,13 +65,13 @@ SLIDE = {"drawer.slide": (-0.1, 0.4)}
 WITHIN = np.array([5]), np.array([-0.1]), np.array([0.4])
 
 
-def allowed(*allowances: ClearanceExemption, within: Any = WITHIN) -> Any:
+def allowed(*find_clearance_exemptions: ClearanceExemption, within: Any = WITHIN) -> Any:
     """Return the pairs with their margins, and where some may be close: (pairs, margin) each."""
-    made = pairing(*allowances)
-    made._within = lambda phase, ranges: (
+    made = pairing(*find_clearance_exemptions)
+    made._resolve_ranges = lambda phase, ranges: (
         within if ranges else (np.zeros(0, int), np.zeros(0), np.zeros(0))
     )
-    table, near = made._allowed(None, np.array(TABLE), LABELS, LABELS)
+    table, near = made._apply_exemptions(None, np.array(TABLE), LABELS, LABELS)
     for place in near:
         assert place[2:] == within
     return table.tolist(), [(place[0].tolist(), place[1]) for place in near]
@@ -141,7 +141,7 @@ def within(ranges: dict[str, tuple[float, float]], before: dict[str, float]) -> 
         object=SimpleNamespace(coordinates=SimpleNamespace(index=("left", "right").index)),
     )
     made = pairing(chain=chain, scene=SimpleNamespace(objects={"cupboard": placed}))
-    return made._within(SimpleNamespace(initial_values=before), ranges)
+    return made._resolve_ranges(SimpleNamespace(initial_values=before), ranges)
 
 
 def test_where_neighbours_are_such() -> None:
@@ -168,7 +168,7 @@ def test_where_neighbours_are_such() -> None:
 def test_only_what_is_above_the_floor_can_hit_it() -> None:
     scene = SimpleNamespace(obstacle_labels=("wall", FLOOR, "box"))
     made = pairing(scene=scene, _obstacles=[None] * 3)
-    found = made._with_obstacles(10, [0, 3, 5], [3])
+    found = made._pair_with_obstacles(10, [0, 3, 5], [3])
     assert found.tolist() == [
         [0.0, 10.0, 0.02],
         [3.0, 10.0, 0.02],
@@ -178,9 +178,9 @@ def test_only_what_is_above_the_floor_can_hit_it() -> None:
         [3.0, 12.0, 0.02],
         [5.0, 12.0, 0.02],
     ]
-    assert made._with_obstacles(10, [0], []).tolist() == [[0.0, 10.0, 0.02], [0.0, 12.0, 0.02]]
+    assert made._pair_with_obstacles(10, [0], []).tolist() == [[0.0, 10.0, 0.02], [0.0, 12.0, 0.02]]
     none = pairing(scene=SimpleNamespace(obstacle_labels=()), _obstacles=[])
-    assert none._with_obstacles(10, [0, 1], [0]).shape == (0, 3)
+    assert none._pair_with_obstacles(10, [0, 1], [0]).shape == (0, 3)
 
 
 def test_links_of_an_object_that_can_meet() -> None:
@@ -190,8 +190,8 @@ def test_links_of_an_object_that_can_meet() -> None:
             objects={"washer": SimpleNamespace(object=SimpleNamespace(own_pairs=own))}
         )
     )
-    assert made._own_pair("washer", "washer.rack", "washer.door")
-    assert not made._own_pair("washer", "washer.rack", "washer.case")
+    assert made._can_self_collide("washer", "washer.rack", "washer.door")
+    assert not made._can_self_collide("washer", "washer.rack", "washer.case")
 
 
 def test_boxes_around_shapes_and_where_they_are() -> None:
@@ -200,12 +200,12 @@ def test_boxes_around_shapes_and_where_they_are() -> None:
         pin.GeometryObject("a", 0, place, coal.Box(0.2, 0.4, 0.6)),
         pin.GeometryObject("b", 0, pin.SE3.Identity(), coal.Sphere(0.1)),
     ]
-    center, half, rotation, translation = _boxes(shapes)
+    center, half, rotation, translation = _compute_boxes(shapes)
     np.testing.assert_allclose(center, np.zeros((2, 3)), atol=1e-12)
     np.testing.assert_allclose(half, [[0.1, 0.2, 0.3], [0.1, 0.1, 0.1]])
     np.testing.assert_array_equal(rotation, [place.rotation, np.eye(3)])
     np.testing.assert_array_equal(translation, [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
-    assert [part.shape for part in _boxes([])] == [(0, 3), (0, 3), (0, 3, 3), (0, 3)]
+    assert [part.shape for part in _compute_boxes([])] == [(0, 3), (0, 3), (0, 3, 3), (0, 3)]
 
 
 def test_contacts_in_numbers() -> None:
@@ -214,14 +214,18 @@ def test_contacts_in_numbers() -> None:
     found = Contacts(
         np.array([0, 2, 2, 3]), np.array([[0, 1]] * 4), distance, margin, vectors, vectors, vectors
     )
-    assert found.violation() == pytest.approx(0.025)
-    assert found.shortfall(5).tolist() == pytest.approx([0.01, 0.0, 0.025, 0.0, 0.0])
-    assert found.clearance() == -0.02
-    assert found.place.tolist() == [0, 0, 1, 0]
+    assert found.compute_violation() == pytest.approx(0.025)
+    assert found.compute_shortfall(5).tolist() == pytest.approx([0.01, 0.0, 0.025, 0.0, 0.0])
+    assert found.compute_clearance() == -0.02
+    assert found.slot.tolist() == [0, 0, 1, 0]
     free = found.select(np.array([3]))
-    assert (free.violation(), free.clearance()) == (0.0, 0.5)
+    assert (free.compute_violation(), free.compute_clearance()) == (0.0, 0.5)
     none = make_empty_contacts()
-    assert (none.violation(), none.clearance(), none.shortfall(2).tolist()) == (
+    assert (
+        none.compute_violation(),
+        none.compute_clearance(),
+        none.compute_shortfall(2).tolist(),
+    ) == (
         0.0,
         np.inf,
         [0.0, 0.0],

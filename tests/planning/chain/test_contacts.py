@@ -24,7 +24,7 @@ from helpers.small_problems import (
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.chain.collision_pairs import phase_geometries
+from vkc_pin.planning.chain.collision_pairs import build_phase_geometries
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.budget import Budget, SpentError
@@ -75,7 +75,7 @@ class Counted(NamedTuple):
 
     robot: int
     planned: int  # of the robot, beyond its base
-    touching: int
+    find_touch_links: int
     own: int  # pairs of the robot with itself
     obstacles: int  # without the floor
 
@@ -99,7 +99,7 @@ def test_pairs_of_every_phase_are_counted() -> None:
     held = (
         n.own
         + n.robot * (panel + lever)
-        - n.touching * lever
+        - n.find_touch_links * lever
         + n.robot * frame
         + (n.robot + panel + lever) * n.obstacles
         + n.planned
@@ -436,7 +436,7 @@ def test_contacts_do_not_depend_on_how_many_configurations_are_looked_at_at_once
     waypoints = problem.ends[np.arange(len(z)) % 4]
     at_once = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=4)
     assert np.all(np.diff(at_once.waypoint) >= 0)
-    monkeypatch.setattr("vkc_pin.planning.chain.contacts._ROWS", 50)
+    monkeypatch.setattr("vkc_pin.planning.chain.contacts._KINEMATICS_BATCH", 50)
     in_portions = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=4)
     for one, other in zip(at_once.arrays(), in_portions.arrays(), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -464,10 +464,10 @@ def test_nothing_within_reach_gives_nothing() -> None:
     contacts = problem.contacts.evaluate(problem.start[None], np.array([1]), reach=1e-6)
     assert contacts.pair.shape == (0, 2)
     assert contacts.normal.shape == contacts.first.shape == contacts.second.shape == (0, 3)
-    assert contacts.clearance() == np.inf
-    assert contacts.violation() == 0.0
-    np.testing.assert_array_equal(contacts.shortfall(3), np.zeros(3))
-    planes, offsets = problem.contacts.planes(problem.start[None], contacts, slots=4)
+    assert contacts.compute_clearance() == np.inf
+    assert contacts.compute_violation() == 0.0
+    np.testing.assert_array_equal(contacts.compute_shortfall(3), np.zeros(3))
+    planes, offsets = problem.contacts.compute_planes(problem.start[None], contacts, slots=4)
     assert planes.shape == (1, 4, 12 * (problem.chain.model.njoints - 1))
     assert not planes.any()
     assert np.all(offsets == -1.0)
@@ -483,19 +483,19 @@ def test_shortfall_violation_and_clearance() -> None:
         first=np.zeros((3, 3)),
         second=np.zeros((3, 3)),
     )
-    np.testing.assert_allclose(contacts.shortfall(4), [0.005, 0.0, 0.05, 0.0])
-    assert contacts.violation() == pytest.approx(0.05)
-    assert contacts.clearance() == -0.03
+    np.testing.assert_allclose(contacts.compute_shortfall(4), [0.005, 0.0, 0.05, 0.0])
+    assert contacts.compute_violation() == pytest.approx(0.05)
+    assert contacts.compute_clearance() == -0.03
     apart = dataclasses.replace(contacts, distance=np.array([0.005, 0.02, 0.03]))
-    assert apart.violation() == 0.0
-    np.testing.assert_array_equal(apart.shortfall(3), np.zeros(3))
+    assert apart.compute_violation() == 0.0
+    np.testing.assert_array_equal(apart.compute_shortfall(3), np.zeros(3))
 
 
 def test_a_boundary_between_phases_belongs_to_the_earlier() -> None:
     problem = door_problem()
     ends = [0, *problem.ends.tolist()]
     for waypoint in range(ends[-1] + 1):
-        phase = problem.contacts.phase_of(waypoint)
+        phase = problem.contacts.find_phase(waypoint)
         assert ends[phase] < waypoint <= ends[phase + 1] or (waypoint == 0 and phase == 0)
 
 
@@ -530,7 +530,7 @@ def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> No
     contacts = problem.contacts.evaluate(
         z, np.full(len(z), problem.ends[phase]), reach=0.25, nearest=slots
     )
-    planes, offsets = problem.contacts.planes(z, contacts, slots=slots)
+    planes, offsets = problem.contacts.compute_planes(z, contacts, slots=slots)
     number = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
     geometry = all_pairs(part)
     data, placed = chain.model.createData(), pin.GeometryData(geometry)
@@ -600,8 +600,8 @@ def test_more_contacts_than_slots_keep_the_worst() -> None:
     z, _ = sampled(0)
     z = z[:10]
     contacts = problem.contacts.evaluate(z, np.full(10, problem.ends[0]), reach=0.5)
-    few, few_offsets = problem.contacts.planes(z, contacts, slots=2)
-    many, many_offsets = problem.contacts.planes(z, contacts, slots=30)
+    few, few_offsets = problem.contacts.compute_planes(z, contacts, slots=2)
+    many, many_offsets = problem.contacts.compute_planes(z, contacts, slots=30)
     assert np.bincount(contacts.waypoint).min() > 2
     np.testing.assert_array_equal(few, many[:, :2])
     np.testing.assert_array_equal(few_offsets, many_offsets[:, :2])
@@ -644,7 +644,7 @@ def test_what_comes_after_what_is_blocked_is_not_spent() -> None:
 def test_pairing_ends_with_the_budget() -> None:
     problem = door_problem()
     with Budget(seconds=0.0).running(), pytest.raises(SpentError):
-        phase_geometries(door_scene(), problem.chain, problem.task, SHORT)
+        build_phase_geometries(door_scene(), problem.chain, problem.task, SHORT)
 
 
 def side_by_side(*, out: float = 0.0) -> Scene:
@@ -661,8 +661,8 @@ def test_neighbours_may_be_close_as_long_as_both_are_where_they_are() -> None:
     """Half as close as they stand; not where one that stands still has left the other's side."""
     shut = program_of(side_by_side(), [Actuate("near", {"slide": 0.3})], options=SHORT)
     (allowance,) = find_clearance_exemptions(side_by_side(), SHORT.dist_safe)
-    part = shut.contacts.phases[shut.contacts.phase_of(waypoint_in(shut, "move"))]
-    (near,) = part.neighbours
+    part = shut.contacts.phases[shut.contacts.find_phase(waypoint_in(shut, "move"))]
+    (near,) = part.margin_regions
     labels = {frozenset((part.labels[i], part.labels[j])) for i, j in part.pairs[near.pairs]}
     assert labels == {frozenset(("near.tray", "next.tray"))}
     assert near.margin == pytest.approx(0.5 * allowance.distance)
@@ -673,15 +673,15 @@ def test_neighbours_may_be_close_as_long_as_both_are_where_they_are() -> None:
         opened, [Actuate("near", {"slide": 0.0})], options=SHORT
     )  # it comes back to where it is one
     assert shutting.contacts.phases[
-        shutting.contacts.phase_of(waypoint_in(shutting, "move"))
-    ].neighbours
+        shutting.contacts.find_phase(waypoint_in(shutting, "move"))
+    ].margin_regions
     end = allowance.ranges["next.slide"][1]
     for out, beside in ((end - 1e-4, True), (end + 1e-4, False)):
         problem = program_of(
             side_by_side(out=out), [Actuate("near", {"slide": 0.3})], options=SHORT
         )
-        part = problem.contacts.phases[problem.contacts.phase_of(waypoint_in(problem, "move"))]
-        assert bool(part.neighbours) == beside
+        part = problem.contacts.phases[problem.contacts.find_phase(waypoint_in(problem, "move"))]
+        assert bool(part.margin_regions) == beside
 
 
 def test_what_a_scene_allows_is_no_pair_or_keeps_what_it_says() -> None:
@@ -692,7 +692,7 @@ def test_what_a_scene_allows_is_no_pair_or_keeps_what_it_says() -> None:
             side_by_side().folder,
         )
         problem = program_of(allowed, [Actuate("near", {"slide": 0.3})], options=SHORT)
-        number = problem.contacts.phase_of(waypoint_in(problem, "move"))
+        number = problem.contacts.find_phase(waypoint_in(problem, "move"))
         own = {
             pair: keep
             for pair, keep in pairs(problem, number).items()

@@ -148,7 +148,7 @@ def test_what_is_let_go_of_somewhere_stands_there(seed: int) -> None:
     z = random_configurations(
         problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
     )
-    contacts = problem.contacts.settled(z)
+    contacts = problem.contacts.with_released_objects(z)
     left = {"ball": (problem.ends[2], (3, 4, 5)), "stick": (problem.ends[4], (5,))}
     for name, (end, later) in left.items():
         where = expected_placement(problem, name, z[end - 1])

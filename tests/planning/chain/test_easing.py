@@ -51,8 +51,8 @@ def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarra
     found: dict[tuple[str, str], np.ndarray] = {}
     for k, pair in enumerate(part.pairs.tolist()):
         row = part.margins_at(np.full(len(waypoints), k), np.array(waypoints))
-        assert k in part.eased or (row == part.margins[k]).all()
-        if k in part.eased and part.labels[pair[0]] not in p.scene.robot.touch_links:
+        assert k in part.reduced_margins or (row == part.margins[k]).all()
+        if k in part.reduced_margins and part.labels[pair[0]] not in p.scene.robot.touch_links:
             key = (part.labels[pair[0]], part.labels[pair[1]])
             found[key] = np.minimum(found.get(key, np.inf), row)
     return found
@@ -95,9 +95,9 @@ def test_the_margin_is_half_the_distance_of_that_shape() -> None:
     p = problem(room(table(gap=GAP), wall), Place("stick", ASIDE))
     part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
     eased = {
-        (part.shapes[i].name, part.labels[j]): [*part.eased[k]]
+        (part.shapes[i].name, part.labels[j]): [*part.reduced_margins[k]]
         for k, (i, j) in enumerate(part.pairs.tolist())
-        if k in part.eased
+        if k in part.reduced_margins
     }
     assert set(eased) >= {
         ("stick.stick_1", "table"),
@@ -122,7 +122,9 @@ def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> 
     ):
         p = program_of(room(table(gap=GAP)), steps, options=options)
         first = int(p.contacts.first_waypoint[1])
-        moments = [moment for eased in p.contacts.phases[1].eased.values() for moment in eased]
+        moments = [
+            moment for eased in p.contacts.phases[1].reduced_margins.values() for moment in eased
+        ]
         spans.append(
             {
                 ((begin - first) * options.dt, (end - first) * options.dt)

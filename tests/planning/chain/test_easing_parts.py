@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.planning.chain import easing as module
-from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO, _moments
+from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO, _find_lift_and_place_moments
 from vkc_pin.world.scene.hold import Hold
 
 STICK, TRAY, PLATE = Hold("stick", "grip"), Hold("tray", "rim"), Hold("plate", "knob")
@@ -52,14 +52,16 @@ def moments(
         on: Placed = dataclasses.replace(objects[ride.object], placement=f"on {carrier.placement}")
         return on
 
-    monkeypatch.setattr(module, "_ridden", ridden)
+    monkeypatch.setattr(module, "_place_supported_object", ridden)
     monkeypatch.setattr(
-        module, "_with", lambda placed, state: dataclasses.replace(placed, placement=str(state))
+        module,
+        "_with_joint_positions",
+        lambda placed, state: dataclasses.replace(placed, placement=str(state)),
     )
     task: Any = SimpleNamespace(phases=phases)
     return [
         (shapes, placed.placement, begins)
-        for shapes, placed, begins in _moments(scene, chain, task, number)
+        for shapes, placed, begins in _find_lift_and_place_moments(scene, chain, task, number)
     ]
 
 
@@ -120,7 +122,7 @@ def test_what_rides_on_what_stands_fixed_begins_and_ends_with_the_phase(monkeypa
 def test_only_an_objects_own_coordinates_are_its_state() -> None:
     given: list[Any] = []
     placed: Any = SimpleNamespace(name="plate", with_state=given.append)
-    module._with(
+    module._with_joint_positions(
         placed,
         {
             "plate.slide": 0.5,

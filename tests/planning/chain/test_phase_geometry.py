@@ -114,7 +114,7 @@ def test_what_is_placed_elsewhere(seed: int) -> None:
     part, joints = random_geometry(rng), random_joints(rng, 4)
     part.boxes.near(0.1, *joints)  # what is kept must not be taken over
     where = {geometry: random_placement(rng, 1.5) for geometry in (8, 11)}
-    moved = part.placed(where)
+    moved = part.with_placements(where)
     at, pairs, _ = moved.boxes.near(0.1, *joints)
     for geometry, placement in where.items():
         assert moved.shapes[geometry].placement.isApprox(placement)
@@ -133,7 +133,7 @@ def test_what_stands_around_a_box(seed: int) -> None:
     lower = rng.uniform(-1.5, 1.0, 3)
     size = rng.uniform(0.05, 0.6, 3)
     box, here = coal.Box(*size), pin.SE3(np.eye(3), lower + size / 2)
-    near = part.within(0.1, lower, lower + size).tolist()
+    near = part.find_static_near(0.1, lower, lower + size).tolist()
     for k in range(7, 16):
         shape = part.shapes[k]
         if compute_shape_distance(box, here, shape.geometry, shape.placement) < 0.1 - COAL:
@@ -141,7 +141,7 @@ def test_what_stands_around_a_box(seed: int) -> None:
     assert min(near, default=7) >= 7, "what moves does not stand"
     listed = part.pairs.tolist()
     for first in range(7):
-        numbers = part.pairs_of(first, np.arange(7, 16)).tolist()
+        numbers = part.find_pairs(first, np.arange(7, 16)).tolist()
         assert [listed[k] for k in numbers] == [
             [first, b] for b in range(7, 16) if [first, b] in listed
         ]
@@ -149,7 +149,9 @@ def test_what_stands_around_a_box(seed: int) -> None:
 
 def test_margins_are_eased_between_waypoints() -> None:
     part = random_geometry(np.random.default_rng(2))
-    object.__setattr__(part, "eased", {3: [(2, 4, 0.001), (4, 6, 0.004)], 5: [(0, 1, 1.0)]})
+    object.__setattr__(
+        part, "reduced_margins", {3: [(2, 4, 0.001), (4, 6, 0.004)], 5: [(0, 1, 1.0)]}
+    )
     pairs, waypoints = (grid.ravel() for grid in np.meshgrid([2, 3, 5], np.arange(8)))
     expected = part.margins[pairs].copy()
     expected[(pairs == 3) & (waypoints >= 2) & (waypoints <= 4)] = 0.001

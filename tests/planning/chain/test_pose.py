@@ -12,16 +12,18 @@ from vkc_pin.planning.chain.pose import (
     POSE_OFFSET_SIZE,
     ROW_BOUNDS,
     PoseRow,
+    build_pose_residual,
+    build_pose_rows,
     compute_pose_offsets,
-    pose_residual,
-    pose_rows,
+    flatten_target,
     relax_target,
-    target_vector,
 )
 
 _R, _p, _target = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("W", 12)
-RESIDUAL = ca.Function("residual", [_R, _p, _target], [pose_residual("pose", _R, _p, _target)])
-ROWS = ca.Function("rows", [_R, _p, _target], [pose_rows("pose", _R, _p, _target)])
+RESIDUAL = ca.Function(
+    "residual", [_R, _p, _target], [build_pose_residual("pose", _R, _p, _target)]
+)
+ROWS = ca.Function("rows", [_R, _p, _target], [build_pose_rows("pose", _R, _p, _target)])
 POSE_LOWER, POSE_UPPER = ROW_BOUNDS["pose"]
 _turn = ca.SX.sym("w", 3)
 _cross = ca.skew(_turn)
@@ -30,13 +32,13 @@ _turned = _R @ (ca.SX.eye(3) + _cross + _cross @ _cross / 2)
 SLOPE = ca.Function(
     "slope",
     [_R, _p, _target, _turn],
-    [ca.jacobian(pose_residual("pose", _turned, _p, _target), _turn)],
+    [ca.jacobian(build_pose_residual("pose", _turned, _p, _target), _turn)],
 )
 
 
 def residual(placement: pin.SE3, target: pin.SE3) -> np.ndarray:
     return np.asarray(
-        RESIDUAL(placement.rotation, placement.translation, target_vector(target))
+        RESIDUAL(placement.rotation, placement.translation, flatten_target(target))
     ).ravel()
 
 
@@ -51,7 +53,7 @@ def turned(target: pin.SE3, angle: float, axis: np.ndarray) -> pin.SE3:
 
 def test_target_vector_is_the_rotation_by_columns_then_the_translation() -> None:
     target = pin.SE3.Random()
-    vector = target_vector(target)
+    vector = flatten_target(target)
     assert vector.shape == (12,)
     for k in range(3):
         np.testing.assert_array_equal(vector[3 * k : 3 * k + 3], target.rotation[:, k])
@@ -131,7 +133,7 @@ def test_newton_steps_lead_away_from_half_a_turn(axis: np.ndarray) -> None:
     target = pin.SE3.Random()
     placement = turned(target, np.pi, axis)
     for _ in range(12):
-        at = (placement.rotation, placement.translation, target_vector(target))
+        at = (placement.rotation, placement.translation, flatten_target(target))
         slope = np.asarray(SLOPE(*at, np.zeros(3)))[3:]
         step = -np.linalg.lstsq(slope, residual(placement, target)[3:], rcond=1e-6)[0]
         step *= min(1.0, 0.5 / max(np.linalg.norm(step), 1e-12))
@@ -144,7 +146,7 @@ def test_its_slope_is_that_of_finite_differences(angle: float) -> None:
     rng, target = np.random.default_rng(3), pin.SE3.Random()
     placement = turned(target, angle, random_axis(rng))
     slope = np.asarray(
-        SLOPE(placement.rotation, placement.translation, target_vector(target), np.zeros(3))
+        SLOPE(placement.rotation, placement.translation, flatten_target(target), np.zeros(3))
     )
     for k in range(3):
         change = 1e-5 * np.eye(3)[k]
@@ -162,7 +164,7 @@ def test_its_slope_is_that_of_finite_differences(angle: float) -> None:
 def missing(placement: pin.SE3, target: pin.SE3) -> float:
     """Return by how much the worst row is outside its bounds."""
     value = np.asarray(
-        ROWS(placement.rotation, placement.translation, target_vector(target))
+        ROWS(placement.rotation, placement.translation, flatten_target(target))
     ).ravel()
     assert value.shape == POSE_LOWER.shape == POSE_UPPER.shape
     return float(np.maximum(POSE_LOWER - value, value - POSE_UPPER).max())
@@ -177,7 +179,7 @@ def test_rows_hold_at_the_target_and_nowhere_else(angle: float) -> None:
             assert missing(placement, target) < 1e-12
         elif angle < np.pi / 2:  # every row of the vector is bound from both sides
             vector = np.asarray(
-                ROWS(placement.rotation, placement.translation, target_vector(target))
+                ROWS(placement.rotation, placement.translation, flatten_target(target))
             ).ravel()[3:6]
             assert np.abs(vector).max() >= np.sin(angle) / np.sqrt(3) - 1e-9
         else:
@@ -194,7 +196,7 @@ def test_rows_are_position_half_vee_and_trace() -> None:
         placement.translation = target.translation + shift
         expected = np.r_[shift, np.sin(angle) * axis, 1.0 + 2.0 * np.cos(angle)]
         found = np.asarray(
-            ROWS(placement.rotation, placement.translation, target_vector(target))
+            ROWS(placement.rotation, placement.translation, flatten_target(target))
         ).ravel()
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
 
@@ -203,7 +205,9 @@ def test_rows_are_linear_in_the_placement() -> None:
     """So that they cost the program nothing in second derivatives."""
     everything = ca.vertcat(ca.vec(_R), _p)
     assert (
-        ca.jacobian(ca.jacobian(pose_rows("pose", _R, _p, _target), everything), everything).nnz()
+        ca.jacobian(
+            ca.jacobian(build_pose_rows("pose", _R, _p, _target), everything), everything
+        ).nnz()
         == 0
     )
 
@@ -213,18 +217,18 @@ def test_rows_are_linear_in_the_placement() -> None:
 
 KINDS = ("pose", "point", "upright", "level")
 RESIDUALS = {
-    kind: ca.Function("residual", [_R, _p, _target], [pose_residual(kind, _R, _p, _target)])
+    kind: ca.Function("residual", [_R, _p, _target], [build_pose_residual(kind, _R, _p, _target)])
     for kind in KINDS
 }
 ALL_ROWS = {
-    kind: ca.Function("rows", [_R, _p, _target], [pose_rows(kind, _R, _p, _target)])
+    kind: ca.Function("rows", [_R, _p, _target], [build_pose_rows(kind, _R, _p, _target)])
     for kind in KINDS
 }
 SLOPES = {
     kind: ca.Function(
         "slope",
         [_R, _p, _target, _turn],
-        [ca.jacobian(pose_residual(kind, _turned, _p, _target), ca.vertcat(_p, _turn))],
+        [ca.jacobian(build_pose_residual(kind, _turned, _p, _target), ca.vertcat(_p, _turn))],
     )
     for kind in KINDS
 }
@@ -232,7 +236,7 @@ SLOPES = {
 
 def value(function: ca.Function, placement: pin.SE3, target: pin.SE3) -> np.ndarray:
     return np.asarray(
-        function(placement.rotation, placement.translation, target_vector(target))
+        function(placement.rotation, placement.translation, flatten_target(target))
     ).ravel()
 
 
@@ -342,7 +346,7 @@ def test_newton_steps_set_upright_what_stands_on_its_head(about: float) -> None:
     target = pin.SE3.Random()
     placement = tilted(target, 0.4, np.pi, about)
     for _ in range(15):
-        at = (placement.rotation, placement.translation, target_vector(target))
+        at = (placement.rotation, placement.translation, flatten_target(target))
         slope = np.asarray(SLOPES["upright"](*at, np.zeros(3)))[3:, 3:]
         step = -np.linalg.lstsq(
             slope, value(RESIDUALS["upright"], placement, target)[3:], rcond=1e-6
@@ -360,7 +364,7 @@ def test_slopes_of_every_kind_are_those_of_finite_differences(kind: str, tilt: f
     placement = tilted(target, 0.6, tilt, 0.9)
     placement.translation = target.translation + rng.normal(size=3)
     slope = np.asarray(
-        SLOPES[kind](placement.rotation, placement.translation, target_vector(target), np.zeros(3))
+        SLOPES[kind](placement.rotation, placement.translation, flatten_target(target), np.zeros(3))
     )
     for k in range(6):
         change = 1e-5 * np.eye(6)[k]
@@ -381,7 +385,9 @@ def test_slopes_of_every_kind_are_those_of_finite_differences(kind: str, tilt: f
 def test_rows_of_every_kind_are_linear_in_the_placement(kind: str) -> None:
     everything = ca.vertcat(ca.vec(_R), _p)
     assert (
-        ca.jacobian(ca.jacobian(pose_rows(kind, _R, _p, _target), everything), everything).nnz()
+        ca.jacobian(
+            ca.jacobian(build_pose_rows(kind, _R, _p, _target), everything), everything
+        ).nnz()
         == 0
     )
 
@@ -422,7 +428,7 @@ SHARES = [0.0, 1e-3, 0.25, 0.5, 0.9, 1.0]
 
 
 def moved_back(target: pin.SE3, away: np.ndarray, share: float) -> pin.SE3:
-    vector = np.asarray(RECEDED(target_vector(target), away, share)).ravel()
+    vector = np.asarray(RECEDED(flatten_target(target), away, share)).ravel()
     assert np.isfinite(vector).all()
     return pin.SE3(vector[:9].reshape(3, 3).T, vector[9:])
 
@@ -615,14 +621,14 @@ def test_on_the_way_a_target_goes_straight_and_turns_evenly(kind: str, angle: fl
 def test_slopes_of_rows_with_a_target_that_recedes(kind: str, angle: float) -> None:
     """By finite differences of the share; a half turn is no worse than any other."""
     rng, target = np.random.default_rng(16), pin.SE3.Random()
-    rows = pose_rows(kind, _R, _p, relax_target(_target, _away, _share))
+    rows = build_pose_rows(kind, _R, _p, relax_target(_target, _away, _share))
     function = ca.Function(
         "rows", [_R, _p, _target, _away, _share], [rows, ca.jacobian(rows, _share)]
     )
     placement = some_placement(kind, target, angle, rng)
     (away,) = away_of(kind, target, placement)
     for share in SHARES:
-        given = (placement.rotation, placement.translation, target_vector(target), away)
+        given = (placement.rotation, placement.translation, flatten_target(target), away)
         slope = np.asarray(function(*given, share)[1]).ravel()
         ahead, behind = (
             np.asarray(function(*given, share + sign * 1e-5)[0]).ravel() for sign in (1.0, -1.0)
@@ -636,14 +642,14 @@ def test_frames_are_placed_in_numbers_as_in_symbols(
 ) -> None:
     row = PoseRow(3, pin.SE3.Random(), (1,), "pose", shift)
     joints = [[pin.SE3.Identity(), *(pin.SE3.Random() for _ in range(4))] for _ in range(6)]
-    found = row.placed(
+    found = row.compute_placements(
         np.array([[joint.rotation for joint in each] for each in joints]),
         np.array([[joint.translation for joint in each] for each in joints]),
     )
     assert [part.shape for part in found] == [(6, 3, 3), (6, 3)]
     for k, each in enumerate(joints):
-        rotation, translation = row.placement(
-            ca.DM(np.column_stack([target_vector(joint) for joint in each[1:]]))
+        rotation, translation = row.build_placement(
+            ca.DM(np.column_stack([flatten_target(joint) for joint in each[1:]]))
         )
         expected = each[3] * row.local
         offset = np.zeros(3) if shift is None else each[shift[0]].rotation @ np.array(shift[1])

@@ -47,7 +47,7 @@ def test_the_seed_drives_the_way_and_the_heading_follows_it() -> None:
     heading = path[:-1, 2] + np.diff(path[:, 2]) / 2
     along = np.abs(steps[:, 0] * np.cos(heading) + steps[:, 1] * np.sin(heading))
     assert np.sum(along) > 0.8 * np.sum(length)  # forwards or backwards, not sideways
-    assert problem.evaluate_contacts(seed.z, reach=0.02).violation() < 0.02
+    assert problem.evaluate_contacts(seed.z, reach=0.02).compute_violation() < 0.02
 
 
 # --- narrow places
@@ -74,7 +74,7 @@ def test_with_the_arm_folded_there_is_a_way_through_a_narrow_gate(width: float) 
     # Nothing but the arm is in the way: with it folded the base hits nothing all along.
     z = np.tile(problem.start, (len(guide), 1))
     z[:, :3], z[:, 3:] = guide, routes.folded_arm(0)
-    assert problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).clearance() > 0.0
+    assert problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).compute_clearance() > 0.0
 
 
 def test_a_gate_too_narrow_for_the_base_has_no_way() -> None:

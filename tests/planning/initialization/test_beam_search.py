@@ -88,7 +88,7 @@ def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool) -> 
         short = (
             problem(around=around)
             .contacts.evaluate(found.paths[:, k], at, reach=0.1)
-            .shortfall(len(trouble))
+            .compute_shortfall(len(trouble))
         )
         trouble += np.where(short > 0.0, 10.0 + 300.0 * short, 0.0)
     reached = found.trouble < 1e3
@@ -347,7 +347,9 @@ def test_before_a_careful_grasp_nothing_is_hit() -> None:
         )
         assert len(held), "every path is blocked"
         near, reached = search.knots.knot(held, before, "track")
-        hit = p.contacts.evaluate(near, np.full(len(near), before), reach=0.1).shortfall(len(near))
+        hit = p.contacts.evaluate(near, np.full(len(near), before), reach=0.1).compute_shortfall(
+            len(near)
+        )
         shares.append(float(np.mean((hit <= 1e-9) & reached)))
     assert shares[0] < shares[1] == 1.0
 

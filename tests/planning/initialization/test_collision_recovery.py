@@ -12,7 +12,7 @@ from helpers.small_problems import door_scene, program_of
 from helpers.telescopes import coupled_scene
 
 import vkc_pin as vkc
-from vkc_pin.planning.chain.inverse_kinematics import LONGEST_STEP
+from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP
 from vkc_pin.planning.initialization import collision_recovery as clearing
 from vkc_pin.planning.initialization.collision_recovery import clear_out
 from vkc_pin.planning.initialization.keyframes import Knots, Known
@@ -164,8 +164,8 @@ def test_a_round_goes_no_further_than_the_linearisation_is_worth(
 ) -> None:
     monkeypatch.setattr(clearing, "_CLEARING_ROUNDS", 1)
     far, near = (np.abs(some.cleared() - some.z).max(axis=1) for some in (scattered, cleared))
-    assert far.max() == pytest.approx(LONGEST_STEP)
-    assert np.any((near > 0.0) & (near < 0.5 * LONGEST_STEP))  # short steps stay as they are
+    assert far.max() == pytest.approx(MAX_STEP)
+    assert np.any((near > 0.0) & (near < 0.5 * MAX_STEP))  # short steps stay as they are
 
 
 def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,7 +67,9 @@ def search(seed: int, *, tries: int = TRIES) -> np.ndarray | None:
 
 
 def overlap(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
-    return float((depth(p, rows, p.contacts.inside(MOVE), reach=0.0) - p.options.dist_safe).max())
+    return float(
+        (depth(p, rows, p.contacts.find_waypoint(MOVE), reach=0.0) - p.options.dist_safe).max()
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -92,7 +92,7 @@ def test_they_keep_within_limits_and_away_from_themselves(load: str, number: int
     # nothing stands.
     z[:2] = 50.0
     last = np.array([p.segments])
-    assert p.contacts.evaluate(z[None], last, reach=p.options.dist_safe).violation() == 0.0
+    assert p.contacts.evaluate(z[None], last, reach=p.options.dist_safe).compute_violation() == 0.0
 
 
 def test_what_stands_does_not_count() -> None:

@@ -325,7 +325,9 @@ def test_trees_lead_base_and_arm_through_a_narrow_gate() -> None:
     z = joiner(p, trees(p)).join(ends, [0, p.segments])
     assert straight is not None
     assert z is not None
-    hit, grazed = (p.evaluate_contacts(each, reach=0.1).violation() for each in (straight, z))
+    hit, grazed = (
+        p.evaluate_contacts(each, reach=0.1).compute_violation() for each in (straight, z)
+    )
     assert hit > 0.2
     assert grazed < p.options.dist_safe + 0.02
     np.testing.assert_allclose(z[-1, :3], GOAL, atol=1e-9)
@@ -362,7 +364,7 @@ def test_trees_turn_as_far_as_the_goal_says_where_there_is_room(wound: int, seed
     np.testing.assert_allclose(way[-1], end, atol=1e-9)
     z = np.tile(p.start, (60, 1))
     z[:, :ROBOT] = way
-    assert p.evaluate_contacts(z, reach=0.1).violation() < p.options.dist_safe + 0.02
+    assert p.evaluate_contacts(z, reach=0.1).compute_violation() < p.options.dist_safe + 0.02
     inside = np.abs(way[:, 0] - 2.0) < 0.1
     assert np.abs(np.sin(way[inside, 2])).max(initial=0.0) < 0.2
 
@@ -479,7 +481,9 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
     there = Approach(own).after(other, p.task.phases[3], p.task.phases[2])
     np.testing.assert_allclose(
         firsts[-1],
-        there[0] if len(there) and own.depth(there, p.contacts.inside(3))[0] < 0.01 else other,
+        there[0]
+        if len(there) and own.depth(there, p.contacts.find_waypoint(3))[0] < 0.01
+        else other,
     )
 
 
@@ -506,7 +510,8 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_allclose(way[-1], last, atol=1e-12)
     straight = first + np.outer(smooth(60), last - first)
     hit, grazed = (
-        p.contacts.evaluate(z, np.ones(60, int), reach=0.1).violation() for z in (straight, way)
+        p.contacts.evaluate(z, np.ones(60, int), reach=0.1).compute_violation()
+        for z in (straight, way)
     )
     assert hit > 0.05
     assert grazed < p.options.dist_safe + 0.02
@@ -518,4 +523,4 @@ def test_a_way_of_trees_stays_free_where_the_goal_says_how_far_to_turn() -> None
     z = joiner(p, trees(p)).join(np.array([p.start, at(p, (*GOAL[:2], -3.1))]), [0, p.segments])
     assert z is not None
     np.testing.assert_allclose(z[-1, 2], -3.1, atol=1e-9)
-    assert p.evaluate_contacts(z, reach=0.1).violation() < p.options.dist_safe + 0.02
+    assert p.evaluate_contacts(z, reach=0.1).compute_violation() < p.options.dist_safe + 0.02

@@ -346,7 +346,7 @@ def test_trees_make_a_seed_through_a_narrow_gate(width: float) -> None:
     (seed,) = initialize(gate, "rrt", 0, notes=notes)
     assert notes == []
     assert seed.name == "rrt"
-    short = gate.evaluate_contacts(seed.z, reach=0.1).shortfall(gate.segments)
+    short = gate.evaluate_contacts(seed.z, reach=0.1).compute_shortfall(gate.segments)
     assert seed.overlap == pytest.approx(max(short.max() - gate.options.dist_safe, 0.0), abs=1e-9)
     assert seed.overlap < _POOR
     assert short.max() < gate.options.dist_safe + 0.01
@@ -533,7 +533,7 @@ def test_where_the_arm_goes_far_round_trees_grow_from_other_grasps_too_and_the_l
         contacts = problem().evaluate_contacts(z, reach=problem().options.largest_margin, nearest=1)
         return (
             problem().objective(z, problem().timing_for(z).dt)
-            + problem().options.penalty * contacts.shortfall(len(z)).sum()
+            + problem().options.penalty * contacts.compute_shortfall(len(z)).sum()
         )
 
     assert merit(best.z) == min(map(merit, joined))

@@ -74,7 +74,7 @@ def missing(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> np.ndarray:
     """Return by how much the robot falls short of its margins [m], every pair looked at, shape (B,)."""
     z = np.tile(problem.start, (len(rows), 1))
     z[:, : rows.shape[1]] = rows
-    return problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).shortfall(len(z))
+    return problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).compute_shortfall(len(z))
 
 
 def test_what_a_coarse_search_overlooks_a_finer_one_does_not(
@@ -534,11 +534,11 @@ def test_lines_refuse_what_does_not_fit() -> None:
     one, contacts = search(), gate()[0].contacts
     how = {"weights": one.weights, "step": 0.1, "reach": 0.0, "allowed": 0.0}
     with pytest.raises(ValueError, match="more coordinates move"):
-        contacts.lines(one.first, one.waypoint, **how | {"weights": np.ones(40)})
+        contacts.make_line_checker(one.first, one.waypoint, **how | {"weights": np.ones(40)})
     with pytest.raises(ValueError, match="no step"):
-        contacts.lines(one.first, one.waypoint, **how | {"step": 0.0})
+        contacts.make_line_checker(one.first, one.waypoint, **how | {"step": 0.0})
     with pytest.raises(IndexError, match="no such coordinate"):
-        contacts.lines(one.first[:-1], one.waypoint, **how)
+        contacts.make_line_checker(one.first[:-1], one.waypoint, **how)
 
 
 # --- spread

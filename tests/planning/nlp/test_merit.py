@@ -123,7 +123,9 @@ def test_its_directional_derivative_is_that_of_finite_differences(kind: str, see
     )
     contacts = p.evaluate_contacts(z, reach=p.options.contact_reach, nearest=t.slots)
     short = contacts.margin > contacts.distance
-    falls = np.einsum("cj,cj->c", p.contacts.gradients(z, contacts), along[contacts.waypoint])
+    falls = np.einsum(
+        "cj,cj->c", p.contacts.compute_gradients(z, contacts), along[contacts.waypoint]
+    )
     slope -= weights["clearance"] * falls[short].sum()
     for goal, solver in zip(p.pose_goals, t.pose_solvers, strict=True):
         at = np.array(goal.row.waypoints, int) - 1

@@ -657,7 +657,7 @@ def test_rate_violation_is_the_worst_excess(two_grasps: TrajectoryProblem, scale
     velocity = np.abs(trajectory.velocities()) / two_grasps.chain.velocity
     acceleration = np.abs(trajectory.accelerations()) / two_grasps.chain.acceleration
     expected = max(velocity.max(), acceleration.max()) - 1.0
-    assert timing.violation(*two_grasps.rates(z)) == pytest.approx(expected, rel=1e-9)
+    assert timing.compute_violation(*two_grasps.rates(z)) == pytest.approx(expected, rel=1e-9)
 
 
 def runs(problem: TrajectoryProblem) -> list[slice]:
@@ -678,12 +678,12 @@ def test_a_way_that_is_too_long_gets_more_time() -> None:
     z[first.stop :, 0] += 30.0
     still, timing = problem.timing_for(problem.still), problem.timing_for(z)
     np.testing.assert_array_equal(still.dt, np.full(problem.segments, SHORT.dt))
-    assert still.violation(*problem.rates(z)) > 1.0
+    assert still.compute_violation(*problem.rates(z)) > 1.0
     assert np.ptp(timing.dt[first]) == 0.0
     assert timing.dt[0] * first.stop > 1.5 * 30.0 / problem.chain.velocity[0]
     for run in others:
         np.testing.assert_array_equal(timing.dt[run], np.full(run.stop - run.start, SHORT.dt))
-    assert timing.violation(*problem.rates(z)) <= 0.0
+    assert timing.compute_violation(*problem.rates(z)) <= 0.0
     # The bounds are the limits over the new times, row by row, and the trajectory is played at
     # them.
     np.testing.assert_allclose(timing.velocity, problem.chain.velocity * timing.dt[:, None])
@@ -710,13 +710,13 @@ def test_a_step_that_is_too_fast_gets_more_time_within_reason() -> None:
         z = problem.still
         z[second.start + 2 :, 3] += jump
         rates, before = problem.rates(z), problem.timing_for(problem.still)
-        assert before.violation(*rates) > 0.0
+        assert before.compute_violation(*rates) > 0.0
         longer = before.stretch(*rates)
         np.testing.assert_array_equal(before.dt, np.full(problem.segments, SHORT.dt))
         np.testing.assert_array_equal(longer.dt[first], before.dt[first])
         assert np.all(longer.dt[second] > before.dt[second])
         assert np.ptp(longer.dt[second]) == 0.0
-        assert (longer.violation(*rates) <= 1e-9) == enough
+        assert (longer.compute_violation(*rates) <= 1e-9) == enough
         assert longer.dt[second.start] <= 2.0 * SHORT.dt  # the rest is left to the solver
         again = longer.stretch(*rates)
         assert np.all(again.dt <= 1.5 * before.dt)  # however often that is asked for
@@ -724,7 +724,7 @@ def test_a_step_that_is_too_fast_gets_more_time_within_reason() -> None:
 
 def test_standing_still_violates_nothing(opened: TrajectoryProblem) -> None:
     timing = opened.timing_for(opened.still)
-    assert timing.violation(*opened.rates(opened.still)) <= 0.0
+    assert timing.compute_violation(*opened.rates(opened.still)) <= 0.0
     assert opened.objective(opened.still, timing.dt) == 0.0
 
 

@@ -15,7 +15,7 @@ from helpers.telescopes import coupled_scene
 
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
-from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, target_vector
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, flatten_target
 from vkc_pin.planning.nlp.waypoint import Structure, WaypointFunctions, get_waypoint_functions
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
@@ -65,7 +65,7 @@ class Numbers:
         return np.concatenate([self.z, self.s, [self.share]])
 
     def inputs(self, own: np.ndarray) -> list[np.ndarray]:
-        targets = np.column_stack([target_vector(target) for target in self.targets])
+        targets = np.column_stack([flatten_target(target) for target in self.targets])
         return [
             own,
             self.planes.ravel(order="F"),
@@ -79,7 +79,7 @@ class Numbers:
         z, s, share = np.split(own, [self.chain.size, self.chain.size + SLOTS])
         model, data = self.chain.model, self.chain.model.createData()
         pin.forwardKinematics(model, data, self.chain.coordinates.q(z))
-        stacked = np.concatenate([target_vector(placement) for placement in list(data.oMi)[1:]])
+        stacked = np.concatenate([flatten_target(placement) for placement in list(data.oMi)[1:]])
         rows = [self.planes @ stacked - self.offsets + s]
         for pose, there, pose_offsets in zip(
             self.poses, self.targets, self.pose_offsets, strict=True

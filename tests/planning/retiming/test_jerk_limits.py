@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from vkc_pin.planning.retiming.jerk_limits import eased
+from vkc_pin.planning.retiming.jerk_limits import limit_jerk
 from vkc_pin.planning.retiming.limits import Limits
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.planning.retiming.topp_ra import compute_speeds
@@ -32,7 +32,7 @@ def made(points: np.ndarray, jerk: float) -> tuple[CubicHermiteSpline, Curve, Li
 def test_limits_are_kept_exactly_and_nothing_jumps(seed: int, count: int, jerk: float) -> None:
     points = np.random.default_rng(seed).uniform(-1.0, 1.0, (count, 3))
     path, pace, limits = made(points, jerk)
-    curve = eased(path, pace, count - 1, limits)
+    curve = limit_jerk(path, pace, count - 1, limits)
     fastest, strongest = curve.compute_max_rates()
     jerks, jumps = curve.compute_jerks()
     assert max(fastest.max() / 1.0, strongest.max() / 2.0, jerks.max() / jerk) <= 1.0 + 1e-6
@@ -47,7 +47,7 @@ def test_it_takes_hardly_longer_where_jerks_may_be_large() -> None:
     points = np.cumsum(np.random.default_rng(4).uniform(0.1, 0.4, (12, 3)), axis=0)
     path, pace, limits = made(points, 2000.0)
     longest = [
-        eased(path, pace, 11, limits._replace(jerk=np.full(3, jerk))).times[-1]
+        limit_jerk(path, pace, 11, limits._replace(jerk=np.full(3, jerk))).times[-1]
         for jerk in (2000.0, 40.0, 10.0)
     ]
     assert longest == sorted(longest)
@@ -57,7 +57,7 @@ def test_it_takes_hardly_longer_where_jerks_may_be_large() -> None:
 def test_it_stays_on_the_path() -> None:
     points = np.cumsum(np.random.default_rng(5).uniform(-0.3, 0.5, (10, 2)), axis=0)
     path, pace, limits = made(points, 20.0)
-    curve = eased(path, pace, 9, limits)
+    curve = limit_jerk(path, pace, 9, limits)
     along = path(np.linspace(0.0, path.x[-1], 20_000))
     for point in curve.at(np.linspace(0.0, curve.times[-1], 300)):
         assert np.linalg.norm(along - point, axis=1).min() < 2e-3

@@ -15,19 +15,21 @@ NAMES = (*SCENE.robot.coordinates.names, "drawer.slide", "drawer.handle")
 
 
 def test_limits_are_those_of_robot_and_objects() -> None:
-    limits = Limits.of(SCENE, NAMES, 0.2)
+    limits = Limits.from_scene(SCENE, NAMES, 0.2)
     size = len(SCENE.robot.coordinates.names)
     np.testing.assert_array_equal(limits.velocity[:size], SCENE.robot.velocity)
     drawer = SCENE.objects["drawer"].object
     assert limits.acceleration[size] == drawer.acceleration[0]
     assert np.isinf(limits.velocity[-1])
     np.testing.assert_allclose(limits.jerk, limits.acceleration / 0.2)
-    assert Limits.of(SCENE, NAMES, 0.0).jerky
-    assert not limits.jerky
+    assert Limits.from_scene(SCENE, NAMES, 0.0).has_unlimited_jerk
+    assert not limits.has_unlimited_jerk
 
 
 def test_wheels_have_a_velocity_of_their_own() -> None:
-    limits = Limits.of(SCENE, NAMES, 0.2).with_wheels(RollingLimits(track=0.8, wheel_speed=0.9))
+    limits = Limits.from_scene(SCENE, NAMES, 0.2).with_wheels(
+        RollingLimits(track=0.8, wheel_speed=0.9)
+    )
     assert limits.velocity[-2:].tolist() == [0.9, 0.9]
     assert np.isinf(limits.jerk[-2:]).all()
 
@@ -48,4 +50,4 @@ def test_a_curve_is_slowed_until_all_limits_are_kept(
     curve = Curve(np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), np.zeros((2, 1)))
     wide = np.array([np.inf])
     limits = Limits(-wide, wide, *(np.array([value]) for value in (velocity, acceleration, jerk)))
-    assert limits.slowed(curve).times[-1] == pytest.approx(factor, rel=1e-8)
+    assert limits.slow_down(curve).times[-1] == pytest.approx(factor, rel=1e-8)

@@ -87,7 +87,7 @@ def test_it_is_nearly_as_fast_as_any_motion_along_its_path() -> None:
     slow = dataclasses.replace(slow, positions=slow.positions[:1] + bends @ ways)
     usual = retime_trajectory(scene, slow).times[-1]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(retime, "_PARTS", 4 * retime._PARTS)
+        patch.setattr(retime, "_MIN_PIECES", 4 * retime._MIN_PIECES)
         best = retime_trajectory(scene, slow).times[-1]
     assert usual <= 1.1 * best
 

@@ -64,11 +64,11 @@ def feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
     """Everything holds at the waypoints, and nothing collides between them."""
     z = solution.z
     assert np.all((z >= problem.lower - 1e-6) & (z <= problem.upper + 1e-6))
-    assert problem.evaluate_contacts(z, reach=0.1).violation() < 1e-3
+    assert problem.evaluate_contacts(z, reach=0.1).compute_violation() < 1e-3
     assert problem.pose_error(z) < 1e-3
     first, second = problem.rates(z)
     still = problem.timing_for(problem.still)
-    assert dataclasses.replace(still, dt=solution.dt).violation(first, second) < 1e-3
+    assert dataclasses.replace(still, dt=solution.dt).compute_violation(first, second) < 1e-3
     assert problem.drift(z) < 1.0
     path = problem.waypoints(z)
     states = np.concatenate(
@@ -80,7 +80,7 @@ def feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
 
 def test_it_goes_round_what_stands_in_the_way() -> None:
     problem = round_a_pillar()
-    assert problem.evaluate_contacts(straight(problem, 3.2), reach=0.0).clearance() < -0.1
+    assert problem.evaluate_contacts(straight(problem, 3.2), reach=0.0).compute_clearance() < -0.1
     assert solved().converged
     assert solved().status == "converged"
     feasible(problem, solved())
@@ -198,7 +198,9 @@ class Scripted:
         self.radii.append(radius.copy())
         objective, shortfall, self.taken = next(self.rounds)
         found = missing(shortfall, self.other)
-        contacts = SimpleNamespace(clearance=lambda: -shortfall, violation=lambda: shortfall)
+        contacts = SimpleNamespace(
+            compute_clearance=lambda: -shortfall, compute_violation=lambda: shortfall
+        )
         return dataclasses.replace(
             blank_trial(40),
             z=np.zeros((40, 1)),
@@ -331,7 +333,9 @@ def test_a_motion_that_nearly_held_is_one_to_compare_with(
     shortfall: float, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first motion at which everything holds is hardly better than it; one that was far from free says nothing."""
-    monkeypatch.setattr(Scripted, "done", lambda _, trial: trial.contacts.violation() == 0.0)
+    monkeypatch.setattr(
+        Scripted, "done", lambda _, trial: trial.contacts.compute_violation() == 0.0
+    )
     solution = scripted(
         (8.0, shortfall, True), (7.9, 0.0, True), (7.8, 0.0, True), (5.0, 0.0, True), step=1.0
     ).solution
@@ -364,7 +368,7 @@ def test_motions_that_stay_far_from_free_are_given_up_soon(monkeypatch: pytest.M
     solution = solve(problem, seed)
     assert (solution.status, solution.converged) == ("not converged", False)
     assert solution.rounds < FEW.max_outer
-    assert problem.evaluate_contacts(solution.z, reach=0.1).violation() > solver.NEARLY
+    assert problem.evaluate_contacts(solution.z, reach=0.1).compute_violation() > solver.NEARLY
     assert solve(problem, seed, rounds=2).rounds == 2
 
 
@@ -393,7 +397,7 @@ def test_nothing_is_carried_through_anything(monkeypatch: pytest.MonkeyPatch) ->
     problem = program_of(hall(obstacles=[post]), [vkc.GoTo(3.2, 0.0, 0.0)], options=cheap)
     bow = straight(problem, 3.2).copy()
     bow[:, 1] -= 1.3 * np.sin(np.linspace(0.0, np.pi, len(bow) + 1)[1:])
-    assert problem.evaluate_contacts(bow, reach=0.02).violation() == 0.0
+    assert problem.evaluate_contacts(bow, reach=0.02).compute_violation() == 0.0
     assert not collisions_between(problem, bow).passages
     seen: list[tuple[bool, bool]] = []
     judge = solver._Loop.judge
@@ -538,7 +542,7 @@ def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(vkc.TrajectoryProblem, "timing_for", lambda self, z: least)
     monkeypatch.setattr(Timing, "stretch", lambda self, *pace: self)
     seed = straight(problem, 2.4)
-    assert least.violation(*problem.rates(seed)) > 0.05
+    assert least.compute_violation(*problem.rates(seed)) > 0.05
     solution = solve(problem, seed)
     assert solution.converged
     first, _ = problem.rates(solution.z)

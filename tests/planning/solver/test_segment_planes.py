@@ -58,7 +58,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     )
     assert free
     assert passed == []
-    assert nothing.violation() == 0.0
+    assert nothing.compute_violation() == 0.0
     nothing = nothing.select(np.zeros(0, int))
     monkeypatch.setattr(
         "vkc_pin.planning.solver.loop.collisions_between",
@@ -79,7 +79,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
     problem, z = straight(past_a_post())
-    assert problem.evaluate_contacts(z, reach=0.02).clearance() == np.inf
+    assert problem.evaluate_contacts(z, reach=0.02).compute_clearance() == np.inf
     found = collisions_between(problem, z).contacts
     labels = problem.contacts.phases[0].labels
     assert {labels[j] for j in found.pair[:, 1]} == {"post"}

@@ -132,7 +132,7 @@ def test_what_is_far_enough_between(gap: float, free: bool) -> None:
     z = np.array([moved(scene.start, x=x, y=y) for x in (0.5, 1.0, 1.5)])
     between = collisions_between(problem, z)
     assert between.free == free
-    assert between.contacts.violation() > 0.0
+    assert between.contacts.compute_violation() > 0.0
 
 
 pairs = st.tuples(st.integers(0, 6), st.integers(0, 6))

@@ -62,7 +62,7 @@ class Made:
             upper=UPPER,
             start="start",
             target_matrix=lambda: "targets",
-            contacts=SimpleNamespace(planes=lambda z, at, slots: ("planes", "offsets")),
+            contacts=SimpleNamespace(compute_planes=lambda z, at, slots: ("planes", "offsets")),
             row_bounds=lambda timing: (
                 f"low {timing and timing.dt}",
                 f"high {timing and timing.dt}",

@@ -54,7 +54,7 @@ def test_what_is_dipped_into_is_none() -> None:
     problem, z = past(1.6, post(2.0))
     there_and_back = np.concatenate([z[1::2], z[1::2][::-1]])
     there_and_back[-1] = problem.start
-    assert collisions_between(problem, there_and_back).contacts.violation() > 0.05
+    assert collisions_between(problem, there_and_back).contacts.compute_violation() > 0.05
     assert ("base_link", "post") not in pairs(problem, there_and_back)
 
 
@@ -62,7 +62,7 @@ def test_what_is_grazed_is_none() -> None:
     """Past the front corner of the base, on the same side before and after."""
     problem, z = past(4.0, post(2.0, 0.37, radius=0.04))
     between = collisions_between(problem, z)
-    assert between.contacts.violation() > 0.0
+    assert between.contacts.compute_violation() > 0.0
     assert not between.free
     assert ("base_link", "post") not in pairs(problem, z)
 

@@ -20,13 +20,15 @@ class Made:
     def __init__(self, back: set[int], *, boundary: int = 99, aside: bool = False) -> None:
         self.back, self.boundary, self.aside = back, boundary, aside
 
-    def phases_of(self, waypoints: np.ndarray) -> np.ndarray:
+    def find_phases(self, waypoints: np.ndarray) -> np.ndarray:
         np.testing.assert_array_equal(
             waypoints, SEGMENTS + 1
         )  # each is at the end of its segment's phase
         return (waypoints > self.boundary).astype(int)
 
-    def normals(self, z: np.ndarray, waypoints: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    def compute_normals(
+        self, z: np.ndarray, waypoints: np.ndarray, pairs: np.ndarray
+    ) -> np.ndarray:
         rows = z[:, 0].astype(int)
         np.testing.assert_array_equal(waypoints, SEGMENTS[rows] + 1)
         assert pairs.shape == (len(rows), 2)

@@ -13,7 +13,7 @@ from vkc_pin.benchmarks.peers.tasks import Given
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.outcome import outcome, spent, still
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.retiming.repair import accepted
+from vkc_pin.planning.retiming.repair import retime_and_repair
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
@@ -111,7 +111,7 @@ def judged(
         waypoints = Trajectory(
             problem.chain.names, times, path, (span,), problem.chain.robot.coordinates.size
         )
-        trajectory, report = accepted(own.scene, waypoints, check)
+        trajectory, report = retime_and_repair(own.scene, waypoints, check)
     said = "success" if report.ok else "rejected" if path is not None else status
     return outcome(
         own.scene,
@@ -137,6 +137,6 @@ def clearances(problem: TrajectoryProblem, trajectory: Trajectory) -> Mapping[st
     for name, times in (("at", trajectory.times), ("between", (begins + share * lasts).ravel())):
         z = trajectory.at(times)
         contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=_NEAR, nearest=1)
-        least = contacts.clearance()
+        least = contacts.compute_clearance()
         found[f"clearance_{name}"] = float(least) if np.isfinite(least) else None
     return found

@@ -1,4 +1,4 @@
-"""The virtual kinematic chain: virtual base, robot, and the objects it handles, inverted, in one Pinocchio model."""
+"""Builds the virtual kinematic chain: virtual base, robot and inverted objects in one model."""
 
 from __future__ import annotations
 
@@ -27,17 +27,19 @@ from vkc_pin.world.scene.support import SupportedObject
 
 __all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
 
-VIRTUAL_VELOCITY = 1.0  # [rad/s] or [m/s], of the hand in a grasp that leaves it a freedom
-VIRTUAL_ACCELERATION = 2.0
+FREEDOM_VELOCITY = 1.0  # [rad/s] or [m/s], limit of a freedom of the grasp
+FREEDOM_ACCELERATION = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """h_chain of eq. 2: where the base link of a held object must stay, or a free one is when it is grasped.
+    """h_chain of eq. 2: target pose of a held object's base link.
+
+    For a fixed object, that is where its base link must stay; for a free one, where it is grasped.
 
     Attributes:
-        joint: The joint of the chain that carries the object's base link.
-        local: Placement of the base link in that joint's frame.
+        joint: Joint of the chain that carries the object's base link.
+        local: Placement of the base link on that joint.
         target: Placement of the base link in the world.
     """
 
@@ -52,25 +54,23 @@ class VirtualKinematicChain:
 
     Attributes:
         robot: The robot at its root.
-        model: `pinocchio.Model`; joint 1 is the planar virtual base, then the arm, then per grasp
-            the virtual joint of the attachment and the object's joints from the attachable link to
-            its base, inverted.
+        model: `pinocchio.Model`; joint 1 is the planar virtual base, followed by the arm and, for
+            each grasp, the virtual joint of the attachment and the object's joints from the
+            attachable link to its base, inverted.
         coordinates: Minimal coordinates z of `model`.
-        names: Their names, shape (n,); objects' as `<object>.<joint>`, virtual joints' as
-            `<object>.<attachment>`.
+        names: Coordinate names, shape (n,); `<object>.<joint>` for objects, `<object>.<attachment>`
+            for virtual joints.
         lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
-        collision: Collision geometry of the robot (first, in the robot's order) and of what moves
-            of the objects.
-        held_geometries: Hold → indices in `collision` of the object's geometry that moves when it
-            is held.
-        ride_geometries: Ride → indices in `collision` of the geometry of what rides.
-        closures: Hold → where the object's base link is on the chain, and where it stands in the
-            world.
+        collision: Collision geometry of the robot (first, in the robot's order) and of the moving
+            parts of objects.
+        held_geometries: Hold → indices in `collision` of the object's geometry that moves when
+            held.
+        ride_geometries: Ride → indices in `collision` of the geometry of the supported object.
+        closures: Hold → closure of the object's base link.
         virtual: Hold → names of the coordinates of its attachment's virtual joint.
-        added: Hold → names of all coordinates that come with it: these, and the joints of the
-            object that it moves.
-        prefixes: Hold → what the object's frames and joints begin with in `model`.
-        cache: What was built for it, and can serve others.
+        added: Hold → names of all coordinates that it adds: virtual joint and object joints.
+        prefixes: Hold → prefix of the object's frames and joints in `model`.
+        cache: Cache of functions built for the chain, shared with others.
     """
 
     robot: Robot
@@ -97,23 +97,27 @@ class VirtualKinematicChain:
 
     @cached_property
     def metric(self) -> Floats:
-        """What a change of each coordinate counts as in searches, shape (n,), [rad/m] and 1: as a turn by so many radians.
+        """Weight of each coordinate in searches, shape (n,), [rad/m] and 1.
 
-        A metre is worth as many as move the hand by a metre, see `Robot.lever`; of joints that move
-        together, all ways count.
+        It converts displacements to equivalent rotations: a metre counts as the rotation that moves
+        the hand by a metre, see `Robot.lever`. The displacements of coupled joints add up.
         """
         return self.coordinates.turns + self.coordinates.lengths / self.robot.lever
 
     @cached_property
     def _kinematics(self) -> Kinematics:
-        """Kept here: to look for it in the cache takes as long as to use it."""
+        """Kinematics, stored here because a cache lookup takes as long as an evaluation."""
         return get_kinematics(self.model, self.cache)
 
     def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m], of all joints in the world.
+        """Return the world placements of all joints.
 
         Args:
-            z: Configurations, shape (W, n). Joint 0, the world, is among the J.
+            z: Configurations, shape (W, n).
+
+        Returns:
+            Rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m]; joint 0 is the
+            world.
         """
         batch, joints = len(z), self.model.njoints
         (columns,) = self._kinematics.batch(z)
@@ -126,17 +130,17 @@ class VirtualKinematicChain:
 
     @cached_property
     def carries(self) -> Bools:
-        """Whether joint j moves when joint k does, shape (J, J)."""
+        """Mask of shape (J, J): whether joint j moves when joint k does."""
         joints = range(self.model.njoints)
         return np.array([[k in self.model.supports[j] for k in joints] for j in joints])
 
     @cached_property
     def motions(self) -> tuple[Ints, Ints, Floats, Floats, Bools]:
-        """How joints move: for each of `Coordinates.moves` coordinate and joint, how that moves linearly and about which axis.
+        """Motion of joints per coordinate, one row for each of `Coordinates.moves`.
 
-        Shapes (m,), (m,), (m, 3) and (m, 3), the last two in the joint's frame. The last array,
-        shape (m,), says where the linear motion is along the world's axes: x and y of a planar
-        joint.
+        These are coordinate and joint, shape (m,) each, linear and angular velocity in the joint's
+        frame, shape (m, 3) each, and a mask of rows whose linear velocity is along the world's
+        axes, shape (m,): x and y of a planar joint.
         """
         data, moves = self.model.createData(), self.coordinates.moves
         pin.forwardKinematics(self.model, data, pin.neutral(self.model))
@@ -162,29 +166,36 @@ class VirtualKinematicChain:
         )
 
     def point_jacobians(self, z: Floats, which: Ints, joint: Ints, point: Floats) -> Floats:
-        """Return how points that are fixed in joints' frames move, shape (C, 3, n).
+        """Return the Jacobians of points that are fixed in joints' frames, shape (C, 3, n).
 
         Args:
             z: Configurations, shape (B, n).
-            which: The configuration of each point, shape (C,).
-            joint: The joint that carries it, shape (C,); 0 stands still.
-            point: Where it is in the world, shape (C, 3) [m].
+            which: Configuration of each point, shape (C,).
+            joint: Joint that carries the point, shape (C,); 0 is the world.
+            point: Position of the point in the world, shape (C, 3) [m].
         """
         coordinate, owner, linear, angular, fixed = self.motions
         rotations, translations = self.joint_placements(z)
         axes = rotations[:, owner]
-        turned = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[which]
-        about = np.einsum("bnij,nj->bni", axes, angular)[which]
-        moved = turned + np.cross(about, point[:, None] - translations[:, owner][which])
-        moved = moved * self.carries[joint][:, owner, None]
+        linear_motion = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[
+            which
+        ]
+        angular_motion = np.einsum("bnij,nj->bni", axes, angular)[which]
+        motion = linear_motion + np.cross(
+            angular_motion, point[:, None] - translations[:, owner][which]
+        )
+        motion = motion * self.carries[joint][:, owner, None]
         return np.asarray(
             np.add.reduceat(
-                moved, np.searchsorted(coordinate, np.arange(self.size)), axis=1
+                motion, np.searchsorted(coordinate, np.arange(self.size)), axis=1
             ).swapaxes(1, 2)
         )
 
     def opened(self, opening: float | None) -> pin.GeometryModel:
-        """Return its collision geometry with the robot's gripper so far open [m]; None: as the robot rests."""
+        """Return the collision geometry with the robot's gripper at an opening [m].
+
+        If `opening` is None, the gripper is as in the robot's home configuration.
+        """
         if opening is None:
             return self.collision
         geometry = self.collision.copy()
@@ -193,13 +204,17 @@ class VirtualKinematicChain:
         return geometry
 
     def index(self, name: str) -> int:
-        """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
+        """Return the position of coordinate `name` in z.
+
+        Raises:
+            UnknownNameError: There is no such coordinate.
+        """
         if name not in self.names:
             raise UnknownNameError("coordinate", name, self.names)
         return self.names.index(name)
 
     def holder(self, hold: Hold) -> tuple[int, pin.SE3]:
-        """Return the joint that carries the frame which holds something, and the frame's placement there."""
+        """Return the joint that carries the frame of a hold, and the frame's placement on it."""
         return (
             self.frame(self.robot.tool_frame)
             if hold.by is None
@@ -209,16 +224,16 @@ class VirtualKinematicChain:
     def frame(
         self, name: str, hold: Hold | None = None, *, opening: float | None = None
     ) -> tuple[int, pin.SE3]:
-        """Return the joint that carries a frame, and the frame's placement there.
+        """Return the joint that carries a frame, and the frame's placement on it.
 
         Args:
-            name: A frame of the robot, or a link of what is held.
-            hold: What holds that; None: it is the robot's.
-            opening: How far the robot's gripper is open [m], which its fingers' frames depend on;
-                None: as the robot rests.
+            name: Frame of the robot, or link of a held object.
+            hold: Hold of that object; None for a frame of the robot.
+            opening: Opening of the robot's gripper [m], which determines the frames of its fingers.
+                Defaults to that of the home configuration.
         """
         if hold is None:
-            model = self.robot.opened(opening).model  # the chain begins with the robot's joints
+            model = self.robot.opened(opening).model  # the chain starts with the robot's joints
         else:
             model, name = self.model, self.prefixes[hold] + name
         frame = model.frames[model.getFrameId(name)]
@@ -235,21 +250,21 @@ def consolidate(
     """Merge the scene's robot with the objects it holds into one model (section III of the paper).
 
     Args:
-        scene: Robot, objects and where they stand.
-        holds: What is held at any time, each after the hold it depends on; or object → attachment,
-            all by the tool. Several become branches of one tree; only what is held at a waypoint,
-            and stands fixed, is closed there.
-        rides: What stands on links of that, at any time.
-        cache: Where the chain's kinematics are kept; None: in one of its own.
+        scene: Robot and placed objects.
+        holds: All holds at any time, each after the hold it depends on; or object → attachment, all
+            held by the tool. Several holds become branches of one tree. A branch is closed only at
+            waypoints where its object is held and fixed in the world.
+        rides: Objects supported by links of held objects at any time.
+        cache: Cache of the chain's kinematics. Defaults to one of its own.
 
     Returns:
-        The chain. Branches of an object beside the path from grasp to base are fixed at their
-        present state.
+        The chain. Branches of an object that are not on the path from grasp to base are locked at
+        their present state.
 
     Raises:
         UnknownNameError: The scene has no such object, or the object no such attachment.
-        InputError: Two grasps move the same joint, or one that leaves a freedom is called like a
-            joint of its object.
+        InputError: Two grasps move the same joint, or a freedom of a grasp has the name of a joint
+            of its object.
     """
     robot = instance(scene, Scene, "scene").robot
     holds = resolve_holds(scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds)
@@ -263,14 +278,14 @@ def consolidate(
     )
     names = list(robot.coordinates.names)
     limits = [list(robot.lower), list(robot.upper), list(robot.velocity), list(robot.acceleration)]
-    held_geometries, closures, virtual, with_hold = {}, {}, {}, {}
+    held_geometries, closures, virtual, hold_coordinates = {}, {}, {}, {}
     prefixes: dict[Hold, str] = {}
     for hold in holds:
         name = hold.object
         placed = scene.objects[name]
         attachment = placed.object.attachment(hold.attachment)
-        # Pinocchio finds a frame only by a name that no other has: the second branch of an object
-        # needs another prefix.
+        # Pinocchio finds frames by unique names: the second branch of an object needs another
+        # prefix.
         prefix = prefixes[hold] = name + "'" * sum(other.object == name for other in prefixes) + "."
         holder = robot.tool_frame if hold.by is None else f"{prefixes[hold.by]}{hold.link}"
         tool = model.frames[model.getFrameId(holder)]
@@ -279,7 +294,8 @@ def consolidate(
             tool.placement * compute_hand_frame(robot, attachment) * attachment.offset.inverse(),
         )
         added = []
-        # J(v)⁻¹, tool to object: each joint's axis is negated, and their order reversed.
+        # J(v)⁻¹, tool to object: the axis of each joint is negated and the order of joints
+        # reversed.
         for suffix, freedom in reversed(
             [*zip(attachment.coordinates, attachment.freedoms, strict=True)]
         ):
@@ -294,7 +310,7 @@ def consolidate(
                 freedom.lower,
                 freedom.upper,
             )
-            own = [np.array([value]) for value in (np.inf, VIRTUAL_VELOCITY, low, high)]
+            own = [np.array([value]) for value in (np.inf, FREEDOM_VELOCITY, low, high)]
             through = pin.SE3(np.eye(3), freedom.through)
             parent = model.addJoint(
                 parent, joint, round_placement(placement * through), joint_name, *own
@@ -302,7 +318,7 @@ def consolidate(
             placement = through.inverse()
             added.append(joint_name)
             for row, value in zip(
-                limits, (low, high, VIRTUAL_VELOCITY, VIRTUAL_ACCELERATION), strict=True
+                limits, (low, high, FREEDOM_VELOCITY, FREEDOM_ACCELERATION), strict=True
             ):
                 row.append(value)
         virtual[hold] = tuple(added)
@@ -313,20 +329,23 @@ def consolidate(
         for joint_name in tree.model.names[1:]:
             names.append(f"{name}.{joint_name}")
             index = placed.object.coordinates.names.index(joint_name)
-            stated = (
+            object_limits = (
                 placed.object.lower,
                 placed.object.upper,
                 placed.object.velocity,
                 placed.object.acceleration,
             )
-            for row, values in zip(limits, stated, strict=True):
+            for row, values in zip(limits, object_limits, strict=True):
                 row.append(float(values[index]))
-        with_hold[hold] = (*added, *(f"{name}.{joint_name}" for joint_name in tree.model.names[1:]))
+        hold_coordinates[hold] = (
+            *added,
+            *(f"{name}.{joint_name}" for joint_name in tree.model.names[1:]),
+        )
         base = model.frames[model.getFrameId(f"{prefix}{placed.object.base_link}")]
         moving = list(tree.collision.geometryObjects)
         if not placed.object.free:
-            # What the joints in hand do not move (a door's frame, another door in it) stands in the
-            # world, closed or not.
+            # Links that the held joints do not move (a door's frame, another door in it) are fixed
+            # in the world, whether or not the chain is closed.
             moving = [shape for shape in moving if joints[shape.parentJoint] != base.parentJoint]
         held_geometries[hold] = tuple(
             graft_geometry(collision, moving, joints=joints, placement=placement, prefix=prefix)
@@ -336,11 +355,10 @@ def consolidate(
     for joint_name in names:
         if names.count(joint_name) > 1:
             problem = (
-                "two grasps of one joint, or an attachment and a joint of its object, share a name"
+                "two coordinates share this name (two grasps of one joint, "
+                "or an attachment named like a joint of its object)"
             )
-            raise InputError(
-                problem, field=joint_name, expected="a coordinate that is in the chain once"
-            )
+            raise InputError(problem, field=joint_name, expected="unique coordinate names")
     ride_geometries = {}
     for number, ride in enumerate(rides):
         frame = model.frames[model.getFrameId(prefixes[ride.hold] + ride.link)]
@@ -373,7 +391,7 @@ def consolidate(
         ride_geometries=ride_geometries,
         closures=closures,
         virtual=virtual,
-        added=with_hold,
+        added=hold_coordinates,
         prefixes=prefixes,
         cache=cache,
     )

@@ -1,4 +1,4 @@
-"""Who can hit whom in each phase of a task, and how close they may come: the pairs of eqs. 6 and 7."""
+"""Selects the collision pairs of each phase of a task and their margins (eqs. 6 and 7)."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase, Task
 
-__all__ = ["phase_geometries"]
+__all__ = ["build_phase_geometries"]
 
 
-def phase_geometries(
+def build_phase_geometries(
     scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
 ) -> list[PhaseGeometry]:
-    """Return the geometry of every phase of a task, and the pairs that can collide in it.
+    """Return the geometry of each phase of a task, with the pairs that can collide.
 
     Args:
         scene: Robot, objects and obstacles.
-        chain: The chain.
-        task: What is held when.
-        options: Which clearances to keep.
+        chain: Virtual kinematic chain.
+        task: Phases of the task.
+        options: Options; the clearances.
 
     Raises:
-        InputError: In some phase nothing can collide with anything.
+        InputError: In some phase there is no pair that can collide.
     """
-    pairing = _Pairing(scene, chain, task, options)
-    return [pairing.phase(number) for number in range(len(task.phases))]
+    builder = _PairBuilder(scene, chain, task, options)
+    return [builder.build_phase(number) for number in range(len(task.phases))]
 
 
-class _Pairing:
+class _PairBuilder:
     def __init__(
         self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
     ) -> None:
@@ -65,21 +65,24 @@ class _Pairing:
             scene.robot.link_of(i) for i in range(len(scene.robot.collision.geometryObjects))
         ]
         held = [(hold.object, indices) for hold, indices in chain.held_geometries.items()]
-        riding = [(ride.object, indices) for ride, indices in chain.ride_geometries.items()]
-        for name, indices in (*held, *riding):
+        supported = [(ride.object, indices) for ride, indices in chain.ride_geometries.items()]
+        for name, indices in (*held, *supported):
             self._labels += [
                 f"{name}.{get_link_name(get_local_name(chain.collision.geometryObjects[i].name))}"
                 for i in indices
             ]
         self._allowances = find_clearance_exemptions(scene, options.dist_safe)
         self._obstacles = scene.obstacles
-        self._boxes = _boxes([*chain.collision.geometryObjects]), _boxes(self._obstacles)
+        self._compute_boxes = (
+            _compute_boxes([*chain.collision.geometryObjects]),
+            _compute_boxes(self._obstacles),
+        )
 
-    def phase(self, number: int) -> PhaseGeometry:
+    def build_phase(self, number: int) -> PhaseGeometry:
         phase, scene, chain = self.task.phases[number], self.scene, self.chain
         holds = {hold.object: hold for hold in phase.held}
         shapes, labels = list(chain.opened(phase.opening).geometryObjects), list(self._labels)
-        of_chain = self._boxes[0] if phase.opening is None else _boxes(shapes)
+        of_chain = self._compute_boxes[0] if phase.opening is None else _compute_boxes(shapes)
         robots, own, margin = (
             range(len(scene.robot.collision.geometryObjects)),
             len(shapes),
@@ -89,32 +92,32 @@ class _Pairing:
             (*pair, own_margin)
             for pair, own_margin in scene.robot.own_margins(self.options.self_distance).items()
         ]
-        moving, mine = list(robots), dict[str, tuple[int, ...]]()
+        moving, attached_shapes = list(robots), dict[str, tuple[int, ...]]()
         for hold in phase.held:
-            mine[hold.object] = chain.held_geometries[hold]
+            attached_shapes[hold.object] = chain.held_geometries[hold]
             pairs += [
-                (i, j, self._held_margin(hold, labels[i], labels[j]))
+                (i, j, self._find_attached_margin(hold, labels[i], labels[j]))
                 for i in moving
-                for j in mine[hold.object]
+                for j in attached_shapes[hold.object]
             ]
             pairs += [
                 (i, j, margin)
-                for i, j in combinations(mine[hold.object], 2)
-                if self._own_pair(hold.object, labels[i], labels[j])
+                for i, j in combinations(attached_shapes[hold.object], 2)
+                if self._can_self_collide(hold.object, labels[i], labels[j])
             ]
-            moving += mine[hold.object]
+            moving += attached_shapes[hold.object]
         for ride in phase.supported:
-            mine[ride.object] = chain.ride_geometries[ride]
-            together = {
-                shapes[j].parentJoint for j in mine[ride.object]
-            }  # with what is on the same joint it moves as one
+            attached_shapes[ride.object] = chain.ride_geometries[ride]
+            same_joint = {
+                shapes[j].parentJoint for j in attached_shapes[ride.object]
+            }  # it moves rigidly with geometry on the same joint
             pairs += [
                 (i, j, margin)
                 for i in moving
-                if shapes[i].parentJoint not in together
-                for j in mine[ride.object]
+                if shapes[i].parentJoint not in same_joint
+                for j in attached_shapes[ride.object]
             ]
-            moving += mine[ride.object]
+            moving += attached_shapes[ride.object]
         pairs = [pair for pair in pairs if np.isfinite(pair[2])]
         left: dict[str, tuple[int, ...]] = {}
         for name, placed in scene.objects.items():
@@ -124,14 +127,14 @@ class _Pairing:
                 if c.startswith(f"{name}.")
             }
             if placed.object.free:
-                if name in mine:
+                if name in attached_shapes:
                     continue
                 placed = dataclasses.replace(
                     placed, placement=phase.resting.get(name, placed.placement)
                 )
             standing = make_world_shapes(placed.with_state(state))
-            if name in mine:  # its frame stands on, the rest is in the hand
-                held_shapes = {get_local_name(shapes[i].name) for i in mine[name]}
+            if name in attached_shapes:  # its static links; the others move with the hand
+                held_shapes = {get_local_name(shapes[i].name) for i in attached_shapes[name]}
                 standing = [shape for shape in standing if shape.name not in held_shapes]
             if name in phase.released_by:
                 left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
@@ -140,11 +143,16 @@ class _Pairing:
                 others = [
                     i
                     for i in moving
-                    if i not in mine.get(name, ()) or self._own_pair(name, labels[i], label)
+                    if i not in attached_shapes.get(name, ())
+                    or self._can_self_collide(name, labels[i], label)
                 ]
-                held = holds.get(name)  # and it moves only some of its joints
+                held = holds.get(name)  # the hand moves only some of its joints
                 pairs += [
-                    (i, len(shapes), self._held_margin(held, labels[i], label) if held else margin)
+                    (
+                        i,
+                        len(shapes),
+                        self._find_attached_margin(held, labels[i], label) if held else margin,
+                    )
                     for i in others
                 ]
                 shape.name = f"{name}.{shape.name}"
@@ -152,21 +160,31 @@ class _Pairing:
                 labels.append(label)
         spend()
         attached = {
-            i for name, indices in mine.items() if scene.objects[name].object.free for i in indices
+            i
+            for name, indices in attached_shapes.items()
+            if scene.objects[name].object.free
+            for i in indices
         }
-        above = [i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)]
+        floor_movers = [
+            i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)
+        ]
         table = np.concatenate(
-            [np.array(pairs).reshape(-1, 3), self._with_obstacles(len(shapes), moving, above)]
+            [
+                np.array(pairs).reshape(-1, 3),
+                self._pair_with_obstacles(len(shapes), moving, floor_movers),
+            ]
         )
         labels += scene.obstacle_labels
         names = [shape.name for shape in shapes] + [shape.name for shape in self._obstacles]
-        table, near = self._allowed(phase, table, labels, make_shape_keys(labels, names))
+        table, margin_regions = self._apply_exemptions(
+            phase, table, labels, make_shape_keys(labels, names)
+        )
         if not len(table):
             expected = "collision geometry in robot or scene"
             raise InputError(
                 "no pair of geometries can collide", field=phase.name, expected=expected
             )
-        boxes = zip(of_chain, _boxes(shapes[own:]), self._boxes[1], strict=True)
+        boxes = zip(of_chain, _compute_boxes(shapes[own:]), self._compute_boxes[1], strict=True)
         center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
         shapes += self._obstacles
         part = PhaseGeometry(
@@ -179,21 +197,21 @@ class _Pairing:
             half=half,
             rotation=rotation,
             translation=translation,
-            neighbours=near,
-            left=left,
+            margin_regions=margin_regions,
+            released=left,
         )
         return dataclasses.replace(
             part,
-            eased=find_reduced_margins(
+            reduced_margins=find_reduced_margins(
                 self.scene, self.chain, self.task, number, part, self.options
             ),
         )
 
-    def _held_margin(self, hold: Hold, one: str, link: str) -> float:
-        """Return the clearance [m] of what has the label `one` from a link, by its label, of what is held.
+    def _find_attached_margin(self, hold: Hold, one: str, link: str) -> float:
+        """Return the clearance [m] between label `one` and label `link` of a grasped object.
 
-        The hand and what it grasps move together, so that there is nothing to plan, unless the
-        grasp leaves a freedom.
+        The hand and the link it grasps move together, so that they need no margin unless the grasp
+        leaves a freedom.
         """
         if one not in find_touch_links(self.scene, hold):
             return self.options.dist_safe
@@ -203,16 +221,16 @@ class _Pairing:
             return -np.inf
         return compute_hand_clearance(self.scene, hold, link, self.options) or -CONTACT_DEPTH
 
-    def _allowed(
+    def _apply_exemptions(
         self, phase: Phase, table: Floats, labels: Sequence[str], keys: Sequence[str]
     ) -> tuple[Floats, list[MarginRegion]]:
-        """Return pairs with their margins, shape (P, 3), as the scene allows them, and those that are exempt for a while.
+        """Return pairs with the margins that the scene allows, and the joint-dependent exemptions.
 
         Args:
             phase: The phase.
-            table: Pairs and the margins that they keep otherwise, shape (P, 3).
-            labels: Of all shapes.
-            keys: Of all shapes, see `neighbours.shape_keys`.
+            table: Pairs and their usual margins, shape (P, 3).
+            labels: Labels of all shapes.
+            keys: Keys of all shapes, see `clearance_exemptions.make_shape_keys`.
         """
         if not self._allowances:
             return table, []
@@ -227,22 +245,28 @@ class _Pairing:
             if not one.ranges:
                 table[rows[one], 2] = np.minimum(table[rows[one], 2], one.margin)
         kept = np.isfinite(table[:, 2])
-        place, near = np.where(kept, np.cumsum(kept) - 1, -1), []
+        place, margin_regions = np.where(kept, np.cumsum(kept) - 1, -1), []
         for one in self._allowances:
-            near_pairs, within = place[rows[one]][kept[rows[one]]], self._within(phase, one.ranges)
-            if one.ranges and len(near_pairs) and within is not None:
+            exempt_pairs, resolved = (
+                place[rows[one]][kept[rows[one]]],
+                self._resolve_ranges(phase, one.ranges),
+            )
+            if one.ranges and len(exempt_pairs) and resolved is not None:
                 margin = (
                     one.margin
                     if one.margin < 0.0
                     else REDUCED_MARGIN_RATIO * max(one.distance, 0.0)
                 )
-                near.append(MarginRegion(near_pairs, margin, *within))
-        return table[kept], near
+                margin_regions.append(MarginRegion(exempt_pairs, margin, *resolved))
+        return table[kept], margin_regions
 
-    def _within(
+    def _resolve_ranges(
         self, phase: Phase, ranges: Mapping[str, tuple[float, float]]
     ) -> tuple[Ints, Floats, Floats] | None:
-        """Return coordinates of the chain and limits, shape (m,) each; None if one that stands still is outside its own."""
+        """Return columns of the chain and their limits, shape (m,) each.
+
+        Returns None if a coordinate that is not in the chain is outside its range.
+        """
         columns, limits = list[int](), list[tuple[float, float]]()
         for name, (lower, upper) in ranges.items():
             if name in self.chain.names:
@@ -259,30 +283,40 @@ class _Pairing:
         low, high = np.array(limits).reshape(-1, 2).T
         return np.array(columns, int), low, high
 
-    def _own_pair(self, name: str, first: str, second: str) -> bool:
-        """Return whether two links of an object, by their labels, can meet."""
+    def _can_self_collide(self, name: str, first: str, second: str) -> bool:
+        """Return whether two links of an object, given by labels, can collide."""
         return (
             frozenset(label.partition(".")[2] for label in (first, second))
             in self.scene.objects[name].object.own_pairs
         )
 
-    def _with_obstacles(self, first: int, moving: Sequence[int], above: Sequence[int]) -> Floats:
-        """Return the pairs of what moves with the obstacles, the first of which is geometry `first`, and their margins.
+    def _pair_with_obstacles(
+        self, first: int, moving: Sequence[int], floor_movers: Sequence[int]
+    ) -> Floats:
+        """Return the pairs of moving geometries with obstacles, and their margins, shape (P, 3).
 
-        Of `moving`, only those that are `above` the floor can hit it: wheels stand on it, and doors
-        hang above it as their makers hung them.
+        Only `floor_movers` are paired with the floor: wheels stand on it, and the gap below doors
+        is as modelled.
+
+        Args:
+            first: Index of the first obstacle.
+            moving: Moving geometries.
+            floor_movers: Those of them that can collide with the floor.
         """
         ones, others = np.array(moving, int), np.arange(len(self._obstacles))
-        floor = np.array([label == FLOOR for label in self.scene.obstacle_labels], bool)
+        is_floor = np.array([label == FLOOR for label in self.scene.obstacle_labels], bool)
         pairs = np.column_stack([np.tile(ones, len(others)), np.repeat(others, len(ones))])
-        pairs = pairs[~floor[pairs[:, 1]] | np.isin(pairs[:, 0], above)]
+        pairs = pairs[~is_floor[pairs[:, 1]] | np.isin(pairs[:, 0], floor_movers)]
         return np.column_stack(
             [pairs[:, 0], first + pairs[:, 1], np.full(len(pairs), self.options.dist_safe)]
         )
 
 
-def _boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:
-    """Return centres and half extents of bounding boxes, and placements as rotations and translations; see `PhaseGeometry`."""
+def _compute_boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:
+    """Return box centres and half extents, and placements as rotations and translations.
+
+    See `PhaseGeometry`.
+    """
     boxes = [compute_bounding_box(shape) for shape in shapes]
     return (
         np.array([center for center, _ in boxes]).reshape(-1, 3),

@@ -1,4 +1,4 @@
-"""Which pairs of a phase may be closer than others for a while, where something is taken, put down or touched."""
+"""Finds pairs whose margin is temporarily reduced, at grasps, placements and touches."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from vkc_pin.world.task.phases import Task
 
 __all__ = ["REDUCED_MARGIN_RATIO", "find_reduced_margins"]
 
-REDUCED_MARGIN_RATIO = 0.5  # margin, as a share of the distance at the contact itself
+REDUCED_MARGIN_RATIO = 0.5  # Margin relative to the distance at the contact itself.
 
-Eased = dict[int, list[tuple[int, int, float]]]
+ReducedMargins = dict[int, list[tuple[int, int, float]]]
 
 
 def find_reduced_margins(
@@ -38,31 +38,30 @@ def find_reduced_margins(
     number: int,
     part: PhaseGeometry,
     options: Options,
-) -> Eased:
-    """Return pair → (first waypoint, last waypoint, margin [m]) of pairs with a temporarily smaller margin.
+) -> ReducedMargins:
+    """Return pair → (first waypoint, last waypoint, margin [m]) of temporarily reduced margins.
 
-    See `world.scene.contact_rules`.
-
-    A hand keeps the attachment's clearance from the object that it takes or lets go of. A free
-    object rests on something where it is lifted from and where it is put down, and may still do so
-    in the hand at the start, with what rides on it; a frame that touches a target may come close to
-    what the target is on: there the margin is half the distance at the contact. What a free object
-    stands in at the start it may stand in then.
+    A hand keeps the attachment's clearance from the object that it grasps or releases. A free
+    object rests on something where it is lifted and where it is placed, and possibly in the hand at
+    the start, with the objects it supports. A frame that touches a target may come close to the
+    surface around the target. In these cases the margin is half the distance at the contact. A
+    penetration of a grasped object in the initial scene is allowed at the start. See
+    `world.scene.contact_rules`.
 
     Args:
-        scene: Where it happens.
-        chain: The chain.
-        task: What is held when.
-        number: Of the phase.
-        part: Its geometry and pairs.
-        options: Waypoints' time, and clearances.
+        scene: Robot, objects and obstacles.
+        chain: Virtual kinematic chain.
+        task: Phases of the task.
+        number: Number of the phase.
+        part: Geometry and pairs of the phase.
+        options: Options; waypoint spacing and clearances.
     """
     phase, before = task.phases[number], task.phases[number - 1] if number else None
     first = sum(earlier.segments for earlier in task.phases[:number])
     last, steps = first + phase.segments, options.steps(CONTACT_WINDOW)
-    shapes, eased = part.shapes, Eased()
+    shapes, reduced = part.shapes, ReducedMargins()
 
-    def ease(
+    def reduce_margins(
         moving: int,
         shape: coal.CollisionGeometry,
         where: pin.SE3,
@@ -71,15 +70,19 @@ def find_reduced_margins(
         *,
         inside: bool = False,
     ) -> None:
-        """Ease the pairs of a geometry that moves with what stands next to a shape, or in it."""
-        beside = part.within(float(part.margins.max()), *compute_world_box(shape, where))
-        for k in part.pairs_of(moving, beside).tolist():
+        """Reduce the margins of a moving geometry with static ones close to `shape`."""
+        nearby = part.find_static_near(float(part.margins.max()), *compute_world_box(shape, where))
+        for k in part.find_pairs(moving, nearby).tolist():
             other = shapes[int(part.pairs[k, 1])]
             distance = compute_shape_distance(shape, where, other.geometry, other.placement)
-            share = REDUCED_MARGIN_RATIO * max(distance, 0.0)
+            resting_margin = REDUCED_MARGIN_RATIO * max(distance, 0.0)
             if distance < part.margins[k]:
-                eased.setdefault(k, []).append(
-                    (begin, end, distance if inside and distance < -CONTACT_DEPTH else share)
+                reduced.setdefault(k, []).append(
+                    (
+                        begin,
+                        end,
+                        distance if inside and distance < -CONTACT_DEPTH else resting_margin,
+                    )
                 )
 
     for holds, begin, end in (
@@ -87,19 +90,21 @@ def find_reduced_margins(
         (phase.grasps, last - steps, last),
     ):
         for hold in holds:
-            hand = np.isin(part.labels, list(find_touch_links(scene, hold)))
-            its = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
-            for k in np.flatnonzero(hand[part.pairs[:, 0]] & its[part.pairs[:, 1]]).tolist():
+            is_hand = np.isin(part.labels, list(find_touch_links(scene, hold)))
+            is_object = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
+            for k in np.flatnonzero(
+                is_hand[part.pairs[:, 0]] & is_object[part.pairs[:, 1]]
+            ).tolist():
                 margin = compute_hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
-                eased.setdefault(k, []).append((begin, end, margin))
-    for geometries, placed, begins in _moments(scene, chain, task, number):
+                reduced.setdefault(k, []).append((begin, end, margin))
+    for geometries, placed, begins in _find_lift_and_place_moments(scene, chain, task, number):
         stands = {shape.name: shape.placement for shape in make_world_shapes(placed)}
         for i in geometries:
             begin, end = (first, first + steps) if begins else (last - steps, last)
             new = begins and placed.name not in {
                 hold.object for earlier in task.phases[:number] for hold in earlier.held
             }
-            ease(
+            reduce_margins(
                 i,
                 shapes[i].geometry,
                 stands[get_local_name(shapes[i].name)],
@@ -107,25 +112,26 @@ def find_reduced_margins(
                 end,
                 inside=new,
             )
-    touches = [(goal, last - steps, last) for goal in phase.frames]
-    touches += [(goal, first, first + steps) for goal in (before.frames if before else ())]
-    for goal, begin, end in touches:
+    touch_goals = [(goal, last - steps, last) for goal in phase.frames]
+    touch_goals += [(goal, first, first + steps) for goal in (before.frames if before else ())]
+    for goal, begin, end in touch_goals:
         if not goal.touches:
             continue
         point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
         joint, _ = chain.frame(goal.frame, goal.hold)
         for i in range(len(chain.collision.geometryObjects)):
             if part.labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint:
-                ease(i, point, where, begin, end)
-    return eased
+                reduce_margins(i, point, where, begin, end)
+    return reduced
 
 
-def _moments(
+def _find_lift_and_place_moments(
     scene: Scene, chain: VirtualKinematicChain, task: Task, number: int
 ) -> Iterator[tuple[Sequence[int], PlacedObject, bool]]:
-    """Yield the geometries, and where their object stands, of what begins or ends to be carried in a phase: (..., begins).
+    """Yield geometries, their object as placed, and whether it is lifted or placed then.
 
-    What is in the hand at the start begins there.
+    These are the objects whose transport begins (True) or ends (False) in a phase. Transport of an
+    object held at the start begins in the first phase.
     """
     phase = task.phases[number]
     at_start = {
@@ -141,7 +147,11 @@ def _moments(
             yield chain.held_geometries[hold], placed, begins
             for ride in phase.supported:
                 if ride.hold == hold:
-                    yield chain.ride_geometries[ride], _ridden(scene, ride, placed), begins
+                    yield (
+                        chain.ride_geometries[ride],
+                        _place_supported_object(scene, ride, placed),
+                        begins,
+                    )
     for ride in phase.supported:
         carrier = scene.objects[ride.hold.object]
         if not carrier.object.free:
@@ -155,21 +165,23 @@ def _moments(
             ):
                 yield (
                     chain.ride_geometries[ride],
-                    _ridden(scene, ride, _with(carrier, state)),
+                    _place_supported_object(scene, ride, _with_joint_positions(carrier, state)),
                     begins,
                 )
 
 
-def _ridden(scene: Scene, ride: SupportedObject, carrier: PlacedObject) -> PlacedObject:
-    """Return what rides, where it stands on a carrier."""
+def _place_supported_object(
+    scene: Scene, ride: SupportedObject, carrier: PlacedObject
+) -> PlacedObject:
+    """Return the supported object, placed on its carrier."""
     return dataclasses.replace(
         scene.objects[ride.object],
         placement=carrier.link_placement(ride.link) * ride.placement_in_link,
     )
 
 
-def _with(placed: PlacedObject, state: Mapping[str, float]) -> PlacedObject:
-    """Return an object with those of some values, by coordinate "<object>.<joint>", that are its own."""
+def _with_joint_positions(placed: PlacedObject, state: Mapping[str, float]) -> PlacedObject:
+    """Return an object with those of the positions "<object>.<joint>" that are its own."""
     return placed.with_state(
         {c.partition(".")[2]: v for c, v in state.items() if c.partition(".")[0] == placed.name}
     )

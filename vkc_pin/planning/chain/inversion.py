@@ -1,4 +1,4 @@
-"""Turns an articulated object round: the tree then starts at the link that is held, so that it can hang on the end of a robot."""
+"""Re-roots an articulated object at a grasped link, so that a robot's hand can carry the tree."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class InvertedTree:
     """An object re-rooted at one of its links: `model`'s universe frame is that link's frame.
 
     Attributes:
-        model: The joints on the path from the link to the base link, each with its name, coordinate
-            and limits; a body frame for every link of the object, by its name.
+        model: Joints on the path from the link to the base link, with their names, coordinates and
+            limits, and a body frame for each link of the object, by its name.
         collision, visual: The object's geometry, with its names, on the bodies of `model`.
-        coordinates: The minimal coordinates of `model`.
-        link: The link that is now the root.
+        coordinates: Minimal coordinates of `model`.
+        link: The new root link.
         base_link: The object's base link, a body frame of `model`.
     """
 
@@ -44,16 +44,20 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
     """Re-root `obj` at `link`.
 
     With placement P and motion J(q) of a joint, parent → child is P·J(q), so child → parent is
-    J(q)⁻¹·P⁻¹. For revolute and prismatic joints J(q)⁻¹ is the same joint with the axis negated.
-    The axis is then turned into z by a constant rotation R, J(q)⁻¹ = R·J_z(q)·R⁻¹, which goes into
-    the placements around it: every joint of the result is one of Pinocchio's z-aligned joints,
-    whose symbolic expressions are the shortest.
+    J(q)⁻¹·P⁻¹. For revolute and prismatic joints J(q)⁻¹ is the same joint with a negated axis. A
+    constant rotation R then aligns the axis with z, J(q)⁻¹ = R·J_z(q)·R⁻¹, and is absorbed into the
+    adjacent placements. All joints of the result are z-aligned Pinocchio joints, whose symbolic
+    expressions are the shortest.
 
     Args:
         obj: The object.
-        link: The link that becomes the root.
-        state: Joint values, shape (n,), [rad] or [m]. Joints beside the path from `link` to the
-            base link are locked at these; the values of those on the path do not matter.
+        link: The new root link.
+        state: Joint positions, shape (n,), [rad] or [m]. Joints that are not on the path from
+            `link` to the base link are locked at these values; the values of joints on the path do
+            not matter.
+
+    Returns:
+        The inverted tree.
 
     Raises:
         UnknownNameError: The object has no such link.
@@ -69,20 +73,20 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
 
     model = pin.Model()
     model.name = obj.name
-    # For every joint of the path: the joint of the new model that carries its body, and the body's
-    # placement there.
+    # For each joint of the path: the joint of the new model that carries its body, and the body's
+    # placement on it.
     carrier: dict[int, tuple[int, pin.SE3]] = {path[0]: (0, root.placement.inverse())}
     for child, parent in pairwise(path):
         new_parent, body = carrier[child]
-        joint, axis = _z_aligned(source, data, child)
-        turn = pin.SE3(_z_to(-axis), np.zeros(3))
+        joint, axis = _align_with_z(source, data, child)
+        turn = pin.SE3(_rotate_z_to(-axis), np.zeros(3))
         index = add_joint(
             model, new_parent, joint, round_placement(body * turn), like=(source, child)
         )
         carrier[parent] = (index, turn.inverse() * source.jointPlacements[child].inverse())
 
     def place(joint: int, placement: pin.SE3) -> tuple[int, pin.SE3]:
-        """Return the new joint that carries `placement`, given on the old `joint`, and the placement on the new one."""
+        """Return the new joint that carries `placement` of the old `joint`, and its placement."""
         anchor = joint
         while anchor not in carrier:
             anchor = source.parents[anchor]
@@ -101,27 +105,27 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
                 pin.Frame(frame.name, new, 0, placement, pin.FrameType.BODY), False
             )
 
-    def carry(geometry: pin.GeometryModel) -> pin.GeometryModel:
-        carried = pin.GeometryModel()
+    def transfer_geometry(geometry: pin.GeometryModel) -> pin.GeometryModel:
+        transferred = pin.GeometryModel()
         for shape in geometry.geometryObjects:
             copy = pin.GeometryObject(shape)
             copy.parentJoint, copy.placement = place(shape.parentJoint, shape.placement)
             copy.parentFrame = frames[shape.parentFrame]
-            carried.addGeometryObject(copy)
-        return carried
+            transferred.addGeometryObject(copy)
+        return transferred
 
     return InvertedTree(
         model=model,
-        collision=carry(obj.collision),
-        visual=carry(obj.visual),
+        collision=transfer_geometry(obj.collision),
+        visual=transfer_geometry(obj.visual),
         coordinates=Coordinates(model),
         link=link,
         base_link=obj.base_link,
     )
 
 
-def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointModel, Floats]:
-    """Return the joint of the same kind about or along z, and the unit axis of joint `index` in its own frame."""
+def _align_with_z(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointModel, Floats]:
+    """Return the z-aligned joint of the same kind, and the unit axis of joint `index`."""
     kind = model.joints[index].shortname().removeprefix("JointModel")
     subspace = np.array(data.joints[index].S, float).ravel()  # linear part, then angular part
     if kind in ("RX", "RY", "RZ", "RevoluteUnaligned"):
@@ -136,10 +140,10 @@ def _z_aligned(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointM
     )
 
 
-def _z_to(axis: Floats) -> Floats:
-    """Return a rotation, shape (3, 3), that turns z into the unit vector `axis`, with as many zeros as possible."""
-    others = np.eye(3)
-    x = others[int(np.argmin(np.abs(axis)))]
+def _rotate_z_to(axis: Floats) -> Floats:
+    """Return a rotation, shape (3, 3), from z to the unit vector `axis`, with many zeros."""
+    basis = np.eye(3)
+    x = basis[int(np.argmin(np.abs(axis)))]
     x = x - axis * (axis @ x)
     x = x / np.linalg.norm(x)
     return np.column_stack([x, np.cross(axis, x), axis])

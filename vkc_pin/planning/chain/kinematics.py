@@ -1,4 +1,4 @@
-"""Placements of a model's joints as a function of its minimal coordinates: for symbols, and for numbers in batches."""
+"""Computes joint placements as a function of minimal coordinates, symbolically and in batches."""
 
 from __future__ import annotations
 
@@ -17,26 +17,29 @@ __all__ = ["Kinematics", "get_kinematics"]
 
 
 class Kinematics:
-    """The kinematics of one model; what needs them symbolically takes the same expressions."""
+    """Kinematics of one model; all symbolic users share its expressions."""
 
     def __init__(self, model: pin.Model) -> None:
         self._coordinates, self._function = Coordinates(model), cpin.joint_placements(model)
 
-    def symbolic(self, z: Any) -> Any:
-        """Return the placements of all joints at the symbols z, shape (n, 1): shape (12, J − 1), see `cpin.joint_placements`."""
+    def build_placements(self, z: Any) -> Any:
+        """Return the placements of all joints at the symbols z, shape (n, 1), as (12, J − 1).
+
+        See `cpin.joint_placements`.
+        """
         return self._function(self._coordinates.q_symbolic(z))
 
     @cached_property
     def batch(self) -> BatchFunction:
-        """Z → (12·(J − 1),): by columns R and t of every joint's placement in the world, for many rows at once."""
+        """Batch function z → columns of R and t of every joint's world placement, (12·(J − 1),)."""
         z = ca.SX.sym("z", self._coordinates.size)
         return BatchFunction(
-            ca.Function("placements", [z], [ca.densify(self.symbolic(z))], {"cse": True})
+            ca.Function("placements", [z], [ca.densify(self.build_placements(z))], {"cse": True})
         )
 
     @property
     def nbytes(self) -> int:
-        """Its size in memory, estimated [bytes]."""
+        """Estimated size in memory [bytes]."""
         return estimate_size(self._function) + (
             self.batch.nbytes if "batch" in self.__dict__ else 0
         )

@@ -1,7 +1,8 @@
-"""Residuals between placements, symbolically: h_chain of eq. 2 and f_task of eq. 3.
+"""Builds symbolic residuals between placements: h_chain of eq. 2 and f_task of eq. 3.
 
-Four kinds of goal: "pose" is a whole placement; "point" only its translation; "level" the world's
-vertical as the target has it, anywhere and at any heading; "upright" that and the translation.
+There are four kinds of goals: "pose" prescribes the whole placement; "point" only the translation;
+"level" the direction of the world's vertical seen from the frame, at any position and heading;
+"upright" that and the translation.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ __all__ = [
     "POSE_OFFSET_SIZE",
     "ROW_BOUNDS",
     "PoseRow",
+    "build_pose_residual",
+    "build_pose_rows",
     "compute_pose_offsets",
-    "pose_residual",
-    "pose_rows",
+    "flatten_target",
     "relax_target",
-    "target_vector",
 ]
 
 ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
@@ -41,16 +42,16 @@ ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
 
 @dataclass(frozen=True)
 class PoseRow:
-    """A frame that must be at a parametric placement at some waypoints.
+    """A frame that must attain a parametric placement at some waypoints.
 
     Attributes:
-        joint: Joint of the model that carries it.
-        local: Its placement in the joint's frame.
-        waypoints: At which waypoints, counted from 1.
+        joint: Joint of the model that carries the frame.
+        local: Placement of the frame on the joint.
+        waypoints: Waypoints at which the goal applies, counted from 1.
         kind: "pose", "point", "upright" or "level"; see `pose`.
-        shift: (joint, vector): what is added to the frame's translation, a vector that is fixed in
-            another joint's frame [m]. With it a hand can be asked to be short of a grasp by so much
-            along its approach, wherever in the grasp that is.
+        shift: (joint, vector): vector [m], fixed in the frame of another joint, that is added to
+            the frame's translation. It keeps a hand at a given distance from a grasp along its
+            approach direction, whatever the freedoms of the grasp.
     """
 
     joint: int
@@ -64,8 +65,15 @@ class PoseRow:
         """Number of constraint rows."""
         return len(ROW_BOUNDS[self.kind][0])
 
-    def placement(self, placements: Any) -> tuple[Any, Any]:
-        """Return rotation, shape (3, 3), and translation, shape (3, 1), of the frame, given those of all joints (`cpin`)."""
+    def build_placement(self, placements: Any) -> tuple[Any, Any]:
+        """Return the symbolic placement of the frame, given those of all joints (see `cpin`).
+
+        Args:
+            placements: Placements of all joints, shape (12, J − 1).
+
+        Returns:
+            Rotation, shape (3, 3), and translation, shape (3, 1).
+        """
         column = placements[:, self.joint - 1]
         rotation = ca.reshape(column[:9], 3, 3)
         translation = rotation @ self.local.translation + column[9:]
@@ -74,8 +82,16 @@ class PoseRow:
             translation = translation + ca.reshape(placements[:9, joint - 1], 3, 3) @ ca.DM(vector)
         return rotation @ self.local.rotation, translation
 
-    def placed(self, rotations: Floats, translations: Floats) -> tuple[Floats, Floats]:
-        """Return rotations, shape (B, 3, 3), and translations, shape (B, 3), of the frame, given those of all joints."""
+    def compute_placements(self, rotations: Floats, translations: Floats) -> tuple[Floats, Floats]:
+        """Return numeric placements of the frame, given those of all joints.
+
+        Args:
+            rotations: Rotations of all joints, shape (B, J, 3, 3).
+            translations: Their translations, shape (B, J, 3) [m].
+
+        Returns:
+            Rotations, shape (B, 3, 3), and translations, shape (B, 3) [m].
+        """
         rotation = rotations[:, self.joint]
         translation = rotation @ self.local.translation + translations[:, self.joint]
         if self.shift is not None:
@@ -85,30 +101,31 @@ class PoseRow:
 
 
 _VERTICAL = ("upright", "level")
-_HALF_TURN = 1e-6  # of (2 cos(θ/2))²
-_GENERIC = ca.DM([0.3, 0.55, 0.78])  # perpendicular to no axis that anybody turns about
+_MIN_SQUARED_COSINE = 1e-6  # of (2 cos(θ/2))²
+_GENERIC_VECTOR = ca.DM([0.3, 0.55, 0.78])  # not perpendicular to any axis that occurs in practice
 
 
-def pose_residual(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
-    """Return (p − p*, 2 sin(θ/2)·a) of a placement to `target` = (R* by columns, p*), shape (12, 1).
+def build_pose_residual(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
+    """Return the residual (p − p*, 2 sin(θ/2)·a) of a placement to `target` = (R*, p*).
 
-    Of a "pose" it has shape (6, 1): θ and a are angle and axis of E = R*ᵀR. Unlike ½ vee(E − Eᵀ),
-    which vanishes at θ = π too, this grows up to π, where the axis, and so every residual, has two
-    signs. Within 1e-3 of π it comes from E + I = 2aaᵀ instead, with a slope that leads away from
-    there. Of a "point" it is p − p*, shape (3, 1). Of "upright", shape (5, 1), θ is the angle
-    between the two verticals, and a has two components; "level", shape (2, 1), is the latter.
+    The target has shape (12, 1), with R* column by column. For a "pose" the residual has shape (6,
+    1); θ and a are angle and axis of E = R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π too,
+    it increases up to π, where the sign of the axis is ambiguous. Within 1e-3 of π it is computed
+    from E + I = 2aaᵀ instead, with a gradient that leads away from π. For a "point" the residual is
+    p − p*, shape (3, 1). For "upright", shape (5, 1), θ is the angle between the two verticals, and
+    a has two components; "level", shape (2, 1), has only these.
     """
     offset = translation - target[9:]
     if kind == "point":
         return offset
     if kind in _VERTICAL:
-        sideways, along = _tilt(rotation, target)
+        tilt_components, along = _compute_tilt(rotation, target)
         squared = 2.0 + 2.0 * along  # (2 cos(θ/2))²
         upside_down = ca.DM([2.0, 0.0])
         tilt = ca.if_else(
-            squared > _HALF_TURN,
-            2.0 * sideways / ca.sqrt(ca.fmax(squared, _HALF_TURN)),
-            upside_down + sideways,
+            squared > _MIN_SQUARED_COSINE,
+            2.0 * tilt_components / ca.sqrt(ca.fmax(squared, _MIN_SQUARED_COSINE)),
+            upside_down + tilt_components,
         )
         return ca.vertcat(offset, tilt) if kind == "upright" else tilt
     error = ca.reshape(target[:9], 3, 3).T @ rotation
@@ -116,27 +133,31 @@ def pose_residual(kind: str, rotation: Any, translation: Any, target: Any) -> An
         error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]
     )
     squared = 1.0 + error[0, 0] + error[1, 1] + error[2, 2]  # (2 cos(θ/2))²
-    turned = error @ _GENERIC + _GENERIC  # 2(a·g)a
-    turned = 2.0 * turned / ca.sqrt(ca.fmax(ca.sumsqr(turned), _HALF_TURN)) + vee
-    angle = ca.if_else(squared > _HALF_TURN, vee / ca.sqrt(ca.fmax(squared, _HALF_TURN)), turned)
+    flipped = error @ _GENERIC_VECTOR + _GENERIC_VECTOR  # 2(a·g)a
+    flipped = 2.0 * flipped / ca.sqrt(ca.fmax(ca.sumsqr(flipped), _MIN_SQUARED_COSINE)) + vee
+    angle = ca.if_else(
+        squared > _MIN_SQUARED_COSINE, vee / ca.sqrt(ca.fmax(squared, _MIN_SQUARED_COSINE)), flipped
+    )
     return ca.vertcat(offset, angle)
 
 
-def pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
-    """Return constraints that are linear in the placement, and lie between `ROW_BOUNDS` where, and only where, the goal holds.
+def build_pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
+    """Return constraint rows that lie within `ROW_BOUNDS` if and only if the goal holds.
 
-    A "pose" gives (p − p*, ½ vee(E − Eᵀ), trace E) with E = R*ᵀR, shape (7, 1): the trace keeps out
-    the half turns, where the antisymmetric part vanishes too. "level" gives (sideways, along),
-    shape (3, 1): the vertical's components across the target's vertical and along it, of which the
-    last keeps out what stands on its head. "upright" gives (p − p*, sideways, along), shape (6, 1).
-    Being linear in (R, p) they add nothing to the second derivatives of the kinematics, as
-    `pose_residual` would.
+    A "pose" gives (p − p*, ½ vee(E − Eᵀ), trace E) with E = R*ᵀR, shape (7, 1); the trace excludes
+    half turns, where the antisymmetric part vanishes too. "level" gives the components of the
+    vertical across the target's vertical and along it, shape (3, 1); the last one excludes the
+    upside-down orientation. "upright" gives p − p* and these, shape (6, 1). The rows are linear in
+    (R, p) and therefore add nothing to the second derivatives of the kinematics, as
+    `build_pose_residual` would.
     """
     offset = translation - target[9:]
     if kind == "point":
         return offset
     if kind in _VERTICAL:
-        return ca.vertcat(*([offset] if kind == "upright" else []), *_tilt(rotation, target))
+        return ca.vertcat(
+            *([offset] if kind == "upright" else []), *_compute_tilt(rotation, target)
+        )
     error = ca.reshape(target[:9], 3, 3).T @ rotation
     vee = (
         ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
@@ -145,77 +166,81 @@ def pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
     return ca.vertcat(offset, vee, error[0, 0] + error[1, 1] + error[2, 2])
 
 
-# numbers that say how far a frame is from its target: offset [m], axis and angle [rad] of the turn
+# Size of a pose offset: translation [m], rotation axis and rotation angle [rad].
 POSE_OFFSET_SIZE = 7
 
 
 def compute_pose_offsets(
     kind: str, rotations: Floats, translations: Floats, target: pin.SE3
 ) -> Floats:
-    """Return how far frames are from their target, shape (B, 7): p − p* [m], and axis a and angle θ [rad] of exp(θa) = R*ᵀR.
+    """Return the offsets of frames from their target, shape (B, 7).
 
-    For "upright" and "level" the turn is the shortest that makes the vertical the target's, for
-    "point" there is none, and no offset for "level"; see `relax_target`. It is as exact next to half
-    turns as anywhere else, which `pose_residual` is not.
+    An offset consists of p − p* [m], and axis a and angle θ [rad] of exp(θa) = R*ᵀR. For "upright"
+    and "level" the rotation is the shortest one that aligns the verticals; for "point" there is
+    none, and for "level" there is no translation; see `relax_target`. Unlike `build_pose_residual`,
+    offsets are accurate near half turns, too.
 
     Args:
-        kind: Of the goal.
-        rotations: Of the frames, shape (B, 3, 3).
-        translations: Theirs, shape (B, 3).
-        target: Where they are to be.
+        kind: Kind of the goal.
+        rotations: Rotations of the frames, shape (B, 3, 3).
+        translations: Translations of the frames, shape (B, 3) [m].
+        target: Target placement.
     """
-    turn, along = (
+    axis_sine, cosine = (
         np.zeros((len(rotations), 3)),
         np.ones(len(rotations)),
-    )  # a·sin and cos of θ, or of θ/2
+    )  # a·sin and cos of θ, or of θ/2 for a pose
     if (
         kind in _VERTICAL
-        # the vertical leans over by θ, as the world sees it; what stands on its head, about any level
+        # θ is the tilt of the vertical in the world; an upside-down frame tilts about any level
         # axis
     ):
         vertical = rotations[:, 2] @ target.rotation.T
-        turn = np.column_stack([vertical[:, 1], -vertical[:, 0], np.zeros(len(turn))])
-        turn, along = (
-            np.where(turn.any(axis=1, keepdims=True), turn, [1e-99, 0.0, 0.0]) @ target.rotation,
+        axis_sine = np.column_stack([vertical[:, 1], -vertical[:, 0], np.zeros(len(axis_sine))])
+        axis_sine, cosine = (
+            np.where(axis_sine.any(axis=1, keepdims=True), axis_sine, [1e-99, 0.0, 0.0])
+            @ target.rotation,
             vertical[:, 2],
         )
     elif kind == "pose":
         errors = map(
             np.asfortranarray, target.rotation.T @ rotations
-        )  # eigenpy never frees its copies of rows-first matrices
+        )  # eigenpy never frees its copies of row-major matrices
         quaternions = np.array([pin.Quaternion(error).coeffs() for error in errors]).reshape(-1, 4)
-        turn, along = (
+        axis_sine, cosine = (
             quaternions[:, :3] * np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0),
             np.abs(quaternions[:, 3]),
         )
-    size = np.linalg.norm(turn, axis=1, keepdims=True)
-    axis = np.where(size > 0.0, turn / np.maximum(size, np.finfo(float).tiny), [0.0, 0.0, 1.0])
-    angle = (2.0 if kind == "pose" else 1.0) * np.arctan2(size[:, 0], along)
+    size = np.linalg.norm(axis_sine, axis=1, keepdims=True)
+    axis = np.where(size > 0.0, axis_sine / np.maximum(size, np.finfo(float).tiny), [0.0, 0.0, 1.0])
+    angle = (2.0 if kind == "pose" else 1.0) * np.arctan2(size[:, 0], cosine)
     return np.column_stack([(kind != "level") * (translations - target.translation), axis, angle])
 
 
-def relax_target(target: Any, away: Any, share: Any) -> Any:
-    """Return a target moved back along the way to it, R*·exp(share·θ·a) and p* + share·(p − p*), shape (12, 1).
+def relax_target(target: Any, pose_offset: Any, relaxation: Any) -> Any:
+    """Return a target moved towards a frame: R*·exp(e·θ·a) and p* + e·(p − p*), shape (12, 1).
 
-    At a share of 1 it is where the frame was from which `away`, shape (7, 1), was taken, see
-    `compute_pose_offsets`; at 0 the target itself. On the way orientations turn about one axis (a geodesic),
-    so that a half turn is as good as any other.
+    With relaxation e = 1 it is where the frame was when `pose_offset`, shape (7, 1), was computed,
+    see `compute_pose_offsets`; with e = 0 it is the target itself. Orientations in between follow a
+    geodesic, so that half turns need no special treatment.
     """
-    skew = ca.skew(away[3:6])
+    skew = ca.skew(pose_offset[3:6])
     turn = (
         ca.DM.eye(3)
-        + ca.sin(share * away[6]) * skew
-        + (1.0 - ca.cos(share * away[6])) * (skew @ skew)
+        + ca.sin(relaxation * pose_offset[6]) * skew
+        + (1.0 - ca.cos(relaxation * pose_offset[6])) * (skew @ skew)
     )
-    return ca.vertcat(ca.vec(ca.reshape(target[:9], 3, 3) @ turn), target[9:] + share * away[:3])
+    return ca.vertcat(
+        ca.vec(ca.reshape(target[:9], 3, 3) @ turn), target[9:] + relaxation * pose_offset[:3]
+    )
 
 
-def _tilt(rotation: Any, target: Any) -> tuple[Any, Any]:
-    """Return the world's vertical, seen from the body, across the target's (2 components) and along it."""
+def _compute_tilt(rotation: Any, target: Any) -> tuple[Any, Any]:
+    """Return the components of the vertical across and along the target's, in the frame."""
     vertical = ca.reshape(target[:9], 3, 3) @ rotation[2, :].T
     return vertical[:2], vertical[2]
 
 
-def target_vector(placement: pin.SE3) -> Floats:
-    """Return `placement` as the 12 numbers that targets are."""
+def flatten_target(placement: pin.SE3) -> Floats:
+    """Return `placement` as the 12 numbers of a target."""
     return np.concatenate([placement.rotation.T.ravel(), placement.translation])

@@ -123,12 +123,12 @@ def blocked(problem: TrajectoryProblem, number: int, random_seed: int) -> Blocke
     contacts = problem.contacts.evaluate(
         reached, np.full(len(reached), end), reach=problem.options.largest_margin
     )
-    shortfall = contacts.shortfall(len(reached))
+    shortfall = contacts.compute_shortfall(len(reached))
     if shortfall.min() <= CLOSE_ENOUGH:  # a motion that ended so may go on so
         return None
     best = int(np.argmin(shortfall))
     worst = int(np.flatnonzero(contacts.waypoint == best)[0])
-    labels = problem.contacts.phases[problem.contacts.phase_of(end)].labels
+    labels = problem.contacts.phases[problem.contacts.find_phase(end)].labels
     first, second = contacts.pair[worst]
     text = (
         f"{phase.name}: all {len(reached)} configurations found there are blocked; in the least blocked one "

@@ -172,8 +172,10 @@ def _standing(
     part = problem.contacts.phases[number]
     robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
     base = [i for i, shape in enumerate(robot) if shape.parentJoint == _BASE]
-    left = {i for own in part.left.values() for i in own}
-    eased = {int(part.pairs[pair, 1]) for pair in part.eased if part.pairs[pair, 0] in base}
+    left = {i for own in part.released.values() for i in own}
+    eased = {
+        int(part.pairs[pair, 1]) for pair in part.reduced_margins if part.pairs[pair, 0] in base
+    }
     hits = np.bincount(part.pairs[np.isin(part.pairs[:, 0], base), 1], minlength=len(part.shapes))
     solid = [
         i

@@ -213,7 +213,7 @@ def folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) -> Floa
 
 def _apart(problem: TrajectoryProblem, phase: int, z: Floats) -> Bools:
     """Return with which configurations, shape (B, n), the robot keeps its margins to itself and to what it carries."""
-    return depth(problem, z, problem.contacts.inside(phase), standing=False) <= 0.0
+    return depth(problem, z, problem.contacts.find_waypoint(phase), standing=False) <= 0.0
 
 
 def _reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[Floats, Floats]:
@@ -221,7 +221,7 @@ def _reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[Floats, F
     chain, shapes = problem.chain, problem.contacts.phases[phase].shapes
     rotations, translations = chain.joint_placements(z)
     reach, base = np.zeros((len(z), 3)), np.zeros(3)
-    carried = problem.contacts.carried(phase)
+    carried = problem.contacts.find_attached_geometries(phase)
     for shape in (
         shapes[i] for i in [*range(len(chain.robot.collision.geometryObjects)), *carried]
     ):
@@ -257,7 +257,7 @@ def grid_shapes(
     chain, part = problem.chain, problem.contacts.phases[phase]
     rotations, translations = chain.joint_placements(z[None])
     robot = range(len(chain.robot.collision.geometryObjects))
-    held = problem.contacts.carried(phase)
+    held = problem.contacts.find_attached_geometries(phase)
     moving: list[tuple[int, Shape]] = []
     for shape in (part.shapes[i] for i in [*robot, *held]):
         joint = shape.parentJoint

@@ -128,7 +128,7 @@ class Beam:
 
     def _closed_at(self, waypoint: int) -> bool:
         return self.problem.closed(
-            self.problem.task.phases[self.problem.contacts.phase_of(waypoint)]
+            self.problem.task.phases[self.problem.contacts.find_phase(waypoint)]
         )
 
     def _knots(self, first: int, last: int) -> list[int]:
@@ -338,10 +338,10 @@ class Beam:
 
     def _around(self, paths: Floats, z: Floats, at: list[int], k: int) -> Floats:
         """Return what paths cost from the knot before `k` to the one after it, if they went through z, shape (B, n), there."""
-        cost = self._path_cost(paths[:, k - 1], z, self.problem.contacts.phase_of(at[k]))
+        cost = self._path_cost(paths[:, k - 1], z, self.problem.contacts.find_phase(at[k]))
         if k + 1 < len(at):
             cost = cost + self._path_cost(
-                z, paths[:, k + 1], self.problem.contacts.phase_of(at[k + 1])
+                z, paths[:, k + 1], self.problem.contacts.find_phase(at[k + 1])
             )
         return cost
 

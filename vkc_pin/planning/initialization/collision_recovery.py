@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.inverse_kinematics import LONGEST_STEP, PoseSolver
+from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP, PoseSolver
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
@@ -33,7 +33,7 @@ def clear_out(
     their margins to keep them, linearised: with the witness points fixed in their bodies the
     gradient of a distance d = n·(b − a) is n·(∂b − ∂a). It aims at `Options.dist_safe` more than
     the margins, looks at `Options.contact_slots` contacts, the nearest, and is no longer than
-    `LONGEST_STEP`.
+    `MAX_STEP`.
 
     Args:
         problem: Whose contacts count.
@@ -55,13 +55,13 @@ def clear_out(
         contacts = problem.contacts.evaluate(
             z[at], np.full(len(at), waypoint), reach=options.largest_margin + extra, nearest=slots
         )
-        short = contacts.shortfall(len(at))
+        short = contacts.compute_shortfall(len(at))
         residual, pose_rows = solver.evaluate(z[at], target)
         done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < TOLERANCE)
         # Gradients of the nearest distances, and by how much they should grow [m].
         rows, growth = np.zeros((len(at), slots, z.shape[1])), np.zeros((len(at), slots))
-        rows[contacts.waypoint, contacts.place] = problem.contacts.gradients(z[at], contacts)
-        growth[contacts.waypoint, contacts.place] = np.maximum(
+        rows[contacts.waypoint, contacts.slot] = problem.contacts.compute_gradients(z[at], contacts)
+        growth[contacts.waypoint, contacts.slot] = np.maximum(
             contacts.margin + extra - contacts.distance, 0.0
         )
         jacobian, wanted = (
@@ -72,7 +72,7 @@ def clear_out(
         system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
         step = np.einsum("bij,bi->bj", scaled, np.linalg.solve(system, wanted[..., None])[..., 0])
         step *= np.minimum(
-            1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12)
+            1.0, MAX_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12)
         )
         step[done[at]] = 0.0
         z[at] = np.clip(z[at] + step, lower[at], upper[at])

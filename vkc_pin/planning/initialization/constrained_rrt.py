@@ -100,7 +100,7 @@ class _Search:
         self.knots, self.problem = knots, knots.problem
         self.end = int(self.problem.ends[phase])
         self.begin = self.end - steps
-        self.waypoint = self.problem.contacts.inside(phase)
+        self.waypoint = self.problem.contacts.find_waypoint(phase)
         pose = knots.pose_at(self.end)
         assert pose is not None, "what is held closes the chain"
         self.solver, self.target = knots.solver(pose)

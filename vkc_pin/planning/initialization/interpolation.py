@@ -223,7 +223,7 @@ class Joiner:
         first = self.approach.after(ends[0], phase, previous)
         last = self.approach.before(ends[1], phase)
         if self.paths is not None and self.paths.careful:
-            waypoint = self.problem.contacts.inside(number)
+            waypoint = self.problem.contacts.find_waypoint(number)
             first, last = (
                 part[: len(part) if self._free(part, waypoint) else 0] for part in (first, last)
             )

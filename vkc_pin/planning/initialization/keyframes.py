@@ -174,7 +174,7 @@ class Knots:
 
     def _held_at(self, waypoint: int) -> bool:
         return self.problem.closed(
-            self.problem.task.phases[self.problem.contacts.phase_of(waypoint)]
+            self.problem.task.phases[self.problem.contacts.find_phase(waypoint)]
         )
 
     def clear(self, z: Floats, waypoint: int) -> Floats:
@@ -309,8 +309,8 @@ def depth(
         np.full(len(z), waypoint),
         problem.options.largest_margin if reach is None else reach,
     )
-    contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, standing=standing)
-    return contacts.shortfall(len(z))
+    contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, static=standing)
+    return contacts.compute_shortfall(len(z))
 
 
 def scatter(

@@ -299,7 +299,7 @@ class _SeedSearch:
             contacts = self.problem.evaluate_contacts(
                 z, reach=self.problem.options.largest_margin, nearest=1
             )
-            short = contacts.shortfall(len(z))
+            short = contacts.compute_shortfall(len(z))
             overlap = float(max(short.max() - self.problem.options.dist_safe, 0.0))
             merit = self.problem.objective(
                 z, self.problem.timing_for(z).dt

@@ -125,7 +125,7 @@ class _Search:
             step,
         )
         self.size = problem.chain.robot.coordinates.size
-        self.waypoint = problem.contacts.inside(phase)
+        self.waypoint = problem.contacts.find_waypoint(phase)
         self.allowed = (
             problem.options.dist_safe
         )  # all of a margin may be missing: the solver pushes that apart
@@ -168,7 +168,7 @@ class _Search:
     def _lines(self) -> Any:
         """Looks at straight lines."""
         contacts, weights = self.problem.contacts, self.weights
-        return contacts.lines(
+        return contacts.make_line_checker(
             self.first,
             self.waypoint,
             weights=weights,

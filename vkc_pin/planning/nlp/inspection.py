@@ -83,12 +83,12 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     """
     t, labels = (
         problem.transcription,
-        problem.contacts.phases[problem.contacts.phase_of(waypoint)].labels,
+        problem.contacts.phases[problem.contacts.find_phase(waypoint)].labels,
     )
-    model = problem.contacts.settled(z)
+    model = problem.contacts.with_released_objects(z)
     waypoints = np.arange(1, problem.segments + 1)
     contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
-    coefficients, offsets = model.planes(z, contacts, slots=t.slots)
+    coefficients, offsets = model.compute_planes(z, contacts, slots=t.slots)
     x = t.pack(z)
     dt, targets = problem.timing_for(z).dt, problem.target_matrix()
     weights, penalty = problem.effort.weights(*problem.rates(z)), problem.options.penalty

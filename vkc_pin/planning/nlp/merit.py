@@ -63,7 +63,7 @@ class Infeasibility:
 
 def compute_shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
     """Return the clearance shortfall of the pairs with witness planes, shape (N, K) [m]."""
-    plane = contacts.place
+    plane = contacts.slot
     has_plane = plane < slots
     shortfalls = np.zeros((segments, slots))
     shortfalls[contacts.waypoint[has_plane], plane[has_plane]] = np.maximum(
@@ -93,7 +93,9 @@ def measure_infeasibility(
         if goal.row.waypoints:
             at = np.array(goal.row.waypoints) - 1
             pose_offsets[at, k] = compute_pose_offsets(
-                goal.row.kind, *goal.row.placed(rotations[at], translations[at]), goal.target
+                goal.row.kind,
+                *goal.row.compute_placements(rotations[at], translations[at]),
+                goal.target,
             )
     amounts["poses"] = np.linalg.norm(pose_offsets[:, :, :3], axis=2).sum(axis=1) + pose_offsets[
         :, :, 6

@@ -11,7 +11,7 @@ import numpy as np
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts
-from vkc_pin.planning.chain.pose import ROW_BOUNDS, target_vector
+from vkc_pin.planning.chain.pose import ROW_BOUNDS, flatten_target
 from vkc_pin.planning.nlp.objective import MotionCost
 from vkc_pin.planning.nlp.pose_goals import (
     find_approach_waypoint,
@@ -273,7 +273,7 @@ class TrajectoryProblem:
             reach: Pairs further apart are omitted [m].
             nearest: Maximum number of pairs per waypoint. Defaults to all.
         """
-        return self.contacts.settled(z).evaluate(
+        return self.contacts.with_released_objects(z).evaluate(
             z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest
         )
 
@@ -382,7 +382,7 @@ class TrajectoryProblem:
 
     def target_matrix(self) -> Floats:
         """Return the pose targets as parameters, shape (poses, 12)."""
-        return np.array([target_vector(t) for t in self.targets]).reshape(-1, 12)
+        return np.array([flatten_target(t) for t in self.targets]).reshape(-1, 12)
 
     def __repr__(self) -> str:
         t, time = self.transcription, self.timing_for(self.still).dt.sum()

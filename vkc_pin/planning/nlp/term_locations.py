@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
-from vkc_pin.planning.chain.pose import target_vector
+from vkc_pin.planning.chain.pose import flatten_target
 from vkc_pin.planning.nlp.term_rows import FrameLocation, TermLocation, TermRow, Tree, Value
 from vkc_pin.planning.nlp.transcription import Transcription
 from vkc_pin.utils.arrays import Floats
@@ -123,7 +123,7 @@ class _FrameLocator:
 
 
 def _flatten_placement(placement: pin.SE3) -> tuple[float, ...]:
-    return tuple(target_vector(placement).tolist())
+    return tuple(flatten_target(placement).tolist())
 
 
 class TermEvaluator:

@@ -152,7 +152,7 @@ class TermFunctions:
             if frame.joint == 0:
                 return ca.DM(frame.local)
             if frame.waypoint not in chain:
-                chain[frame.waypoint] = get_kinematics(model, cache).symbolic(
+                chain[frame.waypoint] = get_kinematics(model, cache).build_placements(
                     points[frame.waypoint]
                 )
             return _to_column(_to_matrix(chain[frame.waypoint][:, frame.joint - 1]) @ local)
@@ -195,7 +195,7 @@ def _place_in_tree(frame: FrameLocation, points: list[Any], cache: Cache) -> Any
         points[frame.waypoint][v.column] if v.column is not None else ca.SX(v.number)
         for v in tree.values
     ]
-    placements = get_kinematics(model, cache).symbolic(ca.vertcat(*values))
+    placements = get_kinematics(model, cache).build_placements(ca.vertcat(*values))
     return base @ _to_matrix(placements[:, frame.joint - 1])
 
 

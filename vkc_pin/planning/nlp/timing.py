@@ -49,7 +49,9 @@ class Timing:
         )
         return np.asarray(self.limits[1] * row_durations[:, None] ** 2)
 
-    def violation(self, first: Floats, second: Floats, needed: Floats | float = 0.0) -> float:
+    def compute_violation(
+        self, first: Floats, second: Floats, needed: Floats | float = 0.0
+    ) -> float:
         """Return the largest bound violation of steps and their changes, relative to the bounds.
 
         Args:

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.planning.chain.kinematics import get_kinematics
-from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, pose_rows, relax_target
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, build_pose_rows, relax_target
 from vkc_pin.planning.kinematics.batch import estimate_size
 from vkc_pin.planning.kinematics.machine_code import MachineCode
 from vkc_pin.planning.nlp.sparse import assemble
@@ -109,7 +109,7 @@ class WaypointFunctions:
         parts = []
         for k, pose in enumerate(poses):
             target = relax_target(targets[:, k], pose_offsets[:, k], relaxation)
-            parts.append(pose_rows(pose.kind, *pose.placement(placements), target))
+            parts.append(build_pose_rows(pose.kind, *pose.build_placement(placements), target))
         pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
         self.pose_rows = [pose.rows for pose in poses]
         self.rows = slots + sum(self.pose_rows)
@@ -265,7 +265,7 @@ class _KinematicSweep:
             ca.SX.sym("z", coordinates.size),
             ca.SX.sym("C", slots, 12 * (model.njoints - 1)),
         )
-        placements = get_kinematics(model, cache).symbolic(z)
+        placements = get_kinematics(model, cache).build_placements(z)
         self.function = ca.Function(
             "sweep",
             [z, planes],

@@ -1,4 +1,4 @@
-"""Motions whose accelerations grow and fade: limits of jerk."""
+"""Limits the jerk of a motion along a path."""
 
 from __future__ import annotations
 
@@ -13,74 +13,89 @@ from vkc_pin.world.trajectory.curve import Curve, sample_intervals
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
-__all__ = ["eased"]
+__all__ = ["limit_jerk"]
 
-_SPANS = np.geomspace(
+_SPAN_FACTORS = np.geomspace(
     0.25, 4.0, 9
-)  # of the average, as multiples of the time in which an acceleration may grow
-_LEAST = 4  # cubics in a step, at least
-_SHARE = 0.5  # of the average that a cubic may last
-_LOOKS = 8  # places on a cubic, between which the time of a waypoint is sought
-_ROUNDS = 6  # of Newton's method
+)  # Averaging intervals, as multiples of the time in which an acceleration may build up.
+_MIN_CUBICS_PER_STEP = 4  # minimum number of cubics per step
+_MAX_CUBIC_DURATION = 0.5  # maximum duration of a cubic, relative to the averaging interval
+_SAMPLES_PER_CUBIC = 8  # samples per cubic to bracket the time of a waypoint
+_NEWTON_ITERATIONS = 6  # iterations of Newton's method
 
 
-def eased(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits) -> Curve:
-    """Return a curve along a path whose jerk is within limits, with accelerations that do not jump, from none to none.
+def limit_jerk(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits) -> Curve:
+    """Return a curve along a path with limited jerk, and zero acceleration at both ends.
 
-    How far it has come, s(t), is replaced by its average over some time before: where s is twice
-    differentiable but for jumps, its average is but for kinks, and goes neither back nor faster.
-    Through places along the path at the times of that, closely, lead cubics that are twice
-    differentiable, whose jerk is the same all along each; the second and the last but one are where
-    that has them, so that there is no acceleration at both ends. They are slowed down until all
-    limits are kept. Of several spans of the average, that one is taken with which they take least
-    time.
+    The progress s(t) along the path is replaced by its moving average, which is smoother by one
+    order and moves neither backwards nor faster. Twice differentiable cubics, each of constant
+    jerk, interpolate the path at the resulting times; at the second point and the last but one they
+    are free, so that the acceleration can vanish at both ends. They are then slowed down until all
+    limits are kept. Several averaging intervals are tried, and the fastest result is returned.
 
     Args:
-        path: The path; knots at the ends of each step, and as many in every step.
-        pace: How far along it when, one coordinate, from rest to rest, beginning with 0 at 0 s.
-        steps: How many.
-        limits: Of the path's coordinates.
+        path: The path, with knots at the ends of each step and the same number of knots in every
+            step.
+        pace: Progress along the path over time, one coordinate, from rest to rest, starting with 0
+            at 0 s.
+        steps: Number of steps.
+        limits: Limits of the path's coordinates.
     """
-    usual = float((limits.acceleration / limits.jerk)[np.isfinite(limits.jerk)].max())
-    found = (limits.slowed(_averaged(path, pace, steps, share * usual)) for share in _SPANS)
-    return min(found, key=lambda curve: float(curve.times[-1]))
+    rise_time = float((limits.acceleration / limits.jerk)[np.isfinite(limits.jerk)].max())
+    candidates = (
+        limits.slow_down(_average_pace(path, pace, steps, factor * rise_time))
+        for factor in _SPAN_FACTORS
+    )
+    return min(candidates, key=lambda curve: float(curve.times[-1]))
 
 
-def _averaged(path: CubicHermiteSpline, pace: Curve, steps: int, span: float) -> Curve:
-    """Return the curve with an average over some time [s], before it is slowed down."""
+def _average_pace(path: CubicHermiteSpline, pace: Curve, steps: int, span: float) -> Curve:
+    """Return the curve for an averaging interval `span` [s], before it is slowed down."""
     from scipy.interpolate import CubicHermiteSpline as Hermite
     from scipy.interpolate import make_interp_spline
 
-    way = Hermite(pace.times, pace.positions[:, 0], pace.rates[:, 0])
-    area, last, length = way.antiderivative(), float(pace.times[-1]), float(pace.positions[-1, 0])
+    progress = Hermite(pace.times, pace.positions[:, 0], pace.rates[:, 0])
+    area, last, length = (
+        progress.antiderivative(),
+        float(pace.times[-1]),
+        float(pace.positions[-1, 0]),
+    )
 
-    def gone(times: Floats) -> Floats:
+    def compute_progress(times: Floats) -> Floats:
         now, before = (
             area(np.clip(t, 0.0, last)) + length * np.maximum(t - last, 0.0)
             for t in (times, times - span)
         )
         return np.asarray((now - before) / span)
 
-    def speed(times: Floats) -> Floats:
-        now, before = (way(np.clip(t, 0.0, last)) for t in (times, times - span))
+    def compute_speed(times: Floats) -> Floats:
+        now, before = (progress(np.clip(t, 0.0, last)) for t in (times, times - span))
         return np.asarray((now - before) / span)
 
-    places = path.x[:: (len(path.x) - 1) // steps]
-    coarse = np.linspace(0.0, last + span, _LOOKS * len(pace.times))
-    stops = np.interp(places, gone(coarse), coarse)
-    for _ in range(_ROUNDS):
-        stops[1:-1] -= np.clip(
-            (gone(stops) - places) / np.maximum(speed(stops), 1e-12), -span, span
+    waypoint_positions = path.x[:: (len(path.x) - 1) // steps]
+    coarse = np.linspace(0.0, last + span, _SAMPLES_PER_CUBIC * len(pace.times))
+    waypoint_times = np.interp(waypoint_positions, compute_progress(coarse), coarse)
+    for _ in range(_NEWTON_ITERATIONS):
+        waypoint_times[1:-1] -= np.clip(
+            (compute_progress(waypoint_times) - waypoint_positions)
+            / np.maximum(compute_speed(waypoint_times), 1e-12),
+            -span,
+            span,
         )[1:-1]
-    stops[0], stops[-1] = 0.0, last + span
-    parts = max(_LEAST, int(np.ceil(np.diff(stops).max() / (_SHARE * span))))
-    times = sample_intervals(stops, np.arange(parts) / parts, last=True)
-    rows = path(np.clip(gone(times), 0.0, length))
-    rows[::parts] = path(places)
-    known = np.delete(np.arange(len(times)), [1, -2])
+    waypoint_times[0], waypoint_times[-1] = 0.0, last + span
+    parts = max(
+        _MIN_CUBICS_PER_STEP,
+        int(np.ceil(np.diff(waypoint_times).max() / (_MAX_CUBIC_DURATION * span))),
+    )
+    times = sample_intervals(waypoint_times, np.arange(parts) / parts, last=True)
+    rows = path(np.clip(compute_progress(times), 0.0, length))
+    rows[::parts] = path(waypoint_positions)
+    interpolated = np.delete(np.arange(len(times)), [1, -2])
     knots = np.concatenate([np.repeat(times[0], 3), times, np.repeat(times[-1], 3)])
-    still = [(order, np.zeros(rows.shape[1])) for order in (1, 2)]
-    spline = make_interp_spline(times[known], rows[known], k=3, t=knots, bc_type=(still, still))
+    at_rest = [(order, np.zeros(rows.shape[1])) for order in (1, 2)]
+    spline = make_interp_spline(
+        times[interpolated], rows[interpolated], k=3, t=knots, bc_type=(at_rest, at_rest)
+    )
     rates = spline(times, 1)
     rates[[0, -1]] = 0.0
     return Curve(times, spline(times), rates)

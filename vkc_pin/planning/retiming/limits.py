@@ -1,4 +1,4 @@
-"""What bounds the speed of coordinates, and by how much a curve is too fast."""
+"""Holds the rate limits of coordinates and slows curves down to keep them."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class Limits(NamedTuple):
     jerk: Floats
 
     @classmethod
-    def of(cls, scene: Scene, names: Sequence[str], jerk_time: float) -> Limits:
-        """Return the limits (eqs. 4 and 5) of the robot's coordinates and "<object>.<joint>"; freedoms of grasps have none.
+    def from_scene(cls, scene: Scene, names: Sequence[str], jerk_time: float) -> Limits:
+        """Return the limits (eqs. 4 and 5) of coordinates; freedoms of grasps have none.
 
         Args:
             scene: Robot and objects.
-            names: Of the coordinates.
+            names: Coordinate names of the robot, and "<object>.<joint>".
             jerk_time: See `Options.jerk_time`.
         """
-        robot, known = scene.robot, dict[str, tuple[float, ...]]()
+        robot, limits_by_name = scene.robot, dict[str, tuple[float, ...]]()
         sources = [
             (
                 "",
@@ -52,45 +52,47 @@ class Limits(NamedTuple):
                     (item.lower, item.upper, item.velocity, item.acceleration),
                 )
             )
-        for prefix, own, values in sources:
-            known |= {
+        for prefix, coordinate_names, values in sources:
+            limits_by_name |= {
                 prefix + name: tuple(row)
-                for name, row in zip(own, np.transpose(values).tolist(), strict=True)
+                for name, row in zip(coordinate_names, np.transpose(values).tolist(), strict=True)
             }
-        rows = np.array([known.get(name, (-np.inf, np.inf, np.inf, np.inf)) for name in names])
+        rows = np.array(
+            [limits_by_name.get(name, (-np.inf, np.inf, np.inf, np.inf)) for name in names]
+        )
         lower, upper, velocity, acceleration = rows.T
         jerk = acceleration / jerk_time if jerk_time > 0.0 else np.full(len(names), np.inf)
         return cls(lower, upper, velocity, acceleration, jerk)
 
     def with_wheels(self, rolling: RollingLimits) -> Limits:
-        """Return the limits of the wheels of a base, left and right, after the others.
+        """Return the limits with those of the left and right wheel appended.
 
-        Nothing is said of their accelerations: what those of the base come to.
+        The wheels' acceleration is limited only by that of the base.
         """
-        strongest = self.acceleration[:2].sum() + rolling.track / 2 * self.acceleration[2]
-        wheel = (-np.inf, np.inf, rolling.wheel_speed, strongest, np.inf)
+        acceleration = self.acceleration[:2].sum() + rolling.track / 2 * self.acceleration[2]
+        wheel = (-np.inf, np.inf, rolling.wheel_speed, acceleration, np.inf)
         return Limits(
             *(np.append(side, [value, value]) for side, value in zip(self, wheel, strict=True))
         )
 
     @property
-    def jerky(self) -> bool:
-        """Whether nothing bounds the jerk."""
+    def has_unlimited_jerk(self) -> bool:
+        """Whether the jerk of no coordinate is limited."""
         return not np.isfinite(self.jerk).any()
 
-    def factor(self, curve: Curve) -> float:
-        """Return how many times as long, at least 1, a curve must take to keep the limits of its rates of change."""
-        fastest, strongest = curve.compute_max_rates()
-        needed = [
+    def compute_slowdown(self, curve: Curve) -> float:
+        """Return the factor, at least 1, by which a curve must be slowed to keep its limits."""
+        speeds, accelerations = curve.compute_max_rates()
+        factors = [
             1.0,
-            float((fastest / self.velocity).max()),
-            float(np.sqrt((strongest / self.acceleration).max())),
+            float((speeds / self.velocity).max()),
+            float(np.sqrt((accelerations / self.acceleration).max())),
         ]
-        if not self.jerky:
-            needed.append(float(np.cbrt((curve.compute_jerks()[0] / self.jerk).max())))
-        return max(needed) * (1.0 + _ROUNDING)
+        if not self.has_unlimited_jerk:
+            factors.append(float(np.cbrt((curve.compute_jerks()[0] / self.jerk).max())))
+        return max(factors) * (1.0 + _ROUNDING)
 
-    def slowed(self, curve: Curve) -> Curve:
-        """Return a curve as it is, or slower by the factor that it takes to keep the limits."""
-        factor = self.factor(curve)
+    def slow_down(self, curve: Curve) -> Curve:
+        """Return a curve, slowed down as much as its rate limits require."""
+        factor = self.compute_slowdown(curve)
         return Curve(curve.times * factor, curve.positions, curve.rates / factor)

@@ -1,4 +1,4 @@
-"""Smooth motions that a check accepts: closer to the straight lines between waypoints where it does not."""
+"""Retimes waypoints and pulls the path towards straight lines where a check rejects it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["accepted"]
+__all__ = ["retime_and_repair"]
 
-# how often a curve is drawn closer to the straight lines; each time it leaves them a quarter as far
-_REPAIRS = 3
+# Maximum number of repairs; each one reduces the deviation from the straight line to a quarter.
+_MAX_REPAIRS = 3
 
 
-class _Found(Protocol):
-    """What is wrong at a waypoint, or between it and the next."""
+class _ViolationLike(Protocol):
+    """A violation at a waypoint, or between it and the next one."""
 
     @property
     def constraint(self) -> str: ...
@@ -27,52 +27,56 @@ class _Found(Protocol):
     def waypoint(self) -> int: ...
 
 
-class _Report(Protocol):
-    """What a check finds."""
+class _ReportLike(Protocol):
+    """The result of a check."""
 
     @property
     def ok(self) -> bool: ...
 
     @property
-    def violations(self) -> Sequence[_Found]: ...
+    def violations(self) -> Sequence[_ViolationLike]: ...
 
 
-R = TypeVar("R", bound=_Report)
+ReportT = TypeVar("ReportT", bound=_ReportLike)
 
 
-def accepted(
+def retime_and_repair(
     scene: Scene,
     waypoints: Trajectory,
-    check: Callable[[Trajectory], R],
+    check: Callable[[Trajectory], ReportT],
     *,
-    repairs: int = _REPAIRS,
+    repairs: int = _MAX_REPAIRS,
     jerk_time: float = 0.0,
-) -> tuple[Trajectory, R]:
-    """Return a motion through waypoints, see `retime_trajectory`, and what a check says of it; a last one, if none is accepted.
+) -> tuple[Trajectory, ReportT]:
+    """Return a trajectory through waypoints and the report of its check, accepted or not.
 
-    Where something is wrong, the path passes the middles of the straight lines as well, which the
-    program has looked along.
+    Where the check finds a violation, the path additionally passes through the midpoints of the
+    straight lines between waypoints, which the optimisation has checked for collision. See
+    `retime_trajectory`.
 
     Args:
         scene: Robot and objects.
-        waypoints: The waypoints, with as much time as they please.
-        check: Looks at a motion.
-        repairs: How often it is drawn closer to the straight lines.
+        waypoints: Trajectory whose waypoints are kept; its times do not matter.
+        check: Function that checks a trajectory.
+        repairs: Maximum number of repairs.
         jerk_time: See `Options.jerk_time`.
+
+    Returns:
+        The last trajectory and its report.
     """
     parts = np.ones(len(waypoints.times) - 1, int)
     trajectory = retime_trajectory(scene, waypoints, jerk_time=jerk_time)
     report = check(trajectory)
     for _ in range(repairs):
-        near = {
-            found.waypoint + k
-            for found in report.violations
+        nearby_steps = {
+            violation.waypoint + k
+            for violation in report.violations
             for k in (-1, 0, 1)
-            if found.constraint != "torque"
+            if violation.constraint != "torque"
         }
-        if not near:  # all is well, or too heavy on whatever curve
+        if not nearby_steps:  # no violation, or only torques, which no other path would reduce
             break
-        parts[[k for k in near if 0 <= k < len(parts)]] *= 2
+        parts[[k for k in nearby_steps if 0 <= k < len(parts)]] *= 2
         trajectory = retime_trajectory(scene, waypoints, parts, jerk_time=jerk_time)
         report = check(trajectory)
     return trajectory, report

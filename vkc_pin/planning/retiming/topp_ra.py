@@ -1,4 +1,4 @@
-"""How fast a path can be gone along, from rest to rest: time-optimal path parametrization (TOPP-RA)."""
+"""Computes the fastest speed along a path from rest to rest (time-optimal path parametrisation)."""
 
 from __future__ import annotations
 
@@ -15,33 +15,37 @@ if TYPE_CHECKING:
 
 __all__ = ["compute_speeds"]
 
-_ASIDE = (
+_KNOT_OFFSETS = (
     1e-3,
     1e-2,
-)  # share of a segment beside its ends at which accelerations are limited: at the end they jump
+    # Offsets of the constrained points from the ends of a segment, relative to its length;
+    # accelerations are discontinuous at the ends.
+)
 
 
 def compute_speeds(
     path: CubicHermiteSpline,
-    places: Floats,
+    positions: Floats,
     velocity: Floats,
     acceleration: Floats,
     linear: Callable[[Floats], tuple[Floats, Floats, Floats]] | None = None,
 ) -> Floats | None:
-    """Return how fast a path can be gone along at some places, from rest to rest, shape (K,) [1/s]; None: it is not known.
+    """Return the fastest speeds along a path at given positions, from rest to rest.
 
-    Between two places the speed changes evenly in time. It is TOPP-RA's (Pham and Pham, A new
-    approach to time-optimal path parameterization based on reachability analysis, 2018), as the
-    library `toppra` computes it.
+    Between two positions the speed is linear in time. The speeds are those of TOPP-RA (Pham and
+    Pham, A new approach to time-optimal path parameterization based on reachability analysis,
+    2018), computed by the library `toppra`.
 
     Args:
-        path: The path, of n coordinates.
-        places: Along it, increasing, from its begin to its end, all knots of the path among them,
-            shape (K,).
-        velocity: Limits, shape (n,) [m/s], [rad/s]; inf: none.
-        acceleration: Limits, shape (n,) [m/s²], [rad/s²]; inf: none.
-        linear: Returns a, b, c at places, shape (K, m) each, with |a u + b w² + c| ≤ 1 for the
-            path's velocity w and acceleration u; None: nothing but limits bounds it.
+        path: Path of n coordinates.
+        positions: Increasing path positions, including both ends and all knots, shape (K,).
+        velocity: Velocity limits, shape (n,) [m/s], [rad/s]; inf: none.
+        acceleration: Acceleration limits, shape (n,) [m/s²], [rad/s²]; inf: none.
+        linear: Further constraints: returns a, b, c at positions, shape (K, m) each, with |a u + b
+            w² + c| ≤ 1 for the path velocity w and acceleration u. Defaults to none.
+
+    Returns:
+        Path velocities, shape (K,) [1/s], or None if they cannot be computed.
     """
     from toppra.algorithm import TOPPRA
     from toppra.constraint import (
@@ -50,50 +54,59 @@ def compute_speeds(
         JointVelocityConstraint,
     )
 
-    both = np.flatnonzero(np.isfinite(velocity) & np.isfinite(acceleration))
-    if not len(both):
+    limited = np.flatnonzero(np.isfinite(velocity) & np.isfinite(acceleration))
+    if not len(limited):
         return None
-    _silence()
-    rates = JointVelocityConstraint(np.column_stack([-velocity[both], velocity[both]]))
-    limits = np.column_stack([-acceleration[both], acceleration[both]])
+    _silence_toppra()
+    rates = JointVelocityConstraint(np.column_stack([-velocity[limited], velocity[limited]]))
+    limits = np.column_stack([-acceleration[limited], acceleration[limited]])
     changes = JointAccelerationConstraint(
         limits, discretization_scheme=DiscretizationType.Interpolation
     )
-    for aside in _ASIDE:
-        grid = _beside(path.x, places, aside)
-        bounds = (
-            [rates, changes] if linear is None else [rates, changes, _linear(linear, len(both))]
+    for offset in _KNOT_OFFSETS:
+        grid = _replace_knots(path.x, positions, offset)
+        constraints = (
+            [rates, changes]
+            if linear is None
+            else [rates, changes, _to_toppra_constraint(linear, len(limited))]
         )
-        found = TOPPRA(bounds, _geometric(path, both), gridpoints=grid, solver_wrapper="seidel")
-        _, speeds, _ = found.compute_parameterization(0.0, 0.0)
+        solver = TOPPRA(
+            constraints, _to_toppra_path(path, limited), gridpoints=grid, solver_wrapper="seidel"
+        )
+        _, speeds, _ = solver.compute_parameterization(0.0, 0.0)
         if speeds is not None and np.isfinite(speeds).all() and (speeds[1:-1] > 0.0).all():
-            return np.sqrt(np.interp(places, grid, np.asarray(speeds) ** 2))
+            return np.sqrt(np.interp(positions, grid, np.asarray(speeds) ** 2))
     return None
 
 
-def _beside(knots: Floats, places: Floats, aside: float) -> Floats:
-    """Return places with two in the stead of every knot inside, a share of the segment aside: accelerations jump at knots."""
-    gaps = np.minimum(np.diff(knots)[1:], np.diff(knots)[:-1]) * aside
+def _replace_knots(knots: Floats, positions: Floats, offset: float) -> Floats:
+    """Return the grid with each interior knot replaced by two points beside it.
+
+    Accelerations are discontinuous at knots. The offset is relative to the shorter segment.
+    """
+    gaps = np.minimum(np.diff(knots)[1:], np.diff(knots)[:-1]) * offset
     inside = knots[1:-1]
-    return np.sort(np.concatenate([np.setdiff1d(places, inside), inside - gaps, inside + gaps]))
+    return np.sort(np.concatenate([np.setdiff1d(positions, inside), inside - gaps, inside + gaps]))
 
 
-def _geometric(path: CubicHermiteSpline, columns: Ints) -> Any:
-    """Return some coordinates of a path as `toppra` knows paths."""
+def _to_toppra_path(path: CubicHermiteSpline, columns: Ints) -> Any:
+    """Return some coordinates of a path as a geometric path of `toppra`."""
     from toppra.interpolator import AbstractGeometricPath
 
     class Path(AbstractGeometricPath):
         dof = len(columns)
         path_interval = np.array([path.x[0], path.x[-1]])
 
-        def __call__(self, places: Any, order: int = 0) -> Any:
-            return path(places, order)[..., columns]
+        def __call__(self, positions: Any, order: int = 0) -> Any:
+            return path(positions, order)[..., columns]
 
     return Path()
 
 
-def _linear(linear: Callable[[Floats], tuple[Floats, Floats, Floats]], size: int) -> Any:
-    """Return what else bounds the speed as `toppra` knows such constraints, at both ends of every piece of its grid."""
+def _to_toppra_constraint(
+    linear: Callable[[Floats], tuple[Floats, Floats, Floats]], size: int
+) -> Any:
+    """Return linear constraints for `toppra`, applied at both ends of each grid interval."""
     from toppra.constraint import LinearConstraint
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
@@ -116,8 +129,8 @@ def _linear(linear: Callable[[Floats], tuple[Floats, Floats, Floats]], size: int
     return Bound()
 
 
-def _silence() -> None:
-    """Let `toppra` say nothing of what it does not find, unless somebody has said that it should: it is told of here."""
+def _silence_toppra() -> None:
+    """Silence the logger of `toppra` unless its level was set; failures are handled here."""
     logger = logging.getLogger("toppra")
     if logger.level == logging.NOTSET:
         logger.setLevel(logging.CRITICAL)

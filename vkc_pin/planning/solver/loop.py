@@ -76,7 +76,7 @@ class _Loop:
         )
         between = collisions_between(self.problem, z)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        clear = between.free and found.violation() < CLOSE_ENOUGH
+        clear = between.free and found.compute_violation() < CLOSE_ENOUGH
         return merge(found, between.contacts), clear, between.passages
 
     def try_step(self, radius: Floats) -> Trial:
@@ -98,7 +98,7 @@ class _Loop:
             contacts=contacts,
             clear=clear,
             passages=passed,
-            rate=self.timing.violation(*self.problem.pace(z)),
+            rate=self.timing.compute_violation(*self.problem.pace(z)),
             step=np.abs(z - self.z).max(axis=1),
             satisfied=satisfied,
         )
@@ -141,12 +141,12 @@ class _Loop:
             self.timing = self.problem.timing_for(self.z)
             self.solution.dt = self.timing.dt
             self.look()
-        nearly = trial.contacts.violation() < NEARLY
+        nearly = trial.contacts.compute_violation() < NEARLY
         if nearly and trial.rate > TOLERANCE:  # before, limits on rates only cost time
             pace = self.problem.pace(trial.z)
             self.timing = self.timing.stretch(*pace)
             self.solution.dt = self.timing.dt
-            if not self.rates and self.timing.violation(*pace) > TOLERANCE:
+            if not self.rates and self.timing.compute_violation(*pace) > TOLERANCE:
                 self.rates = True
                 self.subproblem.forget()
             self.look()
@@ -157,7 +157,7 @@ class _Loop:
             trial.satisfied
             and trial.clear
             and self.pose_error < TOLERANCE
-            and self.timing.violation(*self.problem.pace(trial.z)) <= TOLERANCE
+            and self.timing.compute_violation(*self.problem.pace(trial.z)) <= TOLERANCE
         )
 
     def grow(self) -> bool:
@@ -199,7 +199,7 @@ def solve(
     elif solution.status not in ENDINGS:
         short = problem.evaluate_contacts(
             solution.z, reach=problem.options.largest_margin, nearest=1
-        ).violation()
+        ).compute_violation()
         solution.astray = short if short > NEARLY else 0.0
     solution.radius = region.radius
     return solution
@@ -223,8 +223,8 @@ def _iterate(
             round=solution.rounds,
             iterations=solution.iterations,
             objective=trial.objective,
-            clearance=trial.contacts.clearance(),
-            shortfall=trial.contacts.violation(),
+            clearance=trial.contacts.compute_clearance(),
+            shortfall=trial.contacts.compute_violation(),
             pose_error=trial.pose_error,
             step=float(trial.step.max()),
             radius=float(region.radius.max()),

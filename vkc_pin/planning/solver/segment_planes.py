@@ -47,7 +47,7 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
         problem: The problem.
         z: z_1..z_N, shape (N, n).
     """
-    path, contacts = problem.waypoints(z), problem.contacts.settled(z)
+    path, contacts = problem.waypoints(z), problem.contacts.with_released_objects(z)
     counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
     segment = np.repeat(np.arange(len(z)), counts)
     piece = np.arange(len(segment)) - np.searchsorted(segment, segment)
@@ -70,8 +70,8 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
     # A start that is close to something leaves it as it can: only what collides on the way counts.
     found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
     keep = np.minimum(KEEP, found.margin)
-    joints = contacts.joints_of(found.pair)
-    rotations, translations = contacts.placements(states[found.waypoint])
+    joints = contacts.get_joints(found.pair)
+    rotations, translations = contacts.compute_placements(states[found.waypoint])
     ends = problem.chain.joint_placements(path)
     parts = []
     for offset in (0, 1):

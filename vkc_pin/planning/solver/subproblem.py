@@ -116,7 +116,7 @@ class Subproblem:
         """
         problem, t = self.problem, self.problem.transcription
         begin = time.perf_counter()
-        planes, offsets = problem.contacts.planes(z, at, slots=t.slots)
+        planes, offsets = problem.contacts.compute_planes(z, at, slots=t.slots)
         self.solution.timings["coal"] += time.perf_counter() - begin
         lower, upper = (
             np.maximum(problem.lower, z - radius[:, None]),

@@ -43,14 +43,15 @@ def passages(
     ends = np.flatnonzero(apart)
     begins = np.append(0, ends[:-1] + 1)
     before, after, pairs = rows[begins] - 1, rows[ends] + 1, pairs[begins]
-    phases = contacts.phases_of(segments + 1)
+    phases = contacts.find_phases(segments + 1)
     inside = np.flatnonzero((before >= 0) & (after < len(states)))
     inside = inside[
         phases[before[inside]] == phases[after[inside]]
     ]  # shapes are others in another phase
     before, after, pairs = before[inside], after[inside], pairs[inside]
     here, there = (
-        contacts.normals(states[rows], segments[rows] + 1, pairs) for rows in (before, after)
+        contacts.compute_normals(states[rows], segments[rows] + 1, pairs)
+        for rows in (before, after)
     )
     through = np.einsum("ci,ci->c", here, there) < 0.0
     parts = zip(

@@ -283,7 +283,7 @@ def opening_picture() -> None:
         row = world.compute_positions(plan.trajectory)[-1]
         first = world.coordinates.index("finger_a_joint")
         for number, opening in enumerate((None, FINGERS)):
-            row[first : first + 2] = scene.robot.gripper.positions(opening)
+            row[first : first + 2] = scene.robot.gripper.compute_positions(opening)
             data = world.model.createData()
             pin.forwardKinematics(world.model, data, world.coordinates.q(row))
             axes = figure.add_subplot(1, 2, number + 1)
@@ -302,7 +302,7 @@ def opening_picture() -> None:
                 axes.fill(
                     -outline[:, 1], outline[:, 0], facecolor=colour, edgecolor="0.25", linewidth=0.8
                 )
-            wide = scene.robot.gripper.resting if opening is None else opening
+            wide = scene.robot.gripper.rest_opening if opening is None else opening
             axes.set_title("fully open" if opening is None else f"opening: {opening:g}")
             finger, cheek = -wide / 2.0 - 0.01, -0.06  # outer and inner face [m]
             axes.annotate(

@@ -21,7 +21,7 @@ EQUIVALENT: dict[str, str] = {
     "planning/solver/subproblem.py: self.forget() | dropped: self.forget() → pass": "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
     'solver/subproblem.py: "ipopt.warm_start_slack_bound_frac": 1e-6, | constant: 1e-6 → 2e-06': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
     'solver/subproblem.py: "ipopt.mu_init": 1.0, | constant: 1.0 → 2.0': "a setting of the search or of Ipopt: another one leads to motions that are as good, later or sooner",
-    "validation/samples.py: if abs(gripper.nearest(opening) - opening) > EXACT: | comparison: > → >=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
+    "validation/samples.py: if abs(gripper.clamp_opening(opening) - opening) > EXACT: | comparison: > → >=": "both differ only where two numbers are the same to the last bit, or a distance is exactly zero, which is neither right nor wrong",
     "planning/solver/segment_planes.py: shapes = int(found.pair.max(initial=0)) + 1 | constant: 0 → 1": "any larger number makes keys as unique",
     "validation/samples.py: MOST = 100_000 | constant: 100_000 → 100001": "how many are looked at together, or when what is too long is left alone: the answers are the same",
     "planning/chain/contacts.py: parts = [self.chain.joint_placements(z[row : row + _ROWS]) for row in range(0, max(len(z), 1), _ROWS)] | swapped: len(z), 1 → 1, len(z)": "max(a, b) is max(b, a)",

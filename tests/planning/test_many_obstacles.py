@@ -326,23 +326,23 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
         at: np.ndarray,
         *,
         reach: float,
-        most: Any = None,
-        standing: bool = True,
+        max_pairs: Any = None,
+        include_fixed: bool = True,
     ) -> ClosePairs:
-        where, every = near.placements.at(q), near.boxes.pairs
+        where, every = near.placements.compute_placements(q), near.boxes.pairs
         w, k = np.indices((len(q), len(every))).reshape(2, -1)
-        margins = near.margins.at(k, at[w], z, w)
-        counts = (margins > -np.inf) & (standing | (every[k, 1] < where.shape[1]))
+        margins = near.margins.compute_margins(k, at[w], z, w)
+        counts = (margins > -np.inf) & (include_fixed | (every[k, 1] < where.shape[1]))
         w, k, margins = w[counts], k[counts], margins[counts]
         known: dict[str, Any] = {
-            "numbers": k,
+            "ranks": k,
             "margins": margins,
             "bounds": np.full(len(k), -np.inf),
             "rounding": 0.0,
         }
         edges = np.searchsorted(w, np.arange(len(q) + 1))
-        chosen, found = near.shapes.shortest(
-            where, edges, every[k], reach=reach, most=most, **known
+        chosen, found = near.shapes.find_closest_pairs(
+            where, edges, every[k], reach=reach, max_pairs=max_pairs, **known
         )
         return ClosePairs(w[chosen], k[chosen], found.distance, margins[chosen], *found[1:])
 
@@ -376,8 +376,8 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     ) -> tuple[np.ndarray, np.ndarray]:
         return np.full(3, -1e3), np.full(3, 1e3)
 
-    patch.setattr(Clearances, "nearest", all_of_them)
-    patch.setattr(Clearances, "first_blocked", one_by_one)
+    patch.setattr(Clearances, "find_closest_pairs", all_of_them)
+    patch.setattr(Clearances, "find_first_violation", one_by_one)
     patch.setattr(PlacedShapes, "bounds", nowhere)
     patch.setattr(PairTable, "near", all_of)
     patch.setattr(Body, "_close", lambda body, along: np.arange(len(body.moving)))

@@ -117,7 +117,7 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
         if gripper is not None and hold is not None:
             asked = compute_grasp_opening(scene, hold)
             wide, right = (
-                gripper.resting if opening is None else opening
+                gripper.rest_opening if opening is None else opening
                 for opening in (phase.opening, asked)
             )
             if not abs(wide - right) <= WIDTH_TOLERANCE:

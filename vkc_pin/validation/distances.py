@@ -51,7 +51,7 @@ class CollisionShapes:
 
     def at(self, q: Floats) -> PlacedShapes:
         """Return the shapes as they are placed at Pinocchio's configurations of the world, shape (W, nq)."""
-        return PlacedShapes(self, self._placements.at(q))
+        return PlacedShapes(self, self._placements.compute_placements(q))
 
     def corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
         """Return lower and upper corners of boxes along the world's axes around some shapes, shape (..., k, 3) each [m].
@@ -120,7 +120,7 @@ class PlacedShapes:
 
     def distances(self, states: Ints, pairs: Ints) -> Floats:
         """Return coal's signed distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m]."""
-        return self._solids.asked.distances(self._where, states, pairs)
+        return self._solids.asked.compute_distances(self._where, states, pairs)
 
     def nearest(self, pairs: Ints) -> tuple[Ints, Floats]:
         """Return which of pairs, shape (n, 2), is nearest at each state, and its distance [m]: shape (W,) each.
@@ -131,15 +131,15 @@ class PlacedShapes:
         at, which = np.repeat(np.arange(states), count), np.tile(np.arange(count), states)
         bounds = self.bounds(at, pairs[which])
         order = np.lexsort((which, bounds, at))
-        chosen, found = self._solids.asked.shortest(
+        chosen, found = self._solids.asked.find_closest_pairs(
             self._where,
             np.arange(states + 1) * count,
             pairs[which[order]],
-            numbers=np.arange(len(order)),
+            ranks=np.arange(len(order)),
             margins=np.zeros(len(order)),
             bounds=bounds[order],
             reach=np.inf,
-            most=1,
+            max_pairs=1,
             rounding=0.0,
         )
         return which[order[chosen]], found.distance

@@ -87,7 +87,7 @@ class PairTable:
     def _moved(self, rows: Floats) -> Bools:
         """Return whether each shape moves while the world goes through some configurations, shape (K, n): shape (G,)."""
         world = self.world
-        moved = world.coordinates.moved(np.ptp(rows, axis=0) > _STILL)
+        moved = world.coordinates.find_moved_joints(np.ptp(rows, axis=0) > _STILL)
         for joint in range(1, len(moved)):
             moved[joint] |= moved[world.model.parents[joint]]
         robots = len(self.scene.robot.collision.geometryObjects)
@@ -172,7 +172,7 @@ class PairTable:
             moved: How far any point of each geometry moves in a stretch, shape (K, G) [m].
             limit: [m].
         """
-        return placed.boxes.near(
+        return placed.boxes.find_close_pairs(
             first,
             last,
             self.pairs,

@@ -80,7 +80,7 @@ def _excesses(
             f"drives {{}} less than its turn takes at a radius of {robot.turning_radius:g} m",
         )
     if robot.wheels is not None:
-        rim = robot.wheels.rim
+        rim = robot.wheels.rim_speed
         fast = (np.abs(along) + robot.wheels.track / 2 * np.abs(turn)) / spans - rim
         yield "wheels", fast, WHEEL_TOLERANCE * rim, f"has a wheel that is {{}} over {rim:.3f} m/s"
 

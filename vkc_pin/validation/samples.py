@@ -124,8 +124,8 @@ class Samples:
             raise InputError(
                 "the robot's gripper does not open", field=field, expected=expected, got=opening
             )
-        if abs(gripper.nearest(opening) - opening) > WIDTH_TOLERANCE:
-            expected = f"{gripper.narrowest:.4g} to {gripper.widest:.4g} m"
+        if abs(gripper.clamp_opening(opening) - opening) > WIDTH_TOLERANCE:
+            expected = f"{gripper.min_opening:.4g} to {gripper.max_opening:.4g} m"
             raise InputError(
                 "the gripper cannot be so far open", field=field, expected=expected, got=opening
             )
@@ -159,7 +159,7 @@ class Samples:
         known = dict(
             zip(
                 self.world.coordinates.names,
-                self.world.coordinates.strides(LENGTH_STEP, ANGLE_STEP),
+                self.world.coordinates.compute_max_steps(LENGTH_STEP, ANGLE_STEP),
                 strict=True,
             )
         )

@@ -85,7 +85,7 @@ def test_the_gripper_opens_and_other_hands_stand_still(imported: vkc.ImportedRob
     )
     assert gripper is not None
     assert gripper.names == ("right_finger_a_joint", "right_finger_b_joint")
-    assert (gripper.narrowest, gripper.widest) == (0.0, pytest.approx(0.08, abs=2e-4))
+    assert (gripper.min_opening, gripper.max_opening) == (0.0, pytest.approx(0.08, abs=2e-4))
     assert not set(said["locked_joints"]) & set(said["gripper"])
 
 

@@ -365,7 +365,7 @@ def sampled(phase: int) -> tuple[np.ndarray, np.ndarray]:
 def test_culling_never_drops_a_pair_within_reach(phase: int, reach: float) -> None:
     problem = door_problem()
     z, distances = sampled(phase)
-    at, which, bounds = problem.contacts.phases[phase].boxes.near(
+    at, which, bounds = problem.contacts.phases[phase].boxes.find_close_pairs(
         reach, *problem.chain.joint_placements(z)
     )
     kept = np.zeros(distances.shape, bool)

@@ -87,7 +87,7 @@ def test_nothing_that_is_close_is_left_out(seed: int, reach: float, standing: bo
     rng = np.random.default_rng(seed)
     part, joints = random_geometry(rng), random_joints(rng, 5)
     distances = all_distances(part, *joints)
-    at, pairs, bounds = part.boxes.near(reach, *joints, standing=standing)
+    at, pairs, bounds = part.boxes.find_close_pairs(reach, *joints, include_fixed=standing)
     assert (bounds <= distances[at, pairs] + COAL).all()
     assert (bounds < reach).all()
     assert (np.diff(at * len(part.pairs) + pairs) > 0).all(), "in order, none twice"
@@ -102,7 +102,7 @@ def test_what_is_far_is_left_out() -> None:
     rng = np.random.default_rng(0)
     part, joints = random_geometry(rng, 12, 60), random_joints(rng, 20)
     distances = all_distances(part, *joints)
-    at, pairs, _ = part.boxes.near(0.05, *joints)
+    at, pairs, _ = part.boxes.find_close_pairs(0.05, *joints)
     assert 0 < (distances < 0.05).sum() <= len(at) < 0.05 * distances.size
     assert (distances[at, pairs] < 0.4).all()
 
@@ -112,10 +112,10 @@ def test_what_is_far_is_left_out() -> None:
 def test_what_is_placed_elsewhere(seed: int) -> None:
     rng = np.random.default_rng(seed)
     part, joints = random_geometry(rng), random_joints(rng, 4)
-    part.boxes.near(0.1, *joints)  # what is kept must not be taken over
+    part.boxes.find_close_pairs(0.1, *joints)  # what is kept must not be taken over
     where = {geometry: random_placement(rng, 1.5) for geometry in (8, 11)}
     moved = part.with_placements(where)
-    at, pairs, _ = moved.boxes.near(0.1, *joints)
+    at, pairs, _ = moved.boxes.find_close_pairs(0.1, *joints)
     for geometry, placement in where.items():
         assert moved.shapes[geometry].placement.isApprox(placement)
         assert not part.shapes[geometry].placement.isApprox(placement), (

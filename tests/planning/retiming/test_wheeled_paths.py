@@ -117,7 +117,9 @@ def test_motions_keep_to_what_wheels_can(
     (vx, vy, turn), yaw = motion.velocity(times)[:, :3].T, motion(times)[:, 2]
     along, aside = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx
     assert np.abs(aside).max() < 3e-4
-    assert (np.abs(along) + wheels.track / 2 * np.abs(turn)).max() <= wheels.rim * (1.0 + 1e-4)
+    assert (np.abs(along) + wheels.track / 2 * np.abs(turn)).max() <= wheels.rim_speed * (
+        1.0 + 1e-4
+    )
     np.testing.assert_allclose(motion(motion.times), motion.positions, atol=1e-12)
     if base == "ackermann":
         assert (0.8 * np.abs(turn) - np.abs(along)).max() < 1e-3

@@ -1,4 +1,4 @@
-"""Which boxes may be close, against the same formulas for every pair, one by one."""
+"""Tests the search for close bounding boxes against the same formulas, pair by pair."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.collision import boxes as looking
+from vkc_pin.world.collision import boxes as boxes_module
 from vkc_pin.world.collision.boxes import Boxes
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -18,7 +18,7 @@ JOINTS, MOVING, STANDING, STATES = 3, 6, 8, 12
 
 
 class Room:
-    """Random boxes on joints and in the world, and joints that are anywhere."""
+    """Random boxes on joints and in the world, at random joint placements."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -41,7 +41,7 @@ class Room:
         )
 
     def gaps(self) -> np.ndarray:
-        """Return by how much face normals separate every pair, shape (W, P) [m]."""
+        """Return the separation of every pair along face normals, shape (W, P) [m]."""
         out = np.empty((STATES, len(self.pairs)))
         for w in range(STATES):
             turns = self.turned[w, self.joints] @ self.rotations
@@ -65,28 +65,30 @@ def rotations(rng: np.random.Generator, count: int) -> np.ndarray:
 
 @settings(max_examples=40, deadline=None)
 @given(SEEDS, st.sampled_from([0.0, 0.02, 0.3, 10.0]), st.booleans())
-def test_what_may_be_close(seed: int, reach: float, standing: bool) -> None:
-    """What is kept has the bounds of the formula; what is close, as some points of it show, is kept."""
+def test_close_pairs_are_found_with_their_bounds(seed: int, reach: float, standing: bool) -> None:
+    """Bounds follow the formula, and no pair with points that are close is missed."""
     room = Room(seed)
     gaps = room.gaps()
-    at, pairs, bounds = room.boxes().near(reach, room.turned, room.moved, standing=standing)
-    assert (np.diff(at * len(room.pairs) + pairs) > 0).all(), "in order, none twice"
+    at, pairs, bounds = room.boxes().find_close_pairs(
+        reach, room.turned, room.moved, include_fixed=standing
+    )
+    assert (np.diff(at * len(room.pairs) + pairs) > 0).all(), "not strictly sorted"
     np.testing.assert_allclose(bounds, gaps[at, pairs], rtol=0.0, atol=1e-12)
     assert (bounds < reach).all()
     counts = np.ones(len(room.pairs), bool) if standing else room.joints[room.pairs[:, 1]] != 0
     assert counts[pairs].all()
-    if reach == 10.0:  # nothing is as far as that
+    if reach == 10.0:  # larger than any distance
         assert len(at) == STATES * counts.sum()
     close = {
         (w, k)
         for w, k in itertools.product(range(STATES), np.flatnonzero(counts).tolist())
-        if touch(room, w, k, reach)
+        if has_close_points(room, w, k, reach)
     }
     assert close <= set(zip(at.tolist(), pairs.tolist(), strict=True))
 
 
-def touch(room: Room, w: int, k: int, reach: float) -> bool:
-    """Return whether one of many points of the first box is closer than `reach` to the second, or inside."""
+def has_close_points(room: Room, w: int, k: int, reach: float) -> bool:
+    """Return whether a sampled point of the first box is within `reach` of the second."""
     (a, b), joints = room.pairs[k], room.joints
     turns = [room.turned[w, joints[g]] @ room.rotations[g] for g in (a, b)]
     centers = [
@@ -100,41 +102,45 @@ def touch(room: Room, w: int, k: int, reach: float) -> bool:
 
 @settings(max_examples=10, deadline=None)
 @given(SEEDS)
-def test_threads_and_how_many_at_once_make_no_difference(seed: int) -> None:
+def test_results_do_not_depend_on_threads_or_batch_size(seed: int) -> None:
     room = Room(seed)
-    expected = room.boxes(1).near(0.1, room.turned, room.moved)
+    expected = room.boxes(1).find_close_pairs(0.1, room.turned, room.moved)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(looking, "_WORTH", 1)
+        patch.setattr(boxes_module, "_MIN_ROWS_PER_THREAD", 1)
         for one, other in zip(
-            expected, room.boxes(3).near(0.1, room.turned, room.moved), strict=True
+            expected, room.boxes(3).find_close_pairs(0.1, room.turned, room.moved), strict=True
         ):
             np.testing.assert_array_equal(one, other)
-    alone = [room.boxes().near(0.1, room.turned[[w]], room.moved[[w]]) for w in range(STATES)]
+    alone = [
+        room.boxes().find_close_pairs(0.1, room.turned[[w]], room.moved[[w]]) for w in range(STATES)
+    ]
     np.testing.assert_array_equal(np.concatenate([pairs for _, pairs, _ in alone]), expected[1])
     np.testing.assert_array_equal(np.concatenate([bounds for _, _, bounds in alone]), expected[2])
 
 
-def test_what_stands_elsewhere() -> None:
+def test_fixed_boxes_can_be_moved() -> None:
     room, rng = Room(3), np.random.default_rng(4)
     boxes, which = room.boxes(), np.array([MOVING + 2, MOVING + 5])
-    before = boxes.near(0.2, room.turned, room.moved)
+    before = boxes.find_close_pairs(0.2, room.turned, room.moved)
     room.rotations[which], room.centers[which] = rotations(rng, 2), rng.uniform(-1.0, 1.0, (2, 3))
-    moved = boxes.placed(which, room.rotations[which], room.centers[which])
+    moved = boxes.move_fixed(which, room.rotations[which], room.centers[which])
     for one, other in zip(
-        moved.near(0.2, room.turned, room.moved),
-        room.boxes().near(0.2, room.turned, room.moved),
+        moved.find_close_pairs(0.2, room.turned, room.moved),
+        room.boxes().find_close_pairs(0.2, room.turned, room.moved),
         strict=True,
     ):
         np.testing.assert_array_equal(one, other)
-    for one, other in zip(boxes.near(0.2, room.turned, room.moved), before, strict=True):
+    for one, other in zip(
+        boxes.find_close_pairs(0.2, room.turned, room.moved), before, strict=True
+    ):
         np.testing.assert_array_equal(one, other)
     with pytest.raises(IndexError, match="stands"):
-        boxes.placed(np.array([0]), np.eye(3)[None], np.zeros((1, 3)))
+        boxes.move_fixed(np.array([0]), np.eye(3)[None], np.zeros((1, 3)))
 
 
-def test_nothing_asked_nothing_found() -> None:
+def test_empty_input_gives_empty_output() -> None:
     room = Room(0)
-    for found in room.boxes().near(0.1, room.turned[:0], room.moved[:0]):
+    for found in room.boxes().find_close_pairs(0.1, room.turned[:0], room.moved[:0]):
         assert found.shape == (0,)
     nothing = Boxes(
         np.zeros(0, int),
@@ -143,11 +149,11 @@ def test_nothing_asked_nothing_found() -> None:
         np.zeros((0, 3)),
         np.zeros((0, 2), int),
     )
-    for found in nothing.near(0.1, room.turned, room.moved):
+    for found in nothing.find_close_pairs(0.1, room.turned, room.moved):
         assert found.shape == (0,)
 
 
-def test_wrong_numbers_are_refused() -> None:
+def test_invalid_arrays_raise() -> None:
     room = Room(0)
     with pytest.raises(ValueError, match="first"):
         Boxes(room.joints[::-1].copy(), room.rotations, room.centers, room.halves, room.pairs)
@@ -157,6 +163,6 @@ def test_wrong_numbers_are_refused() -> None:
     with pytest.raises(ValueError, match="shapes"):
         Boxes(room.joints, room.rotations, room.centers[:3], room.halves, room.pairs)
     with pytest.raises(IndexError, match="joint"):
-        room.boxes().near(0.1, room.turned[:, :2].copy(), room.moved[:, :2].copy())
+        room.boxes().find_close_pairs(0.1, room.turned[:, :2].copy(), room.moved[:, :2].copy())
     with pytest.raises(ValueError, match="shapes"):
-        room.boxes().near(0.1, room.turned, room.moved[:3])
+        room.boxes().find_close_pairs(0.1, room.turned, room.moved[:3])

@@ -1,4 +1,4 @@
-"""What falls shortest of its margins, against Pinocchio, coal and all pairs one by one."""
+"""Tests the search for margin violations against Pinocchio and coal, pair by pair."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.collision import clearances as looking
+from vkc_pin.world.collision import clearances as clearances_module
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.clearances import Clearances
 from vkc_pin.world.collision.margins import MarginRegion, Margins
@@ -22,29 +22,29 @@ SEEDS = st.integers(0, 2**32 - 1)
 MOVING, STANDING, STATES, WAYPOINTS = 6, 7, 10, 5
 
 
-def anywhere(rng: np.random.Generator, size: float) -> pin.SE3:
+def random_placement(rng: np.random.Generator, size: float) -> pin.SE3:
     return pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))
 
 
 class Room:
-    """Boxes on an arm that hangs in a room with others; pairs some of which may come closer for a while or somewhere."""
+    """Boxes on an arm among fixed boxes; some pairs have reduced margins."""
 
     def __init__(self, seed: int) -> None:
         rng = self.rng = np.random.default_rng(seed)
         self.model, self.geometry, parent = pin.Model(), pin.GeometryModel(), 0
         for k, joint in enumerate((pin.JointModelPlanar, pin.JointModelRZ, pin.JointModelRX)):
-            parent = self.model.addJoint(parent, joint(), anywhere(rng, 0.3), f"j{k}")
+            parent = self.model.addJoint(parent, joint(), random_placement(rng, 0.3), f"j{k}")
         self.halves = rng.uniform(0.02, 0.2, (MOVING + STANDING, 3))
         self.shapes = [coal.Box(*(2 * half)) for half in self.halves]
         for k in range(MOVING):
             joint = 1 + int(rng.integers(3))
             self.geometry.addGeometryObject(
-                pin.GeometryObject(f"s{k}", joint, 0, anywhere(rng, 0.2), self.shapes[k])
+                pin.GeometryObject(f"s{k}", joint, 0, random_placement(rng, 0.2), self.shapes[k])
             )
         self.joints = np.array(
             [*(s.parentJoint for s in self.geometry.geometryObjects), *[0] * STANDING]
         )
-        self.standing = [anywhere(rng, 0.6) for _ in range(STANDING)]
+        self.standing = [random_placement(rng, 0.6) for _ in range(STANDING)]
         self.pairs = np.array(
             [(a, b) for a, b in itertools.combinations(range(MOVING + STANDING), 2) if a < MOVING]
         )
@@ -77,13 +77,13 @@ class Room:
     def all_pairs(
         self, reach: float, standing: bool
     ) -> list[list[tuple[float, float, int, float]]]:
-        """Return, for each state, distance − margin, distance, number and margin of every pair that counts, sorted."""
+        """Return sorted (distance − margin, distance, pair, margin) of close pairs, by state."""
         data, placed, found = self.model.createData(), pin.GeometryData(self.geometry), []
         every = np.arange(len(self.pairs))
         for state, q in enumerate(self.q):
             pin.updateGeometryPlacements(self.model, data, self.geometry, placed, q)
             where, rows = [*placed.oMg, *self.standing], []
-            margins = self.margins.at(
+            margins = self.margins.compute_margins(
                 every,
                 np.full(len(every), self.waypoints[state]),
                 self.z,
@@ -105,7 +105,7 @@ class Room:
 
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([None, 0, 1, 4]), st.sampled_from([0.0, 0.1, 2.0]), st.booleans())
-def test_those_that_fall_shortest_of_their_margins(
+def test_closest_pairs_match_an_exhaustive_search(
     seed: int, most: int | None, reach: float, standing: bool
 ) -> None:
     room = Room(seed)
@@ -115,10 +115,10 @@ def test_those_that_fall_shortest_of_their_margins(
         for row in rows[:most]
     ]
     with pytest.MonkeyPatch.context() as patch:
-        for worth in (1, 100):  # four threads, and one
-            patch.setattr(looking, "_WORTH", worth)
-            found = room.clearances().nearest(
-                room.q, room.z, room.waypoints, reach=reach, most=most, standing=standing
+        for rows_per_thread in (1, 100):  # four threads, and one
+            patch.setattr(clearances_module, "_MIN_ROWS_PER_THREAD", rows_per_thread)
+            found = room.clearances().find_closest_pairs(
+                room.q, room.z, room.waypoints, reach=reach, max_pairs=most, include_fixed=standing
             )
             short = found.distance - found.margin
             mine = zip(
@@ -135,7 +135,9 @@ def test_those_that_fall_shortest_of_their_margins(
 
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([0.0, 0.1]), st.sampled_from([-0.05, 0.0, 0.02, 0.12, 0.3]))
-def test_the_first_in_which_something_is_hit(seed: int, reach: float, allowed: float) -> None:
+def test_first_violation_matches_an_exhaustive_search(
+    seed: int, reach: float, allowed: float
+) -> None:
     room = Room(seed)
     room.waypoints[:] = waypoint = int(room.waypoints[0])
     rows, order = room.all_pairs(reach, standing=True), room.rng.permutation(STATES)
@@ -144,37 +146,41 @@ def test_the_first_in_which_something_is_hit(seed: int, reach: float, allowed: f
         for state in order
     ]
     expected = hit.index(True) if True in hit else STATES
-    mine = room.clearances().first_blocked(
+    mine = room.clearances().find_first_violation(
         room.q[order], room.z[order], waypoint, reach=reach, allowed=allowed
     )
     assert mine == expected
     assert (
-        room.clearances().first_blocked(
+        room.clearances().find_first_violation(
             room.q[:0], room.z[:0], waypoint, reach=reach, allowed=allowed
         )
         == 0
     )
 
 
-def test_what_stands_elsewhere() -> None:
+def test_fixed_shapes_can_be_moved() -> None:
     room = Room(4)
-    before, place = room.clearances(), anywhere(room.rng, 0.6)
+    before, place = room.clearances(), random_placement(room.rng, 0.6)
     moved = np.array([MOVING + 2])
-    boxes = before.boxes.placed(moved, place.rotation[None], place.translation[None])
-    after = before.placed(boxes, {MOVING + 2: place})
+    boxes = before.boxes.move_fixed(moved, place.rotation[None], place.translation[None])
+    after = before.move_fixed(boxes, {MOVING + 2: place})
     room.standing[2] = place
     for mine, anew in zip(
-        *(c.nearest(room.q, room.z, room.waypoints, reach=0.3) for c in (after, room.clearances())),
+        *(
+            c.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
+            for c in (after, room.clearances())
+        ),
         strict=True,
     ):
         np.testing.assert_array_equal(mine, anew)
-    unmoved = Room(4).clearances().nearest(room.q, room.z, room.waypoints, reach=0.3)
+    unmoved = Room(4).clearances().find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
     np.testing.assert_array_equal(
-        before.nearest(room.q, room.z, room.waypoints, reach=0.3).distance, unmoved.distance
+        before.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3).distance,
+        unmoved.distance,
     )
 
 
-def test_what_does_not_belong_together_is_refused() -> None:
+def test_mismatched_parts_raise() -> None:
     room = Room(0)
     mine = room.clearances()
     for q, z, waypoints in (
@@ -184,9 +190,9 @@ def test_what_does_not_belong_together_is_refused() -> None:
         (room.q, room.z, room.waypoints[:-1]),
     ):
         with pytest.raises(ValueError, match=r"shape|waypoints"):
-            mine.nearest(q, z, waypoints, reach=0.1)
+            mine.find_closest_pairs(q, z, waypoints, reach=0.1)
     fewer = Margins(room.usual[:-1], {})
     with pytest.raises(ValueError, match="belong"):
-        Clearances(mine.placements, mine.boxes, mine.shapes, fewer).nearest(
+        Clearances(mine.placements, mine.boxes, mine.shapes, fewer).find_closest_pairs(
             room.q, room.z, room.waypoints, reach=0.1
         )

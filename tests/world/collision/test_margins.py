@@ -1,4 +1,4 @@
-"""What pairs must keep, against the same rules one by one."""
+"""Tests margin lookup against the same rules, pair by pair."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PAIRS, COORDINATES = 12, 4
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_the_least_that_holds_there(seed: int) -> None:
+def test_the_smallest_applicable_margin_is_used(seed: int) -> None:
     rng = np.random.default_rng(seed)
     usual = rng.uniform(0.0, 0.05, PAIRS)
     eased = {
@@ -45,11 +45,11 @@ def test_the_least_that_holds_there(seed: int) -> None:
         expected.append(min(some))
     assert len(set(expected)) > PAIRS, "something changes"
     np.testing.assert_array_equal(
-        Margins(usual, eased, places).at(pairs, waypoints, z, rows), expected
+        Margins(usual, eased, places).compute_margins(pairs, waypoints, z, rows), expected
     )
 
 
-def test_wrong_numbers_are_refused() -> None:
+def test_invalid_arrays_raise() -> None:
     usual, one, z = np.zeros(3), np.zeros(1, int), np.zeros((1, 2))
     with pytest.raises(IndexError, match="pair"):
         Margins(usual, {3: [(0, 1, 0.0)]})
@@ -64,6 +64,6 @@ def test_wrong_numbers_are_refused() -> None:
     table = Margins(usual, {}, [MarginRegion(one, 0.0, one + 1, z[0, :1], z[0, :1])])
     for pairs, rows in ((one + 3, one), (one - 1, one), (one, one + 1), (one, one - 1)):
         with pytest.raises(IndexError):
-            table.at(pairs, one, z, rows)
+            table.compute_margins(pairs, one, z, rows)
     with pytest.raises(ValueError, match="coordinates"):
-        table.at(one, one, z[:, :1], one)
+        table.compute_margins(one, one, z[:, :1], one)

@@ -1,4 +1,4 @@
-"""Placements as numbers are Pinocchio's, to the last bit."""
+"""Tests that shape placements equal Pinocchio's bit for bit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.world.collision.placements import ShapePlacements, flatten_placemen
 from vkc_pin.world.trajectory.world_model import World
 
 
-def test_numbers_of_a_placement() -> None:
+def test_placements_are_flattened_by_columns() -> None:
     rotation = pin.exp3(np.array([0.1, 0.2, 0.3]))
     (numbers,) = flatten_placements([pin.SE3(rotation, np.array([4.0, 5.0, 6.0]))])
     np.testing.assert_array_equal(
@@ -22,7 +22,7 @@ def test_numbers_of_a_placement() -> None:
     assert flatten_placements([]).shape == (0, 12)
 
 
-def test_models_leave_nothing_behind() -> None:
+def test_serialization_leaks_no_memory() -> None:
     world = World(door_scene())
     left, objects = growth(lambda: [ShapePlacements(world.model, world.bodies) for _ in range(50)])
     assert left <= 50 * 8
@@ -31,7 +31,7 @@ def test_models_leave_nothing_behind() -> None:
 
 def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
     mine = ShapePlacements(model, geometry)
-    found = mine.at(q)
+    found = mine.compute_placements(q)
     assert found.shape == (len(q), len(geometry.geometryObjects), 12)
     data, placed = model.createData(), pin.GeometryData(geometry)
     for row, configuration in zip(found, q, strict=True):
@@ -40,11 +40,11 @@ def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
             np.testing.assert_array_equal(numbers[:9].reshape(3, 3).T, placement.rotation)
             np.testing.assert_array_equal(numbers[9:], placement.translation)
     np.testing.assert_array_equal(
-        mine.at(q[:1]), found[:1]
-    )  # what was handed out before has not changed
+        mine.compute_placements(q[:1]), found[:1]
+    )  # earlier results must not change
 
 
-def test_shapes_are_where_pinocchio_says() -> None:
+def test_placements_match_pinocchio() -> None:
     world = World(door_scene())
     limits = (np.full(world.coordinates.size, limit) for limit in (-1.0, 1.0))
     check(
@@ -64,7 +64,7 @@ JOINTS = [
 ]
 
 
-def test_joints_of_all_types_carry_shapes() -> None:
+def test_all_joint_types_are_supported() -> None:
     rng, model, geometry, parent = np.random.default_rng(3), pin.Model(), pin.GeometryModel(), 0
     for k, joint in enumerate(JOINTS):
         parent = model.addJoint(parent, joint(), pin.SE3.Random(), f"j{k}")
@@ -81,18 +81,24 @@ def test_joints_of_all_types_carry_shapes() -> None:
     )
 
 
-def test_configurations_of_another_size_are_refused() -> None:
+def test_configurations_of_wrong_size_raise() -> None:
     world = World(door_scene())
     with pytest.raises(ValueError, match="nq"):
-        ShapePlacements(world.model, world.bodies).at(np.zeros((2, world.model.nq + 1)))
+        ShapePlacements(world.model, world.bodies).compute_placements(
+            np.zeros((2, world.model.nq + 1))
+        )
 
 
-def test_no_states_and_no_shapes() -> None:
+def test_empty_input_gives_empty_output() -> None:
     world = World(door_scene())
     q = world.coordinates.q(np.zeros((2, world.coordinates.size)))
-    assert ShapePlacements(world.model, world.bodies).at(q[:0]).shape == (
+    assert ShapePlacements(world.model, world.bodies).compute_placements(q[:0]).shape == (
         0,
         len(world.bodies.geometryObjects),
         12,
     )
-    assert ShapePlacements(world.model, pin.GeometryModel()).at(q).shape == (2, 0, 12)
+    assert ShapePlacements(world.model, pin.GeometryModel()).compute_placements(q).shape == (
+        2,
+        0,
+        12,
+    )

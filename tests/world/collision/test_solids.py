@@ -1,4 +1,4 @@
-"""Shapes rebuilt in compiled code have the numbers of coal's, and boxes are taken as they are whatever is asked first."""
+"""Tests the conversion of coal shapes to compiled ones, and the check of library versions."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def hull(seed: int) -> coal.Convex:
 
 def distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> float:
     return float(
-        Shapes([first, second]).distances(NOWHERE, np.zeros(1, int), np.array([[0, 1]]))[0]
+        Shapes([first, second]).compute_distances(NOWHERE, np.zeros(1, int), np.array([[0, 1]]))[0]
     )
 
 
-def test_what_is_not_known_is_refused_by_name() -> None:
+def test_unsupported_shapes_raise() -> None:
     with pytest.raises(InputError, match="HeightFieldAABB"):
         convert_solid(coal.HeightFieldAABB(1.0, 1.0, np.zeros((3, 3)), 0.0))
     with pytest.raises(InputError, match="object"):
         convert_solid(object())
 
 
-def test_hulls_are_rebuilt_once_while_they_live_and_stay_the_same() -> None:
+def test_hulls_are_cached_until_they_change() -> None:
     shape = hull(0)
     first = convert_solid(shape)
     assert convert_solid(shape) is first
@@ -48,26 +48,26 @@ def test_hulls_are_rebuilt_once_while_they_live_and_stay_the_same() -> None:
     other = hull(1)
     assert convert_solid(other) is not convert_solid(shape)
     key = id(shape)
-    assert key in solids._known
+    assert key in solids._cache
     del shape
     gc.collect()
-    assert key not in solids._known
+    assert key not in solids._cache
 
 
-def test_lengths_that_change_are_seen() -> None:
-    """What is made of a few numbers is rebuilt every time."""
+def test_changed_dimensions_are_noticed() -> None:
+    """Primitives are converted at every call."""
     box, ball = coal.Box(1.0, 1.0, 1.0), coal.Sphere(0.1)
     where = NOWHERE.copy()
     where[0, 1, 9] = 2.0
     pair = np.zeros(1, int), np.array([[0, 1]])
-    assert Shapes([box, ball]).distances(where, *pair)[0] == pytest.approx(1.4, abs=1e-6)
+    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(1.4, abs=1e-6)
     box.halfSide = np.array([1.0, 0.5, 0.5])
-    assert Shapes([box, ball]).distances(where, *pair)[0] == pytest.approx(0.9, abs=1e-6)
+    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(0.9, abs=1e-6)
     ball.setSweptSphereRadius(0.2)
-    assert Shapes([box, ball]).distances(where, *pair)[0] == pytest.approx(0.7, abs=1e-6)
+    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(0.7, abs=1e-6)
 
 
-def test_corners_of_triangles() -> None:
+def test_triangles_keep_their_corners() -> None:
     mesh = coal.BVHModelOBBRSS()
     points, faces = np.eye(3), [[0, 2, 1]]
     mesh.beginModel(1, 3)
@@ -82,22 +82,22 @@ def test_corners_of_triangles() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.array([[0, 1, 3]]), np.array([[0, -1, 2]])])
-def test_faces_of_no_points_are_refused(wrong: np.ndarray) -> None:
+def test_faces_without_points_raise(wrong: np.ndarray) -> None:
     with pytest.raises(IndexError, match="corner"):
         solids.load_compiled().convex(np.eye(3), wrong, 0.0)
 
 
-def test_a_module_that_does_not_fit_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It was compiled against another coal or Pinocchio, or is not there."""
+def test_incompatible_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module is missing, or was compiled against other releases."""
     solids.load_compiled.cache_clear()
-    for theirs, mine, said in (
+    for theirs, mine, message in (
         ("2.9.1", pin.__version__, r"against coal 2\.9\.1"),
         (coal.__version__, "3.9.0", r"pin 3\.9\.0"),
     ):
         with monkeypatch.context() as patch:
             built = types.SimpleNamespace(COAL_VERSION=theirs, PINOCCHIO_VERSION=mine)
             patch.setattr(solids, "compiled_module", lambda _, built=built: built)
-            with pytest.raises(BuildError, match=said):
+            with pytest.raises(BuildError, match=message):
                 solids.load_compiled()
 
     def missing(name: str) -> types.ModuleType:
@@ -115,14 +115,15 @@ _FIRST = """
 import numpy as np
 from vkc_pin.world.collision.shapes import Shapes
 import coal
-where = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0], [1.0, 0, 0, 0, 1, 0, 0, 0, 1, -2, 0, 0]]])
+turn = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
+where = np.array([[[*turn, 0, 0, 0], [*turn, -2, 0, 0]]])
 shapes = Shapes([coal.Box(1.0, 1.0, 1.0), coal.Box(1.0, 1.0, 1.0)])
-print(float(shapes.distances(where, np.zeros(1, int), np.array([[0, 1]]))[0]).hex())
+print(float(shapes.compute_distances(where, np.zeros(1, int), np.array([[0, 1]]))[0]).hex())
 """
 
 
-def test_boxes_are_as_large_as_they_are_whatever_is_asked_first() -> None:
-    """Along an axis, as the first question of a process, coal would make them larger by 1e-10 from then on."""
+def test_box_sizes_do_not_depend_on_the_first_query() -> None:
+    """A first query along an axis would make coal enlarge boxes by 1e-10 from then on."""
     answers = {
         subprocess.run(
             [sys.executable, "-c", before + _FIRST],
@@ -137,9 +138,12 @@ def test_boxes_are_as_large_as_they_are_whatever_is_asked_first() -> None:
     assert float.fromhex(answers.pop().strip()) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_nothing_is_said_of_what_lives_until_the_process_ends() -> None:
-    """Caches and globals keep shapes."""
-    code = "import builtins, coal; from vkc_pin.world.collision.shapes import Shapes; builtins.kept = Shapes([coal.Sphere(0.1)])"
+def test_no_leak_warnings_at_exit() -> None:
+    """Caches and globals hold shapes until the process ends."""
+    code = (
+        "import builtins, coal; from vkc_pin.world.collision.shapes import Shapes; "
+        "builtins.kept = Shapes([coal.Sphere(0.1)])"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )

@@ -1,4 +1,4 @@
-"""As many threads as there are cores, or as is said."""
+"""Tests the choice of the number of threads."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from vkc_pin.world.collision.shapes import Shapes
 from vkc_pin.world.collision.threads import count_threads
 
 
-@pytest.mark.parametrize(("said", "most"), [("1", 1), ("3", 3), ("0", 1), ("nonsense", 8), ("", 8)])
-def test_threads(said: str, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", said)
+@pytest.mark.parametrize(
+    ("requested", "expected"), [("1", 1), ("3", 3), ("0", 1), ("nonsense", 8), ("", 8)]
+)
+def test_thread_count_respects_cores_and_environment(
+    requested: str, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", requested)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(12)), raising=False)
-    assert count_threads() == most
+    assert count_threads() == expected
     shapes = Shapes([coal.Sphere(0.1)])
-    assert [shapes._threads(rows) for rows in (0, 10, 10**6)] == [1, 1, most]
-    assert Shapes([coal.Sphere(0.1)], threads=5)._threads(10**6) == 5
+    assert [shapes._count_threads(rows) for rows in (0, 10, 10**6)] == [1, 1, expected]
+    assert Shapes([coal.Sphere(0.1)], threads=5)._count_threads(10**6) == 5
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
     assert count_threads() == 1

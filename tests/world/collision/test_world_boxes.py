@@ -1,4 +1,4 @@
-"""Which boxes along the world's axes come near each other, against all of them looked at one by one."""
+"""Tests the search for close axis-aligned boxes against an exhaustive one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vkc_pin.world.collision.world_boxes import WorldBoxes
 
 
 def gap(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> float:
-    """Return the distance of two boxes, given by lower and upper corners; -inf where they overlap."""
+    """Return the distance of two boxes given by their corners; -inf if they overlap."""
     apart = np.maximum(second[0] - first[1], first[0] - second[1])
     return float(np.linalg.norm(np.maximum(apart, 0.0))) if apart.max() > 0.0 else -np.inf
 
@@ -24,7 +24,7 @@ def gap(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> float:
     st.booleans(),
     st.sampled_from([0.05, 0.5, np.inf]),
 )
-def test_all_that_may_come_near_and_nothing_else(
+def test_close_pairs_match_an_exhaustive_search(
     seed: int, states: int, moving: bool, limit: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -44,7 +44,9 @@ def test_all_that_may_come_near_and_nothing_else(
     moves = np.array([[True] * 5 + [False] * 7, [True, False, True, False, True] + [False] * 7])
     phases = (np.arange(len(first)) > len(first) // 2).astype(int)
     pairs = np.array([(i, j) for j in range(12) for i in range(min(j, 5))])
-    at, which = boxes.near(first, last, pairs, moved=moved, moves=moves, phases=phases, limit=limit)
+    at, which = boxes.find_close_pairs(
+        first, last, pairs, moved=moved, moves=moves, phases=phases, limit=limit
+    )
     expected = []
     for k, (a, b) in enumerate(zip(first, last, strict=True)):
         for p, (i, j) in enumerate(pairs.tolist()):
@@ -56,7 +58,7 @@ def test_all_that_may_come_near_and_nothing_else(
     assert list(zip(at.tolist(), which.tolist(), strict=True)) == expected
 
 
-def test_what_is_not_there_is_refused() -> None:
+def test_invalid_indices_raise() -> None:
     corner = np.zeros((2, 1, 3))
     boxes = WorldBoxes(corner, corner + 1.0, np.full((1, 3), 3.0), np.full((1, 3), 4.0))
     good = {
@@ -66,7 +68,7 @@ def test_what_is_not_there_is_refused() -> None:
         "limit": 9.0,
     }
     here, pair = np.zeros(1, int), np.array([[0, 1]])
-    at, which = boxes.near(here, here, pair, **good)
+    at, which = boxes.find_close_pairs(here, here, pair, **good)
     assert (at.tolist(), which.tolist()) == ([0], [0])
     for first, pairs, more in (
         (here + 2, pair, {}),
@@ -75,13 +77,13 @@ def test_what_is_not_there_is_refused() -> None:
         (here, pair, {"phases": here + 1}),
     ):
         with pytest.raises(IndexError, match="no such"):
-            boxes.near(first, here, pairs, **{**good, **more})
+            boxes.find_close_pairs(first, here, pairs, **{**good, **more})
     for more in (
         {"moved": np.zeros((1, 3))},
         {"moves": np.ones((1, 3), bool)},
         {"moved": np.zeros((2, 2))},
     ):
         with pytest.raises(ValueError, match=r"shape|moves|stretch"):
-            boxes.near(here, here, pair, **{**good, **more})
+            boxes.find_close_pairs(here, here, pair, **{**good, **more})
     with pytest.raises(ValueError, match="shape"):
         WorldBoxes(corner, corner[:1], np.zeros((1, 3)), np.zeros((1, 3)))

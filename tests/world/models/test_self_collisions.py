@@ -294,9 +294,9 @@ def test_tiago_rests_free(tmp_path: Path) -> None:
     from vkc_pin.world.models.shapes import ShapeDistances
 
     distances = ShapeDistances(robot.model, robot.coordinates.q, robot.collision.geometryObjects)
-    distances.place(np.array([0.0, 0.0, 0.0, *robot.home]))
+    distances.set_configuration(np.array([0.0, 0.0, 0.0, *robot.home]))
     for (i, j), margin in robot.own_margins(0.02).items():
-        assert distances.between([(i, j)]) >= margin
+        assert distances.compute_distance([(i, j)]) >= margin
 
 
 def test_a_robot_whose_name_xml_forbids(husky: Robot, tmp_path: Path) -> None:

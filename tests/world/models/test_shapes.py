@@ -190,25 +190,27 @@ def test_distances_of_links_are_those_of_their_shapes(worth: float) -> None:
     assert links.links == list(groups)
     for _ in range(4):
         z = rng.uniform(-2.0, 2.0, len(robot.lower))
-        distances.place(z)
+        distances.set_configuration(z)
         pin.forwardKinematics(robot.model, data, robot.coordinates.q(z))
         placed = [
             (shape.geometry, data.oMi[shape.parentJoint] * shape.placement) for shape in shapes
         ]
         np.testing.assert_allclose(
-            distances.lowest(), [compute_world_box(*one)[0][2] for one in placed], atol=1e-12
+            distances.compute_lowest_points(),
+            [compute_world_box(*one)[0][2] for one in placed],
+            atol=1e-12,
         )
-        bounds = links.bounds()
+        bounds = links.compute_lower_bounds()
         for k, name in enumerate(links.links):
             exact = min(
                 compute_shape_distance(*placed[one], *placed[other]) for one, other in groups[name]
             )
             assert bounds[k] <= exact + 1e-6
-            found = links.between(k, worth)
+            found = links.compute_distance(k, worth)
             assert found == pytest.approx(exact, abs=1e-6) if exact <= worth else found > worth
-        links.keep([k % 3 > 0 for k in range(len(links.links))])
+        links.select([k % 3 > 0 for k in range(len(links.links))])
         if not links.links:
             break
-    links.keep([False] * len(links.links))
+    links.select([False] * len(links.links))
     assert links.links == []
-    assert links.bounds().shape == (0,)
+    assert links.compute_lower_bounds().shape == (0,)

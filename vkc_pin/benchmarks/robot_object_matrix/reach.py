@@ -77,8 +77,10 @@ class _Free:
         self._carried = np.array([shape.parentJoint > 1 for shape in shapes])
 
     def __call__(self, z: Floats) -> bool:
-        self._distances.place(z)
-        if (self._distances.lowest()[self._carried] < self._floor).any():
+        self._distances.set_configuration(z)
+        if (self._distances.compute_lowest_points()[self._carried] < self._floor).any():
             return False
-        close = np.flatnonzero(self._distances.bounds(self._numbers) < self._margins)
-        return all(self._distances.between([self._pairs[k]]) >= self._margins[k] for k in close)
+        close = np.flatnonzero(self._distances.compute_lower_bounds(self._numbers) < self._margins)
+        return all(
+            self._distances.compute_distance([self._pairs[k]]) >= self._margins[k] for k in close
+        )

@@ -55,31 +55,33 @@ class Clearances:
 
     def place(self, arm: Floats) -> None:
         """Put the arm at `arm`, shape (n − 3,), the base at the origin."""
-        self._distances.place(np.concatenate([np.zeros(3), arm]))
+        self._distances.set_configuration(np.concatenate([np.zeros(3), arm]))
 
     def floor(self, *, moved: bool = True) -> list[tuple[str, float]]:
         """Return link → how far above the floor it is [m], of those that the arm moves or of the others, the lowest first."""
         heights: dict[str, float] = {}
-        lowest = self._distances.lowest()
+        lowest = self._distances.compute_lowest_points()
         for k in np.flatnonzero(self._carried == moved).tolist():
             heights[self._names[k]] = min(float(lowest[k]), heights.get(self._names[k], np.inf))
         return sorted(heights.items(), key=lambda item: item[1])
 
     def least(self, worth: float = np.inf) -> float:
         """Return the least distance between links and to the floor [m], looked at up to `worth`."""
-        nearest = float(min(worth, self._distances.lowest()[self._carried].min(initial=np.inf)))
-        bounds = self._distances.bounds(self._pairs)
+        nearest = float(
+            min(worth, self._distances.compute_lowest_points()[self._carried].min(initial=np.inf))
+        )
+        bounds = self._distances.compute_lower_bounds(self._pairs)
         for k in np.argsort(bounds).tolist():
             if bounds[k] > nearest:
                 break
-            nearest = min(nearest, self._distances.between([self.pairs[k]], nearest))
+            nearest = min(nearest, self._distances.compute_distance([self.pairs[k]], nearest))
         return nearest
 
     def links(self, below: float) -> list[tuple[str, str, float]]:
         """Return pairs of links closer than `below` [m], the closest first."""
         found: dict[tuple[str, str], float] = {}
-        for k in np.flatnonzero(self._distances.bounds(self._pairs) < below).tolist():
-            distance = self._distances.between([self.pairs[k]])
+        for k in np.flatnonzero(self._distances.compute_lower_bounds(self._pairs) < below).tolist():
+            distance = self._distances.compute_distance([self.pairs[k]])
             if distance < below:
                 names = (self._names[self.pairs[k][0]], self._names[self.pairs[k][1]])
                 found[names] = min(distance, found.get(names, np.inf))
@@ -177,11 +179,13 @@ def never_apart(
     furthest, apart = dict.fromkeys(pairs.links, -np.inf), dict.fromkeys(pairs.links, 0)
     for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
         look.place(arm)
-        for k, (links, bound) in enumerate(zip(pairs.links, pairs.bounds(), strict=True)):
-            distance = float(bound) if bound > margin else pairs.between(k, margin)
+        for k, (links, bound) in enumerate(
+            zip(pairs.links, pairs.compute_lower_bounds(), strict=True)
+        ):
+            distance = float(bound) if bound > margin else pairs.compute_distance(k, margin)
             furthest[links] = max(furthest[links], distance)
             apart[links] += distance >= margin
-        pairs.keep([apart[links] <= (1.0 - share) * samples for links in pairs.links])
+        pairs.select([apart[links] <= (1.0 - share) * samples for links in pairs.links])
         if not pairs.links:
             break
     return {links: furthest[links] for links in pairs.links}

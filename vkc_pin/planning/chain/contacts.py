@@ -166,7 +166,7 @@ class ContactModel:
                 where |= {index: shape.placement for index, shape in shapes}
             if where:
                 view.phases[number] = self.phases[number].with_placements(where)
-                view._clearances[number] = self._clearances[number].placed(
+                view._clearances[number] = self._clearances[number].move_fixed(
                     view.phases[number].boxes, where
                 )
         return view
@@ -221,8 +221,8 @@ class ContactModel:
                 if len(members) == len(z)
                 else (q[members], z[members], waypoints[members])
             )
-            found = self._clearances[number].nearest(
-                *queries, reach=reach, most=nearest, standing=static
+            found = self._clearances[number].find_closest_pairs(
+                *queries, reach=reach, max_pairs=nearest, include_fixed=static
             )
             pairs = self.phases[number].pairs[found.pair]
             parts.append((members[found.row], pairs, *found[2:]))
@@ -246,7 +246,7 @@ class ContactModel:
             allowed: Allowed margin shortfall [m].
         """
         clearances = self._clearances[self.find_phase(waypoint)]
-        found = clearances.first_blocked(
+        found = clearances.find_first_violation(
             self.chain.coordinates.q(z), z, waypoint, reach=reach, allowed=allowed
         )
         spend(min(found + 1, len(z)))
@@ -262,7 +262,7 @@ class ContactModel:
         reach: float,
         allowed: float,
     ) -> Any:
-        """Return a checker of straight lines in the first coordinates, see `Clearances.lines`.
+        """Return a checker of straight lines in the first coordinates, see `Clearances.make_line_checker`.
 
         Args:
             z: Configuration that gives all other coordinates, shape (n,).
@@ -273,10 +273,10 @@ class ContactModel:
             allowed: Allowed margin shortfall [m].
         """
         places, clearances = (
-            self.chain.coordinates.places,
+            self.chain.coordinates.index_maps,
             self._clearances[self.find_phase(waypoint)],
         )
-        return clearances.lines(
+        return clearances.make_line_checker(
             places, z, waypoint, weights=weights, step=step, reach=reach, allowed=allowed
         )
 
@@ -318,10 +318,10 @@ class ContactModel:
         found, phase_of = np.empty((len(z), 3)), self.find_phases(waypoints)
         for number in set(phase_of.tolist()):
             members = np.flatnonzero(phase_of == number)
-            where = self._clearances[number].placements.at(self.chain.coordinates.q(z[members]))
+            where = self._clearances[number].placements.compute_placements(self.chain.coordinates.q(z[members]))
             found[members] = (
                 self._clearances[number]
-                .shapes.witnesses(where, np.arange(len(members)), pairs[members])
+                .shapes.compute_witnesses(where, np.arange(len(members)), pairs[members])
                 .normal
             )
         return found

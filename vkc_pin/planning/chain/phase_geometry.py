@@ -67,7 +67,7 @@ class PhaseGeometry:
             return self._base_margins.at(
                 pairs, waypoints, np.empty((1, 0)), np.zeros(len(pairs), int)
             )
-        return self.margin_table.at(
+        return self.margin_table.compute_margins(
             pairs, waypoints, z, np.arange(len(z)) if rows is None else rows
         )
 
@@ -86,7 +86,7 @@ class PhaseGeometry:
         for name in ("_n_moving", "_pair_numbers", "margin_table"):  # independent of the placements
             moved.__dict__[name] = getattr(self, name)
         which = np.array(list(placements), int)
-        moved.__dict__["boxes"] = self.boxes.placed(
+        moved.__dict__["boxes"] = self.boxes.move_fixed(
             which, rotation[which], moved._box_centers[which]
         )
         return moved

@@ -98,7 +98,7 @@ def retime_trajectory(
                 limits,
                 scale,
                 rolling,
-                TorqueBounds(torques, phases[steps]) if torques.torque_limits.known else None,
+                TorqueBounds(torques, phases[steps]) if torques.torque_limits.is_known else None,
             )
         for piece, at in curves:
             ends += (ends[-1] + at).tolist()

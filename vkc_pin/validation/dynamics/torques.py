@@ -59,7 +59,7 @@ class Motors:
     @cached_property
     def shares(self) -> Floats:
         """The same without sign, as shares of what the motors have, shape (K, robot's); 0 where that is not known."""
-        if not self._torques.torque_limits.known:
+        if not self._torques.torque_limits.is_known:
             return np.zeros((len(self.moments.times), self.trajectory.robot_size))
         return np.asarray(np.abs(self.torques) / self._torques.torque_limits.limits)
 

@@ -1,1 +1,1 @@
-"""Signed distances of many placed shapes at once, by coal in compiled code; knows neither robots nor scenes."""
+"""Computes signed distances of many shape pairs at once, with coal in compiled code."""

@@ -1,6 +1,6 @@
-"""Which pairs of shapes may be close: bounding boxes, at many configurations at once.
+"""Finds pairs of shapes that may be close, from their bounding boxes, at many configurations.
 
-`clearances` asks them in compiled code; here is what they say, alone.
+`clearances` runs the same test inside its compiled loop; this module exposes it separately.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from vkc_pin.world.collision.threads import count_threads
 
 __all__ = ["Boxes"]
 
-_WORTH = 32  # configurations, some 0.2 ms, for which another thread is worth starting
+_MIN_ROWS_PER_THREAD = 32  # configurations, about 0.2 ms: fewer do not pay for another thread
 
 
 class Boxes:
-    """Boxes around shapes that move on joints, then around shapes that stand in the world, G in all.
+    """Oriented bounding boxes of G shapes: first the moving ones, then those fixed in the world.
 
     Args:
-        joints: Which joint carries each box, from 1; 0: it stands, shape (G,).
-        rotations: Of the boxes, in their joint's frame or in the world, shape (G, 3, 3).
-        centers: Of the boxes, in the same frame, shape (G, 3) [m].
+        joints: Joint that carries each box, shape (G,); 0 for fixed boxes.
+        rotations: Box orientations in the frame of their joint or the world, shape (G, 3, 3).
+        centers: Box centres in the same frame, shape (G, 3) [m].
         halves: Half extents along the boxes' own axes, shape (G, 3) [m].
-        pairs: Which of them to look at, shape (P, 2); of every pair at least the first moves.
-        threads: How many look at most; None: see `count_threads`.
+        pairs: Pairs of boxes to check, shape (P, 2); at least the first box of each pair moves.
+        threads: Maximum number of threads. Default: `threads.count_threads`.
 
     Attributes:
-        pairs: Which pairs it looks at, shape (P, 2).
+        pairs: Pairs of boxes that are checked, shape (P, 2).
 
     Raises:
-        ValueError: Those that move are not the first, or arrays do not fit together.
-        IndexError: There is no such box.
+        ValueError: Moving boxes do not come first, or array shapes do not match.
+        IndexError: A pair refers to a box that does not exist.
         BuildError: See `solids.load_compiled`.
     """
 
@@ -52,33 +52,43 @@ class Boxes:
         self.pairs = pairs
         self.compiled: Any = load_compiled().Boxes(joints, rotations, centers, halves, pairs)
 
-    def placed(self, which: Ints, rotations: Floats, centers: Floats) -> Boxes:
-        """Return the same with some that stand, shape (n,), placed elsewhere: shapes (n, 3, 3) and (n, 3) [m]."""
+    def move_fixed(self, which: Ints, rotations: Floats, centers: Floats) -> Boxes:
+        """Return a copy with some fixed boxes at other placements.
+
+        Args:
+            which: Indices of the boxes, shape (n,).
+            rotations: New orientations in the world frame, shape (n, 3, 3).
+            centers: New centres in the world frame, shape (n, 3) [m].
+        """
         other = object.__new__(Boxes)
         other.threads, other.pairs = self.threads, self.pairs
         other.compiled = self.compiled.placed(which, rotations, centers)
         return other
 
-    def near(
-        self, reach: float, rotations: Floats, translations: Floats, *, standing: bool = True
+    def find_close_pairs(
+        self, reach: float, rotations: Floats, translations: Floats, *, include_fixed: bool = True
     ) -> tuple[Ints, Ints, Floats]:
-        """Return (configuration, pair) of all pairs that bounding volumes cannot prove to be `reach` apart, in this order.
+        """Return all pairs that bounding volumes cannot prove to be `reach` apart.
 
-        First balls (against boxes where they stand in the world), then what the face normals of
-        both boxes separate. The third array has lower bounds of the signed distances [m]. It makes
-        no difference how many configurations are looked at together.
+        Bounding spheres are tested first (against boxes, for fixed shapes), then the face normals
+        of both boxes. Results do not depend on which configurations are evaluated together.
 
         Args:
-            reach: [m].
-            rotations: Of all joints in the world, shape (W, J, 3, 3); joint 0, the world, is among
-                the J.
-            translations: Of all joints in the world, shape (W, J, 3) [m].
-            standing: Whether what stands in the world counts, too; otherwise only pairs of which
-                both move.
+            reach: Distance [m] below which a pair counts as close.
+            rotations: Orientations of all joints in the world frame, shape (W, J, 3, 3); joint 0 is
+                the world.
+            translations: Positions of all joints in the world frame, shape (W, J, 3) [m].
+            include_fixed: Whether to include pairs of a moving and a fixed shape.
+
+        Returns:
+            Configuration index, pair index, and a lower bound of the signed distance [m], each of
+            shape (C,), sorted by configuration, then by pair.
 
         Raises:
-            IndexError: A box is on none of these joints.
+            IndexError: A box is attached to a joint that is not among the J.
         """
-        threads = max(1, min(self.threads, len(rotations) // _WORTH))
-        at, pairs, gaps = self.compiled.near(reach, rotations, translations, standing, threads)
-        return np.asarray(at), np.asarray(pairs), np.asarray(gaps)
+        threads = max(1, min(self.threads, len(rotations) // _MIN_ROWS_PER_THREAD))
+        rows, pairs, gaps = self.compiled.near(
+            reach, rotations, translations, include_fixed, threads
+        )
+        return np.asarray(rows), np.asarray(pairs), np.asarray(gaps)

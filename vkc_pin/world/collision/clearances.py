@@ -1,4 +1,4 @@
-"""Which pairs of shapes fall shortest of their margins, at many configurations of a model at once."""
+"""Finds the pairs of shapes that violate their margins most, at many configurations of a model."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from vkc_pin.world.collision.solids import load_compiled
 
 __all__ = ["Clearances", "ClosePairs"]
 
-_ROUNDING = 1e-6  # [m] of coal
-_WORTH = 16  # configurations, some 0.3 ms, for which another thread is worth starting
+_ROUNDING = 1e-6  # [m] numerical error of coal's distances
+_MIN_ROWS_PER_THREAD = 16  # configurations, about 0.3 ms: fewer do not pay for another thread
 
 
 class ClosePairs(NamedTuple):
-    """Pairs that are close, C in all, by configuration and then by distance − margin.
+    """C pairs of shapes that are close, sorted by configuration, then by distance − margin.
 
     Attributes:
-        row: Of the configurations, shape (C,).
-        pair: Shape (C,).
-        distance: Signed, shape (C,) [m].
-        margin: What the pair must keep there, shape (C,) [m].
-        normal: From its first shape to its second, world frame, shape (C, 3).
-        first, second: The points that are closest, or deepest, on either, world frame, shape (C, 3)
-            each [m].
+        row: Index of the configuration, shape (C,).
+        pair: Index of the pair, shape (C,).
+        distance: Signed distance, shape (C,) [m].
+        margin: Clearance that the pair must keep there, shape (C,) [m].
+        normal: Unit normal from the first to the second shape, world frame, shape (C, 3).
+        first, second: Witness points (closest, or deepest) on either shape, world frame, shape
+            (C, 3) each [m].
     """
 
     row: Ints
@@ -44,15 +44,16 @@ class ClosePairs(NamedTuple):
 
 
 class Clearances:
-    """Shapes on a model's joints and others that stand: kinematics, bounding volumes and distances in one call.
+    """Computes kinematics, bounding volumes and distances of a model's shapes in one compiled call.
 
-    It makes no difference how many configurations are looked at together, nor by how many threads.
+    Results depend neither on the number of threads nor on which configurations are evaluated
+    together.
 
     Attributes:
-        placements: Where the shapes that move are.
-        boxes: Around all shapes; which pairs there are.
+        placements: Kinematics of the moving shapes.
+        boxes: Bounding boxes of all shapes, with the pairs to check.
         shapes: All shapes.
-        margins: What the pairs must keep.
+        margins: Clearances that the pairs must keep.
     """
 
     def __init__(
@@ -60,64 +61,76 @@ class Clearances:
     ) -> None:
         self.placements, self.boxes, self.shapes, self.margins = placements, boxes, shapes, margins
         self._parts = placements.compiled, boxes.compiled, shapes.compiled, margins.compiled
-        self._nearest, self._first_blocked = load_compiled().nearest, load_compiled().first_blocked
+        self._find_closest_pairs, self._find_first_violation = (
+            load_compiled().nearest,
+            load_compiled().first_blocked,
+        )
 
-    def placed(self, boxes: Boxes, where: Mapping[int, pin.SE3]) -> Clearances:
-        """Return the same with some shapes that stand placed elsewhere in the world, where `boxes` has them already."""
-        return Clearances(self.placements, boxes, self.shapes.placed(where), self.margins)
+    def move_fixed(self, boxes: Boxes, where: Mapping[int, pin.SE3]) -> Clearances:
+        """Return a copy with some fixed shapes at other placements.
 
-    def nearest(
+        Args:
+            boxes: The bounding boxes at the new placements.
+            where: Shape index → new placement in the world frame.
+        """
+        return Clearances(self.placements, boxes, self.shapes.move_fixed(where), self.margins)
+
+    def find_closest_pairs(
         self,
         q: Floats,
         z: Floats,
         waypoints: Ints,
         *,
         reach: float,
-        most: int | None = None,
-        standing: bool = True,
+        max_pairs: int | None = None,
+        include_fixed: bool = True,
     ) -> ClosePairs:
-        """Return, for each configuration, the pairs closer than `reach` that fall shortest of their margins.
+        """Return, per configuration, the pairs closer than `reach` with least distance − margin.
 
         Args:
-            q: Pinocchio's configurations, shape (W, nq).
-            z: Coordinates that margins are looked up by, shape (W, n).
-            waypoints: The same, shape (W,).
-            reach: Pairs further apart are left out [m].
-            most: How many to return for each configuration; None: all.
-            standing: Whether what stands counts, too; otherwise only pairs of which both move.
+            q: Pinocchio configurations, shape (W, nq).
+            z: Minimal coordinates, which select the margins, shape (W, n).
+            waypoints: Waypoint indices, which select the margins, shape (W,).
+            reach: Pairs further apart are omitted [m].
+            max_pairs: Maximum number of pairs per configuration. Default: no limit.
+            include_fixed: Whether to include pairs of a moving and a fixed shape.
 
         Raises:
-            ValueError: Arrays do not fit together.
+            ValueError: Array shapes do not match.
         """
-        threads = max(1, min(self.shapes.threads, len(q) // _WORTH))
-        limit = -1 if most is None else most
+        threads = max(1, min(self.shapes.threads, len(q) // _MIN_ROWS_PER_THREAD))
+        limit = -1 if max_pairs is None else max_pairs
         return ClosePairs(
-            *self._nearest(
-                *self._parts, q, z, waypoints, reach, limit, standing, _ROUNDING, threads
+            *self._find_closest_pairs(
+                *self._parts, q, z, waypoints, reach, limit, include_fixed, _ROUNDING, threads
             )
         )
 
-    def first_blocked(
+    def find_first_violation(
         self, q: Floats, z: Floats, waypoint: int, *, reach: float, allowed: float
     ) -> int:
-        """Return the first configuration in which a pair closer than `reach` falls short of its margin by more than `allowed`.
+        """Return the first configuration that violates a margin by more than `allowed`.
 
-        If there is none, the number of configurations. Nothing is looked at after it, nor any pair
-        after that one.
+        Evaluation stops at the first such pair.
 
         Args:
-            q: Pinocchio's configurations, shape (W, nq).
-            z: Coordinates that margins are looked up by, shape (W, n).
-            waypoint: At which margins are looked up.
-            reach: [m].
-            allowed: [m].
+            q: Pinocchio configurations, shape (W, nq).
+            z: Minimal coordinates, which select the margins, shape (W, n).
+            waypoint: Waypoint index, which selects the margins.
+            reach: Pairs further apart are ignored [m].
+            allowed: Tolerated violation [m].
+
+        Returns:
+            The index, or W if no configuration violates a margin.
 
         Raises:
-            ValueError: Arrays do not fit together.
+            ValueError: Array shapes do not match.
         """
-        return int(self._first_blocked(*self._parts, q, z, waypoint, reach, allowed, _ROUNDING))
+        return int(
+            self._find_first_violation(*self._parts, q, z, waypoint, reach, allowed, _ROUNDING)
+        )
 
-    def lines(
+    def make_line_checker(
         self,
         places: Sequence[Ints],
         z: Floats,
@@ -128,27 +141,26 @@ class Clearances:
         reach: float,
         allowed: float,
     ) -> Any:
-        """Return what looks at straight lines from configuration to configuration: up to the first in which `first_blocked` is.
+        """Return a compiled object that checks straight lines between configurations.
 
-        Compiled searches are made with it. It must not outlive what this was made of.
+        Compiled searches take it. It stops at the first configuration that
+        `find_first_violation` would report. This object must outlive it.
 
         Args:
-            places: Where in Pinocchio's configurations the numbers of z go; see
-                `world.models.coordinates.Coordinates.places`.
-            z: A configuration, shape (n,).
-            waypoint: At which margins are looked up.
-            weights: For each coordinate that moves, the first ones of z, how much it counts, shape
-                (m,).
-            step: How far each coordinate, times its weight, goes at most from one configuration to
-                the next.
-            reach: Pairs further apart do not count [m].
-            allowed: By how much pairs may fall short of their margins [m].
+            places: Positions of the entries of z in Pinocchio's configuration; see
+                `world.models.coordinates.Coordinates.index_maps`.
+            z: A configuration, shape (n,), with the values of the coordinates that do not vary.
+            waypoint: Waypoint index, which selects the margins.
+            weights: Weights of the coordinates that vary, which are the first m of z, shape (m,).
+            step: Largest weighted change of any coordinate between successive checks.
+            reach: Pairs further apart are ignored [m].
+            allowed: Tolerated violation of the margins [m].
 
         Raises:
-            ValueError: Arrays do not fit together.
+            ValueError: Array shapes do not match.
         """
-        where = [np.ascontiguousarray(part, np.int64) for part in places]
-        moved = np.ascontiguousarray(z, float), np.ascontiguousarray(weights, float)
+        maps = [np.ascontiguousarray(part, np.int64) for part in places]
+        vectors = np.ascontiguousarray(z, float), np.ascontiguousarray(weights, float)
         return load_compiled().Lines(
-            *self._parts, *where, *moved, step, waypoint, reach, allowed, _ROUNDING
+            *self._parts, *maps, *vectors, step, waypoint, reach, allowed, _ROUNDING
         )

@@ -1,4 +1,4 @@
-"""Which clearance each pair must keep where."""
+"""Looks up the clearance that each pair of shapes must keep, by waypoint and configuration."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ __all__ = ["MarginRegion", "Margins"]
 
 
 class MarginRegion(NamedTuple):
-    """Pairs that may be closer than others as long as some coordinates are within limits.
+    """A box in configuration space inside which some pairs have a smaller margin.
 
     Attributes:
-        pairs: Which, shape (k,).
-        margin: What they keep there [m]; -inf: nothing.
-        columns: The coordinates in z, shape (m,).
-        lower, upper: Their limits, shape (m,) each.
+        pairs: Indices of the pairs, shape (k,).
+        margin: Their margin inside the region [m]; -inf disables the check.
+        columns: Indices in z of the coordinates that bound the region, shape (m,).
+        lower, upper: Bounds of these coordinates, shape (m,) each, [m] or [rad].
     """
 
     pairs: Ints
@@ -31,39 +31,42 @@ class MarginRegion(NamedTuple):
 
 
 class Margins:
-    """What pairs must keep: usually a clearance of their own, between some waypoints and in some places less.
+    """Margins of pairs: a default each, reduced between some waypoints and in some regions.
 
     Args:
-        usual: The pairs' clearances, shape (P,) [m].
-        eased: Pair → (first waypoint, last waypoint, margin [m]): between these it may come closer,
-            so close.
-        places: Where pairs may come closer.
+        default: Default margins of the pairs, shape (P,) [m].
+        relaxed: Pair → (first waypoint, last waypoint, margin [m]) of every span of waypoints with
+            a smaller margin.
+        regions: Regions with smaller margins.
 
     Raises:
-        IndexError: There is no such pair.
+        IndexError: A pair does not exist.
         BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
         self,
-        usual: Floats,
-        eased: Mapping[int, Sequence[tuple[int, int, float]]],
-        places: Iterable[MarginRegion] = (),
+        default: Floats,
+        relaxed: Mapping[int, Sequence[tuple[int, int, float]]],
+        regions: Iterable[MarginRegion] = (),
     ) -> None:
-        self.compiled: Any = load_compiled().Margins(usual)
-        for pair, spans in eased.items():
+        self.compiled: Any = load_compiled().Margins(default)
+        for pair, spans in relaxed.items():
             for first, last, margin in spans:
                 self.compiled.ease(pair, first, last, margin)
-        for place in places:
-            self.compiled.near(*place)
+        for region in regions:
+            self.compiled.near(*region)
 
-    def at(self, pairs: Ints, waypoints: Ints, z: Floats, rows: Ints) -> Floats:
-        """Return what pairs must keep, each at a waypoint and in one of the places z, shape (n,) [m]; -inf: nothing.
+    def compute_margins(self, pairs: Ints, waypoints: Ints, z: Floats, rows: Ints) -> Floats:
+        """Return the margins of pairs at given waypoints and configurations, shape (n,) [m].
 
         Args:
-            pairs: Shape (n,).
-            waypoints: Shape (n,).
-            z: Coordinates, shape (W, m).
-            rows: Which of these each pair is looked at in, shape (n,).
+            pairs: Indices of the pairs, shape (n,).
+            waypoints: Waypoint of each pair, shape (n,).
+            z: Minimal coordinates, shape (W, m).
+            rows: Row of `z` for each pair, shape (n,).
+
+        Returns:
+            The margins; -inf where a pair need not be checked.
         """
         return np.asarray(self.compiled.at(pairs, waypoints, z, rows), float)

@@ -1,4 +1,4 @@
-"""Distances between some of many shapes, at many states at once."""
+"""Computes signed distances and witness points of pairs of shapes, at many states at once."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from vkc_pin.world.collision.threads import count_threads
 
 __all__ = ["TOLERANCE", "Shapes", "Witnesses", "count_distance_queries"]
 
-TOLERANCE = 1e-6  # coal's own, of GJK
-_WORTH = 128  # distances, some 0.2 ms, for which another thread is worth starting
+TOLERANCE = 1e-6  # coal's default tolerance of GJK
+_MIN_PAIRS_PER_THREAD = 128  # distances, about 0.2 ms: fewer do not pay for another thread
 
 
 class Witnesses(NamedTuple):
-    """Distances of pairs, and where they are.
+    """Signed distances of n pairs of shapes, with normals and witness points.
 
     Attributes:
-        distance: Signed, negative where shapes overlap, shape (n,) [m].
-        normal: From the first to the second, world frame, shape (n, 3).
-        first, second: The points that are closest, or deepest, on either, world frame, shape (n, 3)
-            each [m].
+        distance: Signed distance, negative where shapes overlap, shape (n,) [m].
+        normal: Unit normal from the first to the second shape, world frame, shape (n, 3).
+        first, second: Witness points (closest, or deepest) on either shape, world frame, shape
+            (n, 3) each [m].
     """
 
     distance: Floats
@@ -37,40 +37,43 @@ class Witnesses(NamedTuple):
 
 
 class Shapes:
-    """Shapes that move, then shapes that stand, G in all; coal's distances between them, whatever was asked before.
+    """G shapes between which coal computes distances: first the M moving ones, then the fixed ones.
 
-    They are coal's to the last bit (`coal.distance` with a result of its own), however many threads
-    look for them. States say where what moves is: placements in the world, shape (W, M, 12), see
-    `placements.flatten_placements`.
+    Distances equal those of `coal.distance` with a fresh result bit for bit. They depend neither on
+    the number of threads nor on earlier queries. A state is the placements of the moving shapes in
+    the world frame, shape (M, 12), in the format of `placements.flatten_placements`.
 
     Args:
-        geometries: coal's shapes, first those that move.
-        standing: Where the last of them stand in the world, S of them; the other M move.
-        tolerance: Of GJK. At 1e-8 normals are good enough for gradients, at coal's own 1e-6 these
-            are off by up to 5e-3. It takes no longer. (Penetration keeps its tolerance: below 1e-6
-            it fails for cylinders.)
-        threads: How many look for distances at most; None: as many as there are cores for this
-            process, 8 at most, or `OMP_NUM_THREADS`.
+        geometries: coal's shapes, moving ones first.
+        fixed: Placements of the fixed shapes in the world frame; the others move.
+        tolerance: Tolerance of GJK. With 1e-8, normals are accurate enough for gradients; with
+            coal's default of 1e-6 they are off by up to 5e-3. Both take the same time. (EPA keeps
+            its default tolerance, since below 1e-6 it fails for cylinders.)
+        threads: Maximum number of threads. Default: `threads.count_threads`.
 
     Raises:
-        InputError: A shape is of a kind that is not known; see `solids.convert_solid`.
+        InputError: A shape is of an unsupported type; see `solids.convert_solid`.
         BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
         self,
         geometries: Sequence[coal.CollisionGeometry],
-        standing: Sequence[pin.SE3] = (),
+        fixed: Sequence[pin.SE3] = (),
         *,
         tolerance: float = TOLERANCE,
         threads: int | None = None,
     ) -> None:
         self.threads = count_threads() if threads is None else threads
         solids = [convert_solid(geometry) for geometry in geometries]
-        self.compiled: Any = load_compiled().Shapes(solids, flatten_placements(standing), tolerance)
+        self.compiled: Any = load_compiled().Shapes(solids, flatten_placements(fixed), tolerance)
 
-    def placed(self, where: Mapping[int, pin.SE3]) -> Shapes:
-        """Return the same with some that stand placed elsewhere in the world; `where` goes by their numbers among the G."""
+    def move_fixed(self, where: Mapping[int, pin.SE3]) -> Shapes:
+        """Return a copy with some fixed shapes at other placements.
+
+        Args:
+            where: Shape index (among all G) → new placement in the world frame.
+        """
         other = object.__new__(Shapes)
         other.threads = self.threads
         other.compiled = self.compiled.placed(
@@ -78,74 +81,84 @@ class Shapes:
         )
         return other
 
-    def distances(self, moving: Floats, states: Ints, pairs: Ints) -> Floats:
-        """Return the signed distances of pairs, each at one of the states, shape (n,) [m].
+    def compute_distances(self, moving: Floats, states: Ints, pairs: Ints) -> Floats:
+        """Return the signed distances of pairs, shape (n,) [m].
 
         Args:
-            moving: The states, shape (W, M, 12).
-            states: Which state each pair is looked at in, shape (n,).
-            pairs: Numbers of shapes, shape (n, 2).
+            moving: States, shape (W, M, 12).
+            states: State of each pair, shape (n,).
+            pairs: Pairs of shape indices, shape (n, 2).
 
         Raises:
-            IndexError: There is no such state or shape.
+            IndexError: A state or shape does not exist.
         """
-        found = self.compiled.distances(moving, states, pairs, False, self._threads(len(pairs)))
+        found = self.compiled.distances(
+            moving, states, pairs, False, self._count_threads(len(pairs))
+        )
         return np.asarray(found, float)
 
-    def witnesses(self, moving: Floats, states: Ints, pairs: Ints) -> Witnesses:
-        """Return distances, normals and the closest points; arguments and errors as of `distances`."""
-        return _witnesses(
-            self.compiled.distances(moving, states, pairs, True, self._threads(len(pairs)))
+    def compute_witnesses(self, moving: Floats, states: Ints, pairs: Ints) -> Witnesses:
+        """Return the distances, normals and witness points of pairs.
+
+        Arguments and errors are those of `compute_distances`.
+        """
+        return _to_witnesses(
+            self.compiled.distances(moving, states, pairs, True, self._count_threads(len(pairs)))
         )
 
-    def shortest(
+    def find_closest_pairs(
         self,
         moving: Floats,
         edges: Ints,
         pairs: Ints,
         *,
-        numbers: Ints,
+        ranks: Ints,
         margins: Floats,
         bounds: Floats,
         reach: float,
-        most: int | None,
+        max_pairs: int | None,
         rounding: float,
     ) -> tuple[Ints, Witnesses]:
-        """Return, for each state, the pairs closer than `reach` that fall shortest of their margins, and their distances.
+        """Return, for each state, the pairs closer than `reach` with least distance − margin.
 
         Args:
-            moving: The states, shape (W, M, 12).
-            edges: Where each state's pairs begin, and where the last one's end, shape (W + 1,).
-            pairs: Numbers of shapes, shape (n, 2), for each state in the order of `bounds`.
-            numbers: Which goes first of two that are equal, shape (n,).
-            margins: What distances are compared with, shape (n,) [m].
-            bounds: What is known of distance − margin: at least so much, shape (n,) [m].
-            reach: Pairs further apart are left out [m].
-            most: How many to return for each state; None: all. Pairs of which `bounds` shows that
-                they are not among them are not asked for.
-            rounding: How much larger than distance − margin `bounds` may be [m].
+            moving: States, shape (W, M, 12).
+            edges: Index of the first pair of each state, and of the end of the last, shape
+                (W + 1,).
+            pairs: Pairs of shape indices, shape (n, 2), sorted by `bounds` within each state.
+            ranks: Order of pairs that tie, shape (n,).
+            margins: Margins, shape (n,) [m].
+            bounds: Lower bounds of distance − margin, shape (n,) [m].
+            reach: Pairs further apart are omitted [m].
+            max_pairs: Maximum number of pairs per state. Default: no limit. Pairs that `bounds`
+                excludes are not evaluated.
+            rounding: Error of `bounds` that must be allowed for [m].
 
         Returns:
-            Which of the n they are, by state and then by distance − margin, and their distances.
+            Indices of the selected pairs among the n, sorted by state, then by distance − margin;
+            and their distances and witness points.
 
         Raises:
-            IndexError: There is no such shape.
+            IndexError: A shape does not exist.
         """
-        limits, limit = np.column_stack([margins, bounds]), -1 if most is None else most
-        threads = self._threads(len(pairs))
+        limits, limit = np.column_stack([margins, bounds]), -1 if max_pairs is None else max_pairs
+        threads = self._count_threads(len(pairs))
         chosen, table = self.compiled.shortest(
-            moving, edges, pairs, numbers, limits, reach, limit, rounding, threads
+            moving, edges, pairs, ranks, limits, reach, limit, rounding, threads
         )
-        return chosen, _witnesses(table)
+        return chosen, _to_witnesses(table)
 
-    def _threads(self, rows: int) -> int:
-        return max(1, min(self.threads, rows // _WORTH))
+    def _count_threads(self, rows: int) -> int:
+        return max(1, min(self.threads, rows // _MIN_PAIRS_PER_THREAD))
 
 
-def _witnesses(table: Floats) -> Witnesses:
+def _to_witnesses(table: Floats) -> Witnesses:
     return Witnesses(table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7:10])
 
 
 def count_distance_queries() -> int:
-    """Return how many distances were asked of coal so far here, by this process: what bounds have not saved."""
+    """Return the number of distances that coal has computed in this process.
+
+    Pairs that bounds excluded are not counted.
+    """
     return int(load_compiled().asked())

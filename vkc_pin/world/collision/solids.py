@@ -1,4 +1,4 @@
-"""coal's shapes rebuilt in compiled code, from their numbers."""
+"""Converts coal shapes to their counterparts in the compiled module."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = ["convert_solid", "load_compiled"]
 
 @cache
 def load_compiled() -> Any:
-    """Return the compiled module, imported once and after coal and Pinocchio, whose libraries it uses.
+    """Return the compiled module, after importing coal and Pinocchio, whose libraries it uses.
 
     Raises:
-        BuildError: It is missing, or was compiled against another release of one of these than is
-            installed.
+        BuildError: The module is missing, or was compiled against another release of coal or
+            Pinocchio than the installed one.
     """
     module = compiled_module("vkc_pin.world.collision._distances")
     for package, version, installed in (
@@ -34,20 +34,20 @@ def load_compiled() -> Any:
         built = version.split(".")[:2]
         if built != installed.split(".")[:2]:
             raise BuildError(
-                f"vkc_pin.world.collision was compiled against {package} {version}, but {installed} is installed. "
+                f"vkc_pin.world.collision was compiled against {package} {version}, "
+                f"but {installed} is installed. "
                 f"Either pip install '{package}=={'.'.join(built)}.*', or {REBUILD}"
             )
     return module
 
 
 def convert_solid(shape: coal.CollisionGeometry) -> Any:
-    """Return a coal shape as the compiled module has it, with the same numbers and the radius that is swept around it.
+    """Return a coal shape as an object of the compiled module, with its swept sphere radius.
 
-    What is made of points and faces is kept as long as the shape lives and its points stay the
-    same.
+    Convex shapes and meshes are cached as long as the shape lives and its points do not change.
 
     Raises:
-        InputError: It is of a kind that is not known here.
+        InputError: The shape is of an unsupported type.
         BuildError: See `load_compiled`.
     """
     if isinstance(shape, coal.Convex):
@@ -69,10 +69,10 @@ def convert_solid(shape: coal.CollisionGeometry) -> Any:
     elif isinstance(shape, coal.Halfspace | coal.Plane):
         numbers = (*shape.n, shape.d)
     else:
-        known = "a primitive, a convex shape or a mesh (BVHModelOBBRSS)"
+        supported = "a primitive, a convex shape or a mesh (BVHModelOBBRSS)"
         raise InputError(
             "distances to this kind of shape are not known",
-            expected=known,
+            expected=supported,
             got=type(shape).__name__,
         )
     return load_compiled().primitive(
@@ -82,14 +82,17 @@ def convert_solid(shape: coal.CollisionGeometry) -> Any:
     )
 
 
-_known: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of a shape
+_cache: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of the shape
 
 
 def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
-    """Return a shape of points and faces, rebuilt if it is not known with these points: faces are slow to read."""
+    """Return a convex shape or mesh, from the cache if its points are the same.
+
+    Reading the faces is slow.
+    """
     key, content = id(shape), points.tobytes()
-    if key in _known:
-        owner, before, swept, solid = _known[key]
+    if key in _cache:
+        owner, before, swept, solid = _cache[key]
         if owner() is shape and before == content and swept == radius:
             return solid
     faces = indices(shape)
@@ -98,5 +101,5 @@ def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
         if isinstance(shape, coal.Convex)
         else load_compiled().mesh(points, faces)
     )
-    _known[key] = (weakref.ref(shape, lambda _: _known.pop(key, None)), content, radius, solid)
+    _cache[key] = (weakref.ref(shape, lambda _: _cache.pop(key, None)), content, radius, solid)
     return solid

@@ -1,4 +1,4 @@
-"""How many threads look for distances."""
+"""Chooses the number of threads for distance queries."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import os
 
 __all__ = ["count_threads"]
 
-_MOST = 8
+_MAX_THREADS = 8
 
 
 def count_threads() -> int:
-    """Return how many to use: one for each core that this process may use, 8 at most, or as `OMP_NUM_THREADS` says."""
-    said = os.environ.get("OMP_NUM_THREADS", "")
+    """Return the number of threads to use.
+
+    That is the number of cores available to this process, limited to 8 and to `OMP_NUM_THREADS`.
+    """
+    requested = os.environ.get("OMP_NUM_THREADS", "")
     cores = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
-    return max(1, min(int(said) if said.isdigit() else cores, cores, _MOST))
+    return max(1, min(int(requested) if requested.isdigit() else cores, cores, _MAX_THREADS))

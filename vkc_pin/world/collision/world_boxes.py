@@ -1,4 +1,4 @@
-"""Boxes along the world's axes around shapes, at many states, and which of them come near each other."""
+"""Finds pairs of shapes that may come close between two states, from axis-aligned boxes."""
 
 from __future__ import annotations
 
@@ -13,28 +13,27 @@ __all__ = ["WorldBoxes"]
 
 
 class WorldBoxes:
-    """Boxes around shapes: M that move, at W states, then S that stand.
+    """Axis-aligned boxes in the world frame: of M moving shapes at W states, and of S fixed ones.
 
     Args:
-        lower: Of what moves, shape (W, M, 3) [m].
-        upper: Shape (W, M, 3) [m].
-        standing_lower: Of what stands, shape (S, 3) [m].
-        standing_upper: Shape (S, 3) [m].
+        lower: Lower corners of the moving shapes' boxes, shape (W, M, 3) [m].
+        upper: Upper corners of the moving shapes' boxes, shape (W, M, 3) [m].
+        fixed_lower: Lower corners of the fixed shapes' boxes, shape (S, 3) [m].
+        fixed_upper: Upper corners of the fixed shapes' boxes, shape (S, 3) [m].
 
     Raises:
         BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
-        self, lower: Floats, upper: Floats, standing_lower: Floats, standing_upper: Floats
+        self, lower: Floats, upper: Floats, fixed_lower: Floats, fixed_upper: Floats
     ) -> None:
         corners = (
-            np.ascontiguousarray(part, float)
-            for part in (lower, upper, standing_lower, standing_upper)
+            np.ascontiguousarray(part, float) for part in (lower, upper, fixed_lower, fixed_upper)
         )
         self.compiled: Any = load_compiled().WorldBoxes(*corners)
 
-    def near(
+    def find_close_pairs(
         self,
         first: Ints,
         last: Ints,
@@ -45,25 +44,27 @@ class WorldBoxes:
         phases: Ints,
         limit: float,
     ) -> tuple[Ints, Ints]:
-        """Return (k, pair) of all pairs that may come closer than `limit` [m] in a stretch k, by k and then by pair.
+        """Return all pairs that may come closer than `limit` during an interval.
 
-        The distance of two shapes, b at the stretch's ends by their boxes, is at least (b + b' −
-        relative motion) / 2 in between.
+        With b and b' the distances of the boxes at the ends of an interval, two shapes are at least
+        (b + b' − relative motion) / 2 apart during it.
 
         Args:
-            first: States at which stretches begin, shape (K,).
-            last: States at which they end, shape (K,); with no motion in between they may be the
-                same.
-            pairs: Numbers of shapes, shape (P, 2).
-            moved: How far any point of each shape moves in a stretch, at most, shape (K, M + S)
-                [m].
-            moves: Which shapes move in each phase, shape (phases, M + S). Pairs of which neither
-                does are left out.
-            phases: Of the stretches, shape (K,).
-            limit: [m].
+            first: State at the start of each interval, shape (K,).
+            last: State at the end of each interval, shape (K,); may equal `first` if nothing moves.
+            pairs: Pairs of shape indices, shape (P, 2).
+            moved: Upper bound of the motion of any point of each shape in each interval, shape
+                (K, M + S) [m].
+            moves: Whether each shape moves in each phase, shape (phases, M + S). Pairs of which
+                neither shape moves are omitted.
+            phases: Phase of each interval, shape (K,).
+            limit: Distance [m].
+
+        Returns:
+            Interval index and pair index, shape (C,) each, sorted by interval, then by pair.
 
         Raises:
-            IndexError: There is no such state, phase or shape.
+            IndexError: A state, phase or shape does not exist.
         """
         numbers = (
             np.ascontiguousarray(part, np.int64)
@@ -73,7 +74,7 @@ class WorldBoxes:
             np.ascontiguousarray(moves).view(np.uint8),
             np.ascontiguousarray(pairs, np.int64),
         )
-        at, which = self.compiled.near(
+        intervals, which = self.compiled.near(
             *numbers, flags, rows, np.ascontiguousarray(moved, float), limit
         )
-        return np.asarray(at), np.asarray(which)
+        return np.asarray(intervals), np.asarray(which)

@@ -155,7 +155,7 @@ class Coordinates:
         )
 
     @property
-    def places(self) -> tuple[Ints, Ints, Ints]:
+    def index_maps(self) -> tuple[Ints, Ints, Ints]:
         """Where in q, and where in z, what `q` maps begins, shape (K, 2) each: equal numbers, angles, quaternions."""
         plain, angles, quaternions = (
             np.array(p, int).reshape(-1, 2) for p in (self._plain, self._angles, self._quaternions)
@@ -191,7 +191,7 @@ class Coordinates:
                 )
         return tuple(sorted(moves))
 
-    def moved(self, changed: ArrayLike) -> Bools:
+    def find_moved_joints(self, changed: ArrayLike) -> Bools:
         """Return which joints of the model some coordinates move, shape (J,), the universe among them.
 
         Args:
@@ -201,7 +201,7 @@ class Coordinates:
         found[[move.joint for move in self.moves if changed[move.coordinate]]] = True
         return found
 
-    def strides(self, length: float, angle: float) -> Floats:
+    def compute_max_steps(self, length: float, angle: float) -> Floats:
         """Return how far each coordinate can go so that no joint goes further than that, shape (n,) [m] or [rad].
 
         Args:

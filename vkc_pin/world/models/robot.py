@@ -175,7 +175,7 @@ class Robot:
 
     def opening(self, asked: float | None) -> float | None:
         """Return how far its gripper opens, as near as it can to what is asked for [m]; None: nothing is, so that it rests."""
-        return None if asked is None or self.gripper is None else self.gripper.nearest(asked)
+        return None if asked is None or self.gripper is None else self.gripper.clamp_opening(asked)
 
     def opened(self, opening: float | None) -> Robot:
         """Return the robot with its fingers locked where they are so far open [m]; None: the robot itself, with them at rest.
@@ -197,7 +197,7 @@ class Robot:
             )
         if opening not in self._opened:
             model, collision = pin.Model(self.model), self.collision.copy()
-            for name, placement in self.gripper.frames(opening).items():
+            for name, placement in self.gripper.compute_frames(opening).items():
                 model.frames[model.getFrameId(name)].placement = placement
             for shape in collision.geometryObjects:
                 old, new = (

@@ -57,7 +57,7 @@ class Wheels(Schema):
     speed: Positive
 
     @property
-    def rim(self) -> float:
+    def rim_speed(self) -> float:
         """How fast a wheel goes over the floor at most [m/s]."""
         return self.radius * self.speed
 

@@ -196,11 +196,11 @@ def sample_allowed_pairs(
     )
     closest: list[list[tuple[float, tuple[float, ...]]]] = [[] for _ in groups]
     for z in rng.uniform(low, high, (samples, len(low))):
-        distances.place(z)
-        free[undecided[(bounds := look.bounds()) > 0.0]] = True
+        distances.set_configuration(z)
+        free[undecided[(bounds := look.compute_lower_bounds()) > 0.0]] = True
         for k in np.flatnonzero(bounds <= _MAX_DISTANCE).tolist():
             best = closest[pair := undecided[k]]
-            distance = look.between(
+            distance = look.compute_distance(
                 k,
                 min(_MAX_DISTANCE, best[-1][0]) if len(best) == _DESCENT_STARTS else _MAX_DISTANCE,
             )
@@ -212,7 +212,7 @@ def sample_allowed_pairs(
                 and (len(best) < _DESCENT_STARTS or distance < best[-1][0])
             ):
                 closest[pair] = sorted([*best, (distance, tuple(z))])[:_DESCENT_STARTS]
-        look.keep(left := ~(free & hit)[undecided])
+        look.select(left := ~(free & hit)[undecided])
         undecided = undecided[left]
     for pair, (links, parts) in enumerate(groups.items()):
         if not free[pair]:
@@ -255,9 +255,9 @@ def _compute_analysis(
     robot = dataclasses.replace(robot, tight=tight)
     home = _find_free_home(robot, groups, loose)
     distances = _make_shape_distances(robot)
-    distances.place(np.array([0.0, 0.0, 0.0, *home]))
+    distances.set_configuration(np.array([0.0, 0.0, 0.0, *home]))
     for links, parts in groups.items():
-        if (gap := distances.between(parts, _MAX_DISTANCE)) <= 0.0:
+        if (gap := distances.compute_distance(parts, _MAX_DISTANCE)) <= 0.0:
             allowed[links] = "Home"
             tight.pop(links, None)
         elif gap < _MAX_DISTANCE:
@@ -286,14 +286,14 @@ def _find_free_home(
 
     def short(z: Floats, margin: float, most: float) -> int:
         """Return how many pairs keep less than `margin`, or what they can; no more than `most` + 1."""
-        distances.place(z)
+        distances.set_configuration(z)
         count = 0
         for links, parts in groups.items():
             least = robot.own_margin(links, margin)
             count += (
-                distances.between(parts, least) < least
+                distances.compute_distance(parts, least) < least
                 if margin
-                else distances.between(parts, 0.0) <= 0.0
+                else distances.compute_distance(parts, 0.0) <= 0.0
             )
             if count > most:
                 break
@@ -341,13 +341,15 @@ def _compute_max_distances(
     for z in (np.array([0.0, 0.0, 0.0, *robot.home]), *rng.uniform(low, high, (samples, len(low)))):
         if not look.links:
             break
-        distances.place(z)
-        for k, (links, bound) in enumerate(zip(look.links, look.bounds(), strict=True)):
+        distances.set_configuration(z)
+        for k, (links, bound) in enumerate(
+            zip(look.links, look.compute_lower_bounds(), strict=True)
+        ):
             rooms[links] = max(
                 rooms[links],
-                float(bound) if bound > _MAX_DISTANCE else look.between(k, _MAX_DISTANCE),
+                float(bound) if bound > _MAX_DISTANCE else look.compute_distance(k, _MAX_DISTANCE),
             )
-        look.keep([rooms[links] < _MAX_DISTANCE for links in look.links])
+        look.select([rooms[links] < _MAX_DISTANCE for links in look.links])
     return rooms
 
 
@@ -409,12 +411,12 @@ def _descend_to_collision(
 ) -> bool:
     """Return whether random steps from `z` that lessen the distance end in a collision."""
     low, high = limits
-    distances.place(z)
-    nearest = distances.between(parts)
+    distances.set_configuration(z)
+    nearest = distances.compute_distance(parts)
     for width in np.geomspace(0.2, 0.002, _DESCENT_STEPS):
         trial = np.clip(z + width * (high - low) / 6.0 * rng.standard_normal(len(z)), low, high)
-        distances.place(trial)
-        distance = distances.between(parts)
+        distances.set_configuration(trial)
+        distance = distances.compute_distance(parts)
         if distance < nearest:
             z, nearest = trial, distance
         if nearest <= 0.0:

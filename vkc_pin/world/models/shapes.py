@@ -207,7 +207,7 @@ class ShapeDistances:
         self._halves = np.array([_get_half_extents(solid) for solid in self._solids])
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
-    def place(self, z: Floats) -> None:
+    def set_configuration(self, z: Floats) -> None:
         """Put the model at coordinates `z`, shape (n,)."""
         pin.forwardKinematics(self._model, self._data, self._configuration(z))
         rotations = np.array([place.rotation for place in self._data.oMi])[self._joints]
@@ -216,12 +216,12 @@ class ShapeDistances:
         self._verticals = rotations[:, 2]
         self._places: dict[int, coal.Transform3s] = {}
 
-    def lowest(self) -> Floats:
+    def compute_lowest_points(self) -> Floats:
         """Return the height of the lowest point of the box around each shape [m], shape (shapes,)."""
         across = np.abs(np.einsum("kj,kji->ki", self._verticals, self._turns))
         return np.asarray(self._centres[:, 2] - np.einsum("ki,ki->k", across, self._halves))
 
-    def bounds(self, pairs: Ints) -> Floats:
+    def compute_lower_bounds(self, pairs: Ints) -> Floats:
         """Return lower bounds of the distances of pairs of shapes, shape (pairs, 2): those of balls around them [m]."""
         first, second = pairs[:, 0], pairs[:, 1]
         gaps = self._centres[first] - self._centres[second]
@@ -229,22 +229,23 @@ class ShapeDistances:
             np.sqrt(np.einsum("ki,ki->k", gaps, gaps)) - self._radii[first] - self._radii[second]
         )
 
-    def between(self, parts: Iterable[tuple[int, int]], worth: float = np.inf) -> float:
-        """Return the smallest distance [m] of pairs of shapes; a lower bound of it where it is larger than `worth`."""
+    def compute_distance(self, parts: Iterable[tuple[int, int]], cutoff: float = np.inf) -> float:
+        """Return the smallest distance [m] of pairs of shapes; a lower bound of it where it is larger than `cutoff`."""
         smallest = np.inf
         for first, second in parts:
             gap = self._centres[first] - self._centres[second]
             bound = float(np.sqrt(gap @ gap) - self._radii[first] - self._radii[second])
-            if bound <= min(smallest, worth):
+            if bound <= min(smallest, cutoff):
                 self._result.clear()
                 one, other = (
-                    (self._solids[shape], self._place(shape)) for shape in (first, second)
+                    (self._solids[shape], self._compute_placement(shape))
+                    for shape in (first, second)
                 )
                 bound = coal.distance(*one, *other, self._request, self._result)
             smallest = min(smallest, float(bound))
         return smallest
 
-    def _place(self, shape: int) -> coal.Transform3s:
+    def _compute_placement(self, shape: int) -> coal.Transform3s:
         if shape not in self._places:
             place = self._data.oMi[int(self._joints[shape])] * self._locals[shape]
             self._places[shape] = coal.Transform3s(place.rotation, place.translation)
@@ -274,9 +275,9 @@ class LinkDistances:
             distances,
             {links: np.array(parts, np.int64) for links, parts in groups.items()},
         )
-        self._gather()
+        self._concatenate_pairs()
 
-    def keep(self, chosen: Sequence[bool] | Bools) -> None:
+    def select(self, chosen: Sequence[bool] | Bools) -> None:
         """Look only at some of the pairs of links from now on: those `chosen`, shape (links,)."""
         if not all(chosen):
             self._groups = {
@@ -284,22 +285,22 @@ class LinkDistances:
                 for (links, parts), keep in zip(self._groups.items(), chosen, strict=True)
                 if keep
             }
-            self._gather()
+            self._concatenate_pairs()
 
-    def bounds(self) -> Floats:
+    def compute_lower_bounds(self) -> Floats:
         """Return lower bounds of the distances of all pairs of links where the model is placed [m], shape (links,)."""
         if not self._groups:
             return np.zeros(0)
-        self._found = self._distances.bounds(self._pairs)
-        return np.asarray(np.minimum.reduceat(self._found, self._starts))
+        self._bounds = self._distances.compute_lower_bounds(self._pairs)
+        return np.asarray(np.minimum.reduceat(self._bounds, self._starts))
 
-    def between(self, number: int, worth: float) -> float:
-        """Return the distance of pair of links `number` [m], or some number above `worth`; after `bounds`."""
+    def compute_distance(self, number: int, cutoff: float) -> float:
+        """Return the distance of pair of links `number` [m], or some number above `cutoff`; after `bounds`."""
         start, end = self._starts[number], self._ends[number]
-        close = self._pairs[start:end][self._found[start:end] <= worth]
-        return self._distances.between(map(tuple, close.tolist()), worth)
+        close = self._pairs[start:end][self._bounds[start:end] <= cutoff]
+        return self._distances.compute_distance(map(tuple, close.tolist()), cutoff)
 
-    def _gather(self) -> None:
+    def _concatenate_pairs(self) -> None:
         self.links = list(self._groups)
         counts = np.array([len(parts) for parts in self._groups.values()], np.int64)
         self._ends = np.cumsum(counts)

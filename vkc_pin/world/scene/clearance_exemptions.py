@@ -423,7 +423,7 @@ class PlacedShapes:
         where, near = self._moved(label, index, values, standing, reach)
         row, k, j = np.nonzero(near)
         found = np.full(near.shape, np.inf)
-        found[row, k, j] = shapes.distances(where, row, np.column_stack([k, len(own) + j]))
+        found[row, k, j] = shapes.compute_distances(where, row, np.column_stack([k, len(own) + j]))
         return found
 
     def find_links_near_sweep(self, label: str, index: int, values: Floats) -> set[str]:

@@ -268,16 +268,16 @@ def warn_of_openings(
             stacklevel=4,
         )
     elif robot.gripper is not None:
-        least, most = robot.gripper.narrowest, robot.gripper.widest
+        least, most = robot.gripper.min_opening, robot.gripper.max_opening
         beyond = {
             what: opening
             for what, opening in asked.items()
-            if abs(robot.gripper.nearest(opening) - opening) > _ROUNDING
+            if abs(robot.gripper.clamp_opening(opening) - opening) > _ROUNDING
         }
         for what, opening in beyond.items():
             can, nearest = (
                 f"{1e3 * least:.1f} to {1e3 * most:.1f} mm",
-                1e3 * robot.gripper.nearest(opening),
+                1e3 * robot.gripper.clamp_opening(opening),
             )
             text = f"the gripper of '{robot.name}' opens from {can}, not {1e3 * opening:g} mm as asked for {what}"
             warnings.warn(f"{where}: {text}: it opens to {nearest:.1f} mm", stacklevel=4)

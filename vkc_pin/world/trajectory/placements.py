@@ -80,7 +80,7 @@ def sample_motion(
         strides = dict(
             zip(
                 world.coordinates.names,
-                world.coordinates.strides(_TURN, _TURN).tolist(),
+                world.coordinates.compute_max_steps(_TURN, _TURN).tolist(),
                 strict=True,
             )
         )
@@ -97,7 +97,7 @@ def sample_motion(
             local[j].append(data.liMi[j].copy())
             placements[k, j] = data.oMi[j].homogeneous
         tools[k] = pin.updateFramePlacement(model, data, tool).translation
-    moving = world.coordinates.moved(np.abs(rows - rows[0]).max(axis=0) > 1e-9)
+    moving = world.coordinates.find_moved_joints(np.abs(rows - rows[0]).max(axis=0) > 1e-9)
     return Motion(
         np.asarray(times), local, placements, tools, placements[:, 1, :3, 3].copy(), moving
     )

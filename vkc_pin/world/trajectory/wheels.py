@@ -96,5 +96,5 @@ def make_rolling_limits(robot: Robot) -> RollingLimits:
     if robot.wheels is None:
         return RollingLimits(turning_radius=robot.turning_radius)
     return RollingLimits(
-        turning_radius=robot.turning_radius, track=robot.wheels.track, wheel_speed=robot.wheels.rim
+        turning_radius=robot.turning_radius, track=robot.wheels.track, wheel_speed=robot.wheels.rim_speed
     )

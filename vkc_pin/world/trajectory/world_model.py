@@ -96,7 +96,7 @@ class World:
         fingers = (
             np.zeros(0)
             if robot.gripper is None
-            else robot.gripper.positions(compute_start_opening(scene))
+            else robot.gripper.compute_positions(compute_start_opening(scene))
         )
         self.start: Floats = np.concatenate([np.asarray(scene.start), fingers, *states])
 
@@ -139,7 +139,7 @@ class World:
         """Return the shapes of robot and objects, in this order."""
         geometry, here, gripper = pin.GeometryModel(), pin.SE3.Identity(), self.scene.robot.gripper
         own = list(robot.geometryObjects)
-        own = own if gripper is None else gripper.carried(own, self.scene.robot.model)
+        own = own if gripper is None else gripper.attach_shapes(own, self.scene.robot.model)
         graft_geometry(geometry, own, joints=list(range(self._robot_joints)), placement=here)
         for name, source in objects.items():
             placed = self.scene.objects[name]
@@ -209,10 +209,10 @@ def _fingers(
     They move from one phase's opening to the next one's between the first two waypoints of that.
     They are at the first opening from the start, unless the robot stands still there.
     """
-    before, moments, values = gripper.positions(start), list[float](), list[Floats]()
+    before, moments, values = gripper.compute_positions(start), list[float](), list[Floats]()
     robot = trajectory.positions[:, : trajectory.robot_size]
     for number, phase in enumerate(trajectory.phases):
-        here = gripper.positions(phase.opening)
+        here = gripper.compute_positions(phase.opening)
         begin, then, end = (
             float(trajectory.times[k]) for k in (phase.first, phase.first + 1, phase.last)
         )

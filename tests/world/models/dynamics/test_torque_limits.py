@@ -25,7 +25,7 @@ def of(robot: Robot, model: pin.Model) -> TorqueLimits:
 
 
 def test_motors_have_what_the_urdf_says_and_the_base_has_no_limit(husky: Robot) -> None:
-    assert husky.efforts.known
+    assert husky.efforts.is_known
     assert husky.efforts.notes == ()
     np.testing.assert_array_equal(husky.efforts.limits, [np.inf] * 3 + [150.0] * 3 + [28.0] * 3)
 
@@ -35,7 +35,7 @@ def test_without_masses_nothing_is_known(husky: Robot) -> None:
     for joint in range(2, model.njoints):
         model.inertias[joint] = pin.Inertia.Zero()
     found = of(husky, model)
-    assert not found.known
+    assert not found.is_known
     assert found.notes == ("the URDF states no masses of the arm",)
 
 

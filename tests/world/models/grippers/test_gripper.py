@@ -36,11 +36,11 @@ def test_a_gripper_stands_open_and_the_joint_that_mimics_follows(robot: Robot) -
     gripper = robot.gripper
     assert gripper is not None
     assert gripper.names == ("finger_a_joint", "finger_b_joint")
-    assert gripper.resting == gripper.widest == pytest.approx(WIDEST, abs=2e-4)
-    assert gripper.narrowest == 0.0
+    assert gripper.rest_opening == gripper.max_opening == pytest.approx(WIDEST, abs=2e-4)
+    assert gripper.min_opening == 0.0
     assert robot.opened(None) is robot
-    np.testing.assert_allclose(gripper.positions(None), [0.04, 0.04])
-    np.testing.assert_allclose(gripper.positions(0.0), [0.0, 0.0])
+    np.testing.assert_allclose(gripper.compute_positions(None), [0.04, 0.04])
+    np.testing.assert_allclose(gripper.compute_positions(0.0), [0.0, 0.0])
 
 
 @settings(max_examples=20, deadline=None)
@@ -74,7 +74,7 @@ def test_what_is_asked_for_is_met_as_far_as_the_gripper_goes(robot: Robot) -> No
     assert gripper is not None
     assert robot.opening(None) is None
     assert robot.opening(0.05) == 0.05
-    assert robot.opening(0.3) == gripper.widest
+    assert robot.opening(0.3) == gripper.max_opening
     with pytest.raises(vkc.InputError, match=r"cannot be so far open.*0 to 0\.0799"):
         robot.opened(0.3)
 
@@ -101,19 +101,19 @@ def test_fingers_that_turn_need_no_formula(tmp_path: Path) -> None:
     urdf.write_text(text.replace('upper="0.04"', 'upper="0.5"'), encoding="utf-8")
     gripper = vkc.load_robot(file).gripper
     assert gripper is not None
-    assert gripper.narrowest == pytest.approx(0.02, abs=2e-4)
-    assert gripper.widest == pytest.approx(0.02 + 2.0 * 0.064 * np.tan(0.5), abs=2e-4)
+    assert gripper.min_opening == pytest.approx(0.02, abs=2e-4)
+    assert gripper.max_opening == pytest.approx(0.02 + 2.0 * 0.064 * np.tan(0.5), abs=2e-4)
     for opening in (0.03, 0.05, 0.08):
         angle = np.arctan((opening / 2.0 - 0.01) / 0.064)
-        np.testing.assert_allclose(gripper.positions(opening), [angle, angle], atol=1e-4)
+        np.testing.assert_allclose(gripper.compute_positions(opening), [angle, angle], atol=1e-4)
 
 
 def test_an_arm_that_is_locked_otherwise_wins(tmp_path: Path) -> None:
     robot = vkc.load_robot(write_gripper(tmp_path), locked_joints={"finger_a_joint": 0.01})
     gripper = robot.gripper
     assert gripper is not None
-    assert gripper.resting == pytest.approx(0.02, abs=2e-4)
-    assert gripper.widest == pytest.approx(WIDEST, abs=2e-4)
+    assert gripper.rest_opening == pytest.approx(0.02, abs=2e-4)
+    assert gripper.max_opening == pytest.approx(WIDEST, abs=2e-4)
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def apply_robot_limits(
     velocity, acceleration = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
     velocity[:3], acceleration[:3] = settings.base.velocity, settings.base.acceleration
     coordinates = Coordinates(model)
-    unsaid = coordinates.strides(
+    unsaid = coordinates.compute_max_steps(
         1.0, 1.0
     )  # at which rate of a coordinate its fastest joint has one of 1
     for move in coordinates.moves[3:]:

@@ -31,7 +31,7 @@ class TorqueLimits:
     notes: tuple[str, ...] = ()
 
     @property
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """Whether any is known."""
         return bool(np.isfinite(self.limits).any())
 

@@ -1,7 +1,7 @@
 """Grippers: the joints of the fingers, and where these stand when they are so far open.
 
 A hand is as far open as the widest bar is that fits between its fingers, see `bars`. All joints go
-from where they are closed to where they are open by the same share of their ways, as with one
+from where they are closed to where they are open by the same fraction of their ways, as with one
 motor; joints that mimic others follow them.
 """
 
@@ -58,28 +58,28 @@ class Gripper:
     rest: Floats
     tool_frame: str
     collision: pin.GeometryModel = field(repr=False)
-    _shares: dict[float, float] = field(default_factory=dict, repr=False)
+    _fractions: dict[float, float] = field(default_factory=dict, repr=False)
 
     @cached_property
-    def narrowest(self) -> float:
+    def min_opening(self) -> float:
         """Its opening when it is closed [m]."""
-        return find_widest_bar(self._hand(self.closed))
+        return find_widest_bar(self._place_hand(self.closed))
 
     @cached_property
-    def widest(self) -> float:
+    def max_opening(self) -> float:
         """Its opening when it is fully open [m]."""
-        return find_widest_bar(self._hand(self.open))
+        return find_widest_bar(self._place_hand(self.open))
 
     @cached_property
-    def resting(self) -> float:
+    def rest_opening(self) -> float:
         """Its opening if nobody asks for one [m]."""
-        return find_widest_bar(self._hand(self.rest))
+        return find_widest_bar(self._place_hand(self.rest))
 
-    def nearest(self, opening: float) -> float:
+    def clamp_opening(self, opening: float) -> float:
         """Return the opening that it can stand at and is nearest to one that is asked for [m]."""
-        return min(max(opening, self.narrowest), self.widest)
+        return min(max(opening, self.min_opening), self.max_opening)
 
-    def positions(self, opening: float | None) -> Floats:
+    def compute_positions(self, opening: float | None) -> Floats:
         """Return where the joints of its fingers are, shape (k,), [m] or [rad], when it is so far open [m]; None: at rest.
 
         Raises:
@@ -88,22 +88,22 @@ class Gripper:
         if opening is None:
             return self.rest
         opening = arguments.number(opening, "opening", "between the fingers [m]")
-        if not self.narrowest - WIDTH_TOLERANCE <= opening <= self.widest + WIDTH_TOLERANCE:
-            expected = f"{self.narrowest:.4g} to {self.widest:.4g} m"
+        if not self.min_opening - WIDTH_TOLERANCE <= opening <= self.max_opening + WIDTH_TOLERANCE:
+            expected = f"{self.min_opening:.4g} to {self.max_opening:.4g} m"
             raise InputError(
                 "the gripper cannot be so far open",
                 field="opening",
                 expected=expected,
                 got=f"{opening:g} m",
             )
-        if opening not in self._shares:
-            self._shares[opening] = self._share(opening)
-        share = self._shares[opening]
-        return np.asarray((1.0 - share) * self.closed + share * self.open)
+        if opening not in self._fractions:
+            self._fractions[opening] = self._find_open_fraction(opening)
+        fraction = self._fractions[opening]
+        return np.asarray((1.0 - fraction) * self.closed + fraction * self.open)
 
-    def frames(self, opening: float | None) -> dict[str, pin.SE3]:
+    def compute_frames(self, opening: float | None) -> dict[str, pin.SE3]:
         """Return where the frames on its fingers are when it is so far open [m], by name, in the frame of the robot's joint."""
-        data, first = self._data(self.positions(opening)), self._first
+        data, first = self._compute_data(self.compute_positions(opening)), self._first_finger_joint
         found = {}
         for frame in self.model.frames:
             joint = frame.parentJoint
@@ -112,47 +112,47 @@ class Gripper:
                 found[str(frame.name)] = data.oMi[carrier].actInv(data.oMi[joint]) * frame.placement
         return found
 
-    def carried(
+    def attach_shapes(
         self, shapes: Sequence[pin.GeometryObject], model: pin.Model
     ) -> list[pin.GeometryObject]:
         """Return shapes on the joints of `model`, the robot's, as shapes on those of this gripper's model."""
         return _attach_shapes(shapes, model, self.model)
 
     @property
-    def _first(self) -> int:
+    def _first_finger_joint(self) -> int:
         """The first joint of the fingers."""
         return int(self.model.njoints - len(self.names))
 
-    def _data(self, fingers: Floats) -> pin.Data:
+    def _compute_data(self, fingers: Floats) -> pin.Data:
         """Return where all is with the fingers at some positions, and all other joints at zero."""
         data, coordinates = self.model.createData(), Coordinates(self.model)
         z = np.append(np.zeros(coordinates.size - len(fingers)), fingers)
         pin.framesForwardKinematics(self.model, data, coordinates.q(z))
         return data
 
-    def _hand(self, fingers: Floats) -> list[PlacedShape]:
+    def _place_hand(self, fingers: Floats) -> list[PlacedShape]:
         """Return the shapes of fingers and palm in the tool frame, with the fingers at some positions."""
-        data, frame = self._data(fingers), self.model.getFrameId(self.tool_frame)
+        data, frame = self._compute_data(fingers), self.model.getFrameId(self.tool_frame)
         back, palm = data.oMf[frame].inverse(), self.model.frames[frame].parentJoint
         shapes = [
             shape
             for shape in self.collision.geometryObjects
-            if shape.parentJoint == palm or shape.parentJoint >= self._first
+            if shape.parentJoint == palm or shape.parentJoint >= self._first_finger_joint
         ]
         return [
             (shape.geometry, back * data.oMi[shape.parentJoint] * shape.placement)
             for shape in shapes
         ]
 
-    def _share(self, opening: float) -> float:
-        """Return the least share of the way from closed to open at which a bar so wide fits."""
+    def _find_open_fraction(self, opening: float) -> float:
+        """Return the least fraction of the way from closed to open at which a bar so wide fits."""
         low, high = 0.0, 1.0
-        if opening <= self.narrowest or check_bar_fits(opening, self._hand(self.closed)):
+        if opening <= self.min_opening or check_bar_fits(opening, self._place_hand(self.closed)):
             return low
         for _ in range(_BISECTION_STEPS):
             middle = (low + high) / 2.0
             fits = check_bar_fits(
-                opening, self._hand((1.0 - middle) * self.closed + middle * self.open)
+                opening, self._place_hand((1.0 - middle) * self.closed + middle * self.open)
             )
             low, high = (low, middle) if fits else (middle, high)
         return high
@@ -272,8 +272,8 @@ def build_gripper(
         tool_frame=tool_frame,
         collision=shapes,
     )
-    if not gripper.widest > gripper.narrowest:
+    if not gripper.max_opening > gripper.min_opening:
         expected = f"more room where it is open than where it is closed, around the frame '{tool_frame}' and along its x axis"
-        got = f"{1e3 * gripper.narrowest:.1f} mm closed, {1e3 * gripper.widest:.1f} mm open"
+        got = f"{1e3 * gripper.min_opening:.1f} mm closed, {1e3 * gripper.max_opening:.1f} mm open"
         raise document.error(("gripper",), "the gripper does not open", expected=expected, got=got)
     return gripper

@@ -408,9 +408,7 @@ def test_own_robot_and_object(tmp_path: Path) -> None:
     cells = executed("08_own_robot_and_object", tmp_path)
 
     assert "('base_x', 'base_y', 'base_yaw', 'panda_joint1'" in text(cells["panda"])
-    assert "<Robot panda_cart: 7 joints on a base that is omni, tool frame tool>" in text(
-        cells["robot"]
-    )
+    assert "<Robot panda_cart: 7 joints, omni base, tool frame tool>" in text(cells["robot"])
     assert (tmp_path / "mine" / "panda_cart.srdf").is_file()
     assert "'Adjacent': 7" in text(cells["reasons"])
     assert text(cells["other"]).startswith(

@@ -567,7 +567,7 @@ def test_steps_may_come_from_anywhere() -> None:
     assert plan.steps == (vkc.GoTo(0.5, 0.0),)
 
 
-@pytest.mark.filterwarnings("ignore:.*links overlap where the arm would rest")
+@pytest.mark.filterwarnings("ignore:.*links overlap at the default home")
 def test_a_robot_that_nobody_prepared_reaches() -> None:
     """Tiago, from a URDF alone: free at its home, and where links always are as close as 18.8 mm it keeps half of that."""
     scene = vkc.Scene.from_document({"robot": "tiago", "start": {"base": [0.0, 0.0, 0.0]}})

@@ -158,7 +158,7 @@ def test_home_keeps_apart_what_overlaps_at_zero(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter(
             "error"
-        )  # "links that overlap at home are not kept apart", and names of folders that are gone
+        )  # "links that overlap at home are not checked", and names of folders that are gone
         imported = vkc.import_robot(file, tmp_path / "mine", samples=SAMPLES)
     look = Clearances(imported.robot)
     look.place(imported.robot.home)

@@ -181,7 +181,7 @@ def test_an_attachment_moves_as_its_joint_does(
     np.testing.assert_allclose(
         grip.tool(v).homogeneous, placement.homogeneous @ moved.homogeneous, atol=1e-12
     )
-    with pytest.raises(InputError, match="one a freedom"):
+    with pytest.raises(InputError, match="one per freedom"):
         grip.motion([*v, 0.0])
 
 

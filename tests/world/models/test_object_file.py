@@ -58,7 +58,7 @@ def test_a_hand_clamps_what_is_free_unless_told_otherwise(
 
 
 def test_what_stands_free_cannot_be_pushed() -> None:
-    with pytest.raises(InputError, match="nothing that leads it") as caught:
+    with pytest.raises(InputError, match="cannot be pushed") as caught:
         load_text(
             URDF,
             "urdf: thing.urdf\nfree: true\nattachments: [{name: grip, link: panel, contact: push}]",

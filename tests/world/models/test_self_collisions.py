@@ -220,7 +220,7 @@ def test_links_that_touch_wherever_they_are(tmp_path: Path, srdf: str | None) ->
     else:
         with pytest.warns(
             UserWarning,
-            match=r"arm.urdf: links that always overlap or touch are not kept apart: finger – wall$",
+            match=r"arm.urdf: links that always overlap or touch are not checked: finger – wall$",
         ):
             robot = load_robot(file)
     kept_apart = {
@@ -235,7 +235,7 @@ def test_a_home_that_is_stated_may_overlap_with_a_warning(tmp_path: Path) -> Non
     file = slider(tmp_path, room=0.1, at=0.02, srdf="")
     home = {"carriage_joint": -0.03, "finger_joint": 0.0}
     with pytest.warns(
-        UserWarning, match=r"links that overlap at home are not kept apart: finger – wall$"
+        UserWarning, match=r"links that overlap at home are not checked: finger – wall$"
     ):
         robot = load_robot(file, home=home, srdf=file.with_suffix(".srdf"), pairs="sampled")
     assert robot.home.tolist() == [-0.03, 0.0]
@@ -246,7 +246,7 @@ def test_a_home_that_nobody_states_is_free(tmp_path: Path) -> None:
     file = slider(tmp_path, room=0.1, at=-0.01)
     with pytest.warns(
         UserWarning,
-        match=r"arm.urdf: links overlap where the arm would rest; .* carriage_joint: 0.0\d+",
+        match=r"arm.urdf: links overlap at the default home; .* carriage_joint: 0.0\d+",
     ):
         robot = load_robot(file)
     assert 0.03 - 1e-9 <= robot.home[0] < 0.06  # 20 mm of clearance
@@ -289,7 +289,7 @@ def test_a_survey_is_kept_by_all_it_depends_on(
 
 
 def test_tiago_rests_free(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="links overlap where the arm would rest"):
+    with pytest.warns(UserWarning, match="links overlap at the default home"):
         robot = load_robot("tiago")
     from vkc_pin.world.models.shapes import ShapeDistances
 

@@ -1,1 +1,1 @@
-"""Robots and articulated objects: Pinocchio models with convex shapes and limits."""
+"""Defines robots and articulated objects: Pinocchio models with convex shapes and limits."""

@@ -1,7 +1,6 @@
-"""Articulated objects: what can be grasped and moved (a door, a drawer, a stick).
+"""Defines articulated objects that can be grasped and moved: a door, a drawer, a stick.
 
-An object is a URDF tree plus named attachments (where a tool takes hold of it, and what freedom
-that leaves) and latches.
+An object is a URDF tree with named attachments (grasps, and the freedom they leave) and latches.
 """
 
 from __future__ import annotations
@@ -31,22 +30,23 @@ __all__ = [
 ]
 
 DEFAULT_VELOCITY = 1.0
-"""Velocity limit [rad/s] or [m/s] of an object's joint whose URDF states none (a continuous joint without limits)."""
+"""Velocity limit of object joints whose URDF has none [rad/s] or [m/s]."""
 DEFAULT_ACCELERATION = 2.0
-"""Acceleration limit [rad/s²] or [m/s²] of an object's joint whose description states none: URDF has no such field."""
+"""Acceleration limit of object joints whose description has none [rad/s²] or [m/s²]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """One coordinate of a grasp: how the hand may turn or slide in it.
+    """One degree of freedom of the hand in a grasp.
 
     Attributes:
-        suffix: What follows the attachment's name in the coordinate's; empty if it is the only one.
+        suffix: Suffix of the coordinate's name, after the attachment's name; empty if the grasp has
+            one degree of freedom only.
         kind: "revolute" or "prismatic".
-        axis: Unit axis in the tool frame (after the freedoms before this one), shape (3,).
+        axis: Unit axis in the tool frame moved by the preceding freedoms, shape (3,).
         lower, upper: Limits, [rad] or [m].
-        through: A point of the axis of one that turns, in the same frame, shape (3,) [m]: the
-            middle of a rim, say.
+        through: A point on the axis of a revolute freedom in the same frame, shape (3,) [m], such
+            as the centre of a rim.
     """
 
     suffix: str
@@ -58,11 +58,15 @@ class Freedom:
 
     @property
     def unit(self) -> str:
-        """Its unit, "m" or "rad"."""
+        """Unit of the coordinate, "m" or "rad"."""
         return "m" if self.kind == "prismatic" else "rad"
 
     def motion(self, value: float) -> pin.SE3:
-        """Return the motion at `value`, [rad] or [m]. Raises `InputError` if that is no finite number."""
+        """Return the displacement at `value`, [rad] or [m].
+
+        Raises:
+            InputError: The value is not a finite number.
+        """
         value = number(value, "value")
         if self.kind == "revolute":
             turn = pin.exp3(self.axis * value)
@@ -72,33 +76,32 @@ class Freedom:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Attachment:
-    """A place where a tool can take hold of a link, and the freedom that this kind of grasp leaves.
+    """A grasp of a link, with the degrees of freedom that it leaves.
 
-    While grasped, the tool frame expressed in the frame of `link` is `placement · J(v) · offset`,
-    with J(v) the motion of the virtual joint at the values v and offset a translation by
-    `-standoff` along the tool's z axis. The tool's z axis points out of the palm (the direction of
+    While the link is grasped, the tool frame in the frame of `link` is `placement · J(v) · offset`,
+    with J(v) the displacement of the virtual joint at the values v, and offset a translation by
+    `-standoff` along the tool's z axis. The tool's z axis points out of the palm (direction of
     approach), its x axis along the direction in which the fingers close.
 
     Attributes:
-        name: Its name in the object.
-        link: The link that is held.
-        placement: The tool frame in the link's frame at v = 0, were there no standoff: the virtual
-            joint's centre.
-        joint: "fixed" (no freedom), "revolute", "prismatic", "cylindrical" (slides along an axis
-            and turns about it), "spherical" (turns about x, then y, then z) or "listed" (what its
-            description lists).
-        freedoms: The virtual joint's coordinates, J(v) being the product of their motions in this
-            order.
-        standoff: How far before the joint's centre the tool stops, along its approach [m].
-        firm: Whether the hand clamps: v is chosen when grasping, and stays while the object is
-            held.
-        clearance: What the hand keeps from the object's links near the grasp [m]; None:
+        name: Name of the attachment in the object.
+        link: Grasped link.
+        placement: Centre of the virtual joint: the tool frame in the link's frame at v = 0 without
+            standoff.
+        joint: Type of the virtual joint: "fixed", "revolute", "prismatic", "cylindrical"
+            (translation along an axis and rotation about it), "spherical" (rotations about x, then
+            y, then z) or "listed" (freedoms listed in the description).
+        freedoms: Coordinates of the virtual joint; J(v) is the product of their displacements in
+            this order.
+        standoff: Distance of the tool from the joint's centre, against the direction of approach
+            [m].
+        firm: Whether the hand clamps the link: v is chosen at grasping and constant afterwards.
+        clearance: Clearance between the hand and the object's links near the grasp [m]. Default:
             `Options.grasp_clearance`.
-        opening: How far the gripper is open on the way to it and while it holds on [m]; None: as
-            the robot rests, fully open.
-        contact: "grasp": the hand closes on it, and moves it any way. "push": the hand's foremost
-            point is where the tool frame would be, against a face whose inward normal is
-            `placement`'s z axis, and moves it that way only.
+        opening: Gripper opening during approach and grasp [m]. Default: the rest opening.
+        contact: "grasp": the hand closes on the link and moves it in any direction. "push": the
+            hand's foremost point takes the place of the tool frame, against a face whose inward
+            normal is the z axis of `placement`, and moves the link in that direction only.
     """
 
     name: str
@@ -114,23 +117,23 @@ class Attachment:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names, in the object, of the virtual joint's coordinates, in the order of `freedoms`."""
+        """Names of the virtual joint's coordinates in the object, in the order of `freedoms`."""
         return tuple(self.name + freedom.suffix for freedom in self.freedoms)
 
     @property
     def offset(self) -> pin.SE3:
-        """The tool frame in the frame of the virtual joint's moving side."""
+        """Tool frame in the moving frame of the virtual joint."""
         return pin.SE3(np.eye(3), np.array([0.0, 0.0, -self.standoff]))
 
     def motion(self, values: ArrayLike = ()) -> pin.SE3:
-        """Return J(v) · offset at the values v, shape (k,), in the order of `freedoms`, [rad] or [m].
+        """Return J(v) · offset at the values v of the k freedoms, shape (k,), [rad] or [m].
 
         Raises:
-            InputError: There are not as many values as freedoms.
+            InputError: The number of values differs from that of freedoms.
         """
         given = numbers(values, self.name)
         if given.shape != (len(self.freedoms),):
-            expected = f"{len(self.freedoms)}, one a freedom"
+            expected = f"{len(self.freedoms)}, one per freedom"
             raise InputError(
                 "wrong number of values", field=self.name, expected=expected, got=given
             )
@@ -140,23 +143,23 @@ class Attachment:
         return placement * self.offset
 
     def tool(self, values: ArrayLike = ()) -> pin.SE3:
-        """Return the tool frame in the frame of `link`, placement · J(v) · offset, at the values v; see `motion`."""
+        """Return the tool frame in the frame of `link`: placement · J(v) · offset; see `motion`."""
         return self.placement * self.motion(values)
 
 
 @dataclass(frozen=True)
 class Latch:
-    """Holds `joint` at a value until another joint is moved far enough, as a lever handle does with a door.
+    """A latch, which holds `joint` until another joint is moved, like the handle of a door.
 
     The joint may leave `held_at` only while `released_by` ≥ `threshold`. The latch acts only while
-    |joint - held_at| ≤ `engaged_within`; further out the joint moves freely.
+    |joint − held_at| ≤ `engaged_within`; beyond, the joint moves freely.
 
     Attributes:
-        joint: The joint that is held.
-        held_at: The value it is held at, [rad] or [m].
-        released_by: The joint that releases it.
-        threshold: The value from which on it is released, [rad] or [m].
-        engaged_within: The latch's reach, [rad] or [m].
+        joint: Latched joint.
+        held_at: Position at which the joint is latched, [rad] or [m].
+        released_by: Joint that releases the latch.
+        threshold: Position of `released_by` at which the latch is released, [rad] or [m].
+        engaged_within: Range around `held_at` in which the latch acts, [rad] or [m].
     """
 
     joint: str
@@ -168,27 +171,27 @@ class Latch:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedObject:
-    """An object with joints that can be grasped at its attachments. Its base link's frame is the model's universe frame.
+    """An articulated object that can be grasped at its attachments.
+
+    The frame of its base link is the universe frame of `model`.
 
     Attributes:
-        name: Its name.
-        urdf: The URDF it came from; None if that is part of its description.
-        model: Its kinematics, without a root joint.
-        collision: Its collision geometry, convex shapes only, no collision pairs.
-        visual: What to draw.
-        coordinates: Its minimal coordinates; their names are the joints' names.
+        name: Name of the object.
+        urdf: Path of its URDF, or None if the URDF is part of the description.
+        model: Kinematic model without a root joint.
+        collision: Convex collision shapes, without collision pairs.
+        visual: Visual geometry.
+        coordinates: Minimal coordinates, named after the joints.
         lower, upper: Position limits, shape (n,), [rad] or [m].
         velocity: Velocity limits, shape (n,), [rad/s] or [m/s].
         acceleration: Acceleration limits, shape (n,), [rad/s²] or [m/s²].
-        attachments: By name; the first is the default.
-        latches: Its latches.
-        base_link: The name of its base link.
-        free: Whether it can be carried away (a stick), instead of standing fixed in the world (a
+        attachments: Name → attachment; the first one is the default.
+        latches: Latches of joints.
+        base_link: Name of the base link.
+        free: Whether the object can be carried (a stick), rather than being fixed in the world (a
             door).
-        own_pairs: Pairs of its links that can meet; others are taken to be made so that they
-            cannot.
-        resistance: Joint → friction, damping and spring that it resists with; nothing, where its
-            description says nothing.
+        own_pairs: Pairs of links to check for self-collision.
+        resistance: Joint → friction, damping and spring.
     """
 
     name: str
@@ -215,18 +218,18 @@ class ArticulatedObject:
 
     @property
     def mass(self) -> float:
-        """What all its links weigh together [kg]; 0 if nobody says so."""
+        """Total mass of the links [kg]; 0 if the description states none."""
         return compute_mass(self.model)
 
     @property
     def links(self) -> tuple[str, ...]:
-        """The names of its links."""
+        """Names of the links."""
         return tuple(
             str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY
         )
 
     def links_moved_by(self, joints: Set[str]) -> set[str]:
-        """Return the links that any of some joints move."""
+        """Return the names of the links that are moved by any of `joints`."""
         above = [{str(self.model.names[k]) for k in support} for support in self.model.supports]
         bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
         return {
@@ -237,8 +240,8 @@ class ArticulatedObject:
         """Return the attachment `name`, or the default one.
 
         Raises:
-            UnknownNameError: There is none of that name.
-            InputError: There is none at all.
+            UnknownNameError: There is no attachment of that name.
+            InputError: The object has no attachments.
         """
         if name is None:
             if not self.attachments:
@@ -250,7 +253,11 @@ class ArticulatedObject:
         return self.attachments[known(name, self.attachments, f"attachment of {self.name}")]
 
     def link_frame(self, link: str) -> int:
-        """Return the index in `model` of the frame of `link`. Raises `UnknownNameError` if there is none."""
+        """Return the index of the frame of `link` in `model`.
+
+        Raises:
+            UnknownNameError: There is no link of that name.
+        """
         return int(
             self.model.getFrameId(
                 known(link, self.links, f"link of {self.name}"), pin.FrameType.BODY
@@ -258,7 +265,12 @@ class ArticulatedObject:
         )
 
     def link_placement(self, link: str, state: ArrayLike) -> pin.SE3:
-        """Return the placement of `link` in the base link's frame at the joint values `state`, shape (n,)."""
+        """Return the placement of `link` in the base link's frame.
+
+        Args:
+            link: Name of the link.
+            state: Joint positions, shape (n,), [rad] or [m].
+        """
         frame = self.model.frames[self.link_frame(link)]
         data = self.model.createData()
         pin.forwardKinematics(self.model, data, self.coordinates.q(state))

@@ -1,8 +1,8 @@
-"""Minimal coordinates z of a Pinocchio model: one number per degree of freedom.
+"""Maps minimal coordinates z of a Pinocchio model, one per degree of freedom, to its q.
 
 Pinocchio stores a planar joint as (x, y, cos θ, sin θ) and a continuous joint as (cos θ, sin θ).
-Users and the optimiser work with (x, y, θ) and θ; this module maps one to the other, for numbers
-and for CasADi symbols.
+Users and the optimizer work with (x, y, θ) and θ. This module converts both ways, for numbers and
+for CasADi symbols.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _UNBOUNDED = (
 
 
 class MovedJoint(NamedTuple):
-    """A joint that a coordinate moves: to factor · coordinate + offset, [m] or [rad].
+    """A joint driven by a coordinate: its position is factor · coordinate + offset, [m] or [rad].
 
     Attributes:
-        coordinate: Its index.
-        joint: The joint's.
-        factor, offset: 1 and 0, but of a joint that follows another one.
-        slides: Whether the coordinate slides it, rather than turns it.
+        coordinate: Index of the coordinate.
+        joint: Index of the joint.
+        factor, offset: 1 and 0, except for mimic joints.
+        slides: Whether the coordinate translates the joint rather than rotating it.
     """
 
     coordinate: int
@@ -46,30 +46,29 @@ class MovedJoint(NamedTuple):
 
 
 class Coordinates:
-    """The minimal coordinates of `model`.
+    """Minimal coordinates of `model`.
 
-    A joint that follows another one (`pinocchio.JointModelMimic`) has none: the other one's
-    coordinate moves both.
+    Mimic joints (`pinocchio.JointModelMimic`) share the coordinate of their leader.
 
     Attributes:
-        names: One name per coordinate: the joint's, and for a planar joint `<joint>_x`,
-            `<joint>_y`, `<joint>_yaw`; a free joint has seven, `<joint>_x`, `_y`, `_z` [m] and a
-            quaternion `_qx`, `_qy`, `_qz`, `_qw` of any length but zero, so that it interpolates
-            anywhere.
-        units: For each coordinate "m" or "rad", and "1" for the parts of a quaternion.
-        joints: For each coordinate, the index of the joint it belongs to.
-        moves: What each coordinate moves: that joint first, then those that follow it; ordered by
+        names: Name of each coordinate: that of the joint; `<joint>_x`, `<joint>_y`, `<joint>_yaw`
+            for a planar joint; `<joint>_x`, `_y`, `_z` [m] and `_qx`, `_qy`, `_qz`, `_qw` for a
+            free joint. Its quaternion may have any length but zero, so that it can be
+            interpolated.
+        units: Unit of each coordinate: "m", "rad", or "1" for components of a quaternion.
+        joints: Index of the joint that each coordinate belongs to.
+        moves: Joints driven by each coordinate, its own joint before the mimic joints; sorted by
             coordinate.
-        lengths, turns: How far the joints that a coordinate moves go together, slide [m] and turn
-            [rad] each, for a unit of it, shape (n,): 1 and 0, or 0 and 1, but of joints that others
-            follow.
-        size: Their number n (equal to `model.nv`, without free joints).
+        lengths, turns: Total translation [m] and rotation [rad] of the joints that a coordinate
+            drives, per unit of the coordinate, shape (n,). 1 and 0, or 0 and 1, unless there are
+            mimic joints.
+        size: Number of coordinates n (equal to `model.nv` without free joints).
         lower, upper: Position limits, shape (n,), [m] or [rad]; infinite for continuous joints and
             the planar yaw.
         velocity: Velocity limits, shape (n,), [m/s] or [rad/s].
 
     Raises:
-        InputError: The model has a joint that has no such coordinates (spherical, composite).
+        InputError: The model has a joint of another type (spherical, composite).
     """
 
     def __init__(self, model: pin.Model) -> None:
@@ -78,7 +77,7 @@ class Coordinates:
         joints: list[int] = []
         plain: list[tuple[int, int]] = []  # q[i] = z[j]
         angles: list[tuple[int, int]] = []  # q[i] = cos z[j], q[i + 1] = sin z[j]
-        quaternions: list[tuple[int, int]] = []  # q[i:i + 4] = z[j:j + 4], made a unit
+        quaternions: list[tuple[int, int]] = []  # q[i:i + 4] = z[j:j + 4], normalized
         lower, upper = [], []
         followers = [int(index) for index in model.mimicking_joints]
         for index in range(1, model.njoints):
@@ -90,16 +89,16 @@ class Coordinates:
             )
             if joint.nv == 0 and index in followers:
                 continue
-            kind, limited, straight = (
+            kind, limited, direct = (
                 joint.shortname(),
                 0,
                 0,
-            )  # coordinates with limits, and those that are Pinocchio's own
+            )  # numbers of coordinates with limits, and of those equal to entries of q
             if kind == "JointModelPlanar":
-                parts, limited, straight = {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
+                parts, limited, direct = {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
                 angles.append((i + 2, j + 2))
             elif kind == "JointModelFreeFlyer":
-                parts, straight = (
+                parts, direct = (
                     {
                         "_x": "m",
                         "_y": "m",
@@ -116,13 +115,13 @@ class Coordinates:
                 parts = {"": "rad"}
                 angles.append((i, j))
             elif joint.nq == 1 and joint.nv == 1:
-                parts, limited, straight = {"": "m" if kind in _SLIDING else "rad"}, 1, 1
+                parts, limited, direct = {"": "m" if kind in _SLIDING else "rad"}, 1, 1
             else:
                 expected = "a planar joint or one of 1 degree of freedom"
                 raise InputError(
                     "this joint type is not supported", field=name, expected=expected, got=kind
                 )
-            plain += [(i + k, j + k) for k in range(straight)]
+            plain += [(i + k, j + k) for k in range(direct)]
             names += [name + part for part in parts]
             units += parts.values()
             lower += [
@@ -156,7 +155,10 @@ class Coordinates:
 
     @property
     def index_maps(self) -> tuple[Ints, Ints, Ints]:
-        """Where in q, and where in z, what `q` maps begins, shape (K, 2) each: equal numbers, angles, quaternions."""
+        """Index pairs (in q, in z) of equal entries, angles and quaternions, shape (K, 2) each.
+
+        Angles map to two entries of q and quaternions to four; pairs give the first entry.
+        """
         plain, angles, quaternions = (
             np.array(p, int).reshape(-1, 2) for p in (self._plain, self._angles, self._quaternions)
         )
@@ -164,11 +166,11 @@ class Coordinates:
 
     @property
     def followers(self) -> tuple[MovedJoint, ...]:
-        """Those of `moves` whose joint follows another one."""
+        """Entries of `moves` for mimic joints."""
         return tuple(move for move in self.moves if move.joint != self.joints[move.coordinate])
 
     def _moves(self, model: pin.Model, followers: list[int]) -> tuple[MovedJoint, ...]:
-        """Return `moves`."""
+        """Return the joints driven by each coordinate."""
         moves = [
             MovedJoint(k, joint, 1.0, 0.0, self.units[k] == "m")
             for k, joint in enumerate(self.joints)
@@ -176,46 +178,53 @@ class Coordinates:
         if followers:
             data = model.createData()
             pin.forwardKinematics(model, data, pin.neutral(model))
-            at = {model.joints[joint].idx_q: k for k, joint in enumerate(self.joints)}
-            # `mimicked_joints` of Pinocchio 4.1 are not always in the order of `mimicking_joints`
+            coordinate_of = {model.joints[joint].idx_q: k for k, joint in enumerate(self.joints)}
+            # Pinocchio 4.1 may order `mimicked_joints` and `mimicking_joints` differently.
             for joint in followers:
-                following, axis = (
+                mimic_joint, axis = (
                     model.joints[joint].extract(),
                     np.asarray(data.joints[joint].S, float).ravel(),
                 )
-                factor, offset = float(following.scaling), float(following.offset)
+                factor, offset = float(mimic_joint.scaling), float(mimic_joint.offset)
                 moves.append(
                     MovedJoint(
-                        at[model.joints[joint].idx_q], joint, factor, offset, not axis[3:].any()
+                        coordinate_of[model.joints[joint].idx_q],
+                        joint,
+                        factor,
+                        offset,
+                        not axis[3:].any(),
                     )
                 )
         return tuple(sorted(moves))
 
     def find_moved_joints(self, changed: ArrayLike) -> Bools:
-        """Return which joints of the model some coordinates move, shape (J,), the universe among them.
+        """Return whether each joint of the model moves, shape (J,), including the universe.
 
         Args:
-            changed: Which coordinates change, shape (n,).
+            changed: Whether each coordinate changes, shape (n,).
         """
         changed, found = np.asarray(changed, bool), np.zeros(self._joint_count, bool)
         found[[move.joint for move in self.moves if changed[move.coordinate]]] = True
         return found
 
     def compute_max_steps(self, length: float, angle: float) -> Floats:
-        """Return how far each coordinate can go so that no joint goes further than that, shape (n,) [m] or [rad].
+        """Return the largest steps of the coordinates that respect joint steps, shape (n,).
 
         Args:
-            length: How far joints may slide [m].
-            angle: How far they may turn [rad].
+            length: Largest step of prismatic joints [m].
+            angle: Largest step of revolute joints [rad].
+
+        Returns:
+            Steps [m] or [rad].
         """
         found = np.full(self.size, np.inf)
         for move in self.moves:
-            stride = (length if move.slides else angle) / abs(move.factor)
-            found[move.coordinate] = min(found[move.coordinate], stride)
+            step = (length if move.slides else angle) / abs(move.factor)
+            found[move.coordinate] = min(found[move.coordinate], step)
         return found
 
     def q(self, z: ArrayLike) -> Floats:
-        """Return Pinocchio's configuration(s), shape (..., nq), of minimal coordinates `z`, shape (..., n)."""
+        """Return Pinocchio's configurations q, shape (..., nq), for `z`, shape (..., n)."""
         z = numbers(z, "z")
         if z.shape[-1:] != (self.size,):
             raise InputError(
@@ -225,10 +234,10 @@ class Coordinates:
                 got=z.shape,
             )
         q = np.empty((*z.shape[:-1], self.nq))
-        for there, here in self._runs:
-            q[..., there] = z[..., here]
+        for q_slice, z_slice in self._runs:
+            q[..., q_slice] = z[..., z_slice]
         for i, j in self._angles:
-            angle = z[..., j].copy()  # without gaps, where NumPy may compute otherwise
+            angle = z[..., j].copy()  # contiguous, since NumPy may round differently otherwise
             q[..., i], q[..., i + 1] = np.cos(angle), np.sin(angle)
         for i, j in self._quaternions:
             q[..., i : i + 4] = z[..., j : j + 4] / np.linalg.norm(
@@ -237,15 +246,18 @@ class Coordinates:
         return q
 
     def z(self, q: ArrayLike) -> Floats:
-        """Return the minimal coordinates, shape (..., n), of `q`, shape (..., nq); angles in (-π, π]."""
+        """Return minimal coordinates, shape (..., n), for `q`, shape (..., nq).
+
+        Angles are in (-π, π].
+        """
         q = numbers(q, "q")
         if q.shape[-1:] != (self.nq,):
             raise InputError(
                 "wrong size of configuration", field="q", expected=f"(..., {self.nq})", got=q.shape
             )
         z = np.empty((*q.shape[:-1], self.size))
-        for there, here in self._runs:
-            z[..., here] = q[..., there]
+        for q_slice, z_slice in self._runs:
+            z[..., z_slice] = q[..., q_slice]
         for i, j in self._angles:
             z[..., j] = np.arctan2(q[..., i + 1].copy(), q[..., i].copy())
         for i, j in self._quaternions:
@@ -253,7 +265,10 @@ class Coordinates:
         return z
 
     def q_symbolic(self, z: Any) -> Any:
-        """Return Pinocchio's configuration of the CasADi column `z` (SX or MX), shape (nq, 1); free joints have none."""
+        """Return Pinocchio's q for a CasADi column `z` (SX or MX), shape (nq, 1).
+
+        Free joints are not supported.
+        """
         import casadi
 
         entries: list[Any] = [None] * self.nq
@@ -264,17 +279,21 @@ class Coordinates:
         return casadi.vertcat(*entries)
 
     def index(self, name: str) -> int:
-        """Return the position of coordinate `name` in z. Raises `UnknownNameError` if there is none."""
+        """Return the index of coordinate `name` in z.
+
+        Raises:
+            UnknownNameError: The coordinate does not exist.
+        """
         return self.names.index(known(name, self.names, "coordinate"))
 
 
 def wrap_angle(angle: Any) -> Any:
-    """Return an angle, or an array of them, between -π and π [rad]."""
+    """Return angles wrapped to [-π, π) [rad]."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _merge_into_slices(pairs: list[tuple[int, int]]) -> list[tuple[slice, slice]]:
-    """Return pairs that follow each other as slices, which arrays are indexed with in a fraction of the time."""
+    """Merge consecutive index pairs into pairs of slices, which index arrays much faster."""
     found: list[tuple[slice, slice]] = []
     for i, j in pairs:
         if found and (found[-1][0].stop, found[-1][1].stop) == (i, j):

@@ -1,7 +1,7 @@
 """Grafts one kinematic tree onto another, joint by joint.
 
-Pinocchio's own `appendModel` aborts on equal names and has placed sub-models of fixed joints
-wrongly (stack-of-tasks/pinocchio #2328, #2293, #2805); this adds every joint, inertia, frame and
+Pinocchio's `appendModel` aborts on equal names and has misplaced sub-models at fixed joints
+(stack-of-tasks/pinocchio #2328, #2293, #2805). This module adds joints, inertias, frames and
 geometry explicitly and leaves collision pairs to the caller.
 """
 
@@ -16,7 +16,10 @@ __all__ = ["add_joint", "graft", "graft_geometry", "round_placement"]
 
 
 def round_placement(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
-    """Return `placement` with entries within `tolerance` of 0 and ±1 rounded: keeps symbolic kinematics sparse."""
+    """Return `placement` with entries within `tolerance` of 0 and ±1 rounded.
+
+    Exact entries keep symbolic kinematics sparse.
+    """
     rotation, translation = np.array(placement.rotation), np.array(placement.translation)
     for array in (rotation, translation):
         array[np.abs(array) < tolerance] = 0.0
@@ -34,22 +37,22 @@ def add_joint(
     like: tuple[pin.Model, int],
     prefix: str = "",
 ) -> int:
-    """Add `joint` to `model` with the name and limits that a joint of another model has.
+    """Add `joint` to `model` with the name and limits of a joint of another model.
 
     Args:
         model: Changed in place.
-        parent: The joint of `model` that carries it.
-        joint: With as many coordinates as the other joint.
-        placement: In the frame of `parent`.
-        like: The other model, and the joint's index there.
-        prefix: Put before the name.
+        parent: Index of the parent joint.
+        joint: Joint with as many coordinates as the other one.
+        placement: Placement of the joint in the frame of `parent`.
+        like: The other model, and the index of the joint in it.
+        prefix: Prefix of the name.
 
     Returns:
-        Its index in `model`.
+        Index of the joint in `model`.
     """
     source, index = like
-    twin = source.joints[index]
-    q, v = slice(twin.idx_q, twin.idx_q + twin.nq), slice(twin.idx_v, twin.idx_v + twin.nv)
+    copy = source.joints[index]
+    q, v = slice(copy.idx_q, copy.idx_q + copy.nq), slice(copy.idx_v, copy.idx_v + copy.nv)
     limits = (
         source.effortLimit[v],
         source.velocityLimit[v],
@@ -62,20 +65,20 @@ def add_joint(
 def graft(
     model: pin.Model, tree: pin.Model, *, parent: int, placement: pin.SE3, prefix: str = ""
 ) -> list[int]:
-    """Add every joint, inertia and frame of `tree` to `model`, its universe at `placement` in joint `parent`.
+    """Add all joints, inertias and frames of `tree` to `model`.
 
     Args:
         model: Changed in place.
         tree: The tree to add; not changed.
-        parent: The joint of `model` that carries it (0 is the world).
-        placement: Of the tree's universe frame in the frame of `parent`.
-        prefix: Put before every joint and frame name.
+        parent: Index of the joint of `model` that carries the tree (0 is the world).
+        placement: Placement of the tree's universe frame in the frame of `parent`.
+        prefix: Prefix of all joint and frame names.
 
     Returns:
-        For each joint of `tree` its index in `model`; for the universe, `parent`.
+        For each joint of `tree`, its index in `model`; for the universe, `parent`.
     """
     joints = [parent]
-    if tree.inertias[0].mass > 0.0:  # of what is fixed to the tree's root
+    if tree.inertias[0].mass > 0.0:  # of links fixed to the root
         model.appendBodyToJoint(parent, tree.inertias[0], placement)
     for index in range(1, tree.njoints):
         joint, above = tree.joints[index], tree.parents[index]
@@ -88,8 +91,8 @@ def graft(
     bodies = {frame.name for frame in tree.frames if frame.type == pin.FrameType.BODY}
     for frame in tree.frames[1:]:
         if frame.type != pin.FrameType.BODY and frame.name in bodies:
-            # a joint and a link may share a name in a URDF, but Pinocchio finds no frame by a name
-            # that two have
+            # a joint and a link of a URDF may share a name, but Pinocchio cannot look up frames
+            # whose names are not unique
             continue
         local = frame.placement if frame.parentJoint else placement * frame.placement
         model.addFrame(
@@ -112,14 +115,14 @@ def graft_geometry(
     placement: pin.SE3,
     prefix: str = "",
 ) -> list[int]:
-    """Add copies of `objects` to `geometry`, their parent joints mapped.
+    """Add copies of `objects` to `geometry`, with mapped parent joints.
 
     Args:
         geometry: Changed in place.
-        objects: The geometry of a tree that was grafted.
-        joints: For each joint of the tree its index in the model; see `graft`.
-        placement: Of the tree's universe frame in the frame of `joints[0]`.
-        prefix: Put before every name.
+        objects: Geometry objects of a grafted tree.
+        joints: For each joint of the tree, its index in the model; see `graft`.
+        placement: Placement of the tree's universe frame in the frame of `joints[0]`.
+        prefix: Prefix of all names.
 
     Returns:
         The indices of the copies in `geometry`.
@@ -127,12 +130,12 @@ def graft_geometry(
     added = []
     for original in objects:
         local = original.placement if original.parentJoint else placement * original.placement
-        twin = pin.GeometryObject(original)
-        twin.name, twin.parentJoint, twin.parentFrame = (
+        copy = pin.GeometryObject(original)
+        copy.name, copy.parentJoint, copy.parentFrame = (
             prefix + original.name,
             joints[original.parentJoint],
             0,
         )
-        twin.placement = local
-        added.append(geometry.addGeometryObject(twin))
+        copy.placement = local
+        added.append(geometry.addGeometryObject(copy))
     return added

@@ -1,4 +1,4 @@
-"""Reads the description file of an articulated object: what it may contain, and the object it comes to."""
+"""Loads articulated objects and defines the schema of their description files."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ _contains_zero = require(
 _is_nonzero = require(
     lambda value: np.linalg.norm(value) >= 1e-6,
     "a direction cannot be zero",
-    "a vector of some length",
+    "a nonzero vector",
 )
 Limits = Annotated[tuple[Number, Number], count(2), _contains_zero]
 Direction = Annotated[Vector3, _is_nonzero]
 
 
 class FreedomSchema(Schema):
-    """One way in which the hand may move in a grasp; see `vkc_pin.world.models.articulated_object.Freedom`."""
+    """A degree of freedom of the hand in a grasp; see `articulated_object.Freedom`."""
 
     name: Name
     slide: Direction | None = None
@@ -77,14 +77,14 @@ class FreedomSchema(Schema):
     @model_validator(mode="after")
     def _consistent(self) -> FreedomSchema:
         if (self.slide is None) == (self.turn is None):
-            raise fail("it is not clear how the hand may move", "either slide or turn, an axis")
+            raise fail("a freedom needs one axis", "either slide or turn")
         if self.slide is not None and self.through is not None:
-            raise fail("where a slide is does not matter", "through with turn only")
+            raise fail("`through` has no meaning for a slide", "through with turn only")
         return self
 
 
 class AttachmentSchema(Schema):
-    """Where and how a tool takes hold of a link; see `vkc_pin.world.models.articulated_object.Attachment`."""
+    """A grasp of a link; see `articulated_object.Attachment`."""
 
     name: Name
     link: str
@@ -99,16 +99,18 @@ class AttachmentSchema(Schema):
     turn: Limits | None = None
     standoff: NotNegative = 0.0
     freedoms: tuple[FreedomSchema, ...] = ()
-    firm: bool | None = None  # not stated: as the object is free or not
+    firm: bool | None = None  # default: whether the object is free
     clearance: NotNegative | None = None
     opening: NotNegative | None = None
     contact: Literal["grasp", "push"] = "grasp"
 
     @model_validator(mode="after")
     def _consistent(self) -> AttachmentSchema:
-        given = sum(way is not None for way in (self.rpy, self.quaternion, self.approach))
-        unclear = (self.approach is None) != (self.closing is None) or given > 1
-        slanted = (
+        given = sum(
+            orientation is not None for orientation in (self.rpy, self.quaternion, self.approach)
+        )
+        is_ambiguous = (self.approach is None) != (self.closing is None) or given > 1
+        is_oblique = (
             self.approach is not None
             and self.closing is not None
             and abs(np.dot(self.approach, self.closing)) > 1e-9
@@ -117,18 +119,22 @@ class AttachmentSchema(Schema):
             self.joint in ("revolute", "prismatic", "cylindrical"),
             "joint revolute, prismatic or cylindrical",
         )
-        turns = self.joint == "cylindrical"
+        is_cylindrical = self.joint == "cylindrical"
         names = [freedom.name for freedom in self.freedoms]
-        for wrong, problem, expected in (
+        for is_invalid, problem, expected in (
             (
-                unclear,
-                "the tool's direction is not clear",
-                "rpy, quaternion, or approach and closing",
+                is_ambiguous,
+                "the tool's orientation is ambiguous",
+                "one of rpy, quaternion, or approach and closing",
             ),
-            (slanted, "approach and closing are not perpendicular", "two perpendicular directions"),
+            (
+                is_oblique,
+                "approach and closing are not perpendicular",
+                "two perpendicular directions",
+            ),
             (
                 has_axis != (self.axis is not None),
-                "axis and joint do not fit",
+                "axis and joint do not match",
                 f"an axis with {axis}, and only there",
             ),
             (
@@ -142,13 +148,13 @@ class AttachmentSchema(Schema):
                 "no limits, or another joint",
             ),
             (
-                turns != (self.turn is not None),
-                "turn and joint do not fit",
+                is_cylindrical != (self.turn is not None),
+                "turn and joint do not match",
                 "turn [lower, upper] with joint cylindrical, and only there",
             ),
             (
                 names and self.joint != "fixed",
-                "freedoms and joint both say how the hand may move",
+                "`freedoms` and `joint` exclude each other",
                 "one of them",
             ),
             (
@@ -156,16 +162,16 @@ class AttachmentSchema(Schema):
                 "a hand that pushes does not clamp",
                 "firm: false, or contact: grasp",
             ),
-            (len(names) > 6, "more freedoms than a body has", "at most 6"),
+            (len(names) > 6, "too many freedoms", "at most 6"),
             (len(set(names)) < len(names), "two freedoms share a name", "different names"),
         ):
-            if wrong:
+            if is_invalid:
                 raise fail(problem, expected)
         return self
 
 
 class LatchSchema(Schema):
-    """A joint held until another one is moved; see `vkc_pin.world.models.articulated_object.Latch`."""
+    """A latch; see `articulated_object.Latch`."""
 
     joint: str
     held_at: Number = 0.0
@@ -175,15 +181,13 @@ class LatchSchema(Schema):
 
 
 class ObjectSchema(Schema):
-    """The description of an articulated object; `urdf` is the path of a file, or what it says."""
+    """Description of an articulated object; `urdf` is the path or the text of a URDF."""
 
     urdf: str
     free: bool = False
     mass: NotNegative | None = None
     joints: Mapping[str, ObjectJointSchema] = Field(default_factory=dict)
-    attachments: tuple[
-        AttachmentSchema, ...
-    ]  # none, if it is said so: what no hand can open still stands in rooms
+    attachments: tuple[AttachmentSchema, ...]  # may be empty, for objects that are obstacles only
     latches: tuple[LatchSchema, ...] = ()
     own_collisions: tuple[Annotated[tuple[str, ...], count(2)], ...] = ()
 
@@ -194,14 +198,14 @@ def load_object(
     """Load an articulated object.
 
     Args:
-        name_or_path: The name of a description in `scenes/objects`, the path of one (.yaml), or a
-            description itself.
-        folder: Where paths in a description that is handed over start from.
+        name_or_path: Name of a description in `scenes/objects`, path of a description (.yaml), or
+            the description itself.
+        folder: Folder to which paths in a description given as a mapping are relative.
 
     Raises:
-        UnknownNameError: There is no such object, or its description names a field, link or joint
+        UnknownNameError: The object does not exist, or its description names a field, link or joint
             that does not exist.
-        InputError: The description or its URDF is wrong.
+        InputError: The description or its URDF is invalid.
     """
     if isinstance(name_or_path, Mapping):
         return build_object(
@@ -212,16 +216,16 @@ def load_object(
 
 
 def build_object(document: Document, folder: Path, name: str | None = None) -> ArticulatedObject:
-    """Return the object of a description.
+    """Build an object from its description.
 
     Args:
         document: The description.
-        folder: Where paths in it start from.
-        name: Of the object; None: that of the URDF's robot.
+        folder: Folder to which paths in the description are relative.
+        name: Name of the object. Default: the robot name in the URDF.
 
     Raises:
-        UnknownNameError: It names a field, link or joint that does not exist.
-        InputError: The description or its URDF is wrong.
+        UnknownNameError: The description names a field, link or joint that does not exist.
+        InputError: The description or its URDF is invalid.
     """
     schema = check(document, ObjectSchema)
     text = schema.urdf if schema.urdf.lstrip().startswith("<") else None
@@ -250,12 +254,12 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
         acceleration[index] = limits.acceleration or acceleration[index]
     if not (velocity > 0.0).all():
         slow = names[int(np.argmin(velocity))]
-        problem, field = "a joint without velocity cannot move", f"{slow}.limit.velocity"
+        problem, field = "the velocity limit must be positive", f"{slow}.limit.velocity"
         raise InputError(problem, file=urdf, field=field, expected="> 0", got=velocity.min())
     if schema.mass is not None:
         if not schema.free:
             problem, expected = (
-                "what stands fixed is not carried",
+                "`mass` applies to free objects only",
                 "masses of links in its URDF, or free: true",
             )
             raise document.error(("mass",), problem, expected=expected, got=schema.mass)
@@ -267,21 +271,21 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
         if item.name in attachments:
             raise document.error(
                 ("attachments", index, "name"),
-                "this name is taken",
+                "this attachment name is already used",
                 expected="a new name",
                 got=item.name,
             )
         if schema.free and item.contact == "push":
-            problem = "what stands free has nothing that leads it where it is pushed"
+            problem = "free objects cannot be pushed, since no joint guides them"
             raise document.error(
                 ("attachments", index, "contact"), problem, expected="grasp", got=item.contact
             )
         attachment = _build_attachment(item, firm=schema.free)
-        taken = {name for other in attachments.values() for name in other.coordinates}.intersection(
-            attachment.coordinates
-        )
-        if taken:  # "grip_slide" beside a "grip" that slides
-            problem, got = "its coordinate's name is taken", ", ".join(taken)
+        duplicates = {
+            name for other in attachments.values() for name in other.coordinates
+        }.intersection(attachment.coordinates)
+        if duplicates:  # "grip_slide" beside a "grip" that slides
+            problem, got = "its coordinate's name is already used", ", ".join(duplicates)
             raise document.error(
                 ("attachments", index, "name"), problem, expected="a new name", got=got
             )
@@ -307,7 +311,7 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
 
 
 def _build_attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
-    """Return the attachment; `firm` holds where its description does not say."""
+    """Build an attachment; `firm` is the default where the description has none."""
     if item.approach is not None and item.closing is not None:
         z, x = (np.array(v) / np.linalg.norm(v) for v in (item.approach, item.closing))
         rotation = np.column_stack([x, np.cross(z, x), z])
@@ -331,14 +335,14 @@ def _build_attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
 
 def _build_freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
     if item.freedoms:
-        return tuple(_build_freedom(own) for own in item.freedoms)
+        return tuple(_build_freedom(freedom) for freedom in item.freedoms)
     if item.joint == "spherical":
         limits = item.limits or (-np.pi, np.pi)
         return tuple(
             Freedom(f"_{name}", "revolute", axis, *limits)
             for name, axis in zip("xyz", np.eye(3), strict=True)
         )
-    if item.axis is None or item.limits is None:  # a fixed grasp, as the schema says
+    if item.axis is None or item.limits is None:  # a fixed grasp, guaranteed by the schema
         return ()
     axis = np.array(item.axis) / np.linalg.norm(item.axis)
     if item.turn is not None:
@@ -370,7 +374,7 @@ def _read_own_pairs(
         if pair[0] == pair[1]:
             raise document.error(
                 ("own_collisions", number),
-                "a link cannot meet itself",
+                "a link cannot collide with itself",
                 expected="two links",
                 got=pair[0],
             )
@@ -392,9 +396,9 @@ def _build_latches(
             index = coordinates.index(joint)
             lower, upper = coordinates.lower[index], coordinates.upper[index]
             if not lower <= value <= upper:
-                what = "held_at" if role == "joint" else "threshold"
+                key = "held_at" if role == "joint" else "threshold"
                 raise document.error(
-                    (*at, what),
+                    (*at, key),
                     f"outside the limits of {joint}",
                     expected=f"{lower:g} to {upper:g}",
                     got=value,

@@ -1,4 +1,4 @@
-"""Robots: a URDF on a planar virtual base, with limits, a tool frame and convex collision geometry."""
+"""Defines robots: a URDF on a planar virtual base, with limits and convex collision shapes."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name, t
 __all__ = ["Base", "Robot"]
 
 _MIN_LEVER = 0.1  # [m/rad] about the size of a hand
-_FRONT_DISTANCE = 10.0  # [m] further than any hand reaches
-_LEVER_SAMPLES = 200  # random ones over which the lever is averaged
-_TIGHT_FACTOR = 0.5  # margin of links that are always close, as a share of what they can have
+_FRONT_DISTANCE = 10.0  # [m] larger than any hand
+_LEVER_SAMPLES = 200  # random configurations over which the lever is averaged
+_TIGHT_FACTOR = 0.5  # margin of links that are always close, relative to their largest distance
 
 Base = Literal["omni", "differential", "ackermann", "fixed"]
 
@@ -40,32 +40,33 @@ Base = Literal["omni", "differential", "ackermann", "fixed"]
 class Robot:
     """A mobile manipulator.
 
-    The coordinates z are (base_x, base_y, base_yaw, arm joints), [m] and [rad]; n is their number.
+    Its n coordinates z are (base_x, base_y, base_yaw, arm joints), [m] and [rad].
 
     Attributes:
-        name: The robot's name.
-        urdf: The URDF file it was read from.
-        model: Joint 1, named "base", is planar; the planned joints follow. All other joints of the
-            URDF are locked.
-        collision: Convex shapes named `<link>_<k>`; the collision pairs are those that the robot
-            must keep apart.
-        coordinates: The minimal coordinates of `model`.
-        lower, upper: Position limits, shape (n,), infinite for the yaw and for continuous joints.
-        velocity, acceleration: Limits, shape (n,).
-        home: Where the arm rests, shape (n − 3,).
-        tool_frame: The frame of `model` that grasps: z is the approach direction, x the one in
-            which fingers close.
-        base: How the base moves: "omni" in any direction, "differential" along its x axis and
-            round, "ackermann" along its x axis and in turns no tighter than `turning_radius`,
-            "fixed" not at all.
-        touch_links: The links that may touch what is grasped.
-        height: Of its root link above the floor [m].
-        gripper: How its fingers open, if its description says so; otherwise they stand still.
-        wheels: The wheels of its base, if its description says; they limit bases that are
-            "differential" or "ackermann".
-        turning_radius: The least radius on which the base's origin turns if it is "ackermann" [m].
-        tight: Pairs of links, each sorted, that are never, or not at home, 50 mm apart: how far
-            they are at most, or there [m].
+        name: Name of the robot.
+        urdf: Path of its URDF.
+        model: Pinocchio model. Joint 1, named "base", is planar; the planned joints follow. All
+            other joints of the URDF are locked.
+        collision: Convex shapes named `<link>_<k>`, with the pairs to check for self-collision.
+        coordinates: Minimal coordinates of `model`.
+        lower, upper: Position limits, shape (n,) [m], [rad]; infinite for the yaw and for
+            continuous joints.
+        velocity, acceleration: Velocity and acceleration limits, shape (n,).
+        home: Home configuration of the arm, shape (n − 3,) [m], [rad].
+        tool_frame: Frame of `model` that grasps: z is the direction of approach, x the direction
+            in which fingers close.
+        base: Type of the base: "omni" moves in any direction, "differential" moves along its x
+            axis and turns, "ackermann" moves along its x axis and turns no tighter than
+            `turning_radius`, "fixed" does not move.
+        touch_links: Links that may touch grasped objects.
+        height: Height of the root link above the floor [m].
+        gripper: Model of the fingers, if the description has one. Otherwise they are locked.
+        wheels: Wheels of the base, if the description has them. They limit the velocity of bases
+            of type "differential" and "ackermann".
+        turning_radius: Minimum turning radius of the base's origin, for "ackermann" bases [m].
+        tight: Pairs of links, each sorted, that are less than 50 mm apart in all configurations,
+            or at home → their largest distance, or that at home [m].
+        file: The parsed URDF.
     """
 
     name: str
@@ -91,7 +92,7 @@ class Robot:
 
     @cached_property
     def visual(self) -> pin.GeometryModel:
-        """What the robot looks like; read when first asked for, since meshes for display are large.
+        """Visual geometry, loaded on first access, since display meshes are large.
 
         Raises:
             InputError: A mesh cannot be read.
@@ -100,10 +101,10 @@ class Robot:
 
     @cached_property
     def lever(self) -> float:
-        """How far a radian moves the hand, on average over the arm's joints and over random postures [m/rad].
+        """Mean motion of the hand per radian, over the arm's joints and configurations [m/rad].
 
-        It is the metric of searches, and says what driving costs beside turning and reaching. One
-        number for all turns: were those of the wrist cheaper, searches would find long ones.
+        Searches use it to weigh rotations against translations of the base. All rotations have the
+        same weight: with cheaper wrist rotations, searches would find long ones.
         """
         rng, data, frame = (
             np.random.default_rng(0),
@@ -124,20 +125,23 @@ class Robot:
 
     @cached_property
     def efforts(self) -> TorqueLimits:
-        """The torques that its motors have, as far as its description can be relied upon."""
+        """Torque limits of the joints, as far as the description is plausible."""
         return compute_torque_limits(self.model, self.coordinates, self.lower, self.upper)
 
     @cached_property
     def front(self) -> pin.SE3:
-        """The foremost point of the hand in the tool frame, with its axes: as far along the approach as a touch link reaches."""
+        """Foremost point of the hand in the tool frame, with the same axes.
+
+        It is the largest extent of the touch links along the direction of approach.
+        """
         frame = self.model.frames[self.model.getFrameId(self.tool_frame)]
-        ahead = coal.Halfspace(
-            np.array([0.0, 0.0, -1.0]), -_FRONT_DISTANCE
-        )  # all that is so far before the tool
-        carried = [s for s in self.collision.geometryObjects if s.parentJoint == frame.parentJoint]
+        ahead = coal.Halfspace(np.array([0.0, 0.0, -1.0]), -_FRONT_DISTANCE)  # beyond the hand
+        tool_shapes = [
+            s for s in self.collision.geometryObjects if s.parentJoint == frame.parentJoint
+        ]
         hand = [
             (s.geometry, frame.placement.actInv(s.placement))
-            for s in carried
+            for s in tool_shapes
             if get_link_name(s.name) in self.touch_links
         ]
         gaps = [
@@ -150,7 +154,10 @@ class Robot:
 
     @cached_property
     def fingerprint(self) -> str:
-        """A digest of all that distances between its links depend on: shapes, where they are, limits, home, links and joints."""
+        """Digest of all that the distances between links depend on.
+
+        It covers shapes and their placements, limits, home, links and joints.
+        """
         digest, data = hashlib.sha256(), self.model.createData()
         for joint in self.file.root.findall("joint"):
             ends = [
@@ -164,7 +171,7 @@ class Robot:
             digest.update(np.asarray(values, float).tobytes())
         for z in np.random.default_rng(0).uniform(
             -3.0, 3.0, (3, len(self.lower))
-        ):  # axes and placements, by what they do
+        ):  # captures axes and placements of joints
             pin.forwardKinematics(self.model, data, self.coordinates.q(z))
             digest.update(np.array([place.homogeneous for place in data.oMi]).tobytes())
         for shape in self.collision.geometryObjects:
@@ -174,23 +181,29 @@ class Robot:
         return digest.hexdigest()
 
     def opening(self, asked: float | None) -> float | None:
-        """Return how far its gripper opens, as near as it can to what is asked for [m]; None: nothing is, so that it rests."""
+        """Return the feasible gripper opening nearest to `asked` [m].
+
+        Returns None, which stands for the rest position, if `asked` is None or there is no gripper.
+        """
         return None if asked is None or self.gripper is None else self.gripper.clamp_opening(asked)
 
     def opened(self, opening: float | None) -> Robot:
-        """Return the robot with its fingers locked where they are so far open [m]; None: the robot itself, with them at rest.
+        """Return a copy of the robot with its fingers locked at an opening.
 
-        Pairs and margins of its links stay the same.
+        Collision pairs and margins stay the same.
+
+        Args:
+            opening: Gripper opening [m]. None stands for the rest position: the robot itself.
 
         Raises:
-            InputError: It has no gripper that opens, or that cannot be so far open.
+            InputError: The robot has no gripper, or the opening is out of its range.
         """
         if opening is None:
             return self
         if self.gripper is None:
             expected = "a `gripper` in its robot.yaml"
             raise InputError(
-                f"the gripper of '{self.name}' does not open",
+                f"robot '{self.name}' has no gripper that opens",
                 field="opening",
                 expected=expected,
                 got=opening,
@@ -212,35 +225,41 @@ class Robot:
 
     @property
     def start_limits(self) -> tuple[Floats, Floats]:
-        """Limits of a start, shape (n,), [m] and [rad]: the robot's own; a base that cannot move may stand anywhere."""
+        """Limits of start configurations, shape (n,) each [m], [rad].
+
+        They are the robot's position limits, but a fixed base may be placed anywhere.
+        """
         lower, upper = self.lower.copy(), self.upper.copy()
         if self.base == "fixed":
             lower[:3], upper[:3] = -np.inf, np.inf
         return lower, upper
 
     def __repr__(self) -> str:
-        return f"<Robot {self.name}: {len(self.home)} joints on a base that is {self.base}, tool frame {self.tool_frame}>"
+        return (
+            f"<Robot {self.name}: {len(self.home)} joints, {self.base} base, "
+            f"tool frame {self.tool_frame}>"
+        )
 
     def link_of(self, geometry: int) -> str:
-        """Return the name of the link that shape number `geometry` of `collision` belongs to.
+        """Return the link of shape number `geometry` of `collision`.
 
         Raises:
-            InputError: There is no such shape.
+            InputError: The shape does not exist.
         """
         geometry = whole(geometry, "geometry", low=0, high=len(self.collision.geometryObjects) - 1)
         return get_link_name(self.collision.geometryObjects[geometry].name)
 
     def own_margin(self, links: tuple[str, str], margin: float) -> float:
-        """Return the clearance [m] that two of its links, sorted, can keep: `margin`, or half of what they have at most."""
+        """Return the margin of a sorted pair of links: `margin` or half of `tight`, if less [m]."""
         return min(margin, _TIGHT_FACTOR * self.tight.get(links, np.inf))
 
     def own_margins(self, margin: float) -> dict[tuple[int, int], float]:
-        """Return for each of its collision pairs, by the numbers of its shapes, the clearance to keep [m].
+        """Return the margin of each collision pair, by the indices of its shapes [m].
 
-        Program and validation ask for it alike.
+        Both the NLP and the validation use it.
 
         Args:
-            margin: What pairs keep that can: `Options.self_distance` [m].
+            margin: Margin of pairs that are not tight: `Options.self_distance` [m].
         """
         found, links = {}, [get_link_name(shape.name) for shape in self.collision.geometryObjects]
         for pair in self.collision.collisionPairs:
@@ -250,7 +269,7 @@ class Robot:
 
     @property
     def links(self) -> tuple[str, ...]:
-        """The links that have collision geometry, each once."""
+        """Links that have collision geometry, each once."""
         return tuple(
             dict.fromkeys(get_link_name(shape.name) for shape in self.collision.geometryObjects)
         )

@@ -1,4 +1,4 @@
-"""Reads a robot from its files: a URDF, a robot.yaml that says what a URDF cannot, and an SRDF."""
+"""Loads robots from their files: URDF, robot.yaml and SRDF."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ __all__ = ["find_robot", "list_robots", "load_robot"]
 
 _BASES = get_args(Base)
 _PAIRS = ("srdf", "sampled", "all")
-_SAMPLES = 1000  # to find allowed pairs when a robot without an SRDF is loaded
-# Names under which example-robot-data loads URDF files called otherwise.
+_SAMPLES = 1000  # configurations sampled for allowed pairs when a robot is loaded
+# Names under which example-robot-data loads URDF files of other names.
 _ALIASES = {
     "anymal_kinova": "anymal-kinova",
     "asr_twodof": "TwoDofs",
@@ -57,7 +57,7 @@ _ALIASES = {
 
 
 def list_robots() -> dict[str, Path]:
-    """Return the names `load_robot` knows and their files: those in robots/, then those of example-robot-data."""
+    """Return robot name → file: robots in robots/, then those of example-robot-data."""
     known = {
         path.parent.name: path for path in sorted(resources.folder("robots").glob("*/robot.yaml"))
     }
@@ -78,19 +78,19 @@ def find_robot(name: str | Path) -> Path:
     """Return the robot.yaml or URDF file of a robot.
 
     Args:
-        name: A name of `list_robots`, or the path of a URDF file, of a robot.yaml, or of a folder
-            that holds one. Text is a path if it has the ending of such a file or a slash in it.
+        name: A name in `list_robots`, or the path of a URDF file, a robot.yaml, or a folder with a
+            robot.yaml. Strings with a slash or the suffix of such a file are paths.
 
     Raises:
-        UnknownNameError: It is neither.
-        InputError: There is no such file.
+        UnknownNameError: There is no robot of that name.
+        InputError: The file does not exist.
     """
     path = Path(name)
     if isinstance(name, Path) or path.suffix.lower() in (".urdf", ".yaml", ".yml") or "/" in name:
         file = path / "robot.yaml" if path.is_dir() else path
         if not file.is_file():
             raise InputError(
-                "there is no such robot",
+                "this robot file does not exist",
                 file=file,
                 expected="a URDF file, a robot.yaml, or a robot's name",
             )
@@ -119,50 +119,50 @@ def load_robot(
 
     The joints between the root and the tool frame are planned. All others (wheels, heads, other
     arms, fingers) are locked, as are joints of a type other than revolute, continuous and
-    prismatic. Joints that follow one of these (<mimic>, or `couplings` in robot.yaml) move with it,
-    wherever they are: together they have one coordinate, that of the joint they follow.
+    prismatic. Joints coupled to a planned one (<mimic>, or `couplings` in robot.yaml) move with it,
+    wherever they are; coupled joints share the coordinate of their leader.
 
-    Limits come from the URDF and from a `robot.yaml` beside it. Where neither names a velocity or
-    an acceleration they are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, 1 m/s, 2 rad/s, 3 m/s²
-    and 6 rad/s² for the base, ±20 m.
+    Limits come from the URDF and from a `robot.yaml` beside it. Defaults of velocity and
+    acceleration limits are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, and 1 m/s, 2 rad/s,
+    3 m/s² and 6 rad/s² for the base. The default range of the base is ±20 m.
 
-    Where the URDF begins with joints that drive the robot about, the virtual base takes their
-    place: they are locked at 0, with a warning unless something says where, and unless `base` is
-    "fixed".
+    The virtual base replaces the joints of a planar base in the URDF, unless `base` is "fixed".
+    These are locked at 0, with a warning unless their positions are given.
 
-    Pairs of links that may touch come from the SRDF. Without one they are adjacent links and those
-    that sampling finds always, or never, in collision. In any case neighbours may that are always
-    close, links that always overlap, and those that overlap at home; see
-    `vkc_pin.world.models.self_collisions`. There is a warning where these are not neighbours.
+    The SRDF lists the pairs of links that may touch. Without an SRDF, these are adjacent links and
+    pairs that sampling finds always or never in collision. In both cases, neighbours that are
+    always close, links that always overlap, and links that overlap at home are exempt from
+    collision checks, with a warning if they are not neighbours; see
+    `vkc_pin.world.models.self_collisions`.
 
     Args:
-        name: A robot in robots/, one of example-robot-data ("panda", "tiago", "ur5"), or the path
+        name: Name of a robot in robots/ or in example-robot-data ("panda", "tiago", "ur5"), or path
             of a URDF.
-        base: "omni", "differential" (not sideways), "ackermann" (nor tighter than `turning_radius`)
-            or "fixed" (limits of 0).
-        tool_frame: The frame that grasps; by default that of robot.yaml, else the last frame of the
+        base: "omni", "differential" (no lateral motion), "ackermann" (differential, with
+            `turning_radius`) or "fixed" (limits of 0).
+        tool_frame: Frame that grasps. Default: that of robot.yaml, or else the last frame of the
             longest chain.
-        arm: A group of the SRDF, instead of `tool_frame`: the link at its end grasps.
-        locked_joints: More joints to lock, and where, [m] or [rad]; joints locked anyway rest at 0
-            or the nearest limit.
-        home: Where joints rest, [m] or [rad]; by default what robot.yaml says, else a group state
-            of the SRDF that covers all planned joints (one called home if there is one), else 0, or
-            the middle if 0 is outside the limits. Where links overlap there, joints of which nobody
-            says where they rest are moved, with a warning.
-        srdf: File of allowed collisions; by default the one robot.yaml names, or the one beside the
-            URDF.
-        pairs: Where the allowed pairs come from: "srdf"; "sampled" whether there is an SRDF or not;
-            "all" makes every pair of links that move against each other a collision pair, even
-            adjacent ones, to look at the geometry itself.
-        packages: Folders for `package://` addresses; others are looked for around the file.
-        height: Of the root link above the floor [m]; by default what robot.yaml says, else 0.
-        turning_radius: Of an "ackermann" base, the least radius on which its root link turns [m];
-            by default robot.yaml's.
+        arm: Group of the SRDF whose last link grasps; an alternative to `tool_frame`.
+        locked_joints: Positions of additional joints to lock, [m] or [rad]. Other locked joints are
+            at 0 or at the middle of limits that exclude 0.
+        home: Home positions of joints, [m] or [rad]. Default: those of robot.yaml, or else a group
+            state of the SRDF that covers all planned joints (preferably one named home), or else 0,
+            or the middle of limits that exclude 0. If links overlap there, joints without a stated
+            position are moved, with a warning.
+        srdf: Path of the SRDF. Default: the one named in robot.yaml, or one beside the URDF.
+        pairs: Source of the allowed pairs: "srdf"; "sampled", even if there is an SRDF; "all" to
+            make every pair of links in relative motion a collision pair, even adjacent ones, for
+            inspection of the geometry.
+        packages: Package → folder, to resolve `package://` addresses. Other packages are searched
+            for around the file.
+        height: Height of the root link above the floor [m]. Default: that of robot.yaml, or else 0.
+        turning_radius: Minimum turning radius of the root link of an "ackermann" base [m].
+            Default: that of robot.yaml.
 
     Raises:
-        UnknownNameError: There is no such robot, frame, joint or link; the error names the nearest
-            one.
-        InputError: A file or value is wrong, no joint would be planned, or nothing could collide.
+        UnknownNameError: A robot, frame, joint or link does not exist; the error suggests the
+            nearest name.
+        InputError: A file or value is invalid, no joint can be planned, or no links can collide.
     """
     for value, field, choices, kind in (
         (base, "base", _BASES, "kind of base"),
@@ -180,16 +180,16 @@ def load_robot(
             text(given_name, field, kind)
     if arm is not None and tool_frame is not None:
         raise InputError(
-            "both say what grasps",
+            "`arm` and `tool_frame` exclude each other",
             field="arm, tool_frame",
             expected="one of them",
             got=f"{arm}, {tool_frame}",
         )
     positions = {}
     for field, values in (("locked_joints", locked_joints), ("home", home)):
-        named = mapping({} if values is None else values, field, "joints, each with its position")
+        checked = mapping({} if values is None else values, field, "joints, each with its position")
         positions[field] = {
-            joint: quantity(value, f"{field}.{joint}") for joint, value in named.items()
+            joint: quantity(value, f"{field}.{joint}") for joint, value in checked.items()
         }
     home, locked_joints = positions["home"], positions["locked_joints"]
     files = _read_files(
@@ -197,45 +197,47 @@ def load_robot(
         mapping({} if packages is None else packages, "packages", "packages, each with its folder"),
     )
     urdf, settings = files.urdf, files.settings
-    beside = file_path(srdf, "srdf") if srdf is not None else files.srdf()
+    srdf_path = file_path(srdf, "srdf") if srdf is not None else files.find_srdf()
     semantics = (
-        read_srdf(beside, links=urdf.links) if beside is not None and pairs == "srdf" else None
+        read_srdf(srdf_path, links=urdf.links)
+        if srdf_path is not None and pairs == "srdf"
+        else None
     )
     full = build_full_model(urdf)
     tool = (
         tool_frame
         if tool_frame is not None
-        else files.tool_frame(arm, beside) or find_default_tool_frame(full, urdf)
+        else files.find_tool_frame(arm, srdf_path) or find_default_tool_frame(full, urdf)
     )
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
     full = tighten_coupled_limits(full, urdf, tool)
-    replaced = find_base_joints(full, urdf) if base != "fixed" else ()
+    base_joints = find_base_joints(full, urdf) if base != "fixed" else ()
     fingers = {joint: finger.open for joint, finger in settings.gripper.items()}
-    said = {**settings.locked_joints, **locked_joints}
-    locked = {**fingers, **dict.fromkeys(replaced, 0.0), **said}
-    given = {**settings.home, **home, **locked}
-    rest = compute_rest_positions(full, urdf, given)
+    stated_positions = {**settings.locked_joints, **locked_joints}
+    locked = {**fingers, **dict.fromkeys(base_joints, 0.0), **stated_positions}
+    known_positions = {**settings.home, **home, **locked}
+    rest = compute_rest_positions(full, urdf, known_positions)
     files.check_names(rest)
-    for joint in given:
+    for joint in known_positions:
         field = "home" if joint in home else "locked_joints"
         if joint not in rest:
             raise UnknownNameError("joint", joint, rest, file=urdf.path, field=field)
-        if joint in said or joint not in (*replaced, *fingers):
-            files.check_limits(full, joint, given[joint], field)
-    if unsaid := ", ".join(joint for joint in replaced if joint not in said):
-        problem = "the virtual base moves the robot; joints of its own that do are locked"
-        warnings.warn(f"{urdf.path}: {problem}: {unsaid}", stacklevel=2)
-    raised, rest = (
+        if joint in stated_positions or joint not in (*base_joints, *fingers):
+            files.check_limits(full, joint, known_positions[joint], field)
+    if unstated := ", ".join(joint for joint in base_joints if joint not in stated_positions):
+        problem = "the virtual base replaces the joints of the robot's base, which are locked"
+        warnings.warn(f"{urdf.path}: {problem}: {unstated}", stacklevel=2)
+    root_height, rest = (
         settings.base.height if height is None else quantity(height, "height"),
         {**rest, **locked},
     )
-    model = build_planned_model(full, urdf, tool, rest, locked, height=raised)
+    model = build_planned_model(full, urdf, tool, rest, locked, height=root_height)
     coordinates, lower, upper, velocity, acceleration = apply_robot_limits(
         full, model, settings, base
     )
-    files.check_followers(model, rest, given)
-    state = _read_rest_state(model, coordinates.names[3:], semantics, given)
+    files.check_followers(model, rest, known_positions)
+    state = _read_rest_state(model, coordinates.names[3:], semantics, known_positions)
     collision = load_collision_geometry(model, urdf)
     robot = Robot(
         name=files.name,
@@ -249,11 +251,11 @@ def load_robot(
         acceleration=acceleration,
         home=np.clip(
             [{**rest, **state}[joint] for joint in coordinates.names[3:]], lower[3:], upper[3:]
-        ),  # rounding
+        ),  # removes rounding errors
         tool_frame=tool,
         base=base,
         touch_links=settings.touch_links,
-        height=raised,
+        height=root_height,
         **read_wheels(base, turning_radius, settings, files.source),
         gripper=build_gripper(
             full,
@@ -264,28 +266,32 @@ def load_robot(
             rest,
             settings.gripper,
             files.document,
-            height=raised,
+            height=root_height,
         ),
         file=urdf,
     )
     if pairs == "all":
         robot = set_collision_pairs(robot, ())
     else:
-        loose = [
-            joint for joint in coordinates.names[3:] if joint not in given and joint not in state
+        loose_joints = [
+            joint
+            for joint in coordinates.names[3:]
+            if joint not in known_positions and joint not in state
         ]
-        robot = apply_self_collision_analysis(robot, semantics, loose, samples=_SAMPLES)
+        robot = apply_self_collision_analysis(robot, semantics, loose_joints, samples=_SAMPLES)
     if len(robot.collision.collisionPairs) == 0 and (pairs == "all" or semantics is not None):
-        expected = "<collision> elements, and an SRDF that fits"
+        expected = "<collision> elements, and an SRDF that leaves some pairs"
         raise InputError(
-            "no pair of links is left that could collide", file=robot.urdf, expected=expected
+            "no pair of links is left to check for self-collision",
+            file=robot.urdf,
+            expected=expected,
         )
     return robot
 
 
 @dataclass(frozen=True, eq=False)
 class _RobotFiles:
-    """A robot's files: `source`, its robot.yaml or else its URDF; what the first says; and the URDF."""
+    """Parsed files of a robot; `source` is its robot.yaml, or its URDF if there is none."""
 
     source: Path
     settings: RobotSchema
@@ -294,15 +300,15 @@ class _RobotFiles:
 
     @property
     def name(self) -> str:
-        """The robot's name: that of its folder or its file."""
+        """Name of the robot, which is that of its folder or its file."""
         return (
             self.source.resolve().parent.name
             if self.source.name == "robot.yaml"
             else self.source.stem
         )
 
-    def srdf(self) -> Path | None:
-        """Return the SRDF that belongs to the URDF: named in robot.yaml, or found by its name."""
+    def find_srdf(self) -> Path | None:
+        """Return the path of the SRDF named in robot.yaml, or of one beside the URDF, or None."""
         if self.settings.srdf is not None:
             return self.source.parent / self.settings.srdf
         path = self.urdf.path
@@ -314,13 +320,17 @@ class _RobotFiles:
         ]
         return next((place for place in places if place.is_file()), None)
 
-    def tool_frame(self, arm: str | None, srdf: Path | None) -> str | None:
-        """Return the frame that grasps, as a group of the SRDF or robot.yaml names it; None if neither does."""
-        named = self.settings.arm if arm is None else arm
-        return self.settings.tool_frame if named is None else group_tip(srdf, self.urdf.root, named)
+    def find_tool_frame(self, arm: str | None, srdf: Path | None) -> str | None:
+        """Return the tool frame named by a group of the SRDF or by robot.yaml, or None."""
+        group = self.settings.arm if arm is None else arm
+        return self.settings.tool_frame if group is None else group_tip(srdf, self.urdf.root, group)
 
     def check_names(self, joints: Collection[str]) -> None:
-        """Check that the joints and links that robot.yaml names exist. Raises `UnknownNameError` if one does not."""
+        """Check that the joints and links named in robot.yaml exist.
+
+        Raises:
+            UnknownNameError: A joint or link does not exist.
+        """
         settings = self.settings
         for key in ("home", "locked_joints", "gripper", "joints"):
             for joint in getattr(settings, key):
@@ -331,17 +341,24 @@ class _RobotFiles:
                 raise self.document.unknown(("touch_links",), "link", link, self.urdf.links)
 
     def check_limits(self, full: pin.Model, joint: str, position: float, field: str) -> None:
-        """Check that a joint can be where it is said to rest, or to be locked. Raises `InputError` if it cannot."""
+        """Check that a home or locked position is within the joint's limits.
+
+        Raises:
+            InputError: The position is outside the limits.
+        """
         moving = full.joints[full.getJointId(joint)]
         if moving.nq == 1:
             low, high = full.lowerPositionLimit[moving.idx_q], full.upperPositionLimit[moving.idx_q]
             if not low - LIMIT_SLACK <= position <= high + LIMIT_SLACK:
-                problem, expected = "rests outside its limits", f"between {low:g} and {high:g}"
-                for key, said in (
+                problem, expected = (
+                    "this position is outside the joint's limits",
+                    f"between {low:g} and {high:g}",
+                )
+                for key, section in (
                     ("locked_joints", self.settings.locked_joints),
                     ("home", self.settings.home),
                 ):
-                    if said.get(joint) == position:
+                    if section.get(joint) == position:
                         raise self.document.error(
                             (key, joint), problem, expected=expected, got=position
                         )
@@ -354,16 +371,23 @@ class _RobotFiles:
                 )
 
     def check_followers(
-        self, model: pin.Model, rest: Mapping[str, float], given: Collection[str]
+        self, model: pin.Model, rest: Mapping[str, float], known_positions: Collection[str]
     ) -> None:
-        """Check that joints `given` a place to rest at follow those that they follow. Raises `InputError` if one does not."""
+        """Check that given home positions agree with the couplings of joints.
+
+        Raises:
+            InputError: A home position contradicts a coupling.
+        """
         coordinates = Coordinates(model)
         for move in coordinates.moves[3:]:
             joint, leader = str(model.names[move.joint]), coordinates.names[move.coordinate]
-            if joint != leader and joint in given:
+            if joint != leader and joint in known_positions:
                 follows = move.factor * rest[leader] + move.offset
                 if abs(rest[joint] - follows) > LIMIT_SLACK:
-                    problem, expected = f"this joint follows '{leader}'", f"{follows:g}, or nothing"
+                    problem, expected = (
+                        f"this joint follows '{leader}'",
+                        f"{follows:g}, or no value",
+                    )
                     if joint in self.settings.home:
                         raise self.document.error(
                             ("home", joint), problem, expected=expected, got=rest[joint]
@@ -378,14 +402,14 @@ class _RobotFiles:
 
 
 def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotFiles:
-    """Find and read a robot's URDF, and the robot.yaml that belongs to it if there is one."""
+    """Find and read a robot's URDF and its robot.yaml, if there is one."""
     file_path(name, "name", "a robot's name, or a path")
     source = find_robot(name)
     document = Document({})
     settings = RobotSchema(urdf=source.name)
     if source.suffix != ".yaml" and (source.parent / "robot.yaml").is_file():
-        beside, _ = read_robot(source.parent / "robot.yaml")
-        source = source.parent / "robot.yaml" if beside.urdf == source.name else source
+        srdf_path, _ = read_robot(source.parent / "robot.yaml")
+        source = source.parent / "robot.yaml" if srdf_path.urdf == source.name else source
     if source.suffix == ".yaml":
         settings, document = read_robot(source)
     folders = {
@@ -401,12 +425,12 @@ def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotF
 
 
 def _read_rest_state(
-    model: pin.Model, arm: Sequence[str], semantics: Srdf | None, given: Collection[str]
+    model: pin.Model, arm: Sequence[str], semantics: Srdf | None, known_positions: Collection[str]
 ) -> dict[str, float]:
-    """Return where an SRDF says that the joints of an arm rest, those `given` otherwise left out."""
+    """Return the home positions of an arm's joints in an SRDF, without those already known."""
     state = {} if semantics is None else semantics.state(arm)
     return {
         joint: find_nearest_position(model, joint, state[joint])
         for joint in arm
-        if joint in state and joint not in given
+        if joint in state and joint not in known_positions
     }

@@ -1,4 +1,4 @@
-"""Builds the Pinocchio model of a robot: planar base, the joints up to the tool, all else locked; and its shapes."""
+"""Builds the Pinocchio model of a robot: planar base, planned joints, and shapes."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ __all__ = [
     "load_visual_geometry",
 ]
 
-BASE_JOINT = "base"  # the name of the planar joint
-# [m] and of a rotation: URDFs write quarter turns with nine digits; exact ones make lean
-# expressions
+BASE_JOINT = "base"  # name of the planar joint
+# [m] and entries of rotations: URDFs often have quarter turns with nine digits; exact ones make
+# expressions sparse
 _ROUNDING = 1e-9
-_AXIS_TOLERANCE = 1e-3  # sine of the angle up to which axes count as level or upright
-_MAX_FINGER_JOINTS = 7  # joints in the longest finger of a hand
-_MIN_ARM_JOINTS = 4  # joints, at least, that carry a hand
-_MESH_DETAIL = 0.0015  # of displayed meshes, [m]
+_AXIS_TOLERANCE = 1e-3  # sine of the largest angle at which axes count as horizontal or vertical
+_MAX_FINGER_JOINTS = 7  # joints of the longest finger of a hand
+_MIN_ARM_JOINTS = 4  # minimum number of joints that carry a hand
+_MESH_DETAIL = 0.0015  # resolution of displayed meshes [m]
 _GREY = (0.6, 0.6, 0.62, 1.0)
 
 
@@ -49,7 +49,7 @@ def build_full_model(file: UrdfFile) -> pin.Model:
     """Return the model of all joints of `file` on a planar joint.
 
     Raises:
-        InputError: It is no valid URDF.
+        InputError: The file is not a valid URDF.
     """
     return tree_model(file, pin.JointModelPlanar(), BASE_JOINT)
 
@@ -63,54 +63,54 @@ def build_planned_model(
     *,
     height: float = 0.0,
 ) -> pin.Model:
-    """Return `full` with all joints locked but those between the base and `tool_frame`, and those that move with them.
+    """Return the model of the planned joints, with all other joints of `full` locked.
 
-    Joints that follow others are `pinocchio.JointModelMimic`: the model has no coordinate of
-    theirs.
+    Planned joints are those between base and `tool_frame`, and those coupled to them. Followers
+    become `pinocchio.JointModelMimic` and have no coordinate.
 
     Args:
-        full: See `build_full_model`.
-        file: Its file.
-        tool_frame: A frame of it.
-        rest: Where each joint is locked, [m] or [rad]; see `compute_rest_positions`.
-        locked: Joints to lock though they are among these, and where.
-        height: Of the root link above the base's joint, which moves on the floor [m].
+        full: The robot with all joints; see `build_full_model`.
+        file: The robot's URDF.
+        tool_frame: Name of the tool frame.
+        rest: Position at which each joint is locked, [m] or [rad]; see `compute_rest_positions`.
+        locked: Positions of planned joints that are to be locked as well, [m] or [rad].
+        height: Height of the root link above the base joint, which moves on the floor [m].
 
     Raises:
-        InputError: No joint is left, or one is locked that follows one that is not.
+        InputError: No joint is left to plan, or a follower is locked but not its leader.
     """
     follows, groups = find_followers(file.root), find_coupled_groups(full, file, tool_frame)
     groups = {leader: group for leader, group in groups.items() if leader not in locked}
-    if stuck := [
-        (joint, led.leader)
+    if stuck_joints := [
+        (joint, coupling.leader)
         for group in groups.values()
-        for joint, led in group.items()
+        for joint, coupling in group.items()
         if joint in locked
     ]:
         problem, (joint, leader), expected = (
-            "a locked joint follows one that moves",
-            stuck[0],
-            "the joint locked that it follows",
+            "a locked joint follows one that is not locked",
+            stuck_joints[0],
+            "the joint that it follows in `locked_joints`",
         )
         raise InputError(
             problem,
             file=file.path,
             field=f"locked_joints.{joint}",
             expected=expected,
-            got=f"'{leader}' moves",
+            got=f"'{leader}' is not locked",
         )
-    alone = {str(full.names[j]) for j in find_joint_path(full, tool_frame) if j > 1} - {
+    uncoupled = {str(full.names[j]) for j in find_joint_path(full, tool_frame) if j > 1} - {
         *locked,
         *follows,
     }
-    moving = alone.union(groups, *groups.values())
+    moving = uncoupled.union(groups, *groups.values())
     planned = [
         j for j in range(2, full.njoints) if full.names[j] in moving and full.names[j] in rest
     ]
     if not planned:
-        expected = "a frame at the end of an arm"
+        expected = "a frame moved by an arm"
         raise InputError(
-            "no joint moves this frame",
+            "no joint moves the tool frame",
             file=file.path,
             field="tool_frame",
             expected=expected,
@@ -132,18 +132,20 @@ def build_unlocked_model(
     """Return a model with the joints of `model` followed by additional unlocked `joints`.
 
     Args:
-        full: See `build_full_model`.
-        file: Its file.
-        model: The planned joints.
-        joints: The others, each of which moves on its own.
-        rest: Where the rest is locked, [m] or [rad].
-        height: As for `build_planned_model` [m].
+        full: The robot with all joints; see `build_full_model`.
+        file: The robot's URDF.
+        model: The planned joints; see `build_planned_model`.
+        joints: Names of the additional joints; mimic joints among them become independent.
+        rest: Positions at which the other joints are locked, [m] or [rad].
+        height: Height of the root link above the base joint [m].
     """
     own, last = (
         [full.getJointId(str(name)) for name in names] for names in (list(model.names)[1:], joints)
     )
     follows = {
-        joint: led for joint, led in find_followers(file.root).items() if joint not in joints
+        joint: coupling
+        for joint, coupling in find_followers(file.root).items()
+        if joint not in joints
     }
     return _lock_joints(full, {*own, *last}, make_configuration(full, rest), height, follows, last)
 
@@ -151,10 +153,10 @@ def build_unlocked_model(
 def compute_rest_positions(
     full: pin.Model, file: UrdfFile, given: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return for each joint of 1 degree of freedom where it rests, [m] or [rad].
+    """Return the rest position of each joint of one degree of freedom, [m] or [rad].
 
-    That is what `given` says, else where the joint that it follows has it, else 0, or the middle of
-    limits without 0.
+    Positions in `given` come first, then those implied by couplings. The default is 0, or the
+    middle of the limits if these exclude 0.
     """
     rest = {}
     for j in range(2, full.njoints):
@@ -168,14 +170,17 @@ def compute_rest_positions(
             rest[full.names[j]] = float(
                 given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high))
             )
-    for name, led in find_followers(file.root).items():
-        if name in rest and led.leader in rest and name not in given:
-            rest[name] = led.factor * rest[led.leader] + led.offset
+    for name, coupling in find_followers(file.root).items():
+        if name in rest and coupling.leader in rest and name not in given:
+            rest[name] = coupling.factor * rest[coupling.leader] + coupling.offset
     return rest
 
 
 def find_nearest_position(model: pin.Model, joint: str, position: float) -> float:
-    """Return `position` [m] or [rad] of a joint, turned by 2π or else moved to the nearest limit if it lies outside."""
+    """Return the feasible position nearest to `position` [m] or [rad].
+
+    Positions outside the limits are shifted by ±2π for revolute joints, or else clamped.
+    """
     moving = model.joints[model.getJointId(joint)]
     if moving.nq == 2:
         return position
@@ -190,43 +195,45 @@ def find_nearest_position(model: pin.Model, joint: str, position: float) -> floa
 def find_neighbours(
     file: UrdfFile, links: Collection[str]
 ) -> tuple[Set[tuple[str, str]], Set[tuple[str, str]]]:
-    """Return two sets of pairs of `links`, each sorted.
+    """Return adjacent pairs of `links`, and pairs of adjacent rigid bodies, each pair sorted.
 
-    The first has those that one joint connects, or only links that are not among them; the second
-    those that one joint connects that moves, and links that are fixed to either.
+    Two links are adjacent if only links outside `links` lie between them. Two rigid bodies (links
+    connected by fixed joints) are adjacent if a movable joint connects them.
     """
     parents = dict[str, tuple[str, str]]()
     for joint in file.root.findall("joint"):
         parent, child = joint.find("parent"), joint.find("child")
         if parent is not None and child is not None:
             parents[child.get("link", "")] = (parent.get("link", ""), joint.get("type", ""))
-    joined, body, above = set[tuple[str, str]](), dict[str, str](), dict[str, str]()
+    adjacent, body, parent_body = set[tuple[str, str]](), dict[str, str](), dict[str, str]()
     for link in links:
-        up, _ = parents.get(link, ("", ""))
-        while up and up not in links:
-            up, _ = parents.get(up, ("", ""))
-        if up:
-            joined.add((min(link, up), max(link, up)))
+        ancestor, _ = parents.get(link, ("", ""))
+        while ancestor and ancestor not in links:
+            ancestor, _ = parents.get(ancestor, ("", ""))
+        if ancestor:
+            adjacent.add((min(link, ancestor), max(link, ancestor)))
         body[link] = _find_rigid_root(link, parents)
-        above[link] = (
+        parent_body[link] = (
             _find_rigid_root(parents[body[link]][0], parents) if body[link] in parents else ""
         )
-    return joined, {(min(a, b), max(a, b)) for a in links for b in links if above[a] == body[b]}
+    return adjacent, {
+        (min(a, b), max(a, b)) for a in links for b in links if parent_body[a] == body[b]
+    }
 
 
 def _find_rigid_root(link: str, parents: Mapping[str, tuple[str, str]]) -> str:
-    """Return the uppermost of the links that a link is fixed to."""
+    """Return the root of the rigid body that a link belongs to."""
     while link in parents and parents[link][1] == "fixed":
         link, _ = parents[link]
     return link
 
 
 def find_base_joints(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
-    """Return the joints that move a robot in the plane on their own, or none: then its URDF has a base that drives, too.
+    """Return the joints of a planar base in the URDF, or no joints if it has none.
 
-    They are the first three, one after the other: two that slide along the floor, in different
-    directions, and one that turns about the vertical, in any order. Nothing that could collide is
-    in front of the last.
+    A planar base is a chain of the first three joints: two prismatic ones along different
+    horizontal axes and one revolute or continuous one about the vertical axis, in any order. No
+    link before the last of them has collision shapes.
     """
     data, slides, found, joint = full.createData(), list[Floats](), list[str](), 1
     pin.computeJointJacobians(full, data, pin.neutral(full))
@@ -237,10 +244,10 @@ def find_base_joints(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
         if frame.type == pin.FrameType.BODY and frame.name in solid
     }
     while len(found) < 3:
-        after = [j for j in range(2, full.njoints) if full.parents[j] == joint]
-        if joint in carries or len(after) != 1 or full.joints[after[0]].nv != 1:
+        children = [j for j in range(2, full.njoints) if full.parents[j] == joint]
+        if joint in carries or len(children) != 1 or full.joints[children[0]].nv != 1:
             return ()
-        (joint,) = after
+        (joint,) = children
         twist = pin.getJointJacobian(full, data, joint, pin.LOCAL_WORLD_ALIGNED)[
             :, full.joints[joint].idx_v
         ]
@@ -249,15 +256,15 @@ def find_base_joints(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
         elif abs(twist[5]) < 1.0 - _AXIS_TOLERANCE:
             return ()
         found.append(full.names[joint])
-    crossing = (
+    has_two_directions = (
         len(slides) == 2
         and abs(slides[0][0] * slides[1][1] - slides[0][1] * slides[1][0]) > _AXIS_TOLERANCE
     )
-    return tuple(found) if crossing else ()
+    return tuple(found) if has_two_directions else ()
 
 
 def make_configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
-    """Return the configuration, shape (nq,), with joints at `positions`; those not named are neutral."""
+    """Return the configuration with joints at `positions`, the others neutral, shape (nq,)."""
     q: Floats = pin.neutral(model)
     for j in range(1, model.njoints):
         joint, value = model.joints[j], positions.get(model.names[j])
@@ -277,14 +284,14 @@ def find_default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
         children[full.parents[j]].insert(0, j)
         counts = full.joints[j].nv == 1 and full.names[j] not in follows
         depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
-    joint, above = 1, 0
+    joint, joint_count = 1, 0
     while children[joint]:
         hand = len(children[joint]) > 1 and depth[joint] <= _MAX_FINGER_JOINTS
-        if hand and above >= _MIN_ARM_JOINTS:
+        if hand and joint_count >= _MIN_ARM_JOINTS:
             break
-        joint, above = (
+        joint, joint_count = (
             max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)),
-            above + 1,
+            joint_count + 1,
         )
     return str(
         [
@@ -296,11 +303,13 @@ def find_default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
 
 
 def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
-    """Return the collision shapes of `file` on the joints of `model`, named `<link>_<k>`, meshes as their convex hulls.
+    """Return the collision shapes of `file` on the joints of `model`, named `<link>_<k>`.
+
+    Meshes are replaced by their convex hulls.
 
     Raises:
-        InputError: A shape is not understood, a mesh cannot be read or is flat, or there is no
-            shape.
+        InputError: A shape is not supported, a mesh cannot be read or is flat, or there are no
+            shapes.
     """
     geometry = pin.GeometryModel()
     for shape in file.few_shapes("collision"):
@@ -309,7 +318,7 @@ def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryMod
         )
     if len(geometry.geometryObjects) == 0:
         raise InputError(
-            "nothing of this robot can collide",
+            "this robot has no collision geometry",
             file=file.path,
             expected="<collision> elements",
             got="none",
@@ -318,13 +327,14 @@ def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryMod
 
 
 def load_visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
-    """Return what `file` looks like on the joints of `model`: one shape per colour, light enough for a web page.
+    """Return the visual geometry of `file` on the joints of `model`, one shape per colour.
 
-    The shapes hold triangles (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that
-    viewers draw what is here and load no file themselves.
+    Meshes are simplified for display in a browser. The shapes hold triangles
+    (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that viewers do not load files
+    themselves.
 
     Raises:
-        InputError: A shape is not understood, or a mesh cannot be read.
+        InputError: A shape is not supported, or a mesh cannot be read.
     """
     geometry = pin.GeometryModel()
     for shape in file.few_shapes("visual"):
@@ -353,11 +363,18 @@ def _lock_joints(
     follows: Mapping[str, JointCoupling],
     last: Collection[int] = (),
 ) -> pin.Model:
-    """Return `full` with the joints that are not `planned` locked at `q`, and all on joint 1 higher by `height`.
+    """Return `full` with the joints that are not `planned` locked at `q`.
 
-    `pinocchio.buildReducedModel` refuses models in which a link is called like a joint, as many
-    are. Here, the frame of such a joint is left out, so that every frame's name is the only one.
-    Joints come after those they follow, `last` ones last.
+    `pinocchio.buildReducedModel` fails if a link and a joint share a name, which is common. Here,
+    the frames of such joints are omitted, so that frame names are unique.
+
+    Args:
+        full: The robot with all joints.
+        planned: Indices of the joints that stay.
+        q: Configuration at which the others are locked, shape (nq,).
+        height: Height of everything on joint 1 above that joint [m].
+        follows: Follower → coupling. Followers come after their leaders.
+        last: Indices of the joints that come last.
     """
     data = full.createData()
     pin.forwardKinematics(full, data, q)
@@ -365,11 +382,11 @@ def _lock_joints(
     model.name = full.name
     placed = {0: (0, pin.SE3.Identity())}
     coupled = {
-        j: led
+        j: coupling
         for j in sorted(planned)
-        if (led := follows.get(full.names[j])) and full.getJointId(led.leader) in planned
+        if (coupling := follows.get(full.names[j])) and full.getJointId(coupling.leader) in planned
     }
-    before = {j: {full.getJointId(led.leader)} for j, led in coupled.items()} | {
+    before = {j: {full.getJointId(coupling.leader)} for j, coupling in coupled.items()} | {
         j: {*planned} - {*last} for j in last
     }
     for j in sort_joints(full, before):
@@ -405,11 +422,11 @@ def _make_geometry_object(
     solid: coal.CollisionGeometry,
     colour: tuple[float, ...],
 ) -> pin.GeometryObject:
-    """Return `solid` as the geometry of an element of the URDF, on the joint of its link."""
+    """Return `solid` as a geometry object on the joint of the URDF element's link."""
     frame = model.getFrameId(shape.link, pin.FrameType.BODY)
     parent = model.frames[frame]
-    added = pin.GeometryObject(
+    geometry_object = pin.GeometryObject(
         name, parent.parentJoint, frame, round_placement(parent.placement * shape.placement), solid
     )
-    added.meshColor = np.array(colour)
-    return added
+    geometry_object.meshColor = np.array(colour)
+    return geometry_object

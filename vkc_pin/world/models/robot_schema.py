@@ -1,4 +1,4 @@
-"""What a robot.yaml may contain: what a URDF cannot say about a robot."""
+"""Defines the schema of robot.yaml, which holds the properties that a URDF lacks."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ Limits = Annotated[
 
 
 class Wheels(Schema):
-    """The driven wheels of a base, half of them left, half right.
+    """Driven wheels of a base, half of them on each side.
 
     Attributes:
-        track: How far left is from right, as far as turning is concerned [m]: where wheels skid in
-            turns, more than it measures.
-        radius: Of a wheel [m].
-        speed: How fast one turns at most [rad/s].
+        track: Effective distance between left and right wheels in turns [m]; larger than the
+            geometric one if wheels skid.
+        radius: Wheel radius [m].
+        speed: Maximum angular velocity of a wheel [rad/s].
     """
 
     track: Positive
@@ -58,14 +58,15 @@ class Wheels(Schema):
 
     @property
     def rim_speed(self) -> float:
-        """How fast a wheel goes over the floor at most [m/s]."""
+        """Maximum circumferential speed of a wheel [m/s]."""
         return self.radius * self.speed
 
 
 class BaseSchema(Schema):
-    """The planar base: x and y in [m], yaw in [rad]; velocities and accelerations per x, y, yaw; height of the root link [m].
+    """Properties of the planar base, ordered x [m], y [m], yaw [rad].
 
-    Of wheels, and of the least radius of a turn [m], nothing is assumed.
+    `height` is that of the root link above the floor [m]. Wheels and minimum turning radius [m]
+    have no default.
     """
 
     position: tuple[Limits, Limits] = ((-20.0, 20.0), (-20.0, 20.0))
@@ -77,30 +78,30 @@ class BaseSchema(Schema):
 
 
 class RobotJointSchema(JointSchema):
-    """What a URDF does not say about a joint of a robot, or says wrong; effort [N·m] or [N], 0: that is not known."""
+    """Corrections to a robot's joint in the URDF; effort [N·m] or [N], where 0 means unknown."""
 
     effort: NotNegative | None = None
 
 
 class FingerSchema(Schema):
-    """A joint of a finger: where it is when the gripper is closed, and when it is fully open, [m] or [rad]."""
+    """Positions of a finger joint with the gripper closed and fully open, [m] or [rad]."""
 
     closed: Number
     open: Number
 
 
 class CouplingSchema(Schema):
-    """A joint that follows `joint`: it is at multiplier · position + offset, [m] or [rad], as <mimic> in a URDF says."""
+    """Coupling to `joint`: multiplier · position + offset, as <mimic> in a URDF."""
 
     joint: str
     multiplier: Annotated[
-        Number, require(bool, "a joint that stands still", "a number but 0, or `locked_joints`")
+        Number, require(bool, "the multiplier must not be 0", "another number, or `locked_joints`")
     ] = 1.0
     offset: Number = 0.0
 
 
 class RobotSchema(Schema):
-    """A robot.yaml beside a URDF; every field but `urdf` may be left out."""
+    """Contents of a robot.yaml; all fields except `urdf` are optional."""
 
     urdf: str
     srdf: str | None = None
@@ -120,13 +121,13 @@ def read_robot(file: Path) -> tuple[RobotSchema, Document]:
     """Read a robot.yaml.
 
     Raises:
-        InputError: It cannot be read, or a field of it is wrong; the error names file, line and
+        InputError: The file cannot be read, or a field is invalid; the error names file, line and
             field.
     """
     document = read_yaml(file)
     if not isinstance(document.data, dict):
         raise InputError(
-            "not a robot",
+            "this is not a robot description",
             file=file,
             expected="fields (name: value)",
             got=type(document.data).__name__,
@@ -134,41 +135,49 @@ def read_robot(file: Path) -> tuple[RobotSchema, Document]:
     settings = check(document, RobotSchema)
     if settings.arm is not None and settings.tool_frame is not None:
         raise document.error(
-            ("arm",), "tool_frame says what grasps, too", expected="one of them", got=settings.arm
+            ("arm",),
+            "`arm` and `tool_frame` exclude each other",
+            expected="one of them",
+            got=settings.arm,
         )
     return settings, document
 
 
 def read_wheels(
-    base: str, least: float | None, settings: RobotSchema, source: Path
+    base: str, turning_radius: float | None, settings: RobotSchema, source: Path
 ) -> dict[str, Any]:
-    """Return the fields of a `Robot` that its wheels are about.
+    """Return the arguments of `Robot` for wheels and turning radius.
 
     Args:
-        base: How it moves.
-        least: The least radius of a turn [m]; None: what robot.yaml says. Only "ackermann" has one.
-        settings: What robot.yaml says.
-        source: Where that is.
+        base: Type of the base.
+        turning_radius: Minimum turning radius of an "ackermann" base [m]. Default: that of
+            robot.yaml.
+        settings: Contents of the robot.yaml.
+        source: Path of the robot.yaml or URDF, for error messages.
 
     Raises:
-        InputError: The radius is none, the base has none, or it needs one and nobody says.
+        InputError: The radius is invalid, missing for an "ackermann" base, or given for another.
     """
     wheels = settings.base.wheels
     if base != "ackermann":
-        if least is not None:
-            expected = "none, unless the base is ackermann"
+        if turning_radius is not None:
+            expected = "no value, or base='ackermann'"
             raise InputError(
-                f"a base that is {base} has no turning radius",
+                f"a base of type '{base}' has no turning radius",
                 field="turning_radius",
                 expected=expected,
-                got=least,
+                got=turning_radius,
             )
         return {"wheels": wheels}
-    radius = settings.base.turning_radius if least is None else quantity(least, "turning_radius")
+    radius = (
+        settings.base.turning_radius
+        if turning_radius is None
+        else quantity(turning_radius, "turning_radius")
+    )
     if radius is None:
-        expected = "turning_radius [m], beside the base, or under `base` in its robot.yaml"
+        expected = "turning_radius [m] as an argument, or under `base` in robot.yaml"
         raise InputError(
-            "nothing says how tightly it turns",
+            "an ackermann base needs a turning radius",
             file=source,
             field="turning_radius",
             expected=expected,
@@ -176,7 +185,10 @@ def read_wheels(
         )
     if radius <= 0.0:
         raise InputError(
-            "out of range", field="turning_radius", expected="a number > 0 [m]", got=radius
+            "the turning radius must be positive",
+            field="turning_radius",
+            expected="a number > 0 [m]",
+            got=radius,
         )
     return {"wheels": wheels, "turning_radius": radius}
 
@@ -185,7 +197,7 @@ def find_python_packages(names: tuple[str, ...], document: Document) -> dict[str
     """Return the folders of installed Python packages, without importing them.
 
     Raises:
-        InputError: One is not installed.
+        InputError: A package is not installed.
     """
     folders = {}
     for index, name in enumerate(names):

@@ -1,6 +1,6 @@
-"""Collision pairs of a robot's links: which need no check and how far others can get apart, by sampling; a home without overlaps.
+"""Finds the collision pairs of a robot's links by sampling, and a collision-free home.
 
-The results are kept on disk, as they take up to a minute for large robots.
+The results are cached on disk, since they take up to a minute for large robots.
 """
 
 from __future__ import annotations
@@ -38,29 +38,30 @@ __all__ = [
     "write_srdf",
 ]
 
-_VERSION = 1  # of what is kept on disk: another one whenever the same robot would get other pairs
+_VERSION = 1  # of the cached results: increase it whenever the same robot would get other pairs
 _SAMPLES = 20_000
-# [m]: links that come no closer in any sample are not driven together; neighbours that are always
-# closer are exempt
+# [m]: pairs of links that stay further apart in all samples never collide; neighbours that are
+# always closer are exempt
 _MAX_DISTANCE = 0.05
-# [m] as `Options.self_distance`: links that are that far apart do not count against a home
+# [m] equal to `Options.self_distance`: distance of links that a home must keep
 HOME_DISTANCE = 0.02
-_DESCENT_STARTS, _DESCENT_STEPS = 4, 200  # how often and in how many steps the others are
-_CONTACT_DISTANCE = 1e-3  # [m]: links that never get further apart touch; validation sees no less
+_DESCENT_STARTS, _DESCENT_STEPS = 4, 200  # descents per pair of links, and steps of each
+# [m] equal to the resolution of validation: links that never get further apart count as touching
+_CONTACT_DISTANCE = 1e-3
 _HOME_SEARCH_RADII, _HOME_SEARCH_SAMPLES = (
     (0.05, 0.1, 0.2, 0.4, 0.7, 1.0),
     100,
-)  # a free home: shares of the joints' ranges, and postures in each
+)  # fractions of the joint ranges, and samples in each
 
 
 class SelfCollisionAnalysis(NamedTuple):
-    """How a robot's links are to each other.
+    """Results of the analysis of a robot's self-collisions.
 
     Attributes:
-        allowed: Pairs of links that need not be kept apart, each sorted, with the reason.
-        tight: How far apart pairs are at most, or at home if that is less [m], of those that are
-            never or not there 50 mm apart.
-        home: Where the planned joints rest, shape (n - 3,).
+        allowed: Sorted pair of links that need not be checked → reason.
+        tight: Sorted pair of links that are less than 50 mm apart in all samples, or at home →
+            their largest distance, or that at home if it is less [m].
+        home: Home positions of the planned joints, shape (n − 3,) [m], [rad].
     """
 
     allowed: dict[Pair, str]
@@ -69,11 +70,11 @@ class SelfCollisionAnalysis(NamedTuple):
 
 
 def set_collision_pairs(robot: Robot, allowed: Collection[Pair]) -> Robot:
-    """Return `robot` with those of its links that move against each other as collision pairs, less the `allowed` ones.
+    """Return a copy of `robot` with all pairs of links in relative motion as collision pairs.
 
     Args:
-        robot: The robot; its own collision pairs play no part.
-        allowed: Pairs of links that may touch, each sorted.
+        robot: The robot; its collision pairs are ignored.
+        allowed: Sorted pairs of links to leave out.
     """
     collision, shapes = pin.GeometryModel(), robot.collision.geometryObjects
     for shape in shapes:
@@ -93,29 +94,31 @@ def apply_self_collision_analysis(
     Warns if the home was moved, or if links that are not neighbours are exempt from checks.
 
     Args:
-        robot: The robot; its own collision pairs play no part.
-        semantics: Its SRDF; without one pairs are sampled.
-        loose: The planned joints of which nobody says where they rest.
-        samples: How many configurations to look at.
+        robot: The robot; its collision pairs are ignored.
+        semantics: The robot's SRDF. Without one, pairs are sampled.
+        loose: Planned joints without a stated home position.
+        samples: Number of random configurations.
     """
     listed = None if semantics is None else semantics.allowed
     found, names = (
         analyze_self_collisions(robot, listed, loose, samples=samples),
         robot.coordinates.names[3:],
     )
-    home, said = np.array(found.home), f"{robot.urdf}: "
+    home, message = np.array(found.home), f"{robot.urdf}: "
     if moved := [
         f"{name}: {value:.3g}"
         for name, value, was in zip(names, home, robot.home, strict=True)
         if value != was
     ]:
-        said += "links overlap where the arm would rest; home has joints elsewhere of which nobody says where they rest"
-        warnings.warn(f"{said}: {', '.join(moved)}", stacklevel=3)
-    unsaid = {
+        message += (
+            "links overlap at the default home; joints without a stated home position were moved"
+        )
+        warnings.warn(f"{message}: {', '.join(moved)}", stacklevel=3)
+    warned_reasons = {
         "Home": "overlap at home",
         **({} if listed is None else {"Always": "always overlap or touch"}),
     }
-    for reason, what in unsaid.items():
+    for reason, condition in warned_reasons.items():
         links = [
             " – ".join(pair)
             for pair, why in found.allowed.items()
@@ -123,7 +126,7 @@ def apply_self_collision_analysis(
         ]
         if links:
             warnings.warn(
-                f"{robot.urdf}: links that {what} are not kept apart: {', '.join(links)}",
+                f"{robot.urdf}: links that {condition} are not checked: {', '.join(links)}",
                 stacklevel=3,
             )
     return set_collision_pairs(
@@ -134,20 +137,21 @@ def apply_self_collision_analysis(
 def analyze_self_collisions(
     robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[str] = (), *, samples: int
 ) -> SelfCollisionAnalysis:
-    """Return which links need not be kept apart, how far others can be, and a home at which none overlap.
+    """Return the pairs of links that need no check, tight pairs, and a collision-free home.
 
-    To those `listed`, or else found by `sample_allowed_pairs`, come pairs that no motion keeps
-    apart: neighbours that are always close ("Adjacent"), links that always overlap or touch
-    ("Always"), and those that overlap at home ("Home"). Where they do although nobody says that the
-    robot rests there, the nearest posture found in which the fewest do is the home.
+    Allowed pairs are those `listed`, or else those of `sample_allowed_pairs`, and pairs that no
+    motion can separate: neighbours that are always close ("Adjacent"), links that always overlap or
+    touch ("Always"), and links that overlap at home ("Home"). If links overlap at home and there
+    are `loose` joints, the home is moved to the nearest sampled configuration with the fewest
+    overlaps.
 
     Args:
-        robot: The robot; its own collision pairs play no part.
-        listed: The pairs of an SRDF, each sorted, with the reason.
-        loose: The planned joints of which nobody says where they rest.
-        samples: How many configurations to look at.
+        robot: The robot; its collision pairs are ignored.
+        listed: Sorted pairs of the SRDF → reason.
+        loose: Planned joints without a stated home position.
+        samples: Number of random configurations.
     """
-    about = (
+    inputs = (
         "pairs",
         _VERSION,
         samples,
@@ -156,7 +160,7 @@ def analyze_self_collisions(
         sorted(loose),
         robot.fingerprint,
     )
-    key = json.dumps(about).encode()
+    key = json.dumps(inputs).encode()
     allowed, tight, home = record(
         key, lambda: _to_plain_lists(_compute_analysis(robot, listed, loose, samples))
     )
@@ -168,28 +172,31 @@ def analyze_self_collisions(
 def sample_allowed_pairs(
     robot: Robot, *, samples: int = _SAMPLES, seed: int = 0
 ) -> dict[tuple[str, str], str]:
-    """Return the pairs of links that need not be kept apart, each sorted, with the reason.
+    """Return sorted pairs of links that need no collision check → reason.
 
-    "Adjacent": a joint connects them, or one joint and fixed links while they are never 50 mm
-    apart. "Always": they collide in every sample. "Never": they collide in no sample, and those
-    that came closer than 50 mm not even when they are driven together from their closest samples.
-    Samples are uniform within the joints' limits (±π where there are none), the base standing
-    still.
+    "Adjacent": a joint connects the links, or the rigid bodies they belong to if they are always
+    less than 50 mm apart. "Always": they collide in all samples. "Never": they collide in no
+    sample; pairs that come closer than 50 mm do not collide either in random descents of their
+    distance from the closest samples. Samples are uniform within the joint limits (±π if there are
+    none), with the base at the origin.
 
     Args:
-        robot: The robot; its own collision pairs play no part.
-        samples: How many configurations to look at.
-        seed: Of the random numbers; the same seed gives the same pairs.
+        robot: The robot; its collision pairs are ignored.
+        samples: Number of random configurations.
+        seed: Random seed; the same seed gives the same pairs.
     """
-    groups, (joined, welded) = _group_shape_pairs(robot), find_neighbours(robot.file, robot.links)
-    allowed = {links: "Adjacent" for links in groups if links in joined}
-    groups = {links: parts for links, parts in groups.items() if links not in joined}
+    groups, (adjacent, adjacent_bodies) = (
+        _group_shape_pairs(robot),
+        find_neighbours(robot.file, robot.links),
+    )
+    allowed = {links: "Adjacent" for links in groups if links in adjacent}
+    groups = {links: parts for links, parts in groups.items() if links not in adjacent}
     rng, distances, (low, high) = (
         np.random.default_rng(seed),
         _make_shape_distances(robot),
         _find_sampling_bounds(robot),
     )
-    look, undecided, (free, hit) = (
+    link_distances, undecided, (free, hit) = (
         LinkDistances(distances, groups),
         np.arange(len(groups)),
         np.zeros((2, len(groups)), bool),
@@ -197,10 +204,10 @@ def sample_allowed_pairs(
     closest: list[list[tuple[float, tuple[float, ...]]]] = [[] for _ in groups]
     for z in rng.uniform(low, high, (samples, len(low))):
         distances.set_configuration(z)
-        free[undecided[(bounds := look.compute_lower_bounds()) > 0.0]] = True
+        free[undecided[(bounds := link_distances.compute_lower_bounds()) > 0.0]] = True
         for k in np.flatnonzero(bounds <= _MAX_DISTANCE).tolist():
             best = closest[pair := undecided[k]]
-            distance = look.compute_distance(
+            distance = link_distances.compute_distance(
                 k,
                 min(_MAX_DISTANCE, best[-1][0]) if len(best) == _DESCENT_STARTS else _MAX_DISTANCE,
             )
@@ -212,7 +219,7 @@ def sample_allowed_pairs(
                 and (len(best) < _DESCENT_STARTS or distance < best[-1][0])
             ):
                 closest[pair] = sorted([*best, (distance, tuple(z))])[:_DESCENT_STARTS]
-        look.select(left := ~(free & hit)[undecided])
+        link_distances.select(left := ~(free & hit)[undecided])
         undecided = undecided[left]
     for pair, (links, parts) in enumerate(groups.items()):
         if not free[pair]:
@@ -223,13 +230,17 @@ def sample_allowed_pairs(
                 _descend_to_collision(distances, parts, z, (low, high), rng) for z in starts
             ):
                 allowed[links] = "Never"
-    unsure = {
-        links: groups[links] for links in welded & groups.keys() if allowed.get(links) != "Never"
+    undecided_neighbours = {
+        links: groups[links]
+        for links in adjacent_bodies & groups.keys()
+        if allowed.get(links) != "Never"
     }
     allowed |= {
         links: "Adjacent"
-        for links, room in _compute_max_distances(robot, unsure, samples).items()
-        if room < _MAX_DISTANCE
+        for links, max_distance in _compute_max_distances(
+            robot, undecided_neighbours, samples
+        ).items()
+        if max_distance < _MAX_DISTANCE
     }
     return dict(sorted(allowed.items()))
 
@@ -241,17 +252,19 @@ def _compute_analysis(
     groups = {
         links: parts for links, parts in _group_shape_pairs(robot).items() if links not in allowed
     }
-    rooms = {
-        links: room
-        for links, room in _compute_max_distances(robot, groups, samples).items()
-        if room < _MAX_DISTANCE
+    max_distances = {
+        links: max_distance
+        for links, max_distance in _compute_max_distances(robot, groups, samples).items()
+        if max_distance < _MAX_DISTANCE
     }
-    joined = frozenset().union(*find_neighbours(robot.file, robot.links))
-    for links, room in rooms.items():
-        if links in joined or room <= _CONTACT_DISTANCE:
-            allowed[links] = "Adjacent" if links in joined else "Always"
+    adjacent = frozenset().union(*find_neighbours(robot.file, robot.links))
+    for links, max_distance in max_distances.items():
+        if links in adjacent or max_distance <= _CONTACT_DISTANCE:
+            allowed[links] = "Adjacent" if links in adjacent else "Always"
     groups = {links: parts for links, parts in groups.items() if links not in allowed}
-    tight = {links: room for links, room in rooms.items() if links in groups}
+    tight = {
+        links: max_distance for links, max_distance in max_distances.items() if links in groups
+    }
     robot = dataclasses.replace(robot, tight=tight)
     home = _find_free_home(robot, groups, loose)
     distances = _make_shape_distances(robot)
@@ -275,17 +288,17 @@ def _to_plain_lists(
 def _find_free_home(
     robot: Robot, groups: Mapping[Pair, Parts], loose: Collection[str]
 ) -> tuple[float, ...]:
-    """Return the robot's home, or another in which the fewest of some pairs overlap, with only the `loose` joints elsewhere."""
+    """Return the robot's home, or one with fewer overlaps that differs in `loose` joints only."""
     distances, (low, high), rng = (
         _make_shape_distances(robot),
         _find_sampling_bounds(robot),
         np.random.default_rng(0),
     )
-    moves = np.array([name in loose for name in robot.coordinates.names])
-    rest = np.array([0.0, 0.0, 0.0, *robot.home])
+    is_loose = np.array([name in loose for name in robot.coordinates.names])
+    default_home = np.array([0.0, 0.0, 0.0, *robot.home])
 
-    def short(z: Floats, margin: float, most: float) -> int:
-        """Return how many pairs keep less than `margin`, or what they can; no more than `most` + 1."""
+    def count_violations(z: Floats, margin: float, limit: float) -> int:
+        """Return the number of pairs below their margin; counting stops above `limit`."""
         distances.set_configuration(z)
         count = 0
         for links, parts in groups.items():
@@ -295,23 +308,27 @@ def _find_free_home(
                 if margin
                 else distances.compute_distance(parts, 0.0) <= 0.0
             )
-            if count > most:
+            if count > limit:
                 break
         return count
 
-    best, fewest = rest, short(rest, 0.0, np.inf)
-    if not fewest or not moves.any():
+    best, fewest = default_home, count_violations(default_home, 0.0, np.inf)
+    if not fewest or not is_loose.any():
         return tuple(best[3:].tolist())
-    for share in _HOME_SEARCH_RADII:
-        tries = rest + np.where(
-            moves, share * (rng.uniform(low, high, (_HOME_SEARCH_SAMPLES, len(rest))) - rest), 0.0
+    for radius in _HOME_SEARCH_RADII:
+        candidates = default_home + np.where(
+            is_loose,
+            radius
+            * (rng.uniform(low, high, (_HOME_SEARCH_SAMPLES, len(default_home))) - default_home),
+            0.0,
         )
-        for z in tries[
+        for z in candidates[
             np.argsort(
-                (np.abs(tries - rest) / np.maximum(high - low, 1e-9)).max(axis=1), kind="stable"
+                (np.abs(candidates - default_home) / np.maximum(high - low, 1e-9)).max(axis=1),
+                kind="stable",
             )
         ]:
-            if (count := short(z, HOME_DISTANCE, fewest - 1)) < fewest:
+            if (count := count_violations(z, HOME_DISTANCE, fewest - 1)) < fewest:
                 best, fewest = z, count
             if not fewest:
                 return tuple(best[3:].tolist())
@@ -319,7 +336,7 @@ def _find_free_home(
 
 
 def _group_shape_pairs(robot: Robot) -> dict[Pair, Parts]:
-    """Return the pairs of links that move against each other, each sorted, with the pairs of their shapes."""
+    """Return sorted pairs of links in relative motion → pairs of their shapes."""
     shapes, groups = robot.collision.geometryObjects, dict[Pair, Parts]()
     for first, second in itertools.combinations(range(len(shapes)), 2):
         if shapes[first].parentJoint != shapes[second].parentJoint:
@@ -331,30 +348,37 @@ def _group_shape_pairs(robot: Robot) -> dict[Pair, Parts]:
 def _compute_max_distances(
     robot: Robot, groups: Mapping[Pair, Parts], samples: int
 ) -> dict[Pair, float]:
-    """Return how far links are apart at most [m], at home or in random configurations; 50 mm or more where that is certain."""
+    """Return the largest distances of pairs of links, at home and in random configurations [m].
+
+    Distances of 50 mm or more are lower bounds.
+    """
     distances, (low, high), rng = (
         _make_shape_distances(robot),
         _find_sampling_bounds(robot),
         np.random.default_rng(0),
     )
-    look, rooms = LinkDistances(distances, groups), dict.fromkeys(groups, -np.inf)
+    link_distances, max_distances = LinkDistances(distances, groups), dict.fromkeys(groups, -np.inf)
     for z in (np.array([0.0, 0.0, 0.0, *robot.home]), *rng.uniform(low, high, (samples, len(low)))):
-        if not look.links:
+        if not link_distances.links:
             break
         distances.set_configuration(z)
         for k, (links, bound) in enumerate(
-            zip(look.links, look.compute_lower_bounds(), strict=True)
+            zip(link_distances.links, link_distances.compute_lower_bounds(), strict=True)
         ):
-            rooms[links] = max(
-                rooms[links],
-                float(bound) if bound > _MAX_DISTANCE else look.compute_distance(k, _MAX_DISTANCE),
+            max_distances[links] = max(
+                max_distances[links],
+                float(bound)
+                if bound > _MAX_DISTANCE
+                else link_distances.compute_distance(k, _MAX_DISTANCE),
             )
-        look.select([rooms[links] < _MAX_DISTANCE for links in look.links])
-    return rooms
+        link_distances.select(
+            [max_distances[links] < _MAX_DISTANCE for links in link_distances.links]
+        )
+    return max_distances
 
 
 def _find_sampling_bounds(robot: Robot) -> tuple[Floats, Floats]:
-    """Return within which bounds configurations are looked at, shape (n,)."""
+    """Return lower and upper bounds of sampled configurations, shape (n,) each [m], [rad]."""
     low, high = (
         np.where(np.isfinite(robot.lower), robot.lower, -np.pi),
         np.where(np.isfinite(robot.upper), robot.upper, np.pi),
@@ -368,21 +392,22 @@ def _make_shape_distances(robot: Robot) -> ShapeDistances:
 
 
 def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed: int = 0) -> Path:
-    """Write an SRDF with the allowed collisions of `robot` and its home; at once, so that no reader sees half a file.
+    """Write an SRDF with the allowed collisions and the home of `robot`, atomically.
 
     Args:
         robot: The robot.
-        path: The file to write.
-        samples: See `sample_allowed_pairs`.
-        seed: The same.
+        path: Path of the file.
+        samples: Number of random configurations; see `sample_allowed_pairs`.
+        seed: Random seed.
 
     Returns:
-        The file.
+        Path of the file.
     """
     lines = [
         '<?xml version="1.0"?>',
-        f"<!-- Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: a joint connects the links. Always: they",
-        "     collide in every sample. Never: in none, nor when driven together from those in which they came closest. -->",
+        f"<!-- Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: connected by",
+        "     a joint. Always: in collision in all samples. Never: in collision in no sample, nor",
+        "     after descents of the distance from the closest samples. -->",
         f"<robot name={quote(robot.name)}>",
         '  <group name="arm">',
         *(f"    <joint name={quote(name)}/>" for name in robot.coordinates.names[3:]),
@@ -409,7 +434,7 @@ def _descend_to_collision(
     limits: tuple[Floats, Floats],
     rng: np.random.Generator,
 ) -> bool:
-    """Return whether random steps from `z` that lessen the distance end in a collision."""
+    """Return whether a random descent of the distance from `z` ends in a collision."""
     low, high = limits
     distances.set_configuration(z)
     nearest = distances.compute_distance(parts)

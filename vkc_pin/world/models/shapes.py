@@ -1,4 +1,4 @@
-"""Collision shapes: their names, surfaces, boxes, and the distances between them."""
+"""Provides helpers for collision shapes: names, surfaces, bounding boxes and distances."""
 
 from __future__ import annotations
 
@@ -31,12 +31,16 @@ __all__ = [
 ]
 
 LIMIT_SLACK = 1e-6
-"""Joint values up to this far outside their limits, [rad] or [m], count as rounding and are moved to the limit."""
-_CIRCLE_SEGMENTS = 28  # of a circle
+"""Joint values that exceed their limits by at most this are clamped [rad] or [m]."""
+_CIRCLE_SEGMENTS = 28  # segments of a circle
 
 
 def clamp_to_limits(value: float, lower: float, upper: float, field: str | None) -> float:
-    """Return `value`, moved to the limit if it is outside by rounding only. Raises `InputError` if it is further out."""
+    """Return `value`, clamped to its limits if it exceeds them by rounding only.
+
+    Raises:
+        InputError: The value is not finite, or exceeds a limit by more than `LIMIT_SLACK`.
+    """
     if not np.isfinite(value):
         raise InputError("not a finite number", field=field, expected="a finite number", got=value)
     if not lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK:
@@ -50,7 +54,7 @@ def clamp_to_limits(value: float, lower: float, upper: float, field: str | None)
 
 
 def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:
-    """Return a copy of `shape` that stands still at `placement` in the world frame."""
+    """Return a copy of `shape` that is fixed at `placement` in the world frame."""
     copy = pin.GeometryObject(shape)
     copy.name, copy.parentJoint, copy.parentFrame, copy.placement = (
         name,
@@ -62,19 +66,19 @@ def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.
 
 
 def get_link_name(shape_name: str) -> str:
-    """Return the name of the link that a shape belongs to: Pinocchio calls its shapes `<link>_<number>`."""
+    """Return the name of a shape's link, given Pinocchio's shape name `<link>_<number>`."""
     return shape_name.rpartition("_")[0]
 
 
 def get_local_name(shape_name: str) -> str:
-    """Return the name in its object of a shape that is called `<object>.<own name>`."""
+    """Return the part of a shape's name after the object: `<object>.<local name>`."""
     return shape_name.partition(".")[2]
 
 
 def list_placed_shapes(
     shapes: Iterable[pin.GeometryObject],
 ) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
-    """Return (shape, placement) for shapes that stand in the world, for `compute_clearance`."""
+    """Return (geometry, placement) of shapes fixed in the world, for `compute_clearance`."""
     return [(shape.geometry, shape.placement) for shape in shapes]
 
 
@@ -84,12 +88,15 @@ def compute_clearance(
     *,
     reach: float = np.inf,
 ) -> float:
-    """Return the smallest signed distance [m] between two groups of shapes with their placements in the world frame.
+    """Return the smallest signed distance between two groups of shapes [m].
 
     Args:
-        first: One group; a negative distance is a penetration depth.
-        second: The other group.
-        reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
+        first: Shapes of the first group with their placements in the world frame.
+        second: Shapes of the second group, likewise.
+        reach: Cutoff [m]: if all distances are larger, the result is some number ≥ `reach`.
+
+    Returns:
+        The distance; negative values are penetration depths.
     """
     nearest, others = reach, list(second)
     boxes = np.array([compute_world_box(shape, placement) for shape, placement in others]).reshape(
@@ -97,8 +104,8 @@ def compute_clearance(
     )
     for shape, placement in first:
         low, high = compute_world_box(shape, placement)
-        # Moved apart by as much as their boxes overlap, shapes are separate: a bound also where it
-        # is negative.
+        # Shapes translated by the overlap of their boxes are separate, so that negative gaps are
+        # lower bounds, too.
         gaps = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
         for k in np.argsort(gaps, kind="stable").tolist():
             if gaps[k] >= nearest:
@@ -113,7 +120,7 @@ def compute_shape_distance(
     second: coal.CollisionGeometry,
     second_placement: pin.SE3,
 ) -> float:
-    """Return the signed distance [m] between two shapes, each at its placement in a common frame; negative: they overlap."""
+    """Return the signed distance between two shapes at placements in a common frame [m]."""
     a, b = (
         coal.Transform3s(where.rotation, where.translation)
         for where in (first_placement, second_placement)
@@ -122,10 +129,13 @@ def compute_shape_distance(
 
 
 def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the surface of a coal shape in its own frame: vertices, shape (n, 3) [m], and faces, shape (m, 3).
+    """Return the surface of a coal shape in its own frame.
+
+    Returns:
+        Vertices, shape (n, 3) [m], and faces, shape (m, 3).
 
     Raises:
-        InputError: The shape has no surface of finite size (a plane or half-space).
+        InputError: The shape is unbounded (a plane or half-space).
     """
     import trimesh.creation as make
 
@@ -162,13 +172,13 @@ def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64
 
 
 def compute_bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
-    """Return centre and half extents of a shape's bounding box in its own frame."""
+    """Return centre and half extents of a shape's bounding box in its own frame, (3,) each [m]."""
     shape.geometry.computeLocalAABB()
     return np.asarray(shape.geometry.aabb_local.center(), float), _get_half_extents(shape.geometry)
 
 
 def compute_world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
-    """Return the lower and upper corner, shape (3,) each [m], of a box along the world's axes around a shape."""
+    """Return the corners of a shape's axis-aligned box in the world frame, shape (3,) each [m]."""
     shape.computeLocalAABB()
     centre = placement.act(np.asarray(shape.aabb_local.center(), float))
     extent = np.abs(placement.rotation) @ _get_half_extents(shape)
@@ -176,12 +186,12 @@ def compute_world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tupl
 
 
 class ShapeDistances:
-    """Distances of shapes on a model at one configuration after the other, by coal.
+    """Computes distances between shapes of a model with coal, one configuration at a time.
 
     Args:
-        model: What moves them.
-        configuration: Minimal coordinates, shape (n,) → Pinocchio's configuration, shape (nq,).
-        shapes: The shapes.
+        model: The kinematic model.
+        configuration: Maps minimal coordinates, shape (n,), to Pinocchio's q, shape (nq,).
+        shapes: Shapes attached to joints of the model.
     """
 
     def __init__(
@@ -208,7 +218,7 @@ class ShapeDistances:
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
 
     def set_configuration(self, z: Floats) -> None:
-        """Put the model at coordinates `z`, shape (n,)."""
+        """Set the model to the minimal coordinates `z`, shape (n,)."""
         pin.forwardKinematics(self._model, self._data, self._configuration(z))
         rotations = np.array([place.rotation for place in self._data.oMi])[self._joints]
         positions = np.array([place.translation for place in self._data.oMi])[self._joints]
@@ -217,12 +227,19 @@ class ShapeDistances:
         self._places: dict[int, coal.Transform3s] = {}
 
     def compute_lowest_points(self) -> Floats:
-        """Return the height of the lowest point of the box around each shape [m], shape (shapes,)."""
+        """Return the lowest height of each shape's bounding box, shape (shapes,) [m]."""
         across = np.abs(np.einsum("kj,kji->ki", self._verticals, self._turns))
         return np.asarray(self._centres[:, 2] - np.einsum("ki,ki->k", across, self._halves))
 
     def compute_lower_bounds(self, pairs: Ints) -> Floats:
-        """Return lower bounds of the distances of pairs of shapes, shape (pairs, 2): those of balls around them [m]."""
+        """Return lower bounds of the distances of pairs of shapes, from bounding spheres.
+
+        Args:
+            pairs: Pairs of shape indices, shape (P, 2).
+
+        Returns:
+            Lower bounds, shape (P,) [m].
+        """
         first, second = pairs[:, 0], pairs[:, 1]
         gaps = self._centres[first] - self._centres[second]
         return np.asarray(
@@ -230,7 +247,10 @@ class ShapeDistances:
         )
 
     def compute_distance(self, parts: Iterable[tuple[int, int]], cutoff: float = np.inf) -> float:
-        """Return the smallest distance [m] of pairs of shapes; a lower bound of it where it is larger than `cutoff`."""
+        """Return the smallest distance of pairs of shapes [m].
+
+        If it is larger than `cutoff`, a lower bound larger than `cutoff` is returned.
+        """
         smallest = np.inf
         for first, second in parts:
             gap = self._centres[first] - self._centres[second]
@@ -253,17 +273,17 @@ class ShapeDistances:
 
 
 class LinkDistances:
-    """Distances of pairs of links, each by the pairs of their shapes, at one configuration after the other.
+    """Computes distances between pairs of links, one configuration at a time.
 
-    Most pairs of links are far apart in most configurations; balls around the shapes say so for all
-    of them at once.
+    Bounding spheres, evaluated for all pairs at once, exclude most pairs of links in most
+    configurations.
 
     Args:
-        distances: Of the shapes.
+        distances: Distances between the shapes.
         groups: Pair of links → pairs of their shapes.
 
     Attributes:
-        links: The pairs of links that are looked at, in the order in which they were given.
+        links: The pairs of links, in the given order.
     """
 
     links: list[tuple[str, str]]
@@ -278,7 +298,7 @@ class LinkDistances:
         self._concatenate_pairs()
 
     def select(self, chosen: Sequence[bool] | Bools) -> None:
-        """Look only at some of the pairs of links from now on: those `chosen`, shape (links,)."""
+        """Keep only the `chosen` pairs of links, shape (links,)."""
         if not all(chosen):
             self._groups = {
                 links: parts
@@ -288,14 +308,17 @@ class LinkDistances:
             self._concatenate_pairs()
 
     def compute_lower_bounds(self) -> Floats:
-        """Return lower bounds of the distances of all pairs of links where the model is placed [m], shape (links,)."""
+        """Return lower bounds of all distances at the current configuration, shape (links,) [m]."""
         if not self._groups:
             return np.zeros(0)
         self._bounds = self._distances.compute_lower_bounds(self._pairs)
         return np.asarray(np.minimum.reduceat(self._bounds, self._starts))
 
     def compute_distance(self, number: int, cutoff: float) -> float:
-        """Return the distance of pair of links `number` [m], or some number above `cutoff`; after `bounds`."""
+        """Return the distance of the pair of links `number` [m], or some number above `cutoff`.
+
+        Uses the bounds of the last call of `compute_lower_bounds`.
+        """
         start, end = self._starts[number], self._ends[number]
         close = self._pairs[start:end][self._bounds[start:end] <= cutoff]
         return self._distances.compute_distance(map(tuple, close.tolist()), cutoff)

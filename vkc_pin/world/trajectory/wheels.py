@@ -96,5 +96,7 @@ def make_rolling_limits(robot: Robot) -> RollingLimits:
     if robot.wheels is None:
         return RollingLimits(turning_radius=robot.turning_radius)
     return RollingLimits(
-        turning_radius=robot.turning_radius, track=robot.wheels.track, wheel_speed=robot.wheels.rim_speed
+        turning_radius=robot.turning_radius,
+        track=robot.wheels.track,
+        wheel_speed=robot.wheels.rim_speed,
     )

@@ -98,8 +98,8 @@ def test_where_no_file_says_how_fast(tmp_path: Path) -> None:
 
 
 def test_without_limits_the_fastest_joint_has_the_usual_ones(tmp_path: Path) -> None:
-    said = "out_2: {joint: out_1, multiplier: 0.5}, out_3: {joint: out_1, multiplier: -2.0, offset: 0.15}"
-    file = write_telescope(tmp_path, couplings=said).parent / "robot.urdf"
+    couplings = "out_2: {joint: out_1, multiplier: 0.5}, out_3: {joint: out_1, multiplier: -2.0, offset: 0.15}"
+    file = write_telescope(tmp_path, couplings=couplings).parent / "robot.urdf"
     file.write_text(file.read_text().replace('velocity="0.5" ', ""))
     robot = vkc.load_robot(tmp_path)
     assert (robot.velocity[4], robot.acceleration[4]) == (np.pi / 2.0, 0.7)
@@ -122,7 +122,8 @@ def test_what_turns_without_end_leads_as_far_as_the_others_can(
 
 def test_limits_that_leave_nothing_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        vkc.InputError, match=r"one: 'two', which follows it, has nowhere to go.*2 to 3.*-1 to 1"
+        vkc.InputError,
+        match=r"one: no position satisfies the limits of its follower 'two'.*2 to 3.*-1 to 1",
     ):
         two(tmp_path, 'multiplier="1"', second=(2.0, 3.0))
 

@@ -44,8 +44,8 @@ def random_robot(rng: np.random.Generator) -> tuple[str, str]:
             "multiplier": rng.uniform(0.3, 2.0) * rng.choice([-1, 1]),
             "offset": rng.uniform(-0.3, 0.3),
         }
-        said = " ".join(f'{key}="{value}"' for key, value in numbers.items())
-        inside = f'<mimic joint="j{leads[k]}" {said}/>' if k in leads else ""
+        attributes = " ".join(f'{key}="{value}"' for key, value in numbers.items())
+        inside = f'<mimic joint="j{leads[k]}" {attributes}/>' if k in leads else ""
         above = f"l{k if rng.random() < 0.7 else rng.integers(0, k + 1)}"
         at, axis = (" ".join(map(str, rng.normal(size=3))) for _ in range(2))
         kind = str(rng.choice(KINDS))
@@ -158,11 +158,11 @@ def test_a_model_that_is_kept_is_the_same(tmp_path: Path) -> None:
     """Programs are found again by what a model looks like as text: another multiplier is another model."""
     texts = set()
     for k, multiplier in enumerate((1.0, 2.0)):
-        said = ", ".join(
+        attributes = ", ".join(
             f"{joint}: {{joint: {leader}, multiplier: {multiplier}}}"
             for joint, leader in FOLLOWERS.items()
         )
-        model = vkc.load_robot(write_telescope(tmp_path / str(k), couplings=said)).model
+        model = vkc.load_robot(write_telescope(tmp_path / str(k), couplings=attributes)).model
         again = pin.Model()
         again.loadFromString(model.saveToString())
         assert again == model
@@ -178,7 +178,7 @@ def test_joints_wait_for_those_that_lead_them() -> None:
     second = model.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "second")
     assert sort_joints(model, {}) == [1, 2, 3]
     assert sort_joints(model, {first: {second}}) == [3, 1, 2]
-    with pytest.raises(vkc.InputError, match="on each other's followers"):
+    with pytest.raises(vkc.InputError, match="of each other's followers"):
         sort_joints(model, {first: {second}, second: {first}})
 
 

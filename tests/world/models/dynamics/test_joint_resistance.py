@@ -62,7 +62,7 @@ def test_limits_and_resistance_of_a_joint_stand_side_by_side() -> None:
         springref=REAL,
     ),
 )
-def test_what_moves_a_joint_loses_to_friction_and_damping_and_gains_what_the_spring_keeps(
+def test_friction_and_damping_dissipate_and_springs_store_energy(
     position: float, velocity: float, resistance: Resistance
 ) -> None:
     passive = Resistance(stiffness=resistance.stiffness, springref=resistance.springref)
@@ -85,16 +85,16 @@ def test_what_moves_a_joint_loses_to_friction_and_damping_and_gains_what_the_spr
         ("friction: -1", "joints.hinge.friction", "friction"),
         ("damping: fast", "joints.hinge.damping", "damping"),
         ("stiffness: .nan", "joints.hinge.stiffness", "stiffness"),
-        ("springref: 1.0", "joints.hinge.springref", "a spring without stiffness"),
+        ("springref: 1.0", "joints.hinge.springref", "springref without stiffness"),
     ],
 )
-def test_wrong_numbers_are_refused_where_they_stand(fields: str, field: str, problem: str) -> None:
+def test_invalid_values_raise_with_their_line(fields: str, field: str, problem: str) -> None:
     with pytest.raises(InputError, match=problem) as caught:
         load_text(URDF, f"urdf: thing.urdf\njoints:\n  hinge:\n    {fields}\n{TAIL}")
     assert (caught.value.field, caught.value.line) == (field, 4)
 
 
-def test_unknown_terms_are_refused_with_the_nearest_that_exists() -> None:
+def test_unknown_fields_raise_with_a_suggestion() -> None:
     with pytest.raises(UnknownNameError, match="friction"):
         load_text(URDF, f"urdf: thing.urdf\njoints: {{hinge: {{frictionloss: 1}}}}\n{TAIL}")
 

@@ -68,7 +68,7 @@ def test_wrong_masses_are_refused(value: str) -> None:
 
 
 def test_what_stands_fixed_has_no_payload() -> None:
-    with pytest.raises(InputError, match="what stands fixed is not carried") as caught:
+    with pytest.raises(InputError, match="applies to free objects only") as caught:
         load_text(
             '<robot name="t"><link name="a"/></robot>',
             "urdf: thing.urdf\nmass: 3\nattachments: []\n",

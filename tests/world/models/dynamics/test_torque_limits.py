@@ -40,7 +40,7 @@ def test_without_masses_nothing_is_known(husky: Robot) -> None:
 
 
 @pytest.mark.parametrize("stated", [0.0, np.inf, np.finfo(float).max])
-def test_joints_without_an_effort_are_named(husky: Robot, stated: float) -> None:
+def test_joints_without_effort_limit_are_noted(husky: Robot, stated: float) -> None:
     model = pin.Model(husky.model)
     limits = np.array(model.effortLimit)
     limits[5] = stated
@@ -51,7 +51,7 @@ def test_joints_without_an_effort_are_named(husky: Robot, stated: float) -> None
     assert found.notes == ("the URDF states no effort of elbow_joint",)
 
 
-def test_an_effort_that_does_not_hold_the_arm_itself_is_none(husky: Robot) -> None:
+def test_limits_that_cannot_hold_the_arm_are_discarded(husky: Robot) -> None:
     model, data = pin.Model(husky.model), husky.model.createData()
     outstretched = husky.coordinates.q(np.zeros(9))
     weight = abs(pin.computeGeneralizedGravity(husky.model, data, outstretched)[4])
@@ -62,7 +62,7 @@ def test_an_effort_that_does_not_hold_the_arm_itself_is_none(husky: Robot) -> No
     assert np.isinf(found.limits[4])
     assert len(found.notes) == 1
     assert "shoulder_lift_joint" in found.notes[0]
-    assert "do not carry the arm" in found.notes[0]
+    assert "cannot hold the arm" in found.notes[0]
     limits[4] = 1.2 * weight
     model.effortLimit = limits
     assert of(husky, model).limits[4] == pytest.approx(1.2 * weight)
@@ -86,7 +86,7 @@ def test_a_robot_yaml_overrides_the_urdf(tmp_path: Path, effort: float, limit: f
 
 
 @pytest.mark.parametrize("effort", [-1.0, "strong", float("nan")])
-def test_wrong_efforts_are_refused(tmp_path: Path, effort: object) -> None:
+def test_invalid_effort_limits_raise(tmp_path: Path, effort: object) -> None:
     with pytest.raises(InputError) as caught:
         vkc.load_robot(described(tmp_path, effort))
     assert caught.value.field == "joints.elbow_joint.effort"

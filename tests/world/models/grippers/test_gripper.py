@@ -69,25 +69,25 @@ def test_only_the_fingers_move(robot: Robot) -> None:
     assert moved == {"finger_a", "finger_b"}
 
 
-def test_what_is_asked_for_is_met_as_far_as_the_gripper_goes(robot: Robot) -> None:
+def test_openings_are_clamped_to_the_range(robot: Robot) -> None:
     gripper = robot.gripper
     assert gripper is not None
     assert robot.opening(None) is None
     assert robot.opening(0.05) == 0.05
     assert robot.opening(0.3) == gripper.max_opening
-    with pytest.raises(vkc.InputError, match=r"cannot be so far open.*0 to 0\.0799"):
+    with pytest.raises(vkc.InputError, match=r"out of the gripper.s range.*0 to 0\.0799"):
         robot.opened(0.3)
 
 
-def test_a_robot_without_a_gripper_stays_as_it_is() -> None:
+def test_robots_without_gripper_have_no_opening() -> None:
     robot = vkc.load_robot("husky_ur5e")
     assert robot.opening(0.05) is None
-    with pytest.raises(vkc.InputError, match="does not open"):
+    with pytest.raises(vkc.InputError, match="no gripper that opens"):
         robot.opened(0.05)
 
 
-def test_fingers_that_turn_need_no_formula(tmp_path: Path) -> None:
-    """Inner faces go through the joints' axes, 10 mm from the middle; the bar's near edge is 64 mm before these."""
+def test_openings_of_revolute_fingers(tmp_path: Path) -> None:
+    """Inner faces pass through the joint axes; the near edge of the bar is 64 mm ahead."""
     file = write_gripper(tmp_path, gripper="gripper: {finger_a_joint: {closed: 0.0, open: 0.5}}\n")
     urdf = file.parent / "robot.urdf"
     text = urdf.read_text(encoding="utf-8")
@@ -108,7 +108,7 @@ def test_fingers_that_turn_need_no_formula(tmp_path: Path) -> None:
         np.testing.assert_allclose(gripper.compute_positions(opening), [angle, angle], atol=1e-4)
 
 
-def test_an_arm_that_is_locked_otherwise_wins(tmp_path: Path) -> None:
+def test_locked_joints_override_rest_positions(tmp_path: Path) -> None:
     robot = vkc.load_robot(write_gripper(tmp_path), locked_joints={"finger_a_joint": 0.01})
     gripper = robot.gripper
     assert gripper is not None
@@ -137,11 +137,13 @@ def test_an_arm_that_is_locked_otherwise_wins(tmp_path: Path) -> None:
             "gripper: {finger_b_joint: {closed: 0, open: 0.04}}",
             "'finger_a_joint', which it follows",
         ),
-        ("gripper: {arm_5_joint: {closed: 0, open: 0.04}}", "none of a finger"),
+        ("gripper: {arm_5_joint: {closed: 0, open: 0.04}}", "not a finger joint"),
         ("gripper: open", "gripper"),
     ],
 )
-def test_mistakes_name_file_line_and_field(tmp_path: Path, gripper: str, problem: str) -> None:
+def test_invalid_grippers_raise_with_file_and_line(
+    tmp_path: Path, gripper: str, problem: str
+) -> None:
     file = write_gripper(tmp_path, gripper=gripper + "\n")
     with pytest.raises(vkc.InputError, match=problem) as caught:
         vkc.load_robot(file)

@@ -1,1 +1,1 @@
-"""Joints that follow others, as in a telescope: one coordinate moves all of them."""
+"""Handles mimic joints: several joints that share one coordinate, as in a telescope."""

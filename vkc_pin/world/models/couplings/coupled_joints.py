@@ -1,4 +1,4 @@
-"""Which joints of a robot follow others, by the <mimic> of a URDF or the `couplings` of a robot.yaml, and by how much."""
+"""Finds coupled joints, from <mimic> in a URDF or `couplings` in a robot.yaml."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _MOVING = ("revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class JointCoupling:
-    """How a joint follows another one: its position is factor · (the leader's) + offset, [m] or [rad].
+    """Coupling of a joint to a leader: position = factor · leader position + offset.
 
     Attributes:
-        leader: The joint that leads; it follows none.
-        factor: Not 0, but for a joint that stands still.
-        offset: [m] or [rad].
+        leader: Name of the leader, which follows no other joint.
+        factor: Factor; 0 only for a joint that does not move.
+        offset: Offset [m] or [rad].
     """
 
     leader: str
@@ -42,52 +42,55 @@ class JointCoupling:
 
 
 def find_followers(root: ElementTree.Element) -> dict[str, JointCoupling]:
-    """Return the joints of a URDF that follow another one, and how.
+    """Return the coupling of each joint of a URDF that follows another one.
 
-    A joint that follows one that follows a third follows the third. If a joint hangs on one that
-    follows it, then the first of these, from the root on, leads instead. What a file says of joints
-    that do not turn or slide, of such as do not exist, and of joints that follow each other in a
-    circle, counts for nothing: see `check_followers`.
+    Chains of couplings are resolved to their leader. If a leader is a descendant of one of its
+    followers, the follower nearest to the root becomes the leader. Couplings to joints that do not
+    exist or do not move, and circular ones, are ignored; `check_followers` reports them.
     """
-    said, moving = _read_mimics(root), _find_movable_joints(root)
+    mimics, movable = _read_mimics(root), _find_movable_joints(root)
     found = {
-        joint: led
-        for joint in said
-        if joint in moving and (led := _resolve_coupling(joint, said, moving)) is not None
+        joint: coupling
+        for joint in mimics
+        if joint in movable and (coupling := _resolve_coupling(joint, mimics, movable)) is not None
     }
-    for leader in dict.fromkeys(led.leader for led in found.values()):
-        group = {joint for joint, led in found.items() if led.leader == leader and led.factor}
-        above = [joint for joint in _find_ancestors(root, leader) if joint in group]
-        if above:
-            first, led = above[0], found.pop(above[0])
+    for leader in dict.fromkeys(coupling.leader for coupling in found.values()):
+        group = {
+            joint
+            for joint, coupling in found.items()
+            if coupling.leader == leader and coupling.factor
+        }
+        ancestors = [joint for joint in _find_ancestors(root, leader) if joint in group]
+        if ancestors:
+            first, coupling = ancestors[0], found.pop(ancestors[0])
             found[leader] = JointCoupling(leader, 1.0, 0.0)
             for joint, other in [item for item in found.items() if item[1].leader == leader]:
-                factor = other.factor / led.factor
-                found[joint] = JointCoupling(first, factor, other.offset - factor * led.offset)
+                factor = other.factor / coupling.factor
+                found[joint] = JointCoupling(first, factor, other.offset - factor * coupling.offset)
     return found
 
 
 def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
-    """Check that what joints on the way to the tool follow can move, and is there.
+    """Check that the leaders of all joints on the path to the tool exist and can move.
 
     Raises:
-        InputError: A joint follows one that does not exist, that does not turn or slide, or in a
-            circle.
+        InputError: A joint follows one that does not exist or does not move, or couplings are
+            circular.
     """
-    said, moving, found = (
+    mimics, movable, found = (
         _read_mimics(file.root),
         _find_movable_joints(file.root),
         find_followers(file.root),
     )
-    leaders = {led.leader for led in found.values()}
+    leaders = {coupling.leader for coupling in found.values()}
     for joint in (str(full.names[j]) for j in find_joint_path(full, tool_frame)):
-        if joint in said and joint in moving and joint not in found and joint not in leaders:
-            element, expected = said[joint][3], "a joint that turns or slides"
+        if joint in mimics and joint in movable and joint not in found and joint not in leaders:
+            element, expected = mimics[joint][3], "a revolute, continuous or prismatic joint"
             chain = [joint]
-            while chain[-1] in said and chain[-1] in moving and chain[-1] not in chain[:-1]:
-                chain.append(said[chain[-1]][0])
+            while chain[-1] in mimics and chain[-1] in movable and chain[-1] not in chain[:-1]:
+                chain.append(mimics[chain[-1]][0])
             if chain[-1] in chain[:-1]:
-                problem, got = "joints that follow each other in a circle", " → ".join(chain)
+                problem, got = "couplings are circular", " → ".join(chain)
             else:
                 kind = next(
                     (
@@ -97,7 +100,7 @@ def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
                     ),
                     None,
                 )
-                problem = "a joint on the way to the tool follows one that cannot lead"
+                problem = "this joint on the path to the tool follows one that cannot move"
                 got = (
                     f"'{chain[-1]}', which does not exist"
                     if kind is None
@@ -116,62 +119,67 @@ def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
 def find_coupled_groups(
     full: pin.Model, file: UrdfFile, tool_frame: str
 ) -> dict[str, dict[str, JointCoupling]]:
-    """Return leader → the joints that follow it, wherever they are, of joints of which one is on the way to the tool."""
+    """Return leader → its followers, for all groups with a joint on the path to the tool."""
     follows, path = (
         find_followers(file.root),
         {str(full.names[j]) for j in find_joint_path(full, tool_frame)},
     )
     groups: dict[str, dict[str, JointCoupling]] = {}
-    for joint, led in follows.items():
-        if led.factor:
-            groups.setdefault(led.leader, {})[joint] = led
+    for joint, coupling in follows.items():
+        if coupling.factor:
+            groups.setdefault(coupling.leader, {})[joint] = coupling
     return {leader: group for leader, group in groups.items() if path & {leader, *group}}
 
 
 def apply_couplings(
     file: UrdfFile, couplings: Mapping[str, CouplingSchema], document: Document
 ) -> None:
-    """Write the couplings of a robot.yaml into a URDF that was read, as <mimic>, in place of those that it has.
+    """Replace <mimic> elements of a URDF by the couplings of a robot.yaml.
+
+    Args:
+        file: The URDF, changed in place.
+        couplings: Follower → coupling.
+        document: The robot.yaml, for error messages.
 
     Raises:
-        UnknownNameError: There is no such joint.
-        InputError: Joints follow each other in a circle.
+        UnknownNameError: A joint does not exist.
+        InputError: Couplings are circular.
     """
-    moving = _find_movable_joints(file.root)
+    movable = _find_movable_joints(file.root)
     for joint, coupling in couplings.items():
         for name in (joint, coupling.joint):
-            if name not in moving:
+            if name not in movable:
                 raise document.unknown(
-                    ("couplings", joint), "joint that turns or slides", name, moving
+                    ("couplings", joint), "joint that turns or slides", name, movable
                 )
-        for mimic in moving[joint].findall("mimic"):
-            moving[joint].remove(mimic)
+        for mimic in movable[joint].findall("mimic"):
+            movable[joint].remove(mimic)
         multiplier, offset = repr(coupling.multiplier), repr(coupling.offset)
         ElementTree.SubElement(
-            moving[joint], "mimic", joint=coupling.joint, multiplier=multiplier, offset=offset
+            movable[joint], "mimic", joint=coupling.joint, multiplier=multiplier, offset=offset
         )
-    said = _read_mimics(file.root)
+    mimics = _read_mimics(file.root)
     for joint, coupling in couplings.items():
-        if _resolve_coupling(joint, said, moving, anyone=True) is None:
-            problem, expected = "joints that follow each other in a circle", "one joint that leads"
+        if _resolve_coupling(joint, mimics, movable, any_leader=True) is None:
+            problem, expected = "couplings are circular", "a leader that follows no joint"
             raise document.error(
                 ("couplings", joint), problem, expected=expected, got=coupling.joint
             )
 
 
 def find_joint_path(full: pin.Model, frame: str) -> list[int]:
-    """Return the joints from the world to a frame of a robot."""
+    """Return the indices of the joints from the world to a frame of a robot."""
     named = [other for other in full.frames if other.name == frame]
     link = next(
         (other for other in named if other.type == pin.FrameType.BODY), named[0]
-    )  # a link before a joint
+    )  # prefer a link over a joint of the same name
     return list(full.supports[link.parentJoint])
 
 
 def _read_mimics(
     root: ElementTree.Element,
 ) -> dict[str, tuple[str, float, float, ElementTree.Element]]:
-    """Return joint → (the joint it follows, factor, offset, where it says so)."""
+    """Return joint → (leader, factor, offset, <mimic> element)."""
     found = {}
     for joint in root.findall("joint"):
         mimic = joint.find("mimic")
@@ -191,24 +199,27 @@ def _find_movable_joints(root: ElementTree.Element) -> dict[str, ElementTree.Ele
 
 def _resolve_coupling(
     joint: str,
-    said: Mapping[str, tuple[str, float, float, ElementTree.Element]],
-    moving: Mapping[str, ElementTree.Element],
+    mimics: Mapping[str, tuple[str, float, float, ElementTree.Element]],
+    movable: Mapping[str, ElementTree.Element],
     *,
-    anyone: bool = False,
+    any_leader: bool = False,
 ) -> JointCoupling | None:
-    """Return how a joint follows the one at the end of its chain, `anyone` or one that can lead; None: there is none."""
-    leader, factor, offset, passed = joint, 1.0, 0.0, set[str]()
-    while leader in said and leader in moving:
-        if leader in passed:
+    """Return the coupling of a joint to the end of its chain, or None if the chain is circular.
+
+    Also None if the end of the chain cannot move, unless `any_leader` is set.
+    """
+    leader, factor, offset, visited = joint, 1.0, 0.0, set[str]()
+    while leader in mimics and leader in movable:
+        if leader in visited:
             return None
-        passed.add(leader)
-        above, multiplier, shift, _ = said[leader]
-        leader, factor, offset = above, factor * multiplier, offset + factor * shift
-    return JointCoupling(leader, factor, offset) if anyone or leader in moving else None
+        visited.add(leader)
+        next_leader, multiplier, added_offset, _ = mimics[leader]
+        leader, factor, offset = next_leader, factor * multiplier, offset + factor * added_offset
+    return JointCoupling(leader, factor, offset) if any_leader or leader in movable else None
 
 
 def _find_ancestors(root: ElementTree.Element, joint: str) -> list[str]:
-    """Return the joints that a joint hangs on, from the root on."""
+    """Return the ancestors of a joint, from the root on."""
     ends = {
         key: {
             other.get("name", ""): end.get("link", "")
@@ -219,6 +230,6 @@ def _find_ancestors(root: ElementTree.Element, joint: str) -> list[str]:
     }
     carries = {link: name for name, link in ends["child"].items()}
     found: list[str] = []
-    while (above := carries.get(ends["parent"][found[0] if found else joint])) is not None:
-        found.insert(0, above)
+    while (parent := carries.get(ends["parent"][found[0] if found else joint])) is not None:
+        found.insert(0, parent)
     return found

@@ -1,4 +1,4 @@
-"""Limits of a robot's coordinates: of joints that move together, the shortest way and the slowest joint."""
+"""Computes limits of a robot's coordinates; coupled joints share the tightest limits."""
 
 from __future__ import annotations
 
@@ -19,24 +19,23 @@ from vkc_pin.world.models.shapes import LIMIT_SLACK
 __all__ = ["DEFAULT_JOINT_VELOCITY", "apply_robot_limits", "tighten_coupled_limits"]
 
 DEFAULT_JOINT_VELOCITY = np.pi
-"""Of joints for which no file names one [rad/s] or [m/s]."""
-_DEFAULT_JOINT_ACCELERATION = 1.4  # the same [rad/s²] or [m/s²]
+"""Velocity limit of joints for which no file states one [rad/s] or [m/s]."""
+_DEFAULT_JOINT_ACCELERATION = 1.4  # [rad/s²] or [m/s²]
 
 
 def tighten_coupled_limits(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Model:
-    """Return a robot whose joints that lead others on the way to the tool can go as far as these can follow.
+    """Return a model in which the limits of leaders respect the limits of their followers.
 
-    Such joints turn within limits, which may be infinite: a turn is not nothing to those that
-    follow.
+    Only groups with a joint on the path to the tool are considered. Continuous joints among them
+    become revolute ones with infinite limits, since a full turn changes the followers' positions.
 
     Args:
-        full: The robot with all its joints.
-        file: Its file.
-        tool_frame: A frame of it.
+        full: The robot with all joints.
+        file: Its URDF.
+        tool_frame: Name of the tool frame.
 
     Raises:
-        InputError: What a joint on the way to the tool follows cannot move, or is not there; or
-            limits leave nothing.
+        InputError: A leader does not exist or cannot move, or no position satisfies all limits.
     """
     check_followers(full, file, tool_frame)
     groups = find_coupled_groups(full, file, tool_frame)
@@ -47,20 +46,22 @@ def tighten_coupled_limits(full: pin.Model, file: UrdfFile, tool_frame: str) -> 
     )
     lower, upper = model.lowerPositionLimit, model.upperPositionLimit
     for leader, group in groups.items():
-        at = model.joints[model.getJointId(leader)].idx_q
-        for joint, led in group.items():
+        index = model.joints[model.getJointId(leader)].idx_q
+        for joint, coupling in group.items():
             i = model.joints[model.getJointId(joint)].idx_q
-            low, high = sorted((bound - led.offset) / led.factor for bound in (lower[i], upper[i]))
-            if max(low, lower[at]) > min(high, upper[at]) + LIMIT_SLACK:
+            low, high = sorted(
+                (bound - coupling.offset) / coupling.factor for bound in (lower[i], upper[i])
+            )
+            if max(low, lower[index]) > min(high, upper[index]) + LIMIT_SLACK:
                 problem, expected = (
-                    f"'{joint}', which follows it, has nowhere to go",
-                    f"limits that meet {low:g} to {high:g}",
+                    f"no position satisfies the limits of its follower '{joint}'",
+                    f"limits that overlap {low:g} to {high:g}",
                 )
-                got = f"{lower[at]:g} to {upper[at]:g}"
+                got = f"{lower[index]:g} to {upper[index]:g}"
                 raise InputError(problem, file=file.path, field=leader, expected=expected, got=got)
-            lower[at], upper[at] = (
-                max(low, lower[at]),
-                max(min(high, upper[at]), max(low, lower[at])),
+            lower[index], upper[index] = (
+                max(low, lower[index]),
+                max(min(high, upper[index]), max(low, lower[index])),
             )
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     return model
@@ -69,13 +70,17 @@ def tighten_coupled_limits(full: pin.Model, file: UrdfFile, tool_frame: str) -> 
 def apply_robot_limits(
     full: pin.Model, model: pin.Model, settings: RobotSchema, base: str
 ) -> tuple[Coordinates, Floats, Floats, Floats, Floats]:
-    """Write the limits into a robot's model; return its coordinates, and lower, upper, velocity, acceleration, shape (n,) each.
+    """Write the limits of a robot.yaml into a model, and return them.
 
     Args:
-        full: The robot with all its joints, see `tighten_coupled_limits`.
-        model: Those of them that are planned; changed in place.
-        settings: Its robot.yaml.
-        base: How it moves.
+        full: The robot with all joints, see `tighten_coupled_limits`.
+        model: The planned joints; changed in place.
+        settings: The robot.yaml.
+        base: Type of the base.
+
+    Returns:
+        Coordinates, lower and upper position limits, velocity and acceleration limits, shape (n,)
+        each.
     """
     low, high = (
         np.array(settings.base.position).T if base != "fixed" else (np.zeros(2), np.zeros(2))
@@ -86,24 +91,26 @@ def apply_robot_limits(
     velocity, acceleration = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
     velocity[:3], acceleration[:3] = settings.base.velocity, settings.base.acceleration
     coordinates = Coordinates(model)
-    unsaid = coordinates.compute_max_steps(
+    unit_rates = coordinates.compute_max_steps(
         1.0, 1.0
-    )  # at which rate of a coordinate its fastest joint has one of 1
+    )  # at which the fastest joint moves at 1 m/s or 1 rad/s
     for move in coordinates.moves[3:]:
-        name, k, share = model.names[move.joint], move.coordinate, abs(move.factor)
-        named, own = (
+        name, k, factor = model.names[move.joint], move.coordinate, abs(move.factor)
+        joint_settings, urdf_velocity = (
             settings.joints.get(name),
             float(full.velocityLimit[full.joints[full.getJointId(name)].idx_v]),
         )
-        if named is not None and named.velocity is not None:
-            velocity[k] = min(velocity[k], named.velocity / share)
-        elif 0.0 < own < 1e3:  # Pinocchio's value for a joint without limit is the largest number
-            velocity[k] = min(velocity[k], own / share)
-        if named is not None and named.acceleration is not None:
-            acceleration[k] = min(acceleration[k], named.acceleration / share)
-    velocity = np.where(np.isinf(velocity), DEFAULT_JOINT_VELOCITY * unsaid, velocity)
+        if joint_settings is not None and joint_settings.velocity is not None:
+            velocity[k] = min(velocity[k], joint_settings.velocity / factor)
+        elif (
+            0.0 < urdf_velocity < 1e3
+        ):  # Pinocchio stores the largest float for joints without a limit
+            velocity[k] = min(velocity[k], urdf_velocity / factor)
+        if joint_settings is not None and joint_settings.acceleration is not None:
+            acceleration[k] = min(acceleration[k], joint_settings.acceleration / factor)
+    velocity = np.where(np.isinf(velocity), DEFAULT_JOINT_VELOCITY * unit_rates, velocity)
     acceleration = np.where(
-        np.isinf(acceleration), _DEFAULT_JOINT_ACCELERATION * unsaid, acceleration
+        np.isinf(acceleration), _DEFAULT_JOINT_ACCELERATION * unit_rates, acceleration
     )
     model.velocityLimit, model.effortLimit = (
         velocity,
@@ -118,17 +125,17 @@ def apply_robot_limits(
 def _read_torque_limits(
     model: pin.Model, coordinates: Coordinates, settings: RobotSchema
 ) -> Floats:
-    """Return the efforts of the motors, shape (n,): of joints that move together the leading one has it."""
+    """Return the effort limits, shape (n,) [N·m], [N]; coupled joints have that of their leader."""
     effort = model.effortLimit
     for k, joint in enumerate(coordinates.joints):
-        named = settings.joints.get(model.names[joint])
-        if named is not None and named.effort is not None:
-            effort[k] = named.effort
+        joint_settings = settings.joints.get(model.names[joint])
+        if joint_settings is not None and joint_settings.effort is not None:
+            effort[k] = joint_settings.effort
     return np.asarray(effort)
 
 
 def _bound_continuous_joints(full: pin.Model, joints: Set[str]) -> pin.Model:
-    """Return a copy of a model in which those of some joints that turn without end do so between infinite limits."""
+    """Return a copy of a model in which some continuous joints are revolute, without limits."""
     model, data = pin.Model(), full.createData()
     model.name = full.name
     pin.forwardKinematics(full, data, pin.neutral(full))

@@ -1,4 +1,4 @@
-"""Makes joints of a Pinocchio model follow others: they have no coordinate then, and all algorithms know it."""
+"""Turns joints of a Pinocchio model into mimic joints, which have no coordinate of their own."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ __all__ = ["add_mimics", "sort_joints"]
 def add_mimics(
     model: pin.Model, couplings: Sequence[JointCoupling], joints: Sequence[int]
 ) -> pin.Model:
-    """Return a model in which some joints follow others.
+    """Return a model in which some joints are mimic joints.
 
     Args:
-        model: A model of which they are joints like others.
-        couplings: How they follow.
-        joints: Their numbers, larger than those of the joints that they follow.
+        model: A model in which they are ordinary joints.
+        couplings: Coupling of each mimic joint.
+        joints: Indices of the mimic joints, larger than those of their leaders.
     """
-    for led, joint in zip(couplings, joints, strict=True):
+    for coupling, joint in zip(couplings, joints, strict=True):
         model = pin.transformJointIntoMimic(
-            model, model.getJointId(led.leader), joint, led.factor, led.offset
+            model, model.getJointId(coupling.leader), joint, coupling.factor, coupling.offset
         )
     return model
 
 
 def sort_joints(full: pin.Model, before: Mapping[int, Collection[int]]) -> list[int]:
-    """Return the joints of a model in their order, but for those that have to wait for others.
+    """Return the joint indices of a model in topological order, otherwise unchanged.
 
     Args:
-        full: The model; its universe is left out.
-        before: Joint → joints that come before it, such as the one that it follows.
+        full: The model; its universe is omitted.
+        before: Joint → joints that must come before it, such as its leader.
 
     Raises:
-        InputError: Leaders hang on joints that follow others, and these on theirs, in a circle.
+        InputError: The order is circular: leaders are descendants of each other's followers.
     """
     order, waiting = list[int](), list(range(1, full.njoints))
     while waiting:
@@ -52,9 +52,9 @@ def sort_joints(full: pin.Model, before: Mapping[int, Collection[int]]) -> list[
         if len(later) == len(waiting):
             names = ", ".join(str(full.names[j]) for j in later if j in before)
             raise InputError(
-                "joints hang on each other's followers",
+                "leaders are descendants of each other's followers",
                 field=names,
-                expected="leaders nearer to the base",
+                expected="leaders nearer to the base than their followers",
             )
         waiting = later
     return order

@@ -1,1 +1,1 @@
-"""What it takes to move objects: their weight, and friction, damping and springs of their joints."""
+"""Describes dynamics: masses, joint friction, damping and springs, and torque limits."""

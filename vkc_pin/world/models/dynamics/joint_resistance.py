@@ -1,4 +1,4 @@
-"""What the joints of objects resist with: friction, damping, and springs such as those of door closers."""
+"""Reads joint friction, damping and springs of articulated objects."""
 
 from __future__ import annotations
 
@@ -20,15 +20,14 @@ __all__ = ["ObjectJointSchema", "Resistance", "read_resistances"]
 
 @dataclass(frozen=True, kw_only=True)
 class Resistance:
-    """What a joint of an object resists with, in the terms of URDF and MuJoCo; nothing, where nobody says anything.
+    """Passive forces of an object's joint, with the parameters of URDF and MuJoCo.
 
     Attributes:
-        friction: Coulomb's, against any motion, however slow [N·m] or [N]; URDF's `friction`,
-            MuJoCo's `frictionloss`.
-        damping: Against the velocity [N·m·s/rad] or [N·s/m].
-        stiffness: Of a spring that pulls the joint to `springref` [N·m/rad] or [N/m].
-        springref: Where the spring is relaxed [rad] or [m]; far outside the joint's limits for one
-            that is wound up.
+        friction: Coulomb friction [N·m] or [N]; `friction` in URDF, `frictionloss` in MuJoCo.
+        damping: Viscous damping coefficient [N·m·s/rad] or [N·s/m].
+        stiffness: Stiffness of a spring that pulls the joint to `springref` [N·m/rad] or [N/m].
+        springref: Rest position of the spring [rad] or [m]; outside the joint's limits if the
+            spring is preloaded.
     """
 
     friction: float = 0.0
@@ -37,13 +36,13 @@ class Resistance:
     springref: float = 0.0
 
     def force(self, position: Any, velocity: Any) -> Any:
-        """Return what must be applied to the joint beyond its inertia and weight, [N·m] or [N]; friction is 0 at rest.
+        """Return the force or torque that overcomes the resistance [N], [N·m]; no friction at rest.
 
         stiffness · (position − springref) + damping · velocity + friction · sign(velocity)
 
         Args:
-            position: [rad] or [m], a number or an array.
-            velocity: [rad/s] or [m/s], of the same shape.
+            position: Joint position, a number or an array [rad] or [m].
+            velocity: Joint velocity, of the same shape [rad/s] or [m/s].
         """
         return (
             self.stiffness * (position - self.springref)
@@ -53,7 +52,7 @@ class Resistance:
 
 
 class ObjectJointSchema(JointSchema):
-    """What a URDF cannot say about a joint of an object, and what it resists with; see `Resistance`."""
+    """Properties of an object's joint that a URDF lacks, and its resistance; see `Resistance`."""
 
     friction: NotNegative | None = None
     damping: NotNegative | None = None
@@ -68,21 +67,24 @@ def read_resistances(
     text: str | None,
     names: Sequence[str],
 ) -> dict[str, Resistance]:
-    """Return what each joint of an object resists with: as its description says, else as its URDF's `<dynamics>` does, else 0.
+    """Return the resistance of each movable joint of an object.
+
+    Values of the description take precedence over those of `<dynamics>` in the URDF. The default
+    is 0.
 
     Args:
         document: The description.
-        joints: What it says about joints, which exist.
-        urdf: The URDF, which was read before.
-        text: What it says, where that stands elsewhere.
-        names: Of the joints that move.
+        joints: Settings of the joints in the description; the joints exist.
+        urdf: Path of the URDF.
+        text: Text of the URDF, if it is part of the description.
+        names: Names of the movable joints.
 
     Raises:
-        InputError: A number of the URDF is none, or negative, or a spring has a place but no
-            stiffness.
+        InputError: A value in the URDF is not a number or negative, or a joint has `springref`
+            without `stiffness`.
     """
     _, root = read_xml(urdf, "URDF", text)
-    found = dict[str, Resistance]()
+    resistance = dict[str, Resistance]()
     for joint in root.findall("joint"):
         name, stated = joint.get("name", ""), dict[str, float]()
         if name not in names:
@@ -92,7 +94,7 @@ def read_resistances(
                 (stated[key],) = numbers_of(urdf, dynamics, key, 1, default="0", where=name)
                 if stated[key] < 0.0:
                     problem, field, line = (
-                        "a joint cannot drive itself",
+                        "friction and damping must not be negative",
                         f"{name}: dynamics {key}",
                         line_of(dynamics),
                     )
@@ -106,12 +108,12 @@ def read_resistances(
                     )
         given = joints.get(name, ObjectJointSchema())
         if given.springref is not None and given.stiffness is None:
-            problem, expected = "a spring without stiffness", "stiffness beside it"
+            problem, expected = "springref without stiffness", "stiffness as well"
             raise document.error(
                 ("joints", name, "springref"), problem, expected=expected, got=given.springref
             )
-        own = given.model_dump(
+        described = given.model_dump(
             include={"friction", "damping", "stiffness", "springref"}, exclude_none=True
         )
-        found[name] = Resistance(**{**stated, **own})
-    return found
+        resistance[name] = Resistance(**{**stated, **described})
+    return resistance

@@ -1,4 +1,4 @@
-"""What objects weigh, where their description says so, and solids of one density."""
+"""Sets the masses of objects and computes inertias of solids of uniform density."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ __all__ = ["compute_mass", "compute_solid_inertia", "set_mass"]
 
 
 def compute_mass(model: pin.Model) -> float:
-    """Return what all links of a model weigh together [kg]."""
+    """Return the total mass of all links of a model [kg]."""
     return float(sum(inertia.mass for inertia in model.inertias))
 
 
 def set_mass(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
-    """Let all links of a model weigh so much together, in the shares and with the shapes that they had.
+    """Scale the inertias of a model to a given total mass.
 
-    Where they weighed nothing, collision shapes are solids of one density; without these, all is at
-    the origin of the base link.
+    If the model has no mass, its collision shapes are assumed to be solids of uniform density.
+    Without collision shapes, all mass is placed at the origin of the base link.
 
     Args:
         model: Changed in place.
-        collision: Its shapes.
-        mass: [kg], 0 or more.
+        collision: Collision shapes of the model.
+        mass: Total mass, 0 or more [kg].
     """
     if not compute_mass(model) > 0.0:
         for shape in collision.geometryObjects:
@@ -40,7 +40,7 @@ def set_mass(model: pin.Model, collision: pin.GeometryModel, mass: float) -> Non
 
 
 def compute_solid_inertia(shape: pin.GeometryObject, density: float = 1.0) -> pin.Inertia:
-    """Return the inertia of a convex shape in its own frame, all of one density [kg/m³]."""
+    """Return the inertia of a convex shape of uniform `density` [kg/m³], in its own frame."""
     solid = compute_hull(triangulate(shape.geometry)[0])
     solid.density = density
     return pin.Inertia(

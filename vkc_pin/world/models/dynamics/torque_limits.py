@@ -1,4 +1,4 @@
-"""The torques that a robot's motors have, as far as its description can be relied upon."""
+"""Determines the torque limits of a robot's joints and discards implausible ones."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from vkc_pin.world.models.coordinates import Coordinates
 __all__ = ["UNLIMITED", "TorqueLimits", "compute_torque_limits"]
 
 UNLIMITED = 1e300
-"""Pinocchio's efforts above this are none."""
-_SAMPLES = 200  # random ones in which a motor has to hold its own arm
+"""Effort limits of Pinocchio above this mean that there is no limit."""
+_SAMPLES = 200  # random configurations in which a motor must hold the arm
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueLimits:
-    """What the motors of a robot have.
+    """Torque and force limits of a robot's joints.
 
     Attributes:
-        limits: Of torque or force of each coordinate, shape (n,) [N·m], [N]; infinite for the base,
-            and where nothing is known.
-        notes: Why nothing is known of some, one line each.
+        limits: Limit of each coordinate, shape (n,) [N·m], [N]; infinite for the base and where the
+            limit is unknown.
+        notes: Reasons why limits are unknown, one line each.
     """
 
     limits: Floats
@@ -32,24 +32,24 @@ class TorqueLimits:
 
     @property
     def is_known(self) -> bool:
-        """Whether any is known."""
+        """Whether any limit is known."""
         return bool(np.isfinite(self.limits).any())
 
 
 def compute_torque_limits(
     model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Floats
 ) -> TorqueLimits:
-    """Return what the motors of a robot have.
+    """Return the torque limits of a robot.
 
-    Nothing is known without masses, or where no effort is stated. Where the stated effort does not
-    hold the arm itself in all postures, with an empty hand and at rest, it is not what the motor
-    has: a placeholder, or a spring is left out.
+    Limits are unknown if the URDF has no masses or no effort limit. They are also discarded if they
+    cannot hold the arm at rest with an empty hand in all sampled configurations: such values are
+    placeholders, or the model lacks a counterbalancing spring.
 
     Args:
         model: The robot; joint 1 is the base.
-        coordinates: Its coordinates, the first three of which are the base's.
-        lower: Least positions, shape (n,) [m], [rad].
-        upper: Largest positions, shape (n,).
+        coordinates: Coordinates of the robot; the first three are the base's.
+        lower: Lower position limits, shape (n,) [m], [rad].
+        upper: Upper position limits, shape (n,) [m], [rad].
     """
     limits = np.asarray(model.effortLimit, float)[: coordinates.size].copy()
     limits[:3] = np.inf
@@ -58,18 +58,19 @@ def compute_torque_limits(
     stated = (limits > 0.0) & (limits < UNLIMITED)
     limits[~stated] = np.inf
     names, notes = np.array(coordinates.names), list[str]()
-    if len(silent := names[3:][~stated[3:]]):
-        notes.append(f"the URDF states no effort of {', '.join(silent)}")
-    rng, data, weight = np.random.default_rng(0), model.createData(), np.zeros_like(limits)
+    if len(unstated := names[3:][~stated[3:]]):
+        notes.append(f"the URDF states no effort of {', '.join(unstated)}")
+    rng, data, gravity = np.random.default_rng(0), model.createData(), np.zeros_like(limits)
     low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
     for z in rng.uniform(low, np.maximum(low, high), (_SAMPLES, len(low))):
-        weight = np.maximum(
-            weight, np.abs(pin.computeGeneralizedGravity(model, data, coordinates.q(z)))
+        gravity = np.maximum(
+            gravity, np.abs(pin.computeGeneralizedGravity(model, data, coordinates.q(z)))
         )
-    for k in np.flatnonzero((weight > limits) & stated):
+    for k in np.flatnonzero((gravity > limits) & stated):
         unit = {"m": "N", "rad": "N·m"}[coordinates.units[k]]
         notes.append(
-            f"{names[k]}: {limits[k]:g} {unit} do not carry the arm, which weighs up to {weight[k]:.3g} {unit} there"
+            f"{names[k]}: the effort limit of {limits[k]:g} {unit} cannot hold the arm, "
+            f"which needs up to {gravity[k]:.3g} {unit}"
         )
         limits[k] = np.inf
     return TorqueLimits(limits, tuple(notes))

@@ -1,1 +1,1 @@
-"""Hands: their fingers, how these open and close, and how much fits between them."""
+"""Models grippers: finger joints and the opening between the fingers."""

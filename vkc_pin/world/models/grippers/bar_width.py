@@ -1,4 +1,4 @@
-"""How wide a bar fits between the fingers of a hand: the measure of how far it is open."""
+"""Measures the opening of a gripper as the width of a bar that fits between its fingers."""
 
 from __future__ import annotations
 
@@ -11,17 +11,22 @@ import pinocchio as pin
 __all__ = ["BAR_THICKNESS", "WIDTH_TOLERANCE", "PlacedShape", "check_bar_fits", "find_widest_bar"]
 
 BAR_THICKNESS = 2e-3
-"""How thick the bar is, across the direction that is measured [m]."""
+"""Thickness of the bar across the measured direction [m]."""
 WIDTH_TOLERANCE = 1e-4
-"""How exactly the widest bar is known [m]."""
-_MAX_WIDTH = 0.5  # [m]: no hand opens wider
+"""Accuracy of the width of the widest bar [m]."""
+_MAX_WIDTH = 0.5  # [m]: larger than any opening
 
 PlacedShape = tuple[coal.CollisionGeometry, pin.SE3]
-"""A shape, and where it is."""
+"""A shape and its placement."""
 
 
 def check_bar_fits(width: float, shapes: Sequence[PlacedShape]) -> bool:
-    """Return whether a bar at the tool's origin, so wide along its x axis [m], hits none of some shapes in the tool frame."""
+    """Return whether a bar at the tool's origin collides with none of the shapes.
+
+    Args:
+        width: Width of the bar along the tool's x axis [m].
+        shapes: Shapes with their placements in the tool frame.
+    """
     bar, where = (
         coal.Box(width, BAR_THICKNESS, BAR_THICKNESS),
         coal.Transform3s(np.eye(3), np.zeros(3)),
@@ -42,7 +47,7 @@ def check_bar_fits(width: float, shapes: Sequence[PlacedShape]) -> bool:
 
 
 def find_widest_bar(shapes: Sequence[PlacedShape]) -> float:
-    """Return how wide a bar at the tool's origin may be [m], 0 if none fits: all narrower ones fit."""
+    """Return the width of the widest bar that fits at the tool's origin [m]; 0 if none does."""
     low, high = 0.0, _MAX_WIDTH
     while high - low > WIDTH_TOLERANCE:
         middle = (low + high) / 2.0

@@ -1,8 +1,8 @@
-"""Grippers: the joints of the fingers, and where these stand when they are so far open.
+"""Models grippers: maps the opening between the fingers to the positions of their joints.
 
-A hand is as far open as the widest bar is that fits between its fingers, see `bars`. All joints go
-from where they are closed to where they are open by the same fraction of their ways, as with one
-motor; joints that mimic others follow them.
+The opening is the width of the widest bar that fits between the fingers, see `bar_width`. All
+finger joints move from closed to open by the same fraction of their range, as with one motor;
+mimic joints follow.
 """
 
 from __future__ import annotations
@@ -33,21 +33,20 @@ from vkc_pin.world.models.shapes import LIMIT_SLACK
 
 __all__ = ["Gripper", "build_gripper"]
 
-_BISECTION_STEPS = 30  # of the way between closed and open: 1e-9 of it
+_BISECTION_STEPS = 30  # bisection of the range between closed and open, to 1e-9 of it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Gripper:
-    """The fingers of a robot's hand.
+    """Fingers of a robot's gripper.
 
     Attributes:
-        model: The robot's model with the joints of the fingers, k of them, which come last, instead
-            of locked ones.
-        names: Of these joints; those that mimic others are among them.
-        closed, open: Where they are when the gripper is closed and fully open, shape (k,), [m] or
+        model: The robot's model with the k finger joints unlocked, which come last.
+        names: Names of the finger joints, including mimic joints.
+        closed, open: Joint positions with the gripper closed and fully open, shape (k,), [m] or
             [rad].
-        rest: Where they are if nobody asks for an opening, shape (k,).
-        tool_frame: The robot's.
+        rest: Default joint positions, shape (k,), [m] or [rad].
+        tool_frame: The robot's tool frame.
         collision: The robot's collision shapes on `model`.
     """
 
@@ -62,28 +61,31 @@ class Gripper:
 
     @cached_property
     def min_opening(self) -> float:
-        """Its opening when it is closed [m]."""
+        """Opening with the gripper closed [m]."""
         return find_widest_bar(self._place_hand(self.closed))
 
     @cached_property
     def max_opening(self) -> float:
-        """Its opening when it is fully open [m]."""
+        """Opening with the gripper fully open [m]."""
         return find_widest_bar(self._place_hand(self.open))
 
     @cached_property
     def rest_opening(self) -> float:
-        """Its opening if nobody asks for one [m]."""
+        """Opening at the default joint positions [m]."""
         return find_widest_bar(self._place_hand(self.rest))
 
     def clamp_opening(self, opening: float) -> float:
-        """Return the opening that it can stand at and is nearest to one that is asked for [m]."""
+        """Return the feasible opening nearest to `opening` [m]."""
         return min(max(opening, self.min_opening), self.max_opening)
 
     def compute_positions(self, opening: float | None) -> Floats:
-        """Return where the joints of its fingers are, shape (k,), [m] or [rad], when it is so far open [m]; None: at rest.
+        """Return the positions of the finger joints, shape (k,), [m] or [rad].
+
+        Args:
+            opening: Opening [m]. Default: the rest positions.
 
         Raises:
-            InputError: It cannot be so far open, or that is no number.
+            InputError: The opening is out of range or not a number.
         """
         if opening is None:
             return self.rest
@@ -91,7 +93,7 @@ class Gripper:
         if not self.min_opening - WIDTH_TOLERANCE <= opening <= self.max_opening + WIDTH_TOLERANCE:
             expected = f"{self.min_opening:.4g} to {self.max_opening:.4g} m"
             raise InputError(
-                "the gripper cannot be so far open",
+                "the opening is out of the gripper's range",
                 field="opening",
                 expected=expected,
                 got=f"{opening:g} m",
@@ -102,7 +104,10 @@ class Gripper:
         return np.asarray((1.0 - fraction) * self.closed + fraction * self.open)
 
     def compute_frames(self, opening: float | None) -> dict[str, pin.SE3]:
-        """Return where the frames on its fingers are when it is so far open [m], by name, in the frame of the robot's joint."""
+        """Return the placements of the finger frames at an opening [m], by name.
+
+        Placements are in the frame of the robot's joint that carries the finger.
+        """
         data, first = self._compute_data(self.compute_positions(opening)), self._first_finger_joint
         found = {}
         for frame in self.model.frames:
@@ -115,37 +120,37 @@ class Gripper:
     def attach_shapes(
         self, shapes: Sequence[pin.GeometryObject], model: pin.Model
     ) -> list[pin.GeometryObject]:
-        """Return shapes on the joints of `model`, the robot's, as shapes on those of this gripper's model."""
+        """Return copies of shapes on the robot's `model`, attached to the gripper's model."""
         return _attach_shapes(shapes, model, self.model)
 
     @property
     def _first_finger_joint(self) -> int:
-        """The first joint of the fingers."""
+        """Index of the first finger joint."""
         return int(self.model.njoints - len(self.names))
 
     def _compute_data(self, fingers: Floats) -> pin.Data:
-        """Return where all is with the fingers at some positions, and all other joints at zero."""
+        """Return kinematics data with given finger positions, and all other joints at zero."""
         data, coordinates = self.model.createData(), Coordinates(self.model)
         z = np.append(np.zeros(coordinates.size - len(fingers)), fingers)
         pin.framesForwardKinematics(self.model, data, coordinates.q(z))
         return data
 
     def _place_hand(self, fingers: Floats) -> list[PlacedShape]:
-        """Return the shapes of fingers and palm in the tool frame, with the fingers at some positions."""
+        """Return the shapes of fingers and palm in the tool frame, with given finger positions."""
         data, frame = self._compute_data(fingers), self.model.getFrameId(self.tool_frame)
-        back, palm = data.oMf[frame].inverse(), self.model.frames[frame].parentJoint
+        tool_inverse, palm = data.oMf[frame].inverse(), self.model.frames[frame].parentJoint
         shapes = [
             shape
             for shape in self.collision.geometryObjects
             if shape.parentJoint == palm or shape.parentJoint >= self._first_finger_joint
         ]
         return [
-            (shape.geometry, back * data.oMi[shape.parentJoint] * shape.placement)
+            (shape.geometry, tool_inverse * data.oMi[shape.parentJoint] * shape.placement)
             for shape in shapes
         ]
 
     def _find_open_fraction(self, opening: float) -> float:
-        """Return the least fraction of the way from closed to open at which a bar so wide fits."""
+        """Return the smallest fraction of the range from closed to open at which a bar fits."""
         low, high = 0.0, 1.0
         if opening <= self.min_opening or check_bar_fits(opening, self._place_hand(self.closed)):
             return low
@@ -161,16 +166,19 @@ class Gripper:
 def _attach_shapes(
     shapes: Sequence[pin.GeometryObject], model: pin.Model, unlocked: pin.Model
 ) -> list[pin.GeometryObject]:
-    """Return shapes on the joints of `model` as shapes on those of `unlocked`, which begins with the same joints."""
+    """Return copies of shapes on `model`, attached to `unlocked`.
+
+    The first joints of `unlocked` are those of `model`.
+    """
     found = []
     for shape in shapes:
-        twin, old = pin.GeometryObject(shape), model.frames[shape.parentFrame]
-        twin.parentFrame = unlocked.getFrameId(old.name, pin.FrameType.BODY)
-        new = unlocked.frames[twin.parentFrame]
+        copy, old = pin.GeometryObject(shape), model.frames[shape.parentFrame]
+        copy.parentFrame = unlocked.getFrameId(old.name, pin.FrameType.BODY)
+        new = unlocked.frames[copy.parentFrame]
         if new.parentJoint >= model.njoints:
-            twin.placement = new.placement * old.placement.actInv(shape.placement)
-        twin.parentJoint = new.parentJoint
-        found.append(twin)
+            copy.placement = new.placement * old.placement.actInv(shape.placement)
+        copy.parentJoint = new.parentJoint
+        found.append(copy)
     return found
 
 
@@ -186,23 +194,23 @@ def build_gripper(
     *,
     height: float,
 ) -> Gripper | None:
-    """Return the gripper that a robot.yaml describes; None: it says nothing of one.
+    """Return the gripper described in a robot.yaml, or None if it describes none.
 
     Args:
-        full: The robot with all its joints, see `robot_model.build_full_model`.
-        file: Its URDF.
-        model: The same with all joints locked but those that are planned.
-        collision: The robot's shapes on that.
-        tool_frame: Its frame that grasps.
-        rest: Where all joints are if nobody says otherwise, [m] or [rad].
-        stated: Joint of a finger → where it is closed and open; joints that the robot has.
+        full: The robot with all joints, see `robot_model.build_full_model`.
+        file: The robot's URDF.
+        model: The robot with only the planned joints unlocked.
+        collision: The robot's collision shapes on `model`.
+        tool_frame: The robot's tool frame.
+        rest: Rest positions of all joints, [m] or [rad].
+        stated: Finger joint → its closed and open positions; the joints exist.
         document: The robot.yaml.
-        height: Of the root link above the floor [m].
+        height: Height of the root link above the floor [m].
 
     Raises:
-        InputError: A joint is none of a finger: it is part of the arm, mimics another, cannot be
-            where it is said to be, or does not move; or there is no more room between the fingers
-            where they are open than where they are closed.
+        InputError: A joint is not a finger joint (it belongs to the arm, mimics another joint, or
+            does not move), its positions are outside its limits, or the open gripper is not wider
+            than the closed one.
     """
     if not stated:
         return None
@@ -218,35 +226,36 @@ def build_gripper(
             raise document.error(
                 where, problem, expected=f"'{leader}', which it follows", got=joint
             )
-        number = full.getJointId(joint)
-        if number in palm or arm not in list(full.supports[number]):
-            expected = f"a joint of the hand, beyond '{full.names[arm]}'"
-            raise document.error(
-                where, "this joint is none of a finger", expected=expected, got=joint
-            )
-        moving = full.joints[number]
+        joint_index = full.getJointId(joint)
+        if joint_index in palm or arm not in list(full.supports[joint_index]):
+            expected = f"a joint of the hand, a descendant of '{full.names[arm]}'"
+            raise document.error(where, "this is not a finger joint", expected=expected, got=joint)
+        joint_model = full.joints[joint_index]
         low, high = (-np.inf, np.inf)
-        if moving.nq == 1:
-            low, high = full.lowerPositionLimit[moving.idx_q], full.upperPositionLimit[moving.idx_q]
+        if joint_model.nq == 1:
+            low, high = (
+                full.lowerPositionLimit[joint_model.idx_q],
+                full.upperPositionLimit[joint_model.idx_q],
+            )
         for key, value in (("closed", finger.closed), ("open", finger.open)):
             if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK:
-                problem = "a finger outside its limits"
+                problem = "this finger position is outside the joint's limits"
                 raise document.error(
                     (*where, key), problem, expected=f"between {low:g} and {high:g}", got=value
                 )
         if finger.closed == finger.open:
             raise document.error(
                 where,
-                "a finger that does not move",
-                expected="two positions, closed and open",
+                "this finger joint does not move",
+                expected="different positions for closed and open",
                 got=finger.open,
             )
-    moved = [
+    finger_joints = [
         name
         for name in rest
         if name in stated or (name in follows and follows[name].leader in stated)
     ]
-    names = tuple(sorted(moved, key=full.getJointId))
+    names = tuple(sorted(finger_joints, key=full.getJointId))
     unlocked, shapes = (
         build_unlocked_model(full, file, model, names, rest, height),
         pin.GeometryModel(),
@@ -254,26 +263,28 @@ def build_gripper(
     for shape in _attach_shapes(list(collision.geometryObjects), model, unlocked):
         shapes.addGeometryObject(shape)
 
-    def at(position: str) -> Floats:
-        own = {joint: float(getattr(finger, position)) for joint, finger in stated.items()}
-        own |= {
-            name: led.factor * own[led.leader] + led.offset
-            for name, led in follows.items()
-            if led.leader in own
+    def collect_positions(state: str) -> Floats:
+        positions = {joint: float(getattr(finger, state)) for joint, finger in stated.items()}
+        positions |= {
+            name: coupling.factor * positions[coupling.leader] + coupling.offset
+            for name, coupling in follows.items()
+            if coupling.leader in positions
         }
-        return np.array([own[name] for name in names])
+        return np.array([positions[name] for name in names])
 
     gripper = Gripper(
         model=unlocked,
         names=names,
-        closed=at("closed"),
-        open=at("open"),
+        closed=collect_positions("closed"),
+        open=collect_positions("open"),
         rest=np.array([rest[name] for name in names]),
         tool_frame=tool_frame,
         collision=shapes,
     )
     if not gripper.max_opening > gripper.min_opening:
-        expected = f"more room where it is open than where it is closed, around the frame '{tool_frame}' and along its x axis"
+        expected = (
+            f"a larger opening when open than when closed, along the x axis of '{tool_frame}'"
+        )
         got = f"{1e3 * gripper.min_opening:.1f} mm closed, {1e3 * gripper.max_opening:.1f} mm open"
         raise document.error(("gripper",), "the gripper does not open", expected=expected, got=got)
     return gripper

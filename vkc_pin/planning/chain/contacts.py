@@ -318,7 +318,9 @@ class ContactModel:
         found, phase_of = np.empty((len(z), 3)), self.find_phases(waypoints)
         for number in set(phase_of.tolist()):
             members = np.flatnonzero(phase_of == number)
-            where = self._clearances[number].placements.compute_placements(self.chain.coordinates.q(z[members]))
+            where = self._clearances[number].placements.compute_placements(
+                self.chain.coordinates.q(z[members])
+            )
             found[members] = (
                 self._clearances[number]
                 .shapes.compute_witnesses(where, np.arange(len(members)), pairs[members])

@@ -64,7 +64,7 @@ class PhaseGeometry:
             rows: Configuration of each pair, shape (n,).
         """
         if z is None:
-            return self._base_margins.at(
+            return self._base_margins.compute_margins(
                 pairs, waypoints, np.empty((1, 0)), np.zeros(len(pairs), int)
             )
         return self.margin_table.compute_margins(

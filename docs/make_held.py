@@ -13,7 +13,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
 from vkc_pin.planning.initialization import constrained_rrt as held
 from vkc_pin.planning.initialization import interpolation as joining
-from vkc_pin.planning.initialization.keyframes import depth
+from vkc_pin.planning.initialization.keyframes import compute_shortfall
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.world.models.shapes import triangulate
@@ -30,22 +30,22 @@ def main() -> int:
         .with_start(base=(1.2, 2.6, -1.57))
     )
     seen: list[tuple[TrajectoryProblem, list[np.ndarray]]] = []
-    search = joining.RrtPaths.held
+    search = joining.RrtPaths.find_constrained_path
 
     def kept(
         paths: joining.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray
     ) -> np.ndarray | None:
-        path, knots = search(paths, phase, through, straight), paths.knots
+        path, sampler = search(paths, phase, through, straight), paths.sampler
         if path is not None:
-            own = held._Search(knots, phase, len(straight))
-            closed, _ = own.close(straight, np.arange(own.begin + 1.0, own.end + 1.0))
-            seen.append((knots.problem, [closed, path]))
+            own = held._Search(sampler, phase, len(straight))
+            closed, _ = own.project(straight, np.arange(own.begin + 1.0, own.end + 1.0))
+            seen.append((sampler.problem, [closed, path]))
         return path
 
-    joining.RrtPaths.held = kept
+    joining.RrtPaths.find_constrained_path = kept
     step = vkc.Actuate("door", {"hinge": 0.0}, "handle_free")
     plan = vkc.plan(scene, [step], options=chores.CHORES["cluttered"].options, initialization="rrt")
-    joining.RrtPaths.held = search
+    joining.RrtPaths.find_constrained_path = search
     sys.stdout.write(plan.report() + "\n")
     problem, ways = seen[-1]
     phase = len(problem.task.phases) - 1
@@ -56,7 +56,7 @@ def main() -> int:
         ):
             axes = figure.add_subplot(1, 2, number + 1)
             short = (
-                depth(problem, way, problem.contacts.inside(phase), reach=0.0)
+                compute_shortfall(problem, way, problem.contacts.inside(phase), reach=0.0)
                 - problem.options.dist_safe
             )
             draw_held(axes, problem, way, int(np.argmax(short)) if short.max() > 0.0 else None)

@@ -460,7 +460,7 @@ def test_when_planning_fails(tmp_path: Path) -> None:
     assert text(cells["narrow"]).startswith("drawer: success — go to")
 
     assert re.search(
-        r"because reach drawer.handle: (found )?no way for the base", text(cells["fenced"])
+        r"because reach drawer.handle: (found )?no path for the base", text(cells["fenced"])
     )
     assert text(cells["gap-report"]).startswith(
         "drawer: success — reach drawer.handle, move drawer.slide"

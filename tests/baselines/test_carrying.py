@@ -19,7 +19,7 @@ from vkc_pin.baselines import postures as poses
 from vkc_pin.baselines.attempt import Attempt
 from vkc_pin.baselines.following import FailedError
 from vkc_pin.baselines.postures import postures
-from vkc_pin.planning.initialization.base_routes import Routes
+from vkc_pin.planning.initialization.base_routes import BaseRoutes
 from vkc_pin.world.trajectory.world_model import World
 
 OPTIONS = vkc.Options(reach_waypoints=20, move_waypoints=15)
@@ -234,7 +234,7 @@ def stay(scene: vkc.Scene) -> vkc.TrajectoryProblem:
 
 def folded(scene: vkc.Scene) -> np.ndarray:
     """Return the arm of the second baseline posture of an arm at home: as narrow as it becomes."""
-    return Routes(stay(scene)).folded_arm(0)
+    return BaseRoutes(stay(scene)).get_folded_arm(0)
 
 
 def test_an_arm_at_home_stays_there_or_is_folded() -> None:

@@ -13,7 +13,7 @@ import vkc_pin as vkc
 from vkc_pin.baselines import following as module
 from vkc_pin.baselines.following import SEEDS, Followed, follow
 from vkc_pin.baselines.refining import CLEAR
-from vkc_pin.planning.initialization.keyframes import Knots, smooth
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
 from vkc_pin.planning.nlp.merit import TOLERANCE
 
 STILL = 0.0
@@ -63,7 +63,7 @@ def test_it_follows_to_the_end(change: Sequence[float], refine: bool) -> None:
     assert (found.cause, found.share) == ("", 1.0)
     check(problem, found.z)
     np.testing.assert_allclose(found.z[:, :3], way, rtol=0.0, atol=STILL)
-    np.testing.assert_allclose(found.z[:, -1], GOAL * smooth(8), rtol=0.0, atol=STILL)
+    np.testing.assert_allclose(found.z[:, -1], GOAL * sample_smoothstep(8), rtol=0.0, atol=STILL)
     assert np.abs(np.diff(problem.waypoints(found.z)[:, 3:9], axis=0)).max() < 0.6, (
         "from the waypoint before"
     )
@@ -84,7 +84,7 @@ def test_every_arm_is_looked_for_from_the_one_before(monkeypatch: pytest.MonkeyP
     rows = np.array([z for z, _ in given])
     np.testing.assert_array_equal(rows[:, 3:9], problem.waypoints(found.z)[:-1, 3:9])
     np.testing.assert_array_equal(rows[:, :3], way)
-    np.testing.assert_allclose(rows[:, 9], GOAL * smooth(8))
+    np.testing.assert_allclose(rows[:, 9], GOAL * sample_smoothstep(8))
 
 
 def test_the_same_numbers_give_the_same_motion() -> None:
@@ -147,7 +147,7 @@ def test_where_the_arm_as_it_was_collides_other_arms_are_tried(
 
 def test_b2_moves_the_object_off_its_time_law_b1_does_not() -> None:
     problem = pulling(0.94, "handle_free")
-    law = GOAL * smooth(8)
+    law = GOAL * sample_smoothstep(8)
     plain, refined = (followed(problem, base(problem), refine=refine) for refine in (False, True))
     assert (plain.cause, refined.cause) == ("", "")
     check(problem, plain.z)
@@ -197,7 +197,7 @@ def test_the_nearest_of_the_best_kind_is_taken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem = pulling()
-    arm = module._Arm(problem, Knots(problem, np.random.default_rng(0)), refine=False)
+    arm = module._Arm(problem, KeyframeSampler(problem, np.random.default_rng(0)), refine=False)
     answers = iter([first, *others])
 
     def candidate(z: np.ndarray, waypoint: int) -> tuple[np.ndarray, str]:
@@ -214,7 +214,7 @@ def test_the_nearest_of_the_best_kind_is_taken(
 def test_random_arms_are_within_limits_and_nothing_else_changes() -> None:
     problem = pulling(attachment="handle_free")
     problem.chain.upper[5] = problem.start[5] + 0.05
-    arm = module._Arm(problem, Knots(problem, np.random.default_rng(0)), refine=False)
+    arm = module._Arm(problem, KeyframeSampler(problem, np.random.default_rng(0)), refine=False)
     seeds = np.vstack([arm._seeds(problem.start) for _ in range(10)])
     assert len(seeds) == 10 * SEEDS
     assert np.all((seeds >= problem.chain.lower) & (seeds <= problem.chain.upper))
@@ -235,6 +235,6 @@ def test_random_arms_are_within_limits_and_nothing_else_changes() -> None:
 def test_what_falls_short_by_rounding_is_no_collision(monkeypatch: pytest.MonkeyPatch) -> None:
     """Refinement ends on the margin, a hair to one side of it or the other."""
     problem = program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
-    arm = module._Arm(problem, Knots(problem, np.random.default_rng(0)), refine=True)
+    arm = module._Arm(problem, KeyframeSampler(problem, np.random.default_rng(0)), refine=True)
     monkeypatch.setattr(arm.knots, "depth", lambda z, waypoint: np.full(len(z), 1e-7))
     assert arm._candidate(problem.start, 1)[1] == ""

@@ -138,7 +138,7 @@ def test_the_door_that_it_opens_is_not_in_its_way() -> None:
     path = found.path(before, after, 10)
     assert path is not None
     np.testing.assert_allclose(path[:, 1:], np.tile(before[1:], (10, 1)), atol=1e-12)
-    assert not found.grid.clear(2.55, -0.5, 0.0)
+    assert not found.grid.is_pose_free(2.55, -0.5, 0.0)
 
 
 def test_what_stands_still_of_the_object_it_holds_is_in_its_way() -> None:
@@ -179,7 +179,7 @@ def test_the_arm_counts_if_it_is_to() -> None:
         np.diff(bare[:, 0]) * 0.9 / 2.0, -np.diff(bare[:, 1]), atol=1e-9
     )  # straight below the shelf
     whole = BasePaths(problem, whole=True)
-    assert not all(whole.grid.clear(*pose) for pose in bare)
+    assert not all(whole.grid.is_pose_free(*pose) for pose in bare)
     path = whole.path(START, goal, 80)
     assert path is not None
     np.testing.assert_array_equal(path[-1, :2], goal[:2])

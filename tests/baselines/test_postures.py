@@ -13,7 +13,7 @@ from helpers.small_problems import program_of
 import vkc_pin as vkc
 from vkc_pin.baselines import postures as module
 from vkc_pin.baselines.postures import base_poses
-from vkc_pin.planning.initialization.keyframes import SCATTER, Knots
+from vkc_pin.planning.initialization.keyframes import SAMPLE_COUNT, KeyframeSampler
 
 
 def reaching(scene: vkc.Scene, attachment: str = "handle") -> vkc.TrajectoryProblem:
@@ -116,15 +116,15 @@ def behind_a_board() -> vkc.Scene:
 def test_nothing_is_reached(scene: vkc.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """And so many seeds are tried as are allowed, rounded up to whole lots."""
     problem, lots = reaching(scene), []
-    knot = Knots.knot
+    knot = KeyframeSampler.sample
 
     def counted(
-        self: Knots, before: np.ndarray, waypoint: int, how: str
+        self: KeyframeSampler, before: np.ndarray, waypoint: int, how: str
     ) -> tuple[np.ndarray, np.ndarray]:
         lots.append((len(before), how))
         return knot(self, before, waypoint, how)
 
-    monkeypatch.setattr(module, "TRIES", 5 * SCATTER + 1)
-    monkeypatch.setattr(Knots, "knot", counted)
+    monkeypatch.setattr(module, "TRIES", 5 * SAMPLE_COUNT + 1)
+    monkeypatch.setattr(KeyframeSampler, "sample", counted)
     assert found(problem).shape == (0, problem.chain.size)
-    assert lots == [(SCATTER, "scatter")] * 6
+    assert lots == [(SAMPLE_COUNT, "scatter")] * 6

@@ -16,7 +16,7 @@ from vkc_pin.baselines import refining as module
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.postures import base_poses
 from vkc_pin.baselines.refining import CLEAR, refined
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.merit import TOLERANCE
 
 HALF, ROUNDING = 4, 1e-6  # a waypoint; [m]
@@ -32,10 +32,10 @@ class Pulling:
         self.problem = program_of(
             self.scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT
         )
-        self.knots = Knots(self.problem, np.random.default_rng(0))
+        self.knots = KeyframeSampler(self.problem, np.random.default_rng(0))
         arm = ArmKinematics(self.problem, self.knots)
         self.columns, self.waypoint = arm.columns, waypoint
-        self.z, closed = arm.solve(self.knots.objects[waypoint - 1], waypoint)
+        self.z, closed = arm.solve(self.knots.object_motion[waypoint - 1], waypoint)
         assert closed
 
     def refined(
@@ -150,7 +150,7 @@ def test_out_of_reach() -> None:
 
 def test_where_nothing_must_hold() -> None:
     problem = program_of(drawer_scene(), [vkc.Grasp("drawer")])
-    knots = Knots(problem, np.random.default_rng(0))
+    knots = KeyframeSampler(problem, np.random.default_rng(0))
     z, closed = refined(
         problem, knots, problem.start, wanted=problem.start, waypoint=1, columns=np.arange(3, 9)
     )

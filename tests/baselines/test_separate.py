@@ -27,7 +27,7 @@ from vkc_pin.baselines.following import Followed, follow
 from vkc_pin.baselines.paths import BasePaths
 from vkc_pin.benchmarks.household import TASKS
 from vkc_pin.planning.outcome import TIMES
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 
 ROOT = Path(__file__).resolve().parents[2]
 PULL = vkc.Actuate("drawer", {"slide": 0.3})
@@ -369,7 +369,7 @@ def test_of_several_places_the_one_that_came_furthest_counts(
         )
         dt = problem.timing_for(z).dt
         if not works:
-            raise attempt.FailedError(cause, as_trajectory(problem, z, dt))
+            raise attempt.FailedError(cause, make_trajectory(problem, z, dt))
         self._take(problem, z, dt)
 
     def driven(self: attempt.Attempt, pose: np.ndarray) -> None:

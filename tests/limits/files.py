@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class Motion:
-    """Knots of cubics in time: times (K,) [s], positions and velocities (K, n), by the names of the coordinates."""
+    """KeyframeSampler of cubics in time: times (K,) [s], positions and velocities (K, n), by the names of the coordinates."""
 
     names: list[str]
     times: np.ndarray

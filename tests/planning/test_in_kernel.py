@@ -68,7 +68,7 @@ def test_progress_is_one_line_that_is_written_over(jupyter: Kernel) -> None:
 @pytest.mark.parametrize(
     ("where", "code"),
     [
-        ("seeds", "vkc_pin.planning.initialization.methods._SeedSearch, '_search'"),
+        ("seeds", "vkc_pin.planning.initialization.methods._GuessSearch, '_search'"),
         ("solver", "vkc_pin.planning.solver.subproblem.Subproblem, 'solve'"),
         ("validation", "vkc_pin.planning.one_problem, 'validate'"),
         ("building", "vkc_pin.planning.one_problem, 'TrajectoryProblem'"),

@@ -137,7 +137,7 @@ def test_a_closed_gap(step: Any) -> None:
     assert plan.status == "infeasible"
     explained(
         plan,
-        "no way for the base, proven: at any heading, with the arm anywhere, it is cut off by fence",
+        "no path for the base, proven: at any heading, with the arm anywhere, it is cut off by fence",
     )
     assert plan.metrics["rounds"] == 0  # nothing was tried
     assert the(plan, "goal", "").waypoint == len(plan.trajectory.times) - 1

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.benchmarks.scale import crowded
-from vkc_pin.planning.base_paths.base_clearance import Body
+from vkc_pin.planning.base_paths.base_clearance import MovingShapes
 from vkc_pin.planning.chain import easing
 from vkc_pin.planning.chain.contacts import ContactModel
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
@@ -380,7 +380,9 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Clearances, "find_first_violation", one_by_one)
     patch.setattr(PlacedShapes, "bounds", nowhere)
     patch.setattr(PairTable, "near", all_of)
-    patch.setattr(Body, "_close", lambda body, along: np.arange(len(body.moving)))
+    patch.setattr(
+        MovingShapes, "_find_close_pairs", lambda body, along: np.arange(len(body.moving))
+    )
     for module in (geometry, easing):
         patch.setattr(module, "compute_world_box", everywhere)
 

@@ -15,13 +15,13 @@ from helpers.small_problems import door_scene, program_of
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import problem as drawn_problem
 from vkc_pin.planning import one_problem as module
-from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import TIMES
 from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.solver.solution import Iteration, Solution
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.utils.budget import spend
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
@@ -61,7 +61,7 @@ class Scripted:
         monkeypatch.setattr(module, "initialize", self.initialize)
         monkeypatch.setattr(module, "solve", self.solve)
         monkeypatch.setattr(module, "validate", self.validate)
-        monkeypatch.setattr(module, "blocked", lambda *_: None)
+        monkeypatch.setattr(module, "diagnose_goal", lambda *_: None)
 
     def note(self, event: str) -> None:
         self.events.append(event)
@@ -76,10 +76,12 @@ class Scripted:
         z[:, 8] += MARK * NAMES.index(name)  # by which it is recognised
         return z
 
-    def initialize(self, problem: vkc.TrajectoryProblem, *_: Any, **__: Any) -> Iterator[Seed]:
+    def initialize(
+        self, problem: vkc.TrajectoryProblem, *_: Any, **__: Any
+    ) -> Iterator[InitialGuess]:
         for name, height in zip(NAMES, self.heights, strict=False):
             self.note(name)
-            yield Seed(name, self.z(problem, name, height))
+            yield InitialGuess(name, self.z(problem, name, height))
 
     def solve(
         self,
@@ -140,10 +142,10 @@ def test_real_seeds_are_tried_in_turn_until_validation_accepts_a_motion(
     number: int, random_seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is replaced here: what is asked for, solved and checked is written down on the way."""
-    given, solved, asked = list[Seed](), list[Solution](), list[str]()
+    given, solved, asked = list[InitialGuess](), list[Solution](), list[str]()
     search, solver = module.initialize, module.solve
 
-    def noted(*arguments: Any, **named: Any) -> Iterator[Seed]:
+    def noted(*arguments: Any, **named: Any) -> Iterator[InitialGuess]:
         for seed in search(*arguments, **named):
             asked.append("seed")
             given.append(seed)
@@ -178,7 +180,7 @@ def test_real_seeds_are_tried_in_turn_until_validation_accepts_a_motion(
     )
     assert vkc.validate(own.scene, own.steps, plan.trajectory, plan.options).ok
     for solution in solved[:-1]:  # what was given up was no motion
-        motion = as_trajectory(vkc.build(own.scene, own.steps), solution.z, solution.dt)
+        motion = make_trajectory(vkc.build(own.scene, own.steps), solution.z, solution.dt)
         assert not vkc.validate(own.scene, own.steps, motion, plan.options).ok
 
 
@@ -207,24 +209,24 @@ def test_what_clearly_misses_is_checked_only_if_nothing_else_is_left(
     monkeypatch.setattr(module, "solve", answered)
     monkeypatch.setattr(module, "validate", noted)
     monkeypatch.setattr(
-        module, "proofs", lambda _: []
+        module, "find_proofs", lambda _: []
     )  # it would be certain before anything is tried again
     wall = {"name": "wall", "type": "box", "size": [0.6, 9.0, 2.0], "position": [2.0, 0.0, 1.0]}
     plan = vkc.plan(hall(obstacles=[wall]), [vkc.GoTo(4.0, 0.0)], initialization=initialization)
     assert not plan.success
-    astray = [solution for solution in solved if solution.astray]
+    astray = [solution for solution in solved if solution.shortfall]
     assert astray, "all came near: choose a thicker wall"
     assert (len(astray) == len(solved)) == all_astray
     assert len(checked) == max(1, len(solved) - len(astray))
     problem = vkc.build(plan.scene, plan.steps)
     for solution in solved:
         short = problem.evaluate_contacts(solution.z, reach=0.1).compute_violation()
-        assert solution.astray == (pytest.approx(short) if short > 0.01 else 0.0)
+        assert solution.shortfall == (pytest.approx(short) if short > 0.01 else 0.0)
     for solution in astray:
-        motion = as_trajectory(problem, solution.z, solution.dt)
+        motion = make_trajectory(problem, solution.z, solution.dt)
         assert not check(plan.scene, plan.steps, motion, plan.options).ok
     if all_astray:
-        nearest = min(astray, key=lambda solution: solution.astray)
+        nearest = min(astray, key=lambda solution: solution.shortfall)
         np.testing.assert_allclose(plan.trajectory.positions[1:, :2], nearest.z[:, :2], atol=1e-9)
     assert not check(plan.scene, plan.steps, plan.trajectory, plan.options).ok
 
@@ -253,14 +255,14 @@ def test_the_ends_of_a_seed_are_free_or_not() -> None:
     for x, free in ((4.0, True), (2.0, False)):
         z = np.tile(drive.start, (drive.segments, 1))
         z[:, 0] = np.linspace(drive.start[0], x, drive.segments)
-        assert module._ends_free(drive, Seed("straight", z)) == free
+        assert module._ends_free(drive, InitialGuess("straight", z)) == free
 
 
 def test_a_seed_of_ones_own_is_the_only_one(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Scripted(monkeypatch, [3.0, 1.0])
     script.run()
     script.events.clear()
-    plan = script.one.run(lambda problem: Seed("mine", script.z(problem, "d", 1.0)))
+    plan = script.one.run(lambda problem: InitialGuess("mine", script.z(problem, "d", 1.0)))
     assert script.events == ["d*"]
     assert plan.initialization == "mine"
 
@@ -341,7 +343,7 @@ def test_ctrl_c_in_the_solver_returns_the_best(
     np.testing.assert_array_equal(script.one.z, script.z(script.one.problem, name, leads[name][0]))
     alone = program_of(drawer_scene(), PULL, options=SHORT)
     own = script.z(alone, name, leads[name][0])
-    expected = retime_trajectory(alone.scene, as_trajectory(alone, own, alone.timing_for(own).dt))
+    expected = retime_trajectory(alone.scene, make_trajectory(alone, own, alone.timing_for(own).dt))
     assert plan.metrics["duration"] == pytest.approx(float(expected.times[-1]), rel=1e-6)
 
 

@@ -14,7 +14,7 @@ from helpers.small_problems import program_of
 import vkc_pin as vkc
 from vkc_pin.planning import one_problem as module
 from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.one_problem import OneProblem, _Try
 from vkc_pin.planning.settings import Settings
 from vkc_pin.utils.cache import Cache
@@ -83,7 +83,7 @@ class Script:
             module, "_ends_free", lambda problem, seed: self.asked(f"free {seed.name}", free)
         )
         monkeypatch.setattr(
-            module, "ways", lambda *what: self.asked(f"ways {what[3]} {what[4]}", ways)
+            module, "diagnose_paths", lambda *what: self.asked(f"ways {what[3]} {what[4]}", ways)
         )
 
     problem: Any = SimpleNamespace()
@@ -97,7 +97,7 @@ class Script:
         return self.asked(
             f"{seed.name}*",
             SimpleNamespace(
-                astray=0.0 if isinstance(answer, _Try) else answer, status=status, name=seed.name
+                shortfall=0.0 if isinstance(answer, _Try) else answer, status=status, name=seed.name
             ),
         )
 
@@ -224,8 +224,10 @@ def test_proofs_are_looked_for_once(
     hindered: list[str], proven: list[str], told: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr(module, "swept", lambda problem: asked.append("swept") or hindered)
-    monkeypatch.setattr(module, "proofs", lambda problem: asked.append("proofs") or proven)
+    monkeypatch.setattr(
+        module, "find_swept_collisions", lambda problem: asked.append("swept") or hindered
+    )
+    monkeypatch.setattr(module, "find_proofs", lambda problem: asked.append("proofs") or proven)
     one = object.__new__(OneProblem)
     one._proven, one.hindered = None, False
     for _ in range(2):
@@ -239,7 +241,7 @@ def test_each_goal_is_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
     found = {0: None, 1: goal("no room"), 2: goal("no way")}
     monkeypatch.setattr(
         module,
-        "blocked",
+        "diagnose_goal",
         lambda problem, number, seed: asked.append((number, seed)) or found[number],
     )
     one = object.__new__(OneProblem)
@@ -333,7 +335,7 @@ def test_what_a_solution_is_worth(
         asked.update(how, waypoints=waypoints)
         return "curve", report
 
-    monkeypatch.setattr(module, "as_trajectory", lambda problem, z, dt: ("motion", z, dt))
+    monkeypatch.setattr(module, "make_trajectory", lambda problem, z, dt: ("motion", z, dt))
     monkeypatch.setattr(module, "accepted", accepted)
     solution: Any = SimpleNamespace(z="z", dt="dt", converged=converged)
     found = one._judge(None, solution, "name")  # type: ignore[arg-type]
@@ -360,7 +362,7 @@ def test_constraints_on_velocities_keep_the_programs_own_time(
     terms += [vkc.Constraint("speed", lambda s: s.rate("base_x"), upper=9.0)] if speed else []
     one = made(vkc.GoTo(1.0, 0.0), terms=terms)
     assert one._paced == paced
-    monkeypatch.setattr(module, "as_trajectory", lambda *_: "waypoints")
+    monkeypatch.setattr(module, "make_trajectory", lambda *_: "waypoints")
     monkeypatch.setattr(module, "accepted", lambda *_, **__: ("curve", Report()))
     one._check = lambda motion: Report()  # type: ignore[method-assign]
     solution: Any = SimpleNamespace(z="z", dt="dt", converged=True)
@@ -394,7 +396,7 @@ def test_the_ends_of_phases_are_free_and_where_they_should_be(
         evaluate_contacts=lambda z, reach: found,
         pose_error=lambda z: error,
     )
-    assert module._ends_free(problem, Seed("any", np.zeros((6, 2)))) == free
+    assert module._ends_free(problem, InitialGuess("any", np.zeros((6, 2)))) == free
 
 
 def test_pieces_are_the_waypoints_of_each_phase() -> None:
@@ -406,7 +408,7 @@ def test_pieces_are_the_waypoints_of_each_phase() -> None:
     one.z, one.initialization = one.problem.still + np.arange(6.0)[:, None], "mine"
     path = np.vstack([one.problem.start, one.z])
     piece = one.piece()
-    assert (piece.names, piece.seed) == (one.problem.chain.names, "mine")
+    assert (piece.names, piece.initialization) == (one.problem.chain.names, "mine")
     assert [part.tolist() for part in piece.waypoints] == [path[:4].tolist(), path[3:].tolist()]
 
 

@@ -17,7 +17,7 @@ from oracle.judge import judge
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.planning.chain.chain import consolidate
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.placements import sample_motion
 from vkc_pin.world.trajectory.world_model import World
@@ -109,7 +109,7 @@ def test_inverse_kinematics_of_the_arm_alone_moves_all_segments(opened: vkc.Plan
     assert opened.trajectory is not None
     problem = program_of(opened.scene, list(opened.steps))
     arm, goal = (
-        ArmKinematics(problem, Knots(problem, np.random.default_rng(0))),
+        ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0))),
         opened.trajectory.positions[-1],
     )
     begin = goal + np.array([0.0, 0.0, 0.0, 0.05, -0.03, 0.1, 0.1, 0.1, 0.0])

@@ -11,7 +11,7 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
-from vkc_pin.planning.initialization.initial_guess import Seed, seed_of
+from vkc_pin.planning.initialization.initial_guess import InitialGuess, make_initial_guess
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.stepwise import stages
@@ -104,11 +104,11 @@ def problem(scene: vkc.Scene, steps: list[vkc.Step], settings: Settings) -> OneP
     return OneProblem(scene, compile_task(scene, steps, settings.options), settings)
 
 
-def going_on(fixed: OneProblem, problem: vkc.TrajectoryProblem) -> Seed:
+def going_on(fixed: OneProblem, problem: vkc.TrajectoryProblem) -> InitialGuess:
     """Return the motion found with the fixed grasp, which is the middle of all: 0 along and about the stick."""
     z = np.zeros((problem.segments, problem.chain.size))
     z[:, [problem.chain.index(name) for name in fixed.problem.chain.names]] = fixed.z
-    return Seed("as with the fixed grasp", z)
+    return InitialGuess("as with the fixed grasp", z)
 
 
 def test_one_problem_costs_less_than_step_after_step() -> None:
@@ -119,9 +119,9 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     assert [part.plan.success for part in parts] == [True, True]
     pieces = [part.one.piece() for part in parts]
     one = problem(start(), steps, settings)
-    whole = one.run(lambda problem: seed_of(problem, pieces))
+    whole = one.run(lambda problem: make_initial_guess(problem, pieces))
     assert whole.success, whole.report()
-    before = objective(one.problem, seed_of(one.problem, pieces).z)
+    before = objective(one.problem, make_initial_guess(one.problem, pieces).z)
     assert objective(one.problem, one.z) < before
     assert (
         np.abs(one.z[39, :3] - parts[0].one.z[39, :3]).max() > 1e-3

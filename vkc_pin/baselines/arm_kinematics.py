@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats, Ints
@@ -33,18 +33,18 @@ class ArmKinematics:
         columns: The coordinates that it decides: the arm's joints, and the freedoms of its grasps.
     """
 
-    def __init__(self, problem: TrajectoryProblem, knots: Knots) -> None:
+    def __init__(self, problem: TrajectoryProblem, knots: KeyframeSampler) -> None:
         self.problem, self.knots = problem, knots
         chain = problem.chain
         virtual = [chain.index(name) for names in chain.virtual.values() for name in names]
-        self.columns = np.array([*range(3, knots.robot), *virtual], int)
+        self.columns = np.array([*range(3, knots.robot_size), *virtual], int)
         self._models: dict[int, pin.Model] = {}
 
     def solve(self, z: Floats, waypoint: int) -> tuple[Floats, bool]:
         """Return the configuration that iterations from `z`, shape (n,), lead to, and whether it closes the chain there."""
         import pink
 
-        pose = self.knots.pose_at(waypoint)
+        pose = self.knots.find_pose(waypoint)
         if pose is None:
             return z, True
         model, chain = self._model(pose), self.problem.chain

@@ -14,16 +14,16 @@ from vkc_pin.baselines.following import FailedError, follow
 from vkc_pin.baselines.paths import BasePaths, headings
 from vkc_pin.baselines.postures import at_home, base_poses, postures, through
 from vkc_pin.options import Options
-from vkc_pin.planning.initialization.approach_paths import Approach
-from vkc_pin.planning.initialization.initial_guess import Seed
-from vkc_pin.planning.initialization.keyframes import Knots, smooth
+from vkc_pin.planning.initialization.approach_paths import ApproachPaths
+from vkc_pin.planning.initialization.initial_guess import InitialGuess
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.outcome import TIMES, still
 from vkc_pin.planning.solver.loop import solve
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
-from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
+from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import SpentError, spend
 from vkc_pin.utils.cache import Cache
@@ -177,9 +177,9 @@ class Attempt:
         stay = self._problem([self._here()])
         ends = np.tile(stay.start, (len(poses) + 1, 1))
         ends[:-1, :3] = poses[:, :3]
-        depth = Knots(stay, self.rng).depth(ends, stay.segments)
+        depth = KeyframeSampler(stay, self.rng).compute_shortfall(ends, stay.segments)
         return np.asarray(
-            poses[depth[:-1] <= min(depth[-1], CLOSE_ENOUGH)]
+            poses[depth[:-1] <= min(depth[-1], CLEARANCE_TOLERANCE)]
         )  # the arm may be as close to the robot as it is
 
     def _withdraw(self, path: Floats) -> None:
@@ -190,7 +190,7 @@ class Attempt:
         arm = slice(3, problem.chain.robot.coordinates.size)
         problem = _fixed(problem, arm, path[-1, arm], rows=-1)
         seeds = [
-            Seed("straight", through(problem, path[k:])) for k in (0, -1)[: len(path)]
+            InitialGuess("straight", through(problem, path[k:])) for k in (0, -1)[: len(path)]
         ]  # along it, and directly
         self._take(problem, *self._solve(problem, iter(seeds), "arm does not reach"))
 
@@ -212,15 +212,18 @@ class Attempt:
         problem = _fixed(self._problem(steps), _BASE)
         last = np.append(problem.start[:3], pose[3:])
         seeds = [
-            Seed(
+            InitialGuess(
                 "straight",
-                problem.start + smooth(problem.segments)[:, None] * (last - problem.start),
+                problem.start
+                + sample_smoothstep(problem.segments)[:, None] * (last - problem.start),
             )
         ]
         phase = problem.task.phases[-1]
         if phase.lowered:  # from above
-            above = Approach(Knots(problem, self.rng)).away(last, phase)[::-1]
-            seeds = [Seed("from above", through(problem, np.vstack([above, last])))] * (
+            above = ApproachPaths(KeyframeSampler(problem, self.rng)).find_release_retreat(
+                last, phase
+            )[::-1]
+            seeds = [InitialGuess("from above", through(problem, np.vstack([above, last])))] * (
                 len(above) > 0
             ) + seeds
         more = initialize(problem, "interpolated", self._seed())
@@ -253,7 +256,7 @@ class Attempt:
                 return
             if not failure.parts or followed.share > failure.share:
                 failure = FailedError(
-                    cause, as_trajectory(problem, followed.z, timing.dt), followed.share
+                    cause, make_trajectory(problem, followed.z, timing.dt), followed.share
                 )
         raise failure
 
@@ -270,7 +273,7 @@ class Attempt:
         )
 
     def _solve(
-        self, problem: TrajectoryProblem, seeds: Iterator[Seed], cause: str
+        self, problem: TrajectoryProblem, seeds: Iterator[InitialGuess], cause: str
     ) -> tuple[Floats, Floats]:
         """Return the first solution from a seed: z_1..z_N, shape (N, n), and the time of every step, shape (N,) [s]."""
         failure = FailedError(cause)
@@ -283,12 +286,12 @@ class Attempt:
                 return solution.z, solution.dt
             spend()
             if not failure.parts:
-                failure = FailedError(cause, as_trajectory(problem, solution.z, solution.dt))
+                failure = FailedError(cause, make_trajectory(problem, solution.z, solution.dt))
         raise failure
 
     def _take(self, problem: TrajectoryProblem, z: Floats, dt: Floats) -> None:
         """Append a motion, and go on from where it ends."""
-        self.parts.append(as_trajectory(problem, z, dt))
+        self.parts.append(make_trajectory(problem, z, dt))
         self.scene = compute_final_scene(self.scene, self.parts[-1], problem.task.after)
 
     def _seed(self) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.refining import CLEAR, refined
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -74,8 +74,8 @@ def follow(
         refine: Move arm and object at each waypoint out of collision (B2), instead of taking the
             object where the time law has it and the arm as inverse kinematics finds it (B1).
     """
-    knots = Knots(problem, rng)
-    z = knots.objects.copy()
+    knots = KeyframeSampler(problem, rng)
+    z = knots.object_motion.copy()
     z[:, :3] = base
     arm = _Arm(problem, knots, refine=refine)
     before = problem.start
@@ -93,7 +93,7 @@ def follow(
 class _Arm:
     """Looks for what the arm does at single waypoints."""
 
-    def __init__(self, problem: TrajectoryProblem, knots: Knots, *, refine: bool) -> None:
+    def __init__(self, problem: TrajectoryProblem, knots: KeyframeSampler, *, refine: bool) -> None:
         self.problem, self.knots, self.refine = problem, knots, refine
         self.kinematics = ArmKinematics(problem, knots)
 
@@ -124,7 +124,7 @@ class _Arm:
         return found, "" if self._free(found, waypoint) else "collision"
 
     def _free(self, z: Floats, waypoint: int) -> bool:
-        return bool(self.knots.depth(z[None], waypoint)[0] <= CLEAR)
+        return bool(self.knots.compute_shortfall(z[None], waypoint)[0] <= CLEAR)
 
     def _seeds(self, z: Floats) -> Floats:
         """Return `z` with other arms, shape (SEEDS, n)."""

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.planning.base_paths.base_path import poses_along, shortest_path
-from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid, fine_cells
-from vkc_pin.planning.initialization.base_routes import grid_shapes
-from vkc_pin.planning.initialization.initial_guess import Seed
-from vkc_pin.planning.initialization.keyframes import smooth
+from vkc_pin.planning.base_paths.base_path import sample_poses, shortest_path
+from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid, compute_fine_cell_count
+from vkc_pin.planning.initialization.base_routes import collect_grid_shapes
+from vkc_pin.planning.initialization.initial_guess import InitialGuess
+from vkc_pin.planning.initialization.keyframes import sample_smoothstep
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import wrap_angle
@@ -44,7 +44,7 @@ class BasePaths:
         self.omni = problem.chain.robot.base == "omni"
         z = problem.start.copy()
         z[:3] = 0.0
-        moving, standing = grid_shapes(problem, len(problem.task.phases) - 1, z)
+        moving, standing = collect_grid_shapes(problem, len(problem.task.phases) - 1, z)
         base = [shape for joint, shape in moving if whole or joint == 1]
         arena, margin = problem.scene.arena, problem.options.dist_safe
         turning = problem.chain.robot.lever
@@ -55,7 +55,7 @@ class BasePaths:
         # Without margins where an optimisation follows: it restores them.
         self._fine: dict[str, Any] = {
             "margin": 0.0 if whole else margin,
-            "cells": fine_cells(arena, margin),
+            "cells": compute_fine_cell_count(arena, margin),
         }
 
     @functools.cached_property
@@ -75,11 +75,11 @@ class BasePaths:
         goals = np.atleast_2d(goals)
         for goal in goals if self.omni else ():
             places = max(_STEPS, int(np.ceil(np.hypot(*(goal - start)[:2]) / _STEP)))
-            if all(self.grid.clear(*pose) for pose in np.linspace(start, goal, places)):
-                return np.asarray(start + smooth(steps)[:, None] * (goal - start))
+            if all(self.grid.is_pose_free(*pose) for pose in np.linspace(start, goal, places)):
+                return np.asarray(start + sample_smoothstep(steps)[:, None] * (goal - start))
         find = functools.partial(shortest_path, start=start.tolist(), goals=goals)
         found = find(self.grid) or find(self.finer)
-        return None if found is None else poses_along(found, steps, turning=self.grid.turning)
+        return None if found is None else sample_poses(found, steps, turning=self.grid.turning)
 
     def along(self, problem: TrajectoryProblem, goal: Floats) -> Floats | None:
         """Return the base at every waypoint, shape (N, 3): it stands while a latch is released; None: there is no path."""
@@ -96,13 +96,13 @@ class BasePaths:
             base.append(part)
         return np.concatenate(base[1:])
 
-    def seeds(self, problem: TrajectoryProblem, goals: Floats) -> Iterator[Seed]:
+    def seeds(self, problem: TrajectoryProblem, goals: Floats) -> Iterator[InitialGuess]:
         """Yield the path from a problem's start to one of `goals`, shape (G, 3), the arm at rest, if there is one."""
         path = self.path(problem.start[:3], goals, problem.segments)
         if path is not None:
             z = np.tile(problem.start, (problem.segments, 1))
             z[:, :3] = path
-            yield Seed("astar", problem.clip(z))
+            yield InitialGuess("astar", problem.clip(z))
 
 
 def headings(step: GoTo, yaw: float) -> Floats:

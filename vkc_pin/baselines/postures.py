@@ -6,11 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vkc_pin.planning.initialization.approach_paths import Approach
-from vkc_pin.planning.initialization.base_routes import Routes
-from vkc_pin.planning.initialization.keyframes import SCATTER, Knots, smooth
+from vkc_pin.planning.initialization.approach_paths import ApproachPaths
+from vkc_pin.planning.initialization.base_routes import BaseRoutes
+from vkc_pin.planning.initialization.keyframes import (
+    SAMPLE_COUNT,
+    KeyframeSampler,
+    sample_smoothstep,
+)
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats
 
 __all__ = ["ENOUGH", "TRIES", "at_home", "base_poses", "postures", "through"]
@@ -40,12 +44,12 @@ def base_poses(
     Returns:
         Configurations, shape (K, n); none if none is found.
     """
-    knots = Knots(problem, rng)
+    knots = KeyframeSampler(problem, rng)
     found: list[Floats] = []
-    for _ in range(-(-TRIES // SCATTER)):
-        z, solved = knots.knot(np.tile(near, (SCATTER, 1)), waypoint, "scatter")
+    for _ in range(-(-TRIES // SAMPLE_COUNT)):
+        z, solved = knots.sample(np.tile(near, (SAMPLE_COUNT, 1)), waypoint, "scatter")
         z = z[solved]
-        found.extend(z[knots.depth(z, waypoint) <= 0.0] if len(z) else [])
+        found.extend(z[knots.compute_shortfall(z, waypoint) <= 0.0] if len(z) else [])
         if len(found) >= ENOUGH:
             break
     z = np.array(found[:ENOUGH]).reshape(-1, problem.chain.size)
@@ -62,13 +66,16 @@ def postures(problem: TrajectoryProblem) -> Iterator[Floats]:
     Args:
         problem: Lets go of what stands fixed in the world and carries the rest along.
     """
-    knots, robot = Knots(problem, np.random.default_rng(0)), problem.chain.robot  # nothing is drawn
+    knots, robot = (
+        KeyframeSampler(problem, np.random.default_rng(0)),
+        problem.chain.robot,
+    )  # nothing is drawn
 
     def is_free(path: Floats) -> bool:
         end = path[-1:] if len(path) else problem.start[None]
-        return bool(knots.depth(end, problem.segments)[0] <= CLOSE_ENOUGH)
+        return bool(knots.compute_shortfall(end, problem.segments)[0] <= CLEARANCE_TOLERANCE)
 
-    away = Approach(knots).away(problem.start, problem.task.phases[0])
+    away = ApproachPaths(knots).find_release_retreat(problem.start, problem.task.phases[0])
     home = (away[-1] if len(away) else problem.start).copy()
     home[3 : robot.coordinates.size] = robot.home
     paths = [np.empty((0, problem.chain.size))]
@@ -76,7 +83,7 @@ def postures(problem: TrajectoryProblem) -> Iterator[Floats]:
     paths += [] if at_home(problem) else [np.vstack([away, home])]
     yield from filter(is_free, paths)
     folded = home.copy()
-    folded[3 : robot.coordinates.size] = Routes(problem).folded_arm(
+    folded[3 : robot.coordinates.size] = BaseRoutes(problem).get_folded_arm(
         0
     )  # looked for only if nothing else will do
     yield from filter(is_free, [np.vstack([paths[-1], folded])])
@@ -92,5 +99,5 @@ def through(problem: TrajectoryProblem, path: Floats) -> Floats:
     """Return waypoints from a problem's start through configurations, shape (K, n), to the last of them, shape (N, n)."""
     knots = np.vstack([problem.start, path])
     lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(knots, axis=0)).max(axis=1))])
-    at = lengths[-1] * smooth(problem.segments)
+    at = lengths[-1] * sample_smoothstep(problem.segments)
     return problem.clip(np.column_stack([np.interp(at, lengths, column) for column in knots.T]))

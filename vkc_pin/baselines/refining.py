@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from vkc_pin.baselines.arm_kinematics import QP
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["CLEAR", "refined"]
 
-CLEAR = CLOSE_ENOUGH
+CLEAR = CLEARANCE_TOLERANCE
 """By so much [m] a configuration may fall short of its clearances: as much as one of the solver's."""
 
 _ROUNDS = 12
@@ -28,7 +28,7 @@ _REGULAR = 1e-6  # makes the program strictly convex in the slack
 
 def refined(
     problem: TrajectoryProblem,
-    knots: Knots,
+    knots: KeyframeSampler,
     z: Floats,
     *,
     wanted: Floats,
@@ -52,12 +52,12 @@ def refined(
     """
     import qpsolvers
 
-    pose = knots.pose_at(waypoint)
+    pose = knots.find_pose(waypoint)
     if pose is None:
         return z, True
-    solver, target = knots.solver(pose)
+    solver, target = knots.get_pose_solver(pose)
     lower, upper = problem.lower[waypoint - 1], problem.upper[waypoint - 1]
-    free = np.concatenate([columns, knots.driven])
+    free = np.concatenate([columns, knots.object_columns])
     weights = np.where(np.isin(free, columns), 1.0, _OBJECT)
     for _ in range(_ROUNDS):
         residual, jacobian = (part[0] for part in solver.evaluate(z[None], target))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vkc_pin.options import Options
-from vkc_pin.planning.initialization.keyframes import Knots, depth
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, compute_shortfall
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.planner import Planner
@@ -56,32 +56,32 @@ def grasped(
             cache=cache,
         )
         chain, robot = problem.chain, scene.robot.coordinates.size
-        search = Knots(problem, rng)
-        pose = search.pose_at(1)
+        search = KeyframeSampler(problem, rng)
+        pose = search.find_pose(1)
         freedoms = [
             chain.index(f"{name}.{own}")
             for own in scene.objects[name].object.attachments[attachment].coordinates
         ]
         if pose is None:
             return None
-        solver, target = search.solver(pose)
+        solver, target = search.get_pose_solver(pose)
         for _ in range(_DRAWS):
             z = np.tile(problem.start, (_BATCH, 1))
             z[:, freedoms] = rng.uniform(
                 chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms))
             )
-            z, _ = search.knot(z, 1, "scatter")
-            z[:, search.driven] = problem.start[
-                search.driven
+            z, _ = search.sample(z, 1, "scatter")
+            z[:, search.object_columns] = problem.start[
+                search.object_columns
             ]  # as it is at the start, not a step later
             lower, upper = np.tile(chain.lower, (_BATCH, 1)), np.tile(chain.upper, (_BATCH, 1))
-            fixed = [*freedoms, *search.driven.tolist()]
+            fixed = [*freedoms, *search.object_columns.tolist()]
             lower[:, fixed] = upper[:, fixed] = z[:, fixed]
             z, found = solver.solve(
                 z, target, lower=lower, upper=upper, weights=search.weights, tolerance=_EXACT
             )
             z = z[found]
-            z = z[depth(problem, z, 0) <= 0.0] if len(z) else z
+            z = z[compute_shortfall(problem, z, 0) <= 0.0] if len(z) else z
             if len(z):
                 row = z[int(rng.integers(len(z)))]
                 there = scene.with_start(base=row[:3], arm=row[3:robot])

@@ -12,11 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.planning.diagnosis.diagnosis import Blocked, blocked, impossible
-from vkc_pin.planning.diagnosis.paths import ways
-from vkc_pin.planning.diagnosis.proofs import proofs
-from vkc_pin.planning.diagnosis.swept_volumes import swept
-from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, Seed
+from vkc_pin.planning.diagnosis.diagnosis import (
+    BlockedGoal,
+    diagnose_goal,
+    find_impossible_conditions,
+)
+from vkc_pin.planning.diagnosis.paths import diagnose_paths
+from vkc_pin.planning.diagnosis.proofs import find_proofs
+from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
+from vkc_pin.planning.initialization.initial_guess import InitialGuess, PhaseWaypoints
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.outcome import TIMES, outcome, spent, still
@@ -25,7 +29,7 @@ from vkc_pin.planning.retiming.repair import retime_and_repair
 from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.solution import Iteration, Solution
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import ENDINGS, SpentError, spend, unlimited
 from vkc_pin.validation.report import Report
@@ -99,15 +103,15 @@ class OneProblem:
         self.rounds = self.iterations = 0
         self.checking, self.hindered = 0.0, False
         self.history: list[dict[str, float]] = []
-        self.blocked: list[str] = []  # phases in which there is no way for the base
+        self.blocked: list[str] = []  # phases without a base path
         self._best: _Try | None = None
         self._astray: tuple[Solution, str] | None = (
             None  # the nearest of those that nobody need check
         )
-        self._explained: dict[int, Blocked | None] = {}
+        self._explained: dict[int, BlockedGoal | None] = {}
         self._proven: list[str] | None = None
 
-    def run(self, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
+    def run(self, seed: Callable[[TrajectoryProblem], InitialGuess] | None = None) -> Plan:
         """Try seeds until validation accepts a motion, there are no more, or the budget is at its end.
 
         Args:
@@ -131,14 +135,16 @@ class OneProblem:
             spent(took - build_time, build_time, effort=budget.used - used, **self._counts()),
         )
 
-    def _planned(self, seed: Callable[[TrajectoryProblem], Seed] | None) -> tuple[_Try, str]:
+    def _planned(
+        self, seed: Callable[[TrajectoryProblem], InitialGuess] | None
+    ) -> tuple[_Try, str]:
         """Return the best try and the plan's status; see `run`."""
         s = self.settings
         problem = self.problem = TrajectoryProblem(
             self.scene, self.task, s.options, s.terms, cache=s.cache
         )
         s.budget.checking = s.budget.checking or _CHECK * problem.segments
-        reasons = impossible(problem)
+        reasons = find_impossible_conditions(problem)
         if reasons:
             self.hindered = True
             best = self._stationary(problem)
@@ -156,17 +162,17 @@ class OneProblem:
         return PhaseWaypoints(phases, self.problem.chain.names, waypoints, self.initialization)
 
     def _try_seeds(
-        self, problem: TrajectoryProblem, seeds: Iterator[Seed], *, searched: bool
+        self, problem: TrajectoryProblem, seeds: Iterator[InitialGuess], *, searched: bool
     ) -> tuple[_Try, str]:
         """Return the best try, with what is in the way of the task if it is no success, and the plan's status."""
-        notes: list[Blocked] = []
+        notes: list[BlockedGoal] = []
         for number, seed in enumerate(seeds, start=1):
             solution = self._solve(problem, seed)
-            if solution.astray:
+            if solution.shortfall:
                 self._astray = min(
                     self._astray or (solution, seed.name),
                     (solution, seed.name),
-                    key=lambda one: one[0].astray,
+                    key=lambda one: one[0].shortfall,
                 )
             else:
                 found = self._judge(problem, solution, seed.name)
@@ -185,7 +191,7 @@ class OneProblem:
                 notes
             ):  # two seeds failed, and random configurations find no free one at a goal either
                 break
-            if any(goal.deep for goal in notes):
+            if any(goal.is_deep for goal in notes):
                 break
         spend()
         if searched and self._proofs(problem):
@@ -196,7 +202,7 @@ class OneProblem:
         if nearest is None:
             lines += self.blocked
         elif searched and not lines:
-            lines, cut_off = ways(
+            lines, cut_off = diagnose_paths(
                 problem, best.z, best.report, self.blocked, self.settings.random_seed
             )
             status = "infeasible" if cut_off else status
@@ -213,22 +219,22 @@ class OneProblem:
     def _proofs(self, problem: TrajectoryProblem) -> list[str]:
         """Return what is certain, looked for once, and only when something has failed: most tasks can be done."""
         if self._proven is None:
-            hindered = swept(problem)
-            self.hindered, self._proven = bool(hindered), hindered or proofs(problem)
+            hindered = find_swept_collisions(problem)
+            self.hindered, self._proven = bool(hindered), hindered or find_proofs(problem)
         return self._proven
 
     def _goals(
         self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None
-    ) -> list[Blocked]:
+    ) -> list[BlockedGoal]:
         """Return the goals of some phases, None: of all, for which no free configuration is found, each looked for once."""
         found = []
         for number in range(len(problem.task.phases)) if numbers is None else numbers:
             if number not in self._explained:
-                self._explained[number] = blocked(problem, number, self.settings.random_seed)
+                self._explained[number] = diagnose_goal(problem, number, self.settings.random_seed)
             found.append(self._explained[number])
         return [goal for goal in found if goal is not None]
 
-    def _seeds(self, problem: TrajectoryProblem) -> Iterator[Seed]:
+    def _seeds(self, problem: TrajectoryProblem) -> Iterator[InitialGuess]:
         s = self.settings
         seeds = initialize(
             problem,
@@ -237,9 +243,9 @@ class OneProblem:
             count=s.options.max_restarts,
             perturbation=s.perturbation,
             notes=self.blocked,
-            hopeless=lambda phases: (
+            is_infeasible=lambda phases: (
                 bool(self._proofs(problem))
-                or any(goal.deep for goal in self._goals(problem, phases))
+                or any(goal.is_deep for goal in self._goals(problem, phases))
             ),
         )
         while True:
@@ -255,7 +261,7 @@ class OneProblem:
                 return
             yield seed
 
-    def _solve(self, problem: TrajectoryProblem, seed: Seed) -> Solution:
+    def _solve(self, problem: TrajectoryProblem, seed: InitialGuess) -> Solution:
         """Return what the solver makes of a seed."""
         solution = solve(problem, seed.z, callback=self._report, radius=seed.radius)
         self.rounds += solution.rounds
@@ -273,7 +279,7 @@ class OneProblem:
     def _judge(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Try:
         """Return what a solution is worth."""
         with unlimited():
-            waypoints = as_trajectory(problem, solution.z, solution.dt)
+            waypoints = make_trajectory(problem, solution.z, solution.dt)
         began, checked = time.perf_counter(), self.times["validation"]
         if self._paced:
             trajectory, report = waypoints, self._check(waypoints)
@@ -338,7 +344,7 @@ class OneProblem:
         )
 
 
-def _ends_free(problem: TrajectoryProblem, seed: Seed) -> bool:
+def _ends_free(problem: TrajectoryProblem, seed: InitialGuess) -> bool:
     """Return whether a seed's configurations at the ends of the phases are free and what they should be."""
     ends = problem.ends - 1
     free = (

@@ -11,8 +11,8 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.diagnosis.diagnosis import explain, impossible
-from vkc_pin.planning.initialization.keyframes import scatter
+from vkc_pin.planning.diagnosis.diagnosis import diagnose_goals, find_impossible_conditions
+from vkc_pin.planning.initialization.keyframes import sample_goal_configurations
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arguments import instance, whole
@@ -201,7 +201,9 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
         close=tuple(find_close_pairs(scene, options.dist_safe)),
         allowed=find_clearance_exemptions(scene, options.dist_safe),
         attachments=tuple(_attachments(scene, options, seed, cache)),
-        problems=tuple(f"{one.subject}: {one.detail}" for one in impossible(problem)),
+        problems=tuple(
+            f"{one.subject}: {one.detail}" for one in find_impossible_conditions(problem)
+        ),
     )
 
 
@@ -232,7 +234,7 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
     """Return the clearest grasp among random ones, and its clearance, or why there is none."""
     end, safe = int(problem.ends[-1]), problem.options.dist_safe
     for draw in range(3):
-        tried = scatter(problem, end, np.random.default_rng((seed, draw)))
+        tried = sample_goal_configurations(problem, end, np.random.default_rng((seed, draw)))
         z = np.zeros((0, problem.chain.size)) if tried is None else tried[0][tried[1] < TOLERANCE]
         if not len(z):
             continue
@@ -245,7 +247,7 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
         if clearance[best] > -np.inf:
             robot = problem.chain.robot.coordinates.size
             return {"configuration": z[best, :robot].copy(), "clearance": float(clearance[best])}
-    blocked = explain(problem, seed)
+    blocked = diagnose_goals(problem, seed)
     return {"because": blocked[0].text if blocked else "no free configuration was found"}
 
 

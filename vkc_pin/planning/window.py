@@ -9,7 +9,11 @@ from dataclasses import dataclass
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, Seed, seed_of
+from vkc_pin.planning.initialization.initial_guess import (
+    InitialGuess,
+    PhaseWaypoints,
+    make_initial_guess,
+)
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.one_problem import OneProblem
 from vkc_pin.planning.outcome import FINAL, joined
@@ -117,7 +121,7 @@ class SlidingWindow:
         if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
             pieces = [part.piece for part in self.ahead]
             one = self._problem(self._now, first, last)
-            plan = self._solved(first, one, lambda problem: seed_of(problem, pieces))
+            plan = self._solved(first, one, lambda problem: make_initial_guess(problem, pieces))
             if plan.success:
                 self.ahead = self._parts(one, plan, first, last)
         for attempt in range(1, 1 + self._searches):
@@ -200,7 +204,10 @@ class SlidingWindow:
         return plan
 
     def _solved(
-        self, first: int, one: OneProblem, seed: Callable[[TrajectoryProblem], Seed] | None = None
+        self,
+        first: int,
+        one: OneProblem,
+        seed: Callable[[TrajectoryProblem], InitialGuess] | None = None,
     ) -> Plan:
         """Return the plan of a problem that begins with the action `first`."""
         done = len(self._steps(0, first))
@@ -229,7 +236,7 @@ class SlidingWindow:
                 )
                 steps = self._steps(number, number + 1)
                 seed = (
-                    ahead[number].piece.seed if number in ahead else one.initialization
+                    ahead[number].piece.initialization if number in ahead else one.initialization
                 )  # where it came from at first
                 part = dataclasses.replace(
                     plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed

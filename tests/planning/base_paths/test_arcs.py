@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.planning.base_paths.arcs import Curves, between, nearest_arc, spread_along
+from vkc_pin.planning.base_paths.arcs import Curves, find_nearest_arc, interpolate_arcs, sample_path
 
 PLACES = st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(-7.0, 7.0))
 TURNING = 0.3
@@ -35,15 +35,15 @@ def test_every_step_of_a_curve_rolls(
 ) -> None:
     """Not sideways, in no turn tighter than the radius, and to where it is to lead, in steps of any length up to 0.7 rad."""
     a, b, curves = np.array(first), np.array(last), Curves(radius, TURNING)
-    corners = curves.corners(a, b)
+    corners = curves.compute_corners(a, b)
     np.testing.assert_array_equal(corners[0], a)
-    path = np.vstack([a, spread_along(corners, steps, turning=TURNING)])
+    path = np.vstack([a, sample_path(corners, steps, turning=TURNING)])
     assert path.shape == (steps + 1, 3)
     assert equal(path[-1], b)
     along, aside, turn = rolled(path)
     np.testing.assert_allclose(aside, 0.0, atol=1e-6)
     assert (np.abs(along) >= radius * np.abs(turn) - 1e-6)[np.abs(turn) < 0.7].all()
-    (length,), (turned,) = curves.lengths(a[None], b[None])
+    (length,), (turned,) = curves.compute_lengths(a[None], b[None])
     assert np.abs(along).sum() <= length + 1e-6
     assert np.abs(turn).sum() == pytest.approx(turned, abs=1e-6)
     if np.abs(turn).max() < 0.3:
@@ -60,7 +60,7 @@ def test_the_nearest_arc(
     """It rolls; no other arc that is tried at random ends nearer to where it is to lead."""
     a, rng = np.array(first), np.random.default_rng(0)
     b = a + np.array([dx, dy, turn])
-    (found,) = nearest_arc(a[None], b[None], radius=radius, turning=TURNING)
+    (found,) = find_nearest_arc(a[None], b[None], radius=radius, turning=TURNING)
     (along,), (aside,), (turned,) = rolled(np.array([a, found]))
     assert abs(aside) < 1e-9
     assert abs(along) >= radius * abs(turned) - 1e-6
@@ -88,7 +88,7 @@ def test_an_arc_is_its_own_nearest() -> None:
         [chord * np.cos(first[:, 2] + turn / 2), chord * np.sin(first[:, 2] + turn / 2), turn]
     )
     np.testing.assert_allclose(
-        nearest_arc(first, last, radius=1.0, turning=TURNING), last, atol=1e-9
+        find_nearest_arc(first, last, radius=1.0, turning=TURNING), last, atol=1e-9
     )
 
 
@@ -107,16 +107,18 @@ def test_between_two_poses_the_twist_is_constant(
     """Half of the way between two poses of it is the pose half-way between their shares, however they lie."""
     a = np.array([first])
     b = a + np.array([dx, dy, turn])
-    np.testing.assert_allclose(between(a, b, np.array([1.0])), b, atol=1e-9)
-    p, q = between(a, b, np.array([one])), between(a, b, np.array([two]))
+    np.testing.assert_allclose(interpolate_arcs(a, b, np.array([1.0])), b, atol=1e-9)
+    p, q = interpolate_arcs(a, b, np.array([one])), interpolate_arcs(a, b, np.array([two]))
     np.testing.assert_allclose(
-        between(p, q, np.array([0.5])), between(a, b, np.array([(one + two) / 2])), atol=1e-6
+        interpolate_arcs(p, q, np.array([0.5])),
+        interpolate_arcs(a, b, np.array([(one + two) / 2])),
+        atol=1e-6,
     )
 
 
 def test_a_path_stops_at_its_corners() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.557, 1.0], [1.0, 1.557, 0.2]])
-    path = spread_along(corners, 20, turning=TURNING)
+    path = sample_path(corners, 20, turning=TURNING)
     for corner in corners[1:]:
         assert np.abs(path - corner).max(axis=1).min() < 1e-9
     lengths = np.abs(np.diff(path, axis=0)).sum(axis=1)
@@ -125,11 +127,11 @@ def test_a_path_stops_at_its_corners() -> None:
 
 def test_fewer_steps_than_corners_still_lead_there() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.557, 1.0], [1.0, 1.557, 0.2]])
-    path = spread_along(corners, 2, turning=TURNING)
+    path = sample_path(corners, 2, turning=TURNING)
     assert path.shape == (2, 3)
     np.testing.assert_allclose(path[-1], corners[-1], atol=1e-12)
     np.testing.assert_array_equal(
-        spread_along(corners[:1], 3, turning=TURNING), np.tile(corners[:1], (3, 1))
+        sample_path(corners[:1], 3, turning=TURNING), np.tile(corners[:1], (3, 1))
     )
 
 
@@ -150,18 +152,18 @@ def test_a_car_follows_a_path_with_turns_in_place() -> None:
     def free(pose: np.ndarray) -> bool:
         return not (1.5 < pose[0] < 2.5 and pose[1] < 3.0)
 
-    around = curves.through(path, free)
+    around = curves.fit(path, free)
     np.testing.assert_array_equal(around[0], path[0])
     assert equal(around[-1], path[-1])
-    poses = np.vstack([path[:1], spread_along(around, 150, turning=TURNING)])
+    poses = np.vstack([path[:1], sample_path(around, 150, turning=TURNING)])
     assert all(map(free, poses))
     along, aside, turn = rolled(poses)
     np.testing.assert_allclose(aside, 0.0, atol=1e-6)
     assert (np.abs(along) >= 0.6 * np.abs(turn) - 1e-6).all()
     assert np.abs(along).sum() < 1.3 * 12.0
     np.testing.assert_allclose(
-        curves.through(path, lambda _: True), curves.corners(path[0], path[-1]), atol=1e-9
+        curves.fit(path, lambda _: True), curves.compute_corners(path[0], path[-1]), atol=1e-9
     )
-    assert equal(curves.through(path, lambda _: False)[-1], path[-1]), (
+    assert equal(curves.fit(path, lambda _: False)[-1], path[-1]), (
         "what nothing leads through is the solver's to push apart"
     )

@@ -4,16 +4,32 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.base_scenes import BLINK, MARGIN, arm, at, between, chassis, clutter, distance, wedge
+from helpers.base_scenes import (
+    BLINK,
+    MARGIN,
+    arm,
+    at,
+    between,
+    chassis,
+    clutter,
+    distance,
+    wedge,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.planning.base_paths.base_clearance import FAN, Body, Shape, Standing, hull_points
+from vkc_pin.planning.base_paths.base_clearance import (
+    DIRECTIONS,
+    MovingShapes,
+    Obstacles,
+    Shape,
+    compute_hull_points,
+)
 
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def scene(seed: int) -> tuple[list[Shape], list[Shape], Body]:
+def scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
     """Return some shapes on the base, what stands around, and the body of the former."""
     rng = np.random.default_rng(seed)
     shapes = [*chassis(), *arm()[:3], (wedge(), at(0.3, -0.1, 0.6, 0.4))]
@@ -21,7 +37,7 @@ def scene(seed: int) -> tuple[list[Shape], list[Shape], Body]:
         *clutter(int(rng.integers(1000)), 8, reach=1.5),
         (wedge(), at(*rng.uniform(-1.5, 1.5, 2), 0.3, 1.0)),
     ]
-    return shapes, standing, Body(shapes, Standing(standing), MARGIN)
+    return shapes, standing, MovingShapes(shapes, Obstacles(standing), MARGIN)
 
 
 @settings(max_examples=30, deadline=None)
@@ -34,7 +50,7 @@ def test_a_drive_is_free_if_coal_finds_room_all_along(seed: int) -> None:
     nearest = min(
         distance(shapes, standing, pose) for pose in between([*a, yaw], [*b, yaw], length=0.004)
     )
-    if body.driven(a, b, yaw):
+    if body.is_drive_free(a, b, yaw):
         assert nearest >= MARGIN - BLINK
     else:
         assert nearest < MARGIN + 0.004
@@ -51,7 +67,7 @@ def test_a_turn_is_free_if_coal_finds_room_all_along(seed: int) -> None:
         distance(shapes, standing, pose)
         for pose in between([*place, start], [*place, end], angle=0.004)
     )
-    if body.turned(place, start, end):
+    if body.is_turn_free(place, start, end):
         assert nearest >= MARGIN - BLINK
     else:
         assert nearest < MARGIN + 0.004
@@ -64,34 +80,41 @@ def test_both_answers_come_up() -> None:
         _, _, body = scene(seed)
         rng = np.random.default_rng(seed)
         a = rng.uniform(-2.0, 2.0, 2)
-        answers += [body.driven(a, a + 0.3, 0.5), body.turned(a, 0.0, 1.0)]
+        answers += [body.is_drive_free(a, a + 0.3, 0.5), body.is_turn_free(a, 0.0, 1.0)]
     assert 0.2 < np.mean(answers) < 0.8
 
 
 def test_a_drive_along_a_wall_needs_few_questions(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    distance_of = Body._distance
-    monkeypatch.setattr(Body, "_distance", lambda *args: asked.append(args) or distance_of(*args))
+    distance_of = MovingShapes._compute_distance
+    monkeypatch.setattr(
+        MovingShapes, "_compute_distance", lambda *args: asked.append(args) or distance_of(*args)
+    )
     ball: list[Shape] = [(coal.Sphere(0.3), at(0.0, 0.0, 0.4))]
     wall = [(coal.Box(10.0, 0.1, 1.0), at(0.0, 0.355 + MARGIN, 0.5, 0.003))]
-    body = Body(ball, Standing(wall), MARGIN)
-    assert body.driven(np.array([0.0, 0.0]), np.array([3.0, 0.0]), 0.0)
+    body = MovingShapes(ball, Obstacles(wall), MARGIN)
+    assert body.is_drive_free(np.array([0.0, 0.0]), np.array([3.0, 0.0]), 0.0)
     assert len(asked) < 30  # every two millimetres it would be 1500
-    assert not body.driven(np.array([0.0, 0.0]), np.array([-3.0, 0.0]), 0.0)
+    assert not body.is_drive_free(np.array([0.0, 0.0]), np.array([-3.0, 0.0]), 0.0)
 
 
 def test_shapes_at_other_heights_are_no_pairs() -> None:
     table = [(coal.Box(2.0, 2.0, 0.05), at(0.0, 0.0, 0.775))]
-    body = Body([*chassis(), *arm()], Standing(table), MARGIN)
+    body = MovingShapes([*chassis(), *arm()], Obstacles(table), MARGIN)
     assert 0 not in body.moving
     assert len(body.moving) > 0
-    assert Body(chassis(), Standing(table), MARGIN).driven(np.zeros(2), np.ones(2), 0.3)
+    assert MovingShapes(chassis(), Obstacles(table), MARGIN).is_drive_free(
+        np.zeros(2), np.ones(2), 0.3
+    )
 
 
 def test_nothing_to_hit() -> None:
-    for body in (Body([], Standing(clutter(0, 5)), MARGIN), Body(chassis(), Standing([]), MARGIN)):
-        assert body.driven(np.zeros(2), np.ones(2), 0.0)
-        assert body.turned(np.zeros(2), 0.0, 6.0)
+    for body in (
+        MovingShapes([], Obstacles(clutter(0, 5)), MARGIN),
+        MovingShapes(chassis(), Obstacles([]), MARGIN),
+    ):
+        assert body.is_drive_free(np.zeros(2), np.ones(2), 0.0)
+        assert body.is_turn_free(np.zeros(2), 0.0, 6.0)
 
 
 def test_what_is_too_close_at_the_start_may_stay_so_close() -> None:
@@ -100,13 +123,15 @@ def test_what_is_too_close_at_the_start_may_stay_so_close() -> None:
         (coal.Box(1.0, 1.0, 1.0), at(0.0, 0.845, 0.5)),
         (coal.Box(1.0, 1.0, 1.0), at(-3.0, 0.0, 0.5)),
     )
-    body = Body([(coal.Box(1.0, 0.67, 0.4), at(0.0, 0.0, 0.2))], Standing([box, near, far]), MARGIN)
-    margins = body.leaving(np.zeros(2), 0.0)
+    body = MovingShapes(
+        [(coal.Box(1.0, 0.67, 0.4), at(0.0, 0.0, 0.2))], Obstacles([box, near, far]), MARGIN
+    )
+    margins = body.compute_exit_margins(np.zeros(2), 0.0)
     assert margins == pytest.approx([0.01, 0.01, MARGIN], abs=1e-5)
-    assert body.driven(np.zeros(2), np.array([-1.0, 0.0]), 0.0, margins)
-    assert not body.driven(np.zeros(2), np.array([-1.0, 0.0]), 0.0)
-    assert not body.driven(np.zeros(2), np.array([0.005, 0.0]), 0.0, margins)
-    inside = body.leaving(np.array([0.2, 0.0]), 0.0)
+    assert body.is_drive_free(np.zeros(2), np.array([-1.0, 0.0]), 0.0, margins)
+    assert not body.is_drive_free(np.zeros(2), np.array([-1.0, 0.0]), 0.0)
+    assert not body.is_drive_free(np.zeros(2), np.array([0.005, 0.0]), 0.0, margins)
+    inside = body.compute_exit_margins(np.array([0.2, 0.0]), 0.0)
     assert inside[0] == -np.inf
 
 
@@ -132,10 +157,10 @@ def test_outlines_are_inside_and_outside(shape: coal.CollisionGeometry, seed: in
     )
     where = coal.Transform3s(placement.rotation, placement.translation)
     (inner, nothing), (outer, radius) = (
-        hull_points(shape, placement, outer=side) for side in (False, True)
+        compute_hull_points(shape, placement, outer=side) for side in (False, True)
     )
     assert nothing == 0.0
-    for u in FAN[:: int(rng.integers(1, 8))]:
+    for u in DIRECTIONS[:: int(rng.integers(1, 8))]:
         normal = np.array([*u, 0.0])
         # How far the shape reaches along u, from its distance to a half-space far away.
         wall = coal.Halfspace(-normal, -10.0)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.base_clearance import Shape
-from vkc_pin.planning.base_paths.base_path import BasePath, poses_along, shortest_path
+from vkc_pin.planning.base_paths.base_path import BasePath, sample_poses, shortest_path
 from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.planning.base_paths.lattice_search import _Search
 from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS
@@ -103,7 +103,7 @@ def test_nothing_is_hit_all_along_a_path(seed: int) -> None:
     standing = [*furniture(), *clutter(int(rng.integers(10_000)), 12)]
     grid = BaseGrid(chassis(), arm(), standing, HALL, MARGIN, near=NEAR)
     poses = rng.uniform([-4.5, -4.5, -7.0], [4.5, 4.5, 7.0], size=(100, 3))
-    start = next(pose for pose in poses if grid.clear(*pose))
+    start = next(pose for pose in poses if grid.is_pose_free(*pose))
     goals = poses[-4:]
     path, plain = (shortest_path(grid, start, goals, smooth=smooth) for smooth in (True, False))
     assert (path is None) == (plain is None)
@@ -155,7 +155,7 @@ def test_to_turn_in_place_and_to_stay() -> None:
     np.testing.assert_allclose(turned.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 2 * np.pi - 3.0]])
     np.testing.assert_array_equal(stayed.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]])
     assert stayed.cost == 0.0
-    np.testing.assert_array_equal(poses_along(stayed, 3, turning=TURNING), [[0.0, 0.0, 3.0]] * 3)
+    np.testing.assert_array_equal(sample_poses(stayed, 3, turning=TURNING), [[0.0, 0.0, 3.0]] * 3)
 
 
 def test_a_gap_that_only_fits_lengthwise() -> None:
@@ -163,7 +163,7 @@ def test_a_gap_that_only_fits_lengthwise() -> None:
     path = find(standing, start, goals)
     assert path is not None
     check(path, np.array(start), np.array(goals), chassis(), [], standing)
-    waypoints = poses_along(path, 400, turning=TURNING)
+    waypoints = sample_poses(path, 400, turning=TURNING)
     inside = waypoints[np.abs(waypoints[:, 0]) < 0.2]
     assert len(inside) > 5
     assert np.all(np.abs(np.sin(inside[:, 2])) < 0.5)
@@ -194,8 +194,8 @@ def test_near_start_and_goals_only_the_base_counts() -> None:
     tables = [(coal.Box(1.0, 2.0, 0.1), at(x, 0.0, 0.85)) for x in (-3.5, 3.5)]
     start, goals = np.array([-2.5, 0.0, np.pi]), np.array([[2.5, 0.0, 0.0]])
     grid = BaseGrid(chassis(), rod, tables, HALL, MARGIN, near=NEAR)
-    assert not grid.clear(*start)
-    assert not grid.clear(*goals[0])
+    assert not grid.is_pose_free(*start)
+    assert not grid.is_pose_free(*goals[0])
     path = shortest_path(grid, start, goals)
     assert path is not None
     check(path, start, goals, chassis(), rod, tables)
@@ -322,7 +322,7 @@ def test_smoothing_leaves_few_turns(around_the_block: BasePath) -> None:
 @pytest.mark.parametrize("steps", [1, 7, 40])
 def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
     path = around_the_block
-    waypoints = poses_along(path, steps, turning=TURNING)
+    waypoints = sample_poses(path, steps, turning=TURNING)
     assert waypoints.shape == (steps, 3)
     np.testing.assert_array_equal(waypoints[-1], path.poses[-1])
     # Each is on the path, further along than the one before.
@@ -345,9 +345,9 @@ def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
 def test_turning_takes_waypoints() -> None:
     path = find([], [0.0, 0.0, 0.0], [[1.0, 0.0, 3.0]])
     assert path is not None
-    waypoints = poses_along(path, 50, turning=TURNING)
+    waypoints = sample_poses(path, 50, turning=TURNING)
     assert np.sum(waypoints[:, 0] > 1.0 - 1e-9) > 20
-    assert np.sum(poses_along(path, 50, turning=0.01)[:, 0] > 1.0 - 1e-9) < 12
+    assert np.sum(sample_poses(path, 50, turning=0.01)[:, 0] > 1.0 - 1e-9) < 12
 
 
 @pytest.mark.parametrize(
@@ -371,23 +371,23 @@ def test_bad_input(
 
 def test_no_waypoints(around_the_block: BasePath) -> None:
     with pytest.raises(InputError, match="steps"):
-        poses_along(around_the_block, 0, turning=TURNING)
+        sample_poses(around_the_block, 0, turning=TURNING)
 
 
 def test_a_search_asks_about_few_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a thousand cells with a heading, fewer than one is looked at exactly: the rest is left to the heuristic."""
-    move, asked = _Search._move, 0
+    move, asked = _Search._is_move_free, 0
 
     def counted(self: _Search, node: int, after: int) -> bool:
         nonlocal asked
         asked += 1
         return move(self, node, after)
 
-    monkeypatch.setattr(_Search, "_move", counted)
+    monkeypatch.setattr(_Search, "_is_move_free", counted)
     rng, searches = np.random.default_rng(0), 11
     grid = BaseGrid(chassis(), arm(), furniture(), HALL, MARGIN)
     for _ in range(searches):
         start = rng.uniform([1.2, -4.6, -np.pi], [2.8, -4.2, np.pi])
         goals = rng.uniform([1.2, -0.5, -np.pi], [3.8, 2.8, np.pi], size=(8, 3))
         assert shortest_path(grid, start, goals) is not None
-    assert searches <= asked < 1e-3 * searches * grid.stuck.size
+    assert searches <= asked < 1e-3 * searches * grid.blocked.size

@@ -6,7 +6,7 @@ import pytest
 from helpers.base_scenes import HALL, MARGIN, arm, at, chassis, clutter, distance, furniture, wedge
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
-from vkc_pin.planning.base_paths.blocked_cells import Lattice, stuck
+from vkc_pin.planning.base_paths.blocked_cells import Lattice, find_colliding_cells
 from vkc_pin.planning.base_paths.grid import BaseGrid
 
 CARRIED = [
@@ -33,7 +33,7 @@ def test_what_is_stuck_is_blocked_and_nearly_all_that_is_blocked(name: str) -> N
     for i, j, heading in rng.integers([100, 100, 16], size=(800, 3)).tolist():
         pose = [*grid.center(i, j), grid.yaws[heading]]
         for body, (shapes, mask) in enumerate(
-            ((chassis(), grid.stuck), (CARRIED, grid.stuck_carrying))
+            ((chassis(), grid.blocked), (CARRIED, grid.carried_blocked))
         ):
             hit = distance(shapes, standing, pose) < MARGIN
             assert hit or not mask[i, j, heading]
@@ -48,7 +48,9 @@ def test_a_box_before_a_wall() -> None:
     """Exactly the cells whose centres are closer than half the box and the margin."""
     lattice = Lattice(np.array([0.05, 0.05]), np.array([0.1, 0.1]), 20, np.array([0.0, np.pi / 2]))
     wall: list[Shape] = [(coal.Box(0.2, 10.0, 1.0), at(1.0, 1.0, 0.5))]
-    base, carried = stuck([(coal.Box(0.6, 0.3, 0.4), at(0.0, 0.0, 0.2))], [], wall, lattice, MARGIN)
+    base, carried = find_colliding_cells(
+        [(coal.Box(0.6, 0.3, 0.4), at(0.0, 0.0, 0.2))], [], wall, lattice, MARGIN
+    )
     x = 0.05 + 0.1 * np.arange(20)
     for heading, half in ((0, 0.3), (1, 0.15)):
         expected = np.abs(x - 1.0) < half + 0.1 + MARGIN - 1e-9
@@ -63,10 +65,12 @@ def test_only_what_shares_heights_is_stuck() -> None:
         [(coal.Box(0.5, 0.5, 0.4), at(0.0, 0.0, 0.2))],
         [(coal.Box(0.1, 0.1, 0.4), at(0.0, 0.0, 0.7))],
     )
-    base, carried = stuck(low, high, table, lattice, MARGIN)
+    base, carried = find_colliding_cells(low, high, table, lattice, MARGIN)
     assert not base.any()
     assert carried.all()
-    both, over = stuck(low, high, [(coal.Box(5.0, 5.0, 2.0), at(0.5, 0.5, 1.0))], lattice, MARGIN)
+    both, over = find_colliding_cells(
+        low, high, [(coal.Box(5.0, 5.0, 2.0), at(0.5, 0.5, 1.0))], lattice, MARGIN
+    )
     assert both.all()
     assert not over.any()  # it is within the outline of the base, which is stuck anyway
 
@@ -77,7 +81,9 @@ def test_shapes_of_unknown_inside_and_flat_ones_are_left_out() -> None:
         (coal.Ellipsoid(1.0, 1.0, 1.0), at(0.5, 0.5, 0.5)),
         (coal.Box(3.0, 3.0, 0.0), at(0.5, 0.5, 0.1)),
     ]
-    base, _ = stuck([(coal.Box(0.5, 0.5, 0.4), at(0.0, 0.0, 0.2))], [], odd, lattice, MARGIN)
+    base, _ = find_colliding_cells(
+        [(coal.Box(0.5, 0.5, 0.4), at(0.0, 0.0, 0.2))], [], odd, lattice, MARGIN
+    )
     assert not base.any()
-    nothing, _ = stuck([], [], odd, lattice, MARGIN)
+    nothing, _ = find_colliding_cells([], [], odd, lattice, MARGIN)
     assert not nothing.any()

@@ -49,8 +49,8 @@ def test_a_cell_is_free_if_coal_finds_room(grid: BaseGrid) -> None:
     for i, j, heading in states(400, 0):
         pose = [*grid.center(i, j), grid.yaws[heading]]
         base, over = distance(chassis(), STANDING, pose), distance(arm(), STANDING, pose)
-        assert grid.free(i, j, heading, reaching=True) == (base >= MARGIN)
-        assert grid.free(i, j, heading) == (min(base, over) >= MARGIN)
+        assert grid.is_cell_free(i, j, heading, reaching=True) == (base >= MARGIN)
+        assert grid.is_cell_free(i, j, heading) == (min(base, over) >= MARGIN)
         answers.append([base >= MARGIN, over >= MARGIN])
     assert np.all(np.mean(answers, axis=0) > 0.2)
     assert np.all(np.mean(answers, axis=0) < 0.9)
@@ -60,7 +60,7 @@ def test_a_cell_is_free_if_coal_finds_room(grid: BaseGrid) -> None:
 def test_any_pose_is_clear_if_coal_finds_room(grid: BaseGrid) -> None:
     for x, y, yaw in np.random.default_rng(1).uniform([-5, -5, -7], [5, 5, 7], size=(400, 3)):
         expected = distance([*chassis(), *arm()], STANDING, (x, y, yaw)) >= MARGIN
-        assert grid.clear(x, y, yaw) == expected
+        assert grid.is_pose_free(x, y, yaw) == expected
 
 
 @pytest.mark.parametrize("reaching", [True, False])
@@ -74,8 +74,8 @@ def test_moves_between_cells_are_free_all_along(grid: BaseGrid, reaching: bool) 
         there = grid.center(i + grid.moves[heading][0], j + grid.moves[heading][1])
         turned = grid.yaws[heading + 1] if heading < HEADINGS - 1 else 2 * np.pi
         for free, end in (
-            (grid.forward(i, j, heading, reaching=reaching), [*there, yaw]),
-            (grid.left(i, j, heading, reaching=reaching), [*here, turned]),
+            (grid.is_move_free(i, j, heading, reaching=reaching), [*there, yaw]),
+            (grid.is_left_turn_free(i, j, heading, reaching=reaching), [*here, turned]),
         ):
             nearest = min(
                 distance(shapes, STANDING, pose) for pose in between([*here, yaw], end, angle=0.01)
@@ -88,7 +88,7 @@ def test_moves_between_cells_are_free_all_along(grid: BaseGrid, reaching: bool) 
 def test_distances_are_those_of_the_moves_that_are_not_known_to_be_blocked(grid: BaseGrid) -> None:
     """Against a graph built move by move; no way over moves that are really free is shorter."""
     start = grid.center(30, 20)
-    found = grid.distances_from(np.array([start[:2]]))[0]
+    found = grid.compute_distances(np.array([start[:2]]))[0]
     rows, columns, lengths = [], [], []
     for i, j in np.ndindex(100, 100):
         for heading in range(HEADINGS):
@@ -96,7 +96,9 @@ def test_distances_are_those_of_the_moves_that_are_not_known_to_be_blocked(grid:
             if not (0 <= k < 100 and 0 <= m < 100):
                 continue
             back = (heading + HEADINGS // 2) % HEADINGS
-            if any(not grid.stuck[i, j, h] and not grid.stuck[k, m, h] for h in (heading, back)):
+            if any(
+                not grid.blocked[i, j, h] and not grid.blocked[k, m, h] for h in (heading, back)
+            ):
                 rows.append(100 * i + j)
                 columns.append(100 * k + m)
                 lengths.append(grid.lengths[heading])
@@ -105,42 +107,42 @@ def test_distances_are_those_of_the_moves_that_are_not_known_to_be_blocked(grid:
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert found[30, 20] == 0.0
     assert np.isinf(found).sum() > 100
-    assert grid.stuck[np.isinf(found)].any(axis=1).all()
+    assert grid.blocked[np.isinf(found)].any(axis=1).all()
 
 
 def test_distances_around_a_wall() -> None:
     wall: list[Shape] = [(coal.Box(0.1, 8.0, 1.0), at(0.0, -1.0, 0.5))]
     grid = BaseGrid(chassis(), [], wall, HALL, MARGIN)
-    found = grid.distances_from(np.array([(-2.0, -3.0)]))[0]
+    found = grid.compute_distances(np.array([(-2.0, -3.0)]))[0]
     corner = np.array([0.0, 3.0 + 0.335])
     around = np.hypot(*(corner - (-2.0, -3.0))) + np.hypot(*(corner - grid.center(69, 20)))
     assert around < found[69, 20] < 1.1 * around
     assert found[20, 20] < 1.2
-    several = grid.distances_from(np.array([(-2.0, -3.0), (3.0, 3.0)]))
+    several = grid.compute_distances(np.array([(-2.0, -3.0), (3.0, 3.0)]))
     np.testing.assert_array_equal(several[0], found)
     assert several[1, 80, 80] < 0.1
     many = np.random.default_rng(0).uniform(-3.0, 3.0, (7, 2))
     for threads in (2, 9):
         np.testing.assert_array_equal(
-            grid.distances_from(many, threads=threads), grid.distances_from(many)
+            grid.compute_distances(many, threads=threads), grid.compute_distances(many)
         )
 
 
 def test_distances_from_where_the_base_cannot_be() -> None:
     block: list[Shape] = [(coal.Box(2.0, 2.0, 1.0), at(0.0, 0.0, 0.5))]
     grid = BaseGrid(chassis(), [], block, HALL, MARGIN)
-    assert np.isfinite(grid.distances_from(np.array([(0.7, 0.0)]))).any()
+    assert np.isfinite(grid.compute_distances(np.array([(0.7, 0.0)]))).any()
     everywhere = BaseGrid(
         chassis(), [], [(coal.Box(20.0, 20.0, 1.0), at(0.0, 0.0, 0.5))], HALL, MARGIN
     )
-    assert np.isinf(everywhere.distances_from(np.zeros((1, 2)))).all()
+    assert np.isinf(everywhere.compute_distances(np.zeros((1, 2)))).all()
 
 
 def test_moves_that_lead_nowhere_are_refused(grid: BaseGrid) -> None:
     floor = compiled_module("vkc_pin.planning.base_paths._driving").Floor
     for lengths in (np.zeros(HEADINGS), -grid.lengths, np.full(HEADINGS, np.nan)):
         with pytest.raises(ValueError, match="lead"):
-            floor(grid.stuck.view(np.uint8), grid.moves, lengths)
+            floor(grid.blocked.view(np.uint8), grid.moves, lengths)
 
 
 def test_an_arena_that_is_not_square() -> None:
@@ -164,8 +166,8 @@ def test_an_arena_that_is_not_square() -> None:
             )
             >= MARGIN
         )
-        assert grid.free(i, j, heading) == free
-        assert not (free and grid.stuck[i, j, heading])
+        assert grid.is_cell_free(i, j, heading) == free
+        assert not (free and grid.blocked[i, j, heading])
 
 
 @pytest.mark.parametrize(

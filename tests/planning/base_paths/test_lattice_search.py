@@ -12,8 +12,13 @@ from scipy.sparse.csgraph import dijkstra
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
-from vkc_pin.planning.base_paths.lattice_search import cheapest
-from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS, Ground, wrapped
+from vkc_pin.planning.base_paths.lattice_search import find_cheapest_path
+from vkc_pin.planning.base_paths.motion_primitives import (
+    BACKWARDS,
+    SIDEWAYS,
+    SearchSpace,
+    wrap_angle,
+)
 
 TURNING = 0.3  # [m/rad] where a grid is not told
 
@@ -42,11 +47,13 @@ def reference(
     for i, j, heading in np.ndindex(grid.cells, grid.cells, HEADINGS):
         k, m = np.add((i, j), grid.moves[heading])
         here, length = node(i, j, heading), grid.lengths[heading]
-        if 0 <= k < grid.cells and 0 <= m < grid.cells and grid.forward(i, j, heading):
+        if 0 <= k < grid.cells and 0 <= m < grid.cells and grid.is_move_free(i, j, heading):
             edge(here, node(k, m, heading), length)
             edge(node(k, m, heading), here, BACKWARDS * length)
-        if grid.left(i, j, heading):
-            turn = TURNING * abs(wrapped(grid.yaws[(heading + 1) % HEADINGS] - grid.yaws[heading]))
+        if grid.is_left_turn_free(i, j, heading):
+            turn = TURNING * abs(
+                wrap_angle(grid.yaws[(heading + 1) % HEADINGS] - grid.yaws[heading])
+            )
             edge(here, node(i, j, heading + 1), turn)
             edge(node(i, j, heading + 1), here, turn)
 
@@ -64,9 +71,13 @@ def reference(
     ) -> float:
         """Return what turning, driving and turning costs, infinite if it is not free."""
         length = np.hypot(*(b - a))
-        yaw = before + wrapped(yaw - before)
-        after = yaw + wrapped(after - yaw)
-        free = grid.turned(a, before, yaw) and grid.driven(a, b, yaw) and grid.turned(b, yaw, after)
+        yaw = before + wrap_angle(yaw - before)
+        after = yaw + wrap_angle(after - yaw)
+        free = (
+            grid.is_turn_free(a, before, yaw)
+            and grid.is_drive_free(a, b, yaw)
+            and grid.is_turn_free(b, yaw, after)
+        )
         cost = length * (1.0, BACKWARDS, SIDEWAYS)[how] + TURNING * (
             abs(yaw - before) + abs(after - yaw)
         )
@@ -79,14 +90,14 @@ def reference(
         for how in range(3):
             if np.hypot(*(center - start[:2])) <= radius:
                 yaw = toward(start[:2], center, how, start[2])
-                heading = int(np.abs(wrapped(grid.yaws - yaw)).argmin())
+                heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
                 cost = way(start[:2], center, start[2], yaw, grid.yaws[heading], how)
                 if cost < np.inf:
                     edge(first, node(i, j, heading), cost)
             for goal, more in zip(goals, extra, strict=True):
-                if np.hypot(*(center - goal[:2])) <= radius and grid.clear(*goal):
+                if np.hypot(*(center - goal[:2])) <= radius and grid.is_pose_free(*goal):
                     yaw = toward(center, goal[:2], how, goal[2])
-                    heading = int(np.abs(wrapped(grid.yaws - yaw)).argmin())
+                    heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
                     cost = way(center, goal[:2], grid.yaws[heading], yaw, goal[2], how)
                     if cost < np.inf:
                         edge(node(i, j, heading), last, cost + more)
@@ -128,7 +139,7 @@ def task(
         chassis(0.7, 0.4), rod if seed % 2 else [], standing, ROOM, MARGIN, cells=CELLS, near=0.0
     )
     poses = rng.uniform([-1.8, -1.8, -3.0], [1.8, 1.8, 3.0], size=(200, 3))
-    start = next((pose for pose in poses if grid.clear(*pose)), poses[0])
+    start = next((pose for pose in poses if grid.is_pose_free(*pose)), poses[0])
     return grid, start, poses[100:103], rng.choice([0.0, 1.0], 3)
 
 
@@ -139,8 +150,8 @@ def test_no_way_over_the_grid_is_cheaper(seed: int) -> None:
     grid, start, goals, extra = task(seed)
     expected = reference(grid, start, goals, extra)
     fresh, *_ = task(seed)  # which remembers nothing
-    found = cheapest(Ground(fresh, start, goals), extra)
-    if grid.clear(*start):
+    found = find_cheapest_path(SearchSpace(fresh, start, goals), extra)
+    if grid.is_pose_free(*start):
         assert (np.inf if found is None else found[0]) == pytest.approx(expected, abs=1e-4)
 
 
@@ -149,7 +160,7 @@ def test_there_are_ways_and_none() -> None:
     found = []
     for seed in range(30):
         grid, start, goals, extra = task(seed)
-        way = cheapest(Ground(grid, start, goals), extra)
+        way = find_cheapest_path(SearchSpace(grid, start, goals), extra)
         found.append(0 if way is None else len(way[2]))
     assert found.count(0) > 2
     assert sum(drives > 3 for drives in found) > 5
@@ -158,7 +169,7 @@ def test_there_are_ways_and_none() -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_remembering_moves_changes_nothing(seed: int) -> None:
     grid, start, goals, extra = task(seed)
-    first, second = (cheapest(Ground(grid, start, goals), extra) for _ in range(2))
+    first, second = (find_cheapest_path(SearchSpace(grid, start, goals), extra) for _ in range(2))
     assert (first is None) == (second is None)
     if first is not None and second is not None:
         assert first[:2] == second[:2]
@@ -176,9 +187,11 @@ def test_what_other_searches_found_out_changes_nothing(seed: int) -> None:
     for grids in (grid, fresh):
         grids.near = 0.5
     for other in rng.uniform([-1.8, -1.8, -3.0], [1.8, 1.8, 3.0], size=(4, 3)):
-        cheapest(Ground(grid, other, goals[:2]), extra[:2])
-        cheapest(Ground(grid, start, other[None]), extra[:1])
-    first, second = (cheapest(Ground(one, start, goals), extra) for one in (grid, fresh))
+        find_cheapest_path(SearchSpace(grid, other, goals[:2]), extra[:2])
+        find_cheapest_path(SearchSpace(grid, start, other[None]), extra[:1])
+    first, second = (
+        find_cheapest_path(SearchSpace(one, start, goals), extra) for one in (grid, fresh)
+    )
     assert (first is None) == (second is None)
     if first is not None and second is not None:
         assert first[:2] == second[:2]
@@ -199,10 +212,10 @@ def test_start_and_goal_on_cells() -> None:
     )
     start = np.array([*grid.center(2, 2), grid.yaws[4]])
     goals = np.array([[*grid.center(10, 2), grid.yaws[12]]])
-    found = cheapest(Ground(grid, start, goals), np.zeros(1))
+    found = find_cheapest_path(SearchSpace(grid, start, goals), np.zeros(1))
     assert found is not None
     assert found[0] == pytest.approx(reference(grid, start, goals, np.zeros(1)), abs=1e-4)
-    same = cheapest(Ground(grid, start, start[None]), np.zeros(1))
+    same = find_cheapest_path(SearchSpace(grid, start, start[None]), np.zeros(1))
     assert same is not None
     assert same[0] == 0.0
 
@@ -224,7 +237,7 @@ def test_a_way_that_is_far_longer_than_it_seems(monkeypatch: pytest.MonkeyPatch)
         cells=50,
     )
     start, goals = np.array([-1.0, 0.0, 0.0]), np.array([[1.0, 0.0, 0.0]])
-    found = cheapest(Ground(grid, start, goals), np.zeros(1))
+    found = find_cheapest_path(SearchSpace(grid, start, goals), np.zeros(1))
     assert found is not None
     assert found[0] > 4.0
     assert any(drive.b[1] > 2.0 for drive in found[2])

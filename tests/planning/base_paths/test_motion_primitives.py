@@ -15,8 +15,8 @@ from vkc_pin.planning.base_paths.motion_primitives import (
     UNIT,
     Connections,
     Drive,
-    Ground,
-    wrapped,
+    SearchSpace,
+    wrap_angle,
 )
 
 TURNING = 0.3  # [m/rad] where a grid is not told
@@ -24,22 +24,22 @@ TURNING = 0.3  # [m/rad] where a grid is not told
 START = np.array([0.0, 0.0, 0.0])
 
 
-def ground(
+def space(
     standing: list[Shape],
     goals: list[list[float]],
     *,
     carried: list[Shape] | None = None,
     near: float = 1.0,
-) -> Ground:
+) -> SearchSpace:
     grid = BaseGrid(chassis(), carried or [], standing, HALL, MARGIN, near=near)
-    return Ground(grid, START, np.array(goals))
+    return SearchSpace(grid, START, np.array(goals))
 
 
 @given(st.floats(-50.0, 50.0))
 def test_wrapped(angle: float) -> None:
-    assert -np.pi <= wrapped(angle) <= np.pi
-    assert np.cos(wrapped(angle)) == pytest.approx(np.cos(angle), abs=1e-9)
-    assert np.sin(wrapped(angle)) == pytest.approx(np.sin(angle), abs=1e-9)
+    assert -np.pi <= wrap_angle(angle) <= np.pi
+    assert np.cos(wrap_angle(angle)) == pytest.approx(np.cos(angle), abs=1e-9)
+    assert np.sin(wrap_angle(angle)) == pytest.approx(np.sin(angle), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -54,31 +54,31 @@ def test_what_a_drive_costs(turned: float, factor: float) -> None:
 def test_the_parts_of_a_drive_that_are_near_nothing() -> None:
     """Against points on it, one by one."""
     rng = np.random.default_rng(0)
-    places = ground([], rng.uniform(-3.0, 3.0, (4, 3)).tolist())
+    places = space([], rng.uniform(-3.0, 3.0, (4, 3)).tolist())
     for _ in range(50):
         drive = Drive(*rng.uniform(-4.0, 4.0, (2, 2)), 0.0)
-        parts = list(places._outside(drive))
+        parts = list(places._split_outside_ends(drive))
         for share in rng.uniform(size=40):
             point = drive.a + share * (drive.b - drive.a)
             away = min(np.hypot(*(point - place[:2])) for place in (START, *places.goals))
             covered = any((point - a) @ (point - b) <= 0.0 for a, b in parts)
             assert covered == (away > 1.0)
     still = [Drive(np.array(place), np.array(place), 0.0) for place in ([4.5, 4.5], [0.5, 0.5])]
-    assert [len(list(places._outside(drive))) for drive in still] == [1, 0]
+    assert [len(list(places._split_outside_ends(drive))) for drive in still] == [1, 0]
 
 
 def test_cells_near_start_and_goals() -> None:
-    places = ground([], [[3.0, 3.0, 0.0]])
+    places = space([], [[3.0, 3.0, 0.0]])
     for i, j in np.ndindex(100, 100):
         center = places.grid.center(i, j)
         near = [np.hypot(*np.subtract(center, place)) <= 1.0 for place in ((0.0, 0.0), (3.0, 3.0))]
         assert places.near[i, j] == (0 if near[0] else 1 if near[1] else -1)
-    assert np.all(ground([], [[3.0, 3.0, 0.0]], near=0.0).near == -1)
+    assert np.all(space([], [[3.0, 3.0, 0.0]], near=0.0).near == -1)
 
 
 def test_ways_lead_to_the_cells_around() -> None:
-    places = ground([], [[3.0, 3.0, 1.0]])
-    starts, ends = places.starts(), places.ends(0)
+    places = space([], [[3.0, 3.0, 1.0]])
+    starts, ends = places.get_starts(), places.get_ends(0)
     assert len(np.unique(starts.cell)) == np.sum(
         [np.hypot(*np.subtract(places.center(c), (0, 0))) <= 0.6 for c in range(10_000)]
     )
@@ -86,11 +86,15 @@ def test_ways_lead_to_the_cells_around() -> None:
         kinds = set()
         for k in range(len(ways.cell)):
             heading = float(places.grid.yaws[ways.heading[k]])
-            drive, after = places.begin(ways, k) if leaving else places.end(ways, k, 0, heading)
+            drive, after = (
+                places.get_start_drive(ways, k)
+                if leaving
+                else places.get_goal_drive(ways, k, 0, heading)
+            )
             before = 0.0 if leaving else heading
             expected = drive.cost + TURNING * (abs(drive.yaw - before) + abs(after - drive.yaw))
             assert ways.cost[k] * UNIT == pytest.approx(expected, abs=2 * UNIT)
-            assert abs(wrapped(after - (heading if leaving else 1.0))) < 1e-9
+            assert abs(wrap_angle(after - (heading if leaving else 1.0))) < 1e-9
             np.testing.assert_array_equal(
                 drive.a if leaving else drive.b, [0.0, 0.0] if leaving else [3.0, 3.0]
             )
@@ -103,60 +107,60 @@ def test_ways_lead_to_the_cells_around() -> None:
 
 def test_ways_that_it_has_no_room_to_turn_to_are_left_out() -> None:
     walls: list[Shape] = [(coal.Box(4.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-0.55, 0.55)]
-    places = ground(walls, [[3.0, 0.0, 0.0]])
-    turns = np.abs(wrapped(2 * places.starts().yaw)) / 2  # from driving ahead or back
+    places = space(walls, [[3.0, 0.0, 0.0]])
+    turns = np.abs(wrap_angle(2 * places.get_starts().yaw)) / 2  # from driving ahead or back
     assert len(turns) > 0
     assert turns.max() < 0.5
-    assert ground([], [[3.0, 0.0, 0.0]]).starts().yaw.max() > 1.5
+    assert space([], [[3.0, 0.0, 0.0]]).get_starts().yaw.max() > 1.5
 
 
 def test_a_blocked_start() -> None:
     close, over = [(coal.Box(1.0, 1.0, 1.0), at(x, 0.0, 0.5)) for x in (1.01, 0.9)]
     free, near, inside = (
-        ground([], [[3.0, 0.0, 0.0]]),
-        ground([close], [[3.0, 0.0, 0.0]]),
-        ground([over], [[-0.9, 0.0, 0.0]]),
+        space([], [[3.0, 0.0, 0.0]]),
+        space([close], [[3.0, 0.0, 0.0]]),
+        space([over], [[-0.9, 0.0, 0.0]]),
     )
-    assert free.leaving is None
-    assert near.leaving is not None
-    assert near.leaving == pytest.approx([0.01], abs=1e-5)
-    assert near.haste == 1.0
-    assert inside.leaving is not None
-    assert inside.leaving[0] == -np.inf
-    assert inside.haste > 1.0
-    back = near.direct(0, 1)
+    assert free.exit_margins is None
+    assert near.exit_margins is not None
+    assert near.exit_margins == pytest.approx([0.01], abs=1e-5)
+    assert near.exit_cost == 1.0
+    assert inside.exit_margins is not None
+    assert inside.exit_margins[0] == -np.inf
+    assert inside.exit_cost > 1.0
+    back = near.get_direct_drive(0, 1)
     assert back is None  # three metres, too far for a blocked start
-    short = inside.direct(0, 1)
+    short = inside.get_direct_drive(0, 1)
     assert short is not None
-    assert inside.swept(0.0, *short, inside.leaving)
-    assert not inside.swept(0.0, *short)
+    assert inside.is_sweep_free(0.0, *short, inside.exit_margins)
+    assert not inside.is_sweep_free(0.0, *short)
 
 
 def test_what_is_carried_counts_away_from_start_and_goals() -> None:
     rod: list[Shape] = [(coal.Box(0.05, 2.0, 0.05), at(0.0, 0.0, 0.8))]
     post: list[Shape] = [(coal.Box(0.1, 0.1, 1.0), at(x, 0.9, 0.5)) for x in (0.0, 2.0)]
-    places = ground(post, [[4.0, 0.0, 0.0]], carried=rod)
-    assert places.clear(START)
-    assert not places.clear(np.array([2.0, 0.0, 0.0]))
-    assert places.driven(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))
-    assert not places.driven(Drive(np.array([0.5, 0.0]), np.array([3.5, 0.0]), 0.0))
-    assert places.turned(START[:2], 0.0, 3.0)
-    assert not places.turned(np.array([2.0, 0.0]), 0.3, 3.3)
+    places = space(post, [[4.0, 0.0, 0.0]], carried=rod)
+    assert places.is_pose_free(START)
+    assert not places.is_pose_free(np.array([2.0, 0.0, 0.0]))
+    assert places.is_drive_free(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))
+    assert not places.is_drive_free(Drive(np.array([0.5, 0.0]), np.array([3.5, 0.0]), 0.0))
+    assert places.is_turn_free(START[:2], 0.0, 3.0)
+    assert not places.is_turn_free(np.array([2.0, 0.0]), 0.3, 3.3)
     # The rod passes over the second post's cells, where only the mask knows.
-    assert not places.likely(Drive(np.array([0.5, 0.0]), np.array([3.5, 0.0]), 0.0))
-    assert places.likely(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))
+    assert not places.looks_free(Drive(np.array([0.5, 0.0]), np.array([3.5, 0.0]), 0.0))
+    assert places.looks_free(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))
 
 
 def test_how_far_the_base_turns_is_remembered_for_each_place_alone() -> None:
-    """Between two walls it turns a little, in the open all round, whichever is asked first, and with other margins further."""
+    """The turning range depends on place and margins, not on the order of the queries."""
     walls: list[Shape] = [(coal.Box(2.0, 0.1, 1.0), at(0.0, sign * 0.5, 0.5)) for sign in (-1, 1)]
     places = [START, np.array([3.5, 0.0, 0.0])]
 
     def turns(grid: BaseGrid, place: np.ndarray, margins: np.ndarray | None = None) -> list[bool]:
-        one = Ground(grid, place, np.array([[3.5, 3.0, 0.0]]))
+        one = SearchSpace(grid, place, np.array([[3.5, 3.0, 0.0]]))
         yaws = np.linspace(-3.0, 3.0, 41)
         every = Connections(np.zeros(41, int), np.zeros(41, int), yaws, np.zeros(41, int))
-        return one.turnable(place, every, margins).tolist()
+        return one.find_turnable(place, every, margins).tolist()
 
     alone = [turns(BaseGrid(chassis(), [], walls, HALL, MARGIN), place) for place in places]
     assert 0 < sum(alone[0]) < 41 == sum(alone[1])

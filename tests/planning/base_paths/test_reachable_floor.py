@@ -6,7 +6,12 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
-from vkc_pin.planning.base_paths.reachable_floor import Cells, Discs, flooded, taken
+from vkc_pin.planning.base_paths.reachable_floor import (
+    CellGrid,
+    InscribedDiscs,
+    find_blocked_cells,
+    flood_fill,
+)
 
 
 def box(
@@ -23,35 +28,37 @@ BASE = [
 
 
 def test_the_disc_is_that_of_all_shapes_at_a_height_together() -> None:
-    discs = Discs(BASE)
-    assert discs.radius(0.2) == pytest.approx(
+    discs = InscribedDiscs(BASE)
+    assert discs.get_radius(0.2) == pytest.approx(
         0.335
     )  # to the outer sides of the wheels, less what is taken off
-    assert discs.radius(0.299) == pytest.approx(0.335)
-    assert discs.radius(0.05) <= 0.0  # between the wheels is nothing
-    assert discs.radius(0.35) <= 0.0
+    assert discs.get_radius(0.299) == pytest.approx(0.335)
+    assert discs.get_radius(0.05) <= 0.0  # between the wheels is nothing
+    assert discs.get_radius(0.35) <= 0.0
 
 
 def test_shapes_that_do_not_touch_cover_no_more_than_their_own() -> None:
     apart = [box((0.4, 0.4, 0.2), (0.0, 0.0, 0.1)), box((0.4, 0.4, 0.2), (0.0, 0.5, 0.1))]
-    assert Discs(apart).radius(0.1) == pytest.approx(0.195)
+    assert InscribedDiscs(apart).get_radius(0.1) == pytest.approx(0.195)
 
 
 def test_what_is_above_or_below_the_base_keeps_nothing_away() -> None:
-    discs = Discs(BASE)
+    discs = InscribedDiscs(BASE)
     assert (
-        discs.walls([box((1.0, 1.0, 0.1), (0.0, 0.0, 0.5)), box((1.0, 1.0, 0.04), (0.0, 0.0, 0.0))])
+        discs.make_walls(
+            [box((1.0, 1.0, 0.1), (0.0, 0.0, 0.5)), box((1.0, 1.0, 0.04), (0.0, 0.0, 0.0))]
+        )
         == []
     )
-    (plate,) = discs.walls(
+    (plate,) = discs.make_walls(
         [box((1.0, 1.0, 0.01), (0.0, 0.0, 0.225))]
     )  # thinner than what lies between the levels
     assert plate.radius == pytest.approx(0.335)
 
 
 def test_no_base_and_no_obstacle() -> None:
-    assert Discs([]).walls([box((1.0, 1.0, 1.0), (0.0, 0.0, 0.5))]) == []
-    assert Discs(BASE).walls([]) == []
+    assert InscribedDiscs([]).make_walls([box((1.0, 1.0, 1.0), (0.0, 0.0, 0.5))]) == []
+    assert InscribedDiscs(BASE).make_walls([]) == []
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -67,10 +74,10 @@ def test_wherever_a_cell_is_taken_the_base_hits_the_obstacle_at_every_heading(se
         coal.Sphere(0.2),
         coal.Capsule(0.1, 0.4),
     ][seed % 4]
-    cells, count = Cells.over(np.full(2, -1.5), np.full(2, 1.5), 0.05), 0
+    cells, count = CellGrid.over(np.full(2, -1.5), np.full(2, 1.5), 0.05), 0
     request, result = coal.CollisionRequest(), coal.CollisionResult()
-    for wall in Discs(BASE).walls([(shape, tilt)]):
-        (rows, columns), own = taken(cells, wall, -0.05 * np.sqrt(0.5))
+    for wall in InscribedDiscs(BASE).make_walls([(shape, tilt)]):
+        (rows, columns), own = find_blocked_cells(cells, wall, -0.05 * np.sqrt(0.5))
         x, y = cells.centers()
         for i, j in rng.permutation(np.argwhere(own))[:40].tolist():
             at = np.array([x[rows][i, 0], y[:, columns][0, j]]) + rng.uniform(-0.025, 0.025, 2)
@@ -92,11 +99,11 @@ def test_a_flood_passes_corners_only_if_it_may() -> None:
     free = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 0]], bool)
     begin = np.zeros((3, 3), bool)
     begin[0, 0] = True
-    assert flooded(free, begin, corners=True).sum() == 2
-    assert flooded(free, begin, corners=False).sum() == 1
+    assert flood_fill(free, begin, corners=True).sum() == 2
+    assert flood_fill(free, begin, corners=False).sum() == 1
 
 
 def test_a_flood_may_begin_where_all_is_taken() -> None:
     free, begin = np.ones((1, 5), bool), np.zeros((1, 5), bool)
     free[0, 2], begin[0, 2] = False, True
-    assert flooded(free, begin, corners=True).all()
+    assert flood_fill(free, begin, corners=True).all()

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.planning.base_paths.reeds_shepp import lengths_of, shortest_words
+from vkc_pin.planning.base_paths.reeds_shepp import compute_lengths, find_shortest_path_pieces
 
 GOALS = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0), st.floats(-np.pi, np.pi))
 RADII = st.floats(0.2, 3.0)
@@ -32,7 +32,7 @@ def driven(pieces: list[tuple[float, float]]) -> np.ndarray:
 def test_pieces_are_arcs_of_the_radius_and_lines_that_lead_there(
     goal: tuple[float, float, float], radius: float
 ) -> None:
-    pieces = shortest_words(np.array(goal), radius)
+    pieces = find_shortest_path_pieces(np.array(goal), radius)
     assert len(pieces) <= 5
     for length, turn in pieces:
         assert turn == 0.0 or abs(turn) == pytest.approx(abs(length) / radius)
@@ -42,7 +42,7 @@ def test_pieces_are_arcs_of_the_radius_and_lines_that_lead_there(
         where = where + np.array([chord * np.cos(middle), chord * np.sin(middle), turn])
     np.testing.assert_allclose(where[:2], radius * np.array(goal[:2]), atol=1e-6 * radius)
     assert np.cos(where[2] - goal[2]) == pytest.approx(1.0, abs=1e-9)
-    length, turned = lengths_of(np.array([goal]), radius)
+    length, turned = compute_lengths(np.array([goal]), radius)
     assert length[0] == pytest.approx(sum(abs(length) for length, _ in pieces))
     assert turned[0] == pytest.approx(sum(abs(turn) for _, turn in pieces))
 
@@ -52,7 +52,7 @@ def test_pieces_are_arcs_of_the_radius_and_lines_that_lead_there(
 def test_it_is_as_far_there_as_back_and_in_the_mirror(goal: tuple[float, float, float]) -> None:
     x, y, yaw = goal
     back = [-(x * np.cos(yaw) + y * np.sin(yaw)), x * np.sin(yaw) - y * np.cos(yaw), -yaw]
-    lengths, _ = lengths_of(np.array([goal, back, (x, -y, -yaw), (-x, y, -yaw)]), 1.0)
+    lengths, _ = compute_lengths(np.array([goal, back, (x, -y, -yaw), (-x, y, -yaw)]), 1.0)
     np.testing.assert_allclose(lengths, lengths[0], atol=1e-6)
     assert lengths[0] >= np.hypot(x, y) - 1e-9
     assert lengths[0] >= abs(yaw) - 1e-9
@@ -73,7 +73,7 @@ def test_no_other_word_is_shorter() -> None:
             middle, chord = where[2] + turn / 2, length * np.sinc(turn / (2 * np.pi))
             where = where + np.array([chord * np.cos(middle), chord * np.sin(middle), turn])
         where[2] = (where[2] + np.pi) % (2 * np.pi) - np.pi
-        (length,), _ = lengths_of(where[None], 1.0)
+        (length,), _ = compute_lengths(where[None], 1.0)
         assert length <= sum(abs(piece) for piece, _ in pieces) + 1e-6
 
 
@@ -92,5 +92,7 @@ def test_no_other_word_is_shorter() -> None:
     ],
 )
 def test_known_lengths(goal: tuple[float, float, float], length: float) -> None:
-    assert lengths_of(np.array([goal]), 1.0)[0][0] == pytest.approx(length, abs=1e-6)
-    np.testing.assert_allclose(driven(shortest_words(np.array(goal), 1.0))[:2], goal[:2], atol=1e-5)
+    assert compute_lengths(np.array([goal]), 1.0)[0][0] == pytest.approx(length, abs=1e-6)
+    np.testing.assert_allclose(
+        driven(find_shortest_path_pieces(np.array(goal), 1.0))[:2], goal[:2], atol=1e-5
+    )

@@ -8,7 +8,7 @@ from helpers.small_problems import SHORT, program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.impossible import KINDS
-from vkc_pin.planning.diagnosis.paths import ways
+from vkc_pin.planning.diagnosis.paths import diagnose_paths
 from vkc_pin.validation.report import Report, Violation
 
 HIT = Report(
@@ -30,14 +30,14 @@ def across(bottom: float, *, report: Report = HIT, blocked: tuple[str, ...] = ()
     }
     own = program_of(hall(obstacles=[beam]), [vkc.GoTo(3.6, 0.0, 0.0)], options=SHORT)
     z = np.linspace(own.start, own.start + np.eye(len(own.start))[0] * 3.6, own.segments + 1)[1:]
-    return ways(own, z, report, blocked, 0).lines
+    return diagnose_paths(own, z, report, blocked, 0).lines
 
 
 def test_no_way_even_with_the_arm_folded() -> None:
     (line,) = across(0.5)
     assert (
         line
-        == "go to: found no way for the base from (0.00, 0.00) to (3.60, 0.00), and none with the arm folded"
+        == "go to: found no path for the base from (0.00, 0.00) to (3.60, 0.00), and none with the arm folded"
     )
 
 
@@ -45,15 +45,15 @@ def test_a_way_for_the_base_but_none_for_the_arm() -> None:
     (line,) = across(2.0)
     assert (
         line
-        == "go to: found a way for the base from (0.00, 0.00) to (3.60, 0.00), but none for the arm at the goal"
+        == "go to: found a path for the base from (0.00, 0.00) to (3.60, 0.00), but none for the arm at the goal"
     )
 
 
 def test_what_hits_nothing_is_not_asked_about() -> None:
     assert across(0.5, report=Report()) == []
     assert across(
-        2.0, report=Report(), blocked=("go to: found no way for the base from here to there",)
-    ) == ["go to: found no way for the base from here to there"]
+        2.0, report=Report(), blocked=("go to: found no path for the base from here to there",)
+    ) == ["go to: found no path for the base from here to there"]
 
 
 def test_a_door_that_is_pushed_from_the_far_side_and_leaves_no_room_to_get_there() -> None:
@@ -67,7 +67,7 @@ def test_a_door_that_is_pushed_from_the_far_side_and_leaves_no_room_to_get_there
     assert plan.status == "infeasible"
     (note,) = plan.validation.notes
     assert note.startswith(
-        "reach door.push_back: found no way for the base from (1.50, -1.00) to any of "
+        "reach door.push_back: found no path for the base from (1.50, -1.00) to any of "
     )
     assert note.endswith(" places from which the goal was reached, and none with the arm folded")
     wide = scene.with_state("door", {"hinge": 1.52})
@@ -92,8 +92,8 @@ def test_no_way_later_on_says_nothing_of_the_whole() -> None:
             unit="m",
             detail="overlap",
         )
-        found = ways(own, z, Report((hit,)), (), 0)
-        assert found.cut_off == cut_off
+        found = diagnose_paths(own, z, Report((hit,)), (), 0)
+        assert found.is_cut_off == cut_off
         assert "and none with the arm folded" in found.lines[-1]
 
 
@@ -102,5 +102,5 @@ def test_a_bend_that_is_too_tight() -> None:
     plan = vkc.plan(scene, steps, options=vkc.Options(max_restarts=1))
     assert not plan.success
     (note,) = plan.validation.notes
-    assert "found no way for the base" in note
+    assert "found no path for the base" in note
     assert "and none with the arm folded" in note

@@ -11,7 +11,7 @@ import pytest
 from helpers.small_problems import door_scene
 
 from vkc_pin.options import Options
-from vkc_pin.planning.diagnosis.swept_volumes import swept
+from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.models.shapes import compute_world_box, get_link_name
 from vkc_pin.world.scene.placed_object import make_world_shapes
@@ -58,8 +58,8 @@ def problem(
 
 
 def test_what_stands_where_the_leaf_goes_is_named() -> None:
-    (line,) = swept(problem(1.3, POST))
-    assert "no way for door.hinge, proven: between 0 and 1.3, at " in line
+    (line,) = find_swept_collisions(problem(1.3, POST))
+    assert "no path for door.hinge, proven: between 0 and 1.3, at " in line
     assert "door.panel – post overlap by " in line
     at = float(line.partition(", at ")[2].partition(",")[0])
     assert 1.0 < at < 1.3
@@ -76,14 +76,19 @@ def test_what_stands_where_the_leaf_goes_is_named() -> None:
 def test_what_stands_elsewhere_proves_nothing(
     hinge: float, at: Sequence[float], state: float
 ) -> None:
-    assert swept(problem(hinge, at, state=state)) == []
+    assert find_swept_collisions(problem(hinge, at, state=state)) == []
 
 
 def test_what_can_be_carried_away_proves_nothing() -> None:
-    assert swept(problem(1.3, (3.2, 0.14, 0.4), object_type="ball")) == []
-    assert swept(problem(1.3, (3.2, 0.14, 0.0), object_type="cabinet")) != []  # its case stays
+    assert find_swept_collisions(problem(1.3, (3.2, 0.14, 0.4), object_type="ball")) == []
     assert (
-        swept(problem(1.3, (3.2, 0.14, 0.0), object_type={"urdf": BAR, "attachments": []})) == []
+        find_swept_collisions(problem(1.3, (3.2, 0.14, 0.0), object_type="cabinet")) != []
+    )  # its case stays
+    assert (
+        find_swept_collisions(
+            problem(1.3, (3.2, 0.14, 0.0), object_type={"urdf": BAR, "attachments": []})
+        )
+        == []
     )  # it slides out of the way
 
 
@@ -99,8 +104,8 @@ def around_the_hinge(angle: float, at: np.ndarray) -> np.ndarray:
 def test_the_goal_is_the_limit_if_it_is_beyond() -> None:
     assert np.allclose(around_the_hinge(0.8, np.array(POST))[2], POST[2])
     further = around_the_hinge(0.86, np.array(POST))  # where the leaf would be at 2 rad
-    assert swept(problem(9.0, further)) == []
-    assert swept(problem(9.0, around_the_hinge(0.2, np.array(POST)))) != []
+    assert find_swept_collisions(problem(9.0, further)) == []
+    assert find_swept_collisions(problem(9.0, around_the_hinge(0.2, np.array(POST)))) != []
 
 
 def test_a_lever_that_may_be_turned_out_of_the_way_proves_nothing() -> None:
@@ -108,12 +113,12 @@ def test_a_lever_that_may_be_turned_out_of_the_way_proves_nothing() -> None:
     placed = door_scene().objects["door"]
     bar = placed.link_placement("lever") * placed.object.attachments["handle"].placement
     there = around_the_hinge(0.1, bar.translation)  # the leaf turns away from it
-    assert swept(problem(1.3, there, size=(0.02, 0.02, 0.02))) == []
+    assert find_swept_collisions(problem(1.3, there, size=(0.02, 0.02, 0.02))) == []
     inside = around_the_hinge(
         0.6,
         (placed.link_placement("panel") * placed.object.attachments["push"].placement).translation,
     )
-    assert swept(problem(1.3, inside, size=(0.02, 0.02, 0.02))) != []
+    assert find_swept_collisions(problem(1.3, inside, size=(0.02, 0.02, 0.02))) != []
 
 
 @pytest.mark.parametrize(("deep", "proven"), [(0.0005, False), (0.004, True)])
@@ -132,11 +137,11 @@ def test_an_overlap_that_validation_might_overlook_proves_nothing(
         0.6, (placed.placement * pin.SE3.Identity()).act(np.array([0.0, -0.5, 0.0]))
     )
     slab = [*middle[:2], low + deep - 0.05]
-    assert bool(swept(problem(1.3, slab, size=(0.1, 0.1, 0.1)))) == proven
+    assert bool(find_swept_collisions(problem(1.3, slab, size=(0.1, 0.1, 0.1)))) == proven
 
 
 @pytest.mark.parametrize(("margin", "proven"), [(-0.01, True), (-0.5, False), (None, False)])
 def test_what_the_scene_allows_proves_nothing(margin: float | None, proven: bool) -> None:
     pair = ["door.panel", "post"]
     allow: Any = pair if margin is None else {"pair": pair, "margin": margin}
-    assert bool(swept(problem(1.3, POST, allow=[allow]))) == proven
+    assert bool(find_swept_collisions(problem(1.3, POST, allow=[allow]))) == proven

@@ -1,4 +1,4 @@
-"""Straight ways in and out, with a base that drives along or stands."""
+"""Straight ways in and out, with a base that drives along or keeps_base_fixed."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.initialization.approach_paths import Approach
-from vkc_pin.planning.initialization.beam_search import Beam
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.initialization.approach_paths import ApproachPaths
+from vkc_pin.planning.initialization.beam_search import BeamSearch
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
@@ -21,12 +21,14 @@ FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 def grasp() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """Return the problem of opening the door and a configuration that holds its handle."""
     problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=FEW)
-    found = Beam(Knots(problem, np.random.default_rng(0))).search(thorough=True)
+    found = BeamSearch(KeyframeSampler(problem, np.random.default_rng(0))).search(thorough=True)
     return problem, found.paths[int(np.argmin(found.cost)), 1]
 
 
-def approach(*, stands: bool) -> Approach:
-    return Approach(Knots(grasp()[0], np.random.default_rng(0)), stands=stands)
+def approach(*, keeps_base_fixed: bool) -> ApproachPaths:
+    return ApproachPaths(
+        KeyframeSampler(grasp()[0], np.random.default_rng(0)), keeps_base_fixed=keeps_base_fixed
+    )
 
 
 def back(z: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -38,13 +40,15 @@ def back(z: np.ndarray, near: np.ndarray) -> np.ndarray:
     return np.array([*off.translation, (np.trace(off.rotation) - 1.0) / 2.0])
 
 
-@pytest.mark.parametrize("stands", [False, True])
-def test_the_hand_goes_straight_back_from_a_handle(stands: bool) -> None:
+@pytest.mark.parametrize("keeps_base_fixed", [False, True])
+def test_the_hand_goes_straight_back_from_a_handle(keeps_base_fixed: bool) -> None:
     problem, z = grasp()
-    (near,) = approach(stands=stands).before(z, problem.task.phases[0])
+    (near,) = approach(keeps_base_fixed=keeps_base_fixed).find_approach_start(
+        z, problem.task.phases[0]
+    )
     np.testing.assert_allclose(back(z, near), [0.0, 0.0, -FEW.approach, 1.0], atol=1e-3)
     driven = np.abs(near - z)[:3].max()
-    assert driven == 0.0 if stands else driven > 1e-3
+    assert driven == 0.0 if keeps_base_fixed else driven > 1e-3
     assert np.all(near[9:] == z[9:]), "what is grasped stays where it is"
 
 
@@ -52,8 +56,10 @@ def test_the_base_drives_where_the_arm_alone_cannot_do_it(monkeypatch: pytest.Mo
     problem, z = grasp()
     for metres in (0.6, 1.0):
         monkeypatch.setattr(problem, "options", dataclasses.replace(FEW, approach=metres))
-        (near,) = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]))
-        alone = approach(stands=True)._retreat(z, np.array([0.0, -1.0, 0.0]), drives=False)
+        (near,) = approach(keeps_base_fixed=True)._move_tool(z, np.array([0.0, -1.0, 0.0]))
+        alone = approach(keeps_base_fixed=True)._move_tool(
+            z, np.array([0.0, -1.0, 0.0]), drives=False
+        )
         hand, there = (
             dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near)
         )

@@ -6,35 +6,40 @@ from helpers.gates import GOAL, NARROW, TIGHT, gated, walled
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.initialization.base_routes import Routes
-from vkc_pin.planning.initialization.keyframes import ALIKE
+from vkc_pin.planning.initialization.base_routes import BaseRoutes
+from vkc_pin.planning.initialization.keyframes import SIMILARITY_TOLERANCE
 from vkc_pin.planning.initialization.methods import initialize
 
 
 def test_the_way_leads_through_the_gap() -> None:
     problem = walled(1.6)
-    routes, start = Routes(problem), problem.start[:3]
+    routes, start = BaseRoutes(problem), problem.start[:3]
     goal = np.array([4.0, 1.5, 0.0])
-    way = routes.path(0, start, goal, 40)
+    way = routes.find_path(0, start, goal, 40)
     assert way is not None
     assert way.shape == (40, 3)
     np.testing.assert_allclose(way[-1, :2], goal[:2], atol=1e-9)
     assert abs((way[-1, 2] - goal[2] + np.pi) % (2 * np.pi) - np.pi) < 1e-9
     crossing = way[np.argmin(np.abs(way[:, 0] - 2.0))]
     assert crossing[1] < -1.4  # the wall reaches from y = -1.4 up
-    assert routes.distances(0, start[None], goal[None])[0] > np.hypot(*(goal[:2] - start[:2])) + 1.0
+    assert (
+        routes.compute_distances(0, start[None], goal[None])[0]
+        > np.hypot(*(goal[:2] - start[:2])) + 1.0
+    )
 
 
 def test_no_way_is_said() -> None:
     problem = walled(0.0)
-    assert Routes(problem).path(0, problem.start[:3], np.array([4.0, 1.5, 0.0]), 40) is None
+    assert (
+        BaseRoutes(problem).find_path(0, problem.start[:3], np.array([4.0, 1.5, 0.0]), 40) is None
+    )
     notes: list[str] = []
     assert list(initialize(problem, "astar", 0, notes=notes)) == []
     assert len(notes) == 1
-    assert "found no way for the base" in notes[0]
+    assert "found no path for the base" in notes[0]
     plan = vkc.plan(problem.scene, [vkc.GoTo(4.0, 1.5, 0.0)], initialization="astar")
     assert plan.status == "infeasible"
-    assert "no way for the base, proven" in plan.report()
+    assert "no path for the base, proven" in plan.report()
 
 
 def test_the_seed_drives_the_way_and_the_heading_follows_it() -> None:
@@ -57,15 +62,16 @@ def test_the_seed_drives_the_way_and_the_heading_follows_it() -> None:
 @pytest.mark.parametrize("width", [NARROW, TIGHT])
 def test_with_the_arm_folded_there_is_a_way_through_a_narrow_gate(width: float) -> None:
     problem = gated(width)
-    routes, start, goal = Routes(problem), problem.start[:3], np.array(GOAL)
+    routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array(GOAL)
     home, folded = (
-        routes.distances(0, start[None], goal[None], folded=each)[0] for each in (False, True)
+        routes.compute_distances(0, start[None], goal[None], folded=each)[0]
+        for each in (False, True)
     )
     straight = np.hypot(*(goal - start)[:2])
     assert np.isinf(home)
     assert straight <= folded < 1.1 * straight
-    assert routes.path(0, start, goal, 40) is None
-    guide = routes.guide(0, start, goal, 40)
+    assert routes.find_path(0, start, goal, 40) is None
+    guide = routes.find_guide_path(0, start, goal, 40)
     assert guide is not None
     assert guide.shape == (40, 3)
     np.testing.assert_allclose(guide[-1], goal, atol=1e-9)
@@ -73,30 +79,30 @@ def test_with_the_arm_folded_there_is_a_way_through_a_narrow_gate(width: float) 
     assert abs(through) < 0.03, "it is as wide as the base and a hand"
     # Nothing but the arm is in the way: with it folded the base hits nothing all along.
     z = np.tile(problem.start, (len(guide), 1))
-    z[:, :3], z[:, 3:] = guide, routes.folded_arm(0)
+    z[:, :3], z[:, 3:] = guide, routes.get_folded_arm(0)
     assert problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).compute_clearance() > 0.0
 
 
 def test_a_gate_too_narrow_for_the_base_has_no_way() -> None:
     problem = gated(0.64)
-    routes, start, goal = Routes(problem), problem.start[:3], np.array(GOAL)
-    assert np.isinf(routes.distances(0, start[None], goal[None], folded=True)[0])
-    assert routes.guide(0, start, goal, 40) is None
+    routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array(GOAL)
+    assert np.isinf(routes.compute_distances(0, start[None], goal[None], folded=True)[0])
+    assert routes.find_guide_path(0, start, goal, 40) is None
 
 
 def test_the_grids_are_kept_apart() -> None:
-    routes = Routes(gated(NARROW))
-    home, folded = routes.grid(0), routes.grid(0, folded=True)
-    assert home is routes.grid(0)
-    assert folded is routes.grid(0, folded=True)
+    routes = BaseRoutes(gated(NARROW))
+    home, folded = routes.get_grid(0), routes.get_grid(0, folded=True)
+    assert home is routes.get_grid(0)
+    assert folded is routes.get_grid(0, folded=True)
     assert folded is not home
     assert np.all(folded.step < home.step)
 
 
 def test_where_the_arm_at_home_fits_the_guide_is_the_usual_way() -> None:
     problem = walled(1.6)
-    routes, start, goal = Routes(problem), problem.start[:3], np.array([4.0, 1.5, 0.0])
-    guide, way = routes.guide(0, start, goal, 40), routes.path(0, start, goal, 40)
+    routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array([4.0, 1.5, 0.0])
+    guide, way = routes.find_guide_path(0, start, goal, 40), routes.find_path(0, start, goal, 40)
     assert guide is not None
     assert way is not None
     np.testing.assert_allclose(guide, way, atol=1e-9)
@@ -105,23 +111,23 @@ def test_where_the_arm_at_home_fits_the_guide_is_the_usual_way() -> None:
 def test_a_guide_leads_to_what_is_a_little_too_close_to_something() -> None:
     """What is sent there by inverse kinematics often is."""
     problem = walled(1.6)
-    routes, start = Routes(problem), problem.start[:3]
+    routes, start = BaseRoutes(problem), problem.start[:3]
     near, inside = (
         np.array([1.39, 1.0, 0.0]),
         np.array([1.5, 1.0, 0.0]),
     )  # the wall begins at 1.9, the base is 0.5 m long before
     assert problem.options.dist_safe > 0.01
-    assert routes.path(0, start, near, 40) is None
-    guide = routes.guide(0, start, near, 40)
+    assert routes.find_path(0, start, near, 40) is None
+    guide = routes.find_guide_path(0, start, near, 40)
     assert guide is not None
     np.testing.assert_allclose(guide[-1], near, atol=1e-9)
-    assert routes.guide(0, start, inside, 40) is None
+    assert routes.find_guide_path(0, start, inside, 40) is None
 
 
 def test_a_guide_to_what_is_far_inside_something_does_not_exist() -> None:
     problem = walled(0.0)
     block = np.array([5.5, 0.0, 0.0])  # behind the wall, and so is all that is beside it
-    assert Routes(problem).guide(0, problem.start[:3], block, 40) is None
+    assert BaseRoutes(problem).find_guide_path(0, problem.start[:3], block, 40) is None
 
 
 def test_the_arm_is_folded_once_for_what_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,9 +139,9 @@ def test_the_arm_is_folded_once_for_what_is_held(monkeypatch: pytest.MonkeyPatch
         asked.append(phase)
         return np.full((1, 6), float(phase))
 
-    monkeypatch.setattr("vkc_pin.planning.initialization.base_routes.folded_arms", fold)
-    routes = Routes(problem)
-    assert [routes.folded_arm(phase)[0] for phase in (0, 1, 0, 1)] == [0.0, 1.0, 0.0, 1.0]
+    monkeypatch.setattr("vkc_pin.planning.initialization.base_routes.find_folded_arms", fold)
+    routes = BaseRoutes(problem)
+    assert [routes.get_folded_arm(phase)[0] for phase in (0, 1, 0, 1)] == [0.0, 1.0, 0.0, 1.0]
     assert asked == [0, 1]
 
 
@@ -144,15 +150,18 @@ def test_starts_share_distances_where_they_are_alike_and_nowhere_else() -> None:
     problem = walled(1.6)
     goal = np.array([4.0, 1.5, 0.0])
     starts = np.array([[x, y, 0.0] for x in (0.5, 3.5) for y in (-0.55, -0.35, 0.05, 0.85)])
-    together = Routes(problem).distances(0, starts, np.tile(goal, (len(starts), 1)))
-    alone = [Routes(problem).distances(0, start[None], goal[None])[0] for start in starts]
+    together = BaseRoutes(problem).compute_distances(0, starts, np.tile(goal, (len(starts), 1)))
+    alone = [
+        BaseRoutes(problem).compute_distances(0, start[None], goal[None])[0] for start in starts
+    ]
     np.testing.assert_array_equal(together, alone)
     assert np.abs(np.diff(np.sort(together))).min() > 1e-3
     beside = starts + np.array([0.04, -0.04, 0.0])
-    routes = Routes(problem)
+    routes = BaseRoutes(problem)
     shared = [
-        routes.distances(0, each, np.tile(goal, (len(starts), 1))) for each in (starts, beside)
+        routes.compute_distances(0, each, np.tile(goal, (len(starts), 1)))
+        for each in (starts, beside)
     ]
     np.testing.assert_array_equal(shared[0], shared[1])
-    own = Routes(problem).distances(0, beside, np.tile(goal, (len(starts), 1)))
-    assert np.abs(own - shared[1]).max() < np.hypot(ALIKE, ALIKE)
+    own = BaseRoutes(problem).compute_distances(0, beside, np.tile(goal, (len(starts), 1)))
+    assert np.abs(own - shared[1]).max() < np.hypot(SIMILARITY_TOLERANCE, SIMILARITY_TOLERANCE)

@@ -18,9 +18,9 @@ from helpers.small_problems import (
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import beam_search as module
-from vkc_pin.planning.initialization.base_routes import Routes
-from vkc_pin.planning.initialization.beam_search import Beam, Found
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.initialization.base_routes import BaseRoutes
+from vkc_pin.planning.initialization.beam_search import BeamSearch, SearchResult
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 OPEN = vkc.Actuate("door", {"hinge": 1.2})
@@ -34,9 +34,11 @@ def problem(*, around: bool = False) -> vkc.TrajectoryProblem:
     return program_of(door_scene(), steps, options=FEW)
 
 
-def beam(seed: int = 0, *, around: bool = False, routes: bool = False) -> Beam:
+def beam(seed: int = 0, *, around: bool = False, routes: bool = False) -> BeamSearch:
     p = problem(around=around)
-    return Beam(Knots(p, np.random.default_rng(seed)), Routes(p) if routes else None)
+    return BeamSearch(
+        KeyframeSampler(p, np.random.default_rng(seed)), BaseRoutes(p) if routes else None
+    )
 
 
 @DIRECTIONS
@@ -47,23 +49,23 @@ def test_knots_are_in_order_of_time_and_hold_the_closure(
 ) -> None:
     p, search = problem(around=around), beam(around=around)
     found = search.search(thorough=thorough, backwards=backwards)
-    assert found.at[0] == 0
-    assert np.all(np.diff(found.at) > 0)
-    assert set(p.ends.tolist()) <= set(found.at), "a knot at the end of every phase"
-    assert found.at == beam(around=around).search(thorough=thorough).at
-    assert found.paths.shape == (len(found.cost), len(found.at), p.chain.size)
-    assert found.cost.shape == found.trouble.shape
+    assert found.waypoints[0] == 0
+    assert np.all(np.diff(found.waypoints) > 0)
+    assert set(p.ends.tolist()) <= set(found.waypoints), "a knot at the end of every phase"
+    assert found.waypoints == beam(around=around).search(thorough=thorough).waypoints
+    assert found.paths.shape == (len(found.cost), len(found.waypoints), p.chain.size)
+    assert found.cost.shape == found.collision_cost.shape
     np.testing.assert_array_equal(found.paths[:, 0], np.tile(p.start, (len(found.cost), 1)))
-    rows = np.array(found.at[1:]) - 1
+    rows = np.array(found.waypoints[1:]) - 1
     assert np.all(found.paths[:, 1:] >= p.lower[rows] - 1e-9)
     assert np.all(found.paths[:, 1:] <= p.upper[rows] + 1e-9)
     hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
     np.testing.assert_allclose(
         found.paths[:, 1:, [hinge, knob]],
-        np.tile(search.knots.objects[rows][:, [hinge, knob]], (len(found.cost), 1, 1)),
+        np.tile(search.sampler.object_motion[rows][:, [hinge, knob]], (len(found.cost), 1, 1)),
     )
     reach, _, move = (int(end) for end in p.ends[1 if around else 0 :][:3])
-    held = [k for k, waypoint in enumerate(found.at) if reach <= waypoint <= move]
+    held = [k for k, waypoint in enumerate(found.waypoints) if reach <= waypoint <= move]
     assert len(held) >= 6
     good = np.argsort(found.cost)[:3]
     for path in found.paths[good]:
@@ -81,9 +83,9 @@ def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool) -> 
         problem(around=around).effort.metric / 0.025
     )
     way = np.linalg.norm(steps[..., :2], axis=2).sum(axis=1) + steps[..., 2:].sum(axis=(1, 2))
-    np.testing.assert_allclose(found.cost, way + found.trouble, rtol=1e-9)
+    np.testing.assert_allclose(found.cost, way + found.collision_cost, rtol=1e-9)
     trouble = np.zeros(len(found.cost))
-    for k, waypoint in enumerate(found.at[1:], start=1):
+    for k, waypoint in enumerate(found.waypoints[1:], start=1):
         at = np.full(len(trouble), waypoint)
         short = (
             problem(around=around)
@@ -91,9 +93,9 @@ def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool) -> 
             .compute_shortfall(len(trouble))
         )
         trouble += np.where(short > 0.0, 10.0 + 300.0 * short, 0.0)
-    reached = found.trouble < 1e3
+    reached = found.collision_cost < 1e3
     assert reached.any()
-    np.testing.assert_allclose(found.trouble[reached], trouble[reached], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(found.collision_cost[reached], trouble[reached], rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -101,20 +103,20 @@ def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool) -> 
 )
 def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step]) -> None:
     p = program_of(door_scene(), steps, options=FEW)
-    search = Beam(Knots(p, np.random.default_rng(1)))
+    search = BeamSearch(KeyframeSampler(p, np.random.default_rng(1)))
     found = search.search(thorough=False)
-    short = search.shortened(found)
+    short = search.shorten(found)
     assert (short.cost <= found.cost).all()
     # What is held already binds the base to where it is grasped; there all together would have to
     # move.
     assert (short.cost / found.cost).min() < (0.97 if len(steps) == 1 else 1.0)
     ways = np.abs(np.diff(short.paths, axis=1)) * np.sqrt(p.effort.metric / 0.025)
     way = np.linalg.norm(ways[..., :2], axis=2).sum(axis=1) + ways[..., 2:].sum(axis=(1, 2))
-    np.testing.assert_allclose(short.cost, way + short.trouble, rtol=1e-9)
+    np.testing.assert_allclose(short.cost, way + short.collision_cost, rtol=1e-9)
     (moved,) = np.flatnonzero((short.paths != found.paths).any(axis=(0, 2)))
-    assert found.at[moved] == p.ends[len(steps) - 1]  # where the base is sent it stays
+    assert found.waypoints[moved] == p.ends[len(steps) - 1]  # where the base is sent it stays
     hinge, knob = (p.chain.index(name) for name in ("door.hinge", "door.knob"))
-    for row, trouble in zip(short.paths[:, moved], short.trouble, strict=True):
+    for row, trouble in zip(short.paths[:, moved], short.collision_cost, strict=True):
         assert (
             trouble >= 1e3 or hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
         )
@@ -125,26 +127,29 @@ def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step]) -> 
 def test_shortened_paths_know_what_is_wrong_where_they_lead_now(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    search = Beam(
-        Knots(program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)),
-        careful=True,
+    search = BeamSearch(
+        KeyframeSampler(
+            program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)
+        ),
+        for_narrow_passages=True,
     )
     found = search.search(thorough=False)
-    monkeypatch.setattr(search, "_bad", lambda z, *_: np.abs(z[:, 0]))
-    short = search.shortened(found)
-    assert np.count_nonzero(short.trouble != found.trouble) > len(found.cost) / 2
+    monkeypatch.setattr(search, "_compute_penalty", lambda z, *_: np.abs(z[:, 0]))
+    short = search.shorten(found)
+    assert np.count_nonzero(short.collision_cost != found.collision_cost) > len(found.cost) / 2
     np.testing.assert_allclose(
-        short.trouble - found.trouble, np.abs(short.paths[:, -1, 0]) - np.abs(found.paths[:, -1, 0])
+        short.collision_cost - found.collision_cost,
+        np.abs(short.paths[:, -1, 0]) - np.abs(found.paths[:, -1, 0]),
     )
 
 
 def test_of_paths_that_end_alike_the_cheapest_is_kept() -> None:
     z = np.array([[0.0, 0.0], [0.05, 0.05], [0.3, 0.0], [0.3, 0.05], [0.3, 0.25], [2.0, 0.0]])
     total = np.array([3.0, 2.0, 4.0, 5.0, 6.0, 1.0])
-    assert Beam._kept(total, z, 6, 10).tolist() == [5, 1, 2, 4]
-    assert Beam._kept(total, z, 6, 3).tolist() == [5, 1, 2]
-    assert Beam._kept(total, z, 5, 10).tolist() == [5, 1, 2, 4]
-    assert Beam._kept(total, z, 2, 4).tolist() == [
+    assert BeamSearch._select_beam(total, z, 6, 10).tolist() == [5, 1, 2, 4]
+    assert BeamSearch._select_beam(total, z, 6, 3).tolist() == [5, 1, 2]
+    assert BeamSearch._select_beam(total, z, 5, 10).tolist() == [5, 1, 2, 4]
+    assert BeamSearch._select_beam(total, z, 2, 4).tolist() == [
         5,
         1,
         2,
@@ -156,9 +161,9 @@ def test_headings_are_kept_apart_if_asked_for() -> None:
     z = np.zeros((12, 4))
     z[:, 0], z[10:, 2] = np.arange(12.0), (2.0, -2.0)
     total = np.arange(12.0)
-    assert Beam._kept(total, z, 12, 6, 1).tolist() == [0, 1, 2, 3, 4, 5]
-    assert Beam._kept(total, z, 12, 6, 8).tolist() == [0, 1, 2, 3, 10, 11]
-    assert Beam._kept(total, z, 12, 8, 8).tolist() == [0, 1, 2, 3, 10, 11, 4, 5]
+    assert BeamSearch._select_beam(total, z, 12, 6, 1).tolist() == [0, 1, 2, 3, 4, 5]
+    assert BeamSearch._select_beam(total, z, 12, 6, 8).tolist() == [0, 1, 2, 3, 10, 11]
+    assert BeamSearch._select_beam(total, z, 12, 8, 8).tolist() == [0, 1, 2, 3, 10, 11, 4, 5]
 
 
 def test_no_two_paths_of_a_search_end_alike() -> None:
@@ -174,18 +179,22 @@ def test_ways_to_what_is_grasped_are_short_when_they_are_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The best that a search returns for a grasp alone becomes hardly cheaper when it is shortened again."""
-    search = Beam(
-        Knots(program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1))
+    search = BeamSearch(
+        KeyframeSampler(
+            program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)
+        )
     )
     found = search.search(thorough=False)
-    assert found.cost.min() < 1.02 * search.shortened(found).cost.min()
+    assert found.cost.min() < 1.02 * search.shorten(found).cost.min()
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_SHORTENINGS", 0)
-        drawn = Beam(Knots(search.problem, np.random.default_rng(1))).search(thorough=False)
+        patch.setattr(module, "_SHORTENING_ROUNDS", 0)
+        drawn = BeamSearch(KeyframeSampler(search.problem, np.random.default_rng(1))).search(
+            thorough=False
+        )
     assert found.cost.min() < drawn.cost.min()
-    careful = Beam(Knots(search.problem, np.random.default_rng(1)), careful=True).search(
-        thorough=False
-    )
+    careful = BeamSearch(
+        KeyframeSampler(search.problem, np.random.default_rng(1)), for_narrow_passages=True
+    ).search(thorough=False)
     assert careful.cost.min() > found.cost.min(), "what is short may be what trees do not lead to"
 
 
@@ -199,11 +208,13 @@ def test_the_same_random_numbers_find_the_same(backwards: bool) -> None:
 def test_without_a_grasp_backwards_is_forwards() -> None:
     gone = walled(1.6)
     one, other = (
-        Beam(Knots(gone, np.random.default_rng(0))).search(thorough=True, backwards=back)
+        BeamSearch(KeyframeSampler(gone, np.random.default_rng(0))).search(
+            thorough=True, backwards=back
+        )
         for back in (False, True)
     )
     np.testing.assert_array_equal(one.paths, other.paths)
-    assert one.at == other.at == [0, gone.segments]
+    assert one.waypoints == other.waypoints == [0, gone.segments]
 
 
 def test_backwards_a_firm_hand_keeps_what_it_has_chosen() -> None:
@@ -232,7 +243,9 @@ def test_a_hand_that_chooses_and_does_not_give_way_does_so_before_it_moves_anyth
     p = gripping(firm=firm)
     assert bool(p.choices) == firm
     one, other = (
-        Beam(Knots(p, np.random.default_rng(0))).search(thorough=True, backwards=back)
+        BeamSearch(KeyframeSampler(p, np.random.default_rng(0))).search(
+            thorough=True, backwards=back
+        )
         for back in (False, True)
     )
     assert np.array_equal(one.paths, other.paths) == firm
@@ -241,8 +254,10 @@ def test_a_hand_that_chooses_and_does_not_give_way_does_so_before_it_moves_anyth
 def clamped(*, backwards: bool) -> None:
     p = gripping(firm=True)
     ((column, grasp, last),) = p.choices
-    found = Beam(Knots(p, np.random.default_rng(1))).search(thorough=True, backwards=backwards)
-    held = [k for k, waypoint in enumerate(found.at) if grasp <= waypoint <= last]
+    found = BeamSearch(KeyframeSampler(p, np.random.default_rng(1))).search(
+        thorough=True, backwards=backwards
+    )
+    held = [k for k, waypoint in enumerate(found.waypoints) if grasp <= waypoint <= last]
     chosen = found.paths[:, held, column]
     assert np.ptp(chosen, axis=1).max() < 1e-6, "the freedom changes while the hand clamps"
     assert np.ptp(chosen) > 0.01, "it is the same in all paths"
@@ -252,31 +267,31 @@ def clamped(*, backwards: bool) -> None:
 # ---------------------------------------------------------------------------------------------------
 
 
-def going(jump: float, when: int, *, trouble: float = 0.0) -> Found:
+def going(jump: float, when: int, *, trouble: float = 0.0) -> SearchResult:
     """Return two paths, of which the cheapest is where it was but for one jump of the base [m] before a knot."""
-    p, at = problem(), beam().search(thorough=False).at
+    p, at = problem(), beam().search(thorough=False).waypoints
     paths = np.tile(p.start, (2, len(at), 1))
     paths[1, at.index(when) :, 1] += jump
     paths[0, :, :2] += np.linspace(0.0, 50.0, len(at))[:, None]
-    return Found(paths, np.array([2.0, 1.0]), np.array([1e3, trouble]), at)
+    return SearchResult(paths, np.array([2.0, 1.0]), np.array([1e3, trouble]), at)
 
 
 @pytest.mark.parametrize("routes", [False, True])
 def test_grazes_are_tolerable_and_collisions_are_not(routes: bool) -> None:
     search, end = beam(routes=routes), int(problem().ends[0])
-    assert search.tolerable(going(0.0, end))
-    assert search.tolerable(going(0.0, end, trouble=59.0))
-    assert not search.tolerable(going(0.0, end, trouble=61.0))
+    assert search.is_acceptable(going(0.0, end))
+    assert search.is_acceptable(going(0.0, end, trouble=59.0))
+    assert not search.is_acceptable(going(0.0, end, trouble=61.0))
 
 
 def test_the_base_does_not_jump_while_something_is_held() -> None:
     reach, turn, move = problem().ends.tolist()
     for when in (turn, move):
-        assert beam(routes=True).tolerable(going(0.4, when))
-        assert not beam(routes=True).tolerable(going(0.6, when))
-        assert not beam(routes=True).tolerable(going(-0.6, when))
-        assert beam().tolerable(going(0.6, when)), "without ways of the base nobody asks"
-    assert beam(routes=True).tolerable(going(3.0, reach)), (
+        assert beam(routes=True).is_acceptable(going(0.4, when))
+        assert not beam(routes=True).is_acceptable(going(0.6, when))
+        assert not beam(routes=True).is_acceptable(going(-0.6, when))
+        assert beam().is_acceptable(going(0.6, when)), "without ways of the base nobody asks"
+    assert beam(routes=True).is_acceptable(going(3.0, reach)), (
         "on the way to the handle it may be anywhere"
     )
 
@@ -289,11 +304,11 @@ def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> No
     """Where the row of the straight way in stands, at the latest after the first waypoint of its phase."""
     grasp, options = int(problem().ends[0]), problem().options
     assert beam().approaches == {grasp: grasp - options.steps(options.approach_time)}
-    assert beam().knots.pose_at(grasp - options.steps(options.approach_time)) is not None
+    assert beam().sampler.find_pose(grasp - options.steps(options.approach_time)) is not None
     _, grasp, *_ = problem(around=True).ends.tolist()
     assert beam(around=True).approaches == {grasp: grasp - options.steps(options.approach_time)}
     brief = program_of(door_scene(), [OPEN], options=dataclasses.replace(FEW, reach_waypoints=3))
-    assert Beam(Knots(brief, np.random.default_rng(0))).approaches == {3: 1}
+    assert BeamSearch(KeyframeSampler(brief, np.random.default_rng(0))).approaches == {3: 1}
 
 
 @pytest.mark.parametrize("careful", [False, True])
@@ -302,7 +317,9 @@ def test_a_careful_search_counts_what_is_hit_before_a_grasp(
 ) -> None:
     """Of four grasps one is blocked, one has a blocked way, one has none; and at other waypoints nothing changes."""
     search, grasp = (
-        Beam(Knots(problem(), np.random.default_rng(0)), careful=careful),
+        BeamSearch(
+            KeyframeSampler(problem(), np.random.default_rng(0)), for_narrow_passages=careful
+        ),
         int(problem().ends[0]),
     )
     before = search.approaches[grasp]
@@ -315,18 +332,20 @@ def test_a_careful_search_counts_what_is_hit_before_a_grasp(
         np.testing.assert_array_equal(near, z[1:])  # those that are free where they grasp
         return near, np.array([True, False, True])
 
-    monkeypatch.setattr(search.knots, "depth", lambda _, waypoint: depths[waypoint])
-    monkeypatch.setattr(search.knots, "knot", knot)
-    bad = search._bad(z, found, grasp)
-    collision = [module._COLLISION + module._DEPTH * depth for depth in (0.01, 0.02)]
+    monkeypatch.setattr(search.sampler, "compute_shortfall", lambda _, waypoint: depths[waypoint])
+    monkeypatch.setattr(search.sampler, "sample", knot)
+    bad = search._compute_penalty(z, found, grasp)
+    collision = [module._COLLISION_COST + module._DEPTH_COST * depth for depth in (0.01, 0.02)]
     np.testing.assert_allclose(
         bad,
-        [collision[0], collision[1], module._NOT_FOUND, 0.0]
+        [collision[0], collision[1], module._UNREACHABLE_COST, 0.0]
         if careful
         else [collision[0], 0, 0, 0],
     )
     depths[int(problem().ends[1])] = np.zeros(4)
-    np.testing.assert_array_equal(search._bad(z, found, int(problem().ends[1])), np.zeros(4))
+    np.testing.assert_array_equal(
+        search._compute_penalty(z, found, int(problem().ends[1])), np.zeros(4)
+    )
 
 
 def test_before_a_careful_grasp_nothing_is_hit() -> None:
@@ -337,16 +356,18 @@ def test_before_a_careful_grasp_nothing_is_hit() -> None:
         .with_start(base=(1.5, -0.5, 1.57))
     )
     p = program_of(scene, [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})])
-    grasp, routes, shares = int(p.ends[0]), Routes(p), []
+    grasp, routes, shares = int(p.ends[0]), BaseRoutes(p), []
     for careful in (False, True):
-        search = Beam(Knots(p, np.random.default_rng(0)), routes, careful=careful)
+        search = BeamSearch(
+            KeyframeSampler(p, np.random.default_rng(0)), routes, for_narrow_passages=careful
+        )
         found = search.search(thorough=True, backwards=True)
         before, held = (
             search.approaches[grasp],
-            found.paths[found.trouble == 0.0, found.at.index(grasp)],
+            found.paths[found.collision_cost == 0.0, found.waypoints.index(grasp)],
         )
         assert len(held), "every path is blocked"
-        near, reached = search.knots.knot(held, before, "track")
+        near, reached = search.sampler.sample(held, before, "track")
         hit = p.contacts.evaluate(near, np.full(len(near), before), reach=0.1).compute_shortfall(
             len(near)
         )
@@ -360,10 +381,12 @@ def test_a_task_that_ends_with_a_grasp_of_which_the_hand_chooses_where() -> None
     problem = program_of(scene, [vkc.Grasp("stick")])
     assert {grasp for _, grasp, _ in problem.choices} == {problem.segments}
     one, other = (
-        Beam(Knots(problem, np.random.default_rng(0))).search(thorough=True, backwards=back)
+        BeamSearch(KeyframeSampler(problem, np.random.default_rng(0))).search(
+            thorough=True, backwards=back
+        )
         for back in (False, True)
     )
     assert one is not None
     assert other is not None
-    assert one.at == other.at == [0, problem.segments]
+    assert one.waypoints == other.waypoints == [0, problem.segments]
     np.testing.assert_array_equal(one.paths, other.paths)

@@ -6,13 +6,13 @@ from helpers.small_problems import SHORT, door_scene, program_of
 from numpy.typing import NDArray
 
 import vkc_pin as vkc
-from vkc_pin.planning.initialization.beam_search import Beam, _Mode
-from vkc_pin.planning.initialization.keyframes import Knots
+from vkc_pin.planning.initialization.beam_search import BeamSearch, _Mode
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 
 
-def beam(seed: int = 0) -> Beam:
+def beam(seed: int = 0) -> BeamSearch:
     problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
-    return Beam(Knots(problem, np.random.default_rng(seed)))
+    return BeamSearch(KeyframeSampler(problem, np.random.default_rng(seed)))
 
 
 def test_a_way_costs_what_the_program_makes_it_cost_in_radians_of_the_arm() -> None:
@@ -22,12 +22,14 @@ def test_a_way_costs_what_the_program_makes_it_cost_in_radians_of_the_arm() -> N
     for column, expected in ((0, metre), (1, metre), (2, 1.0), (3, 1.0)):
         moved = start.copy()
         moved[0, column] -= 0.5
-        assert search._path_cost(start, moved, 0)[0] == pytest.approx(0.5 * expected, rel=1e-12)
+        assert search._compute_path_cost(start, moved, 0)[0] == pytest.approx(
+            0.5 * expected, rel=1e-12
+        )
     moved = start.copy()
     moved[0, :2] += [0.3, 0.4]
-    assert search._path_cost(start, moved, 0)[0] == pytest.approx(0.5 * metre, rel=1e-12)
+    assert search._compute_path_cost(start, moved, 0)[0] == pytest.approx(0.5 * metre, rel=1e-12)
     lever = search.problem.chain.robot.lever
-    assert search.knots.weights[:3].tolist() == [
+    assert search.sampler.weights[:3].tolist() == [
         1 / lever,
         1 / lever,
         1.0,
@@ -35,9 +37,9 @@ def test_a_way_costs_what_the_program_makes_it_cost_in_radians_of_the_arm() -> N
 
 
 class Ways:
-    """Routes twice as long as straight ones."""
+    """BaseRoutes twice as long as straight ones."""
 
-    def distances(
+    def compute_distances(
         self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], *, folded: bool
     ) -> NDArray[np.float64]:
         return np.asarray(2.0 * np.linalg.norm(last[:, :2] - first[:, :2], axis=1))
@@ -49,7 +51,7 @@ def test_a_way_around_costs_as_much_as_it_is_long() -> None:
     start = search.problem.start[None]
     moved = start.copy()
     moved[0, :2] += [0.3, 0.4]
-    assert search._path_cost(start, moved, 0)[0] == pytest.approx(
+    assert search._compute_path_cost(start, moved, 0)[0] == pytest.approx(
         2 * 0.5 / np.sqrt(0.025), rel=1e-12
     )
 
@@ -57,7 +59,7 @@ def test_a_way_around_costs_as_much_as_it_is_long() -> None:
 def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
     """Return how often the search draws grasps of which a share is free."""
     search, draws = beam(), list[str]()
-    knot = search.knots.knot
+    knot = search.sampler.sample
 
     def counted(
         before: NDArray[np.float64], waypoint: int, how: str
@@ -69,10 +71,10 @@ def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
     def depth(z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
         return np.where(np.arange(len(z)) < share * len(z), 0.0, 0.1)
 
-    monkeypatch.setattr(search.knots, "knot", counted)
-    monkeypatch.setattr(search.knots, "depth", depth)
+    monkeypatch.setattr(search.sampler, "sample", counted)
+    monkeypatch.setattr(search.sampler, "compute_shortfall", depth)
     grasp = int(search.problem.ends[0])
-    search._continue(
+    search._sample_continuations(
         search.problem.start[None, None],
         np.zeros(1),
         grasp,
@@ -103,11 +105,11 @@ def test_where_some_are_free_none_are_pushed(
         called.append(len(z))
         return z
 
-    monkeypatch.setattr(search.knots, "clear", clear)
+    monkeypatch.setattr(search.sampler, "push_clear", clear)
     z, bad = np.tile(search.problem.start, (96, 1)), np.where(np.arange(96) < free, 0.0, 50.0)
     paths, parents = search.problem.start[None, None], np.zeros(96, int)
     knot = int(search.problem.ends[-1 if holding else 0])
-    _, after, _ = search._pushed(paths, np.zeros(1), parents, z, bad, knot, 2 if holding else 0)
+    _, after, _ = search._add_pushed(paths, np.zeros(1), parents, z, bad, knot, 2 if holding else 0)
     assert bool(called) == pushed
     assert len(after) == 96 + sum(called)
 

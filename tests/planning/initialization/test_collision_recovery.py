@@ -14,15 +14,15 @@ from helpers.telescopes import coupled_scene
 import vkc_pin as vkc
 from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP
 from vkc_pin.planning.initialization import collision_recovery as clearing
-from vkc_pin.planning.initialization.collision_recovery import clear_out
-from vkc_pin.planning.initialization.keyframes import Knots, Known
+from vkc_pin.planning.initialization.collision_recovery import resolve_collisions
+from vkc_pin.planning.initialization.keyframes import KeyframeCache, KeyframeSampler
 
 
 def drawn(
     steps: list[vkc.Grasp | vkc.Actuate | vkc.Touch], scene: vkc.Scene
-) -> tuple[vkc.TrajectoryProblem, Knots]:
+) -> tuple[vkc.TrajectoryProblem, KeyframeSampler]:
     problem = program_of(scene, steps)
-    return problem, Knots(problem, np.random.default_rng(0))
+    return problem, KeyframeSampler(problem, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -64,13 +64,13 @@ def test_points_move_as_finite_differences_say(seed: int, coupled: bool, tmp_pat
 def test_what_is_pushed_is_further_out_and_still_there() -> None:
     """Touching a cube under a table: most random configurations collide; pushing frees many more than there were."""
     scene = vkc.load_scene("init_1").with_held({"stick": "grip"}).with_start(base=[1.2, 1.0, 1.0])
-    problem, knots = drawn([vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))], scene)
+    problem, sampler = drawn([vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))], scene)
     waypoint = problem.segments
-    z, found = knots.knot(np.tile(problem.start, (96, 1)), waypoint, "scatter")
+    z, found = sampler.sample(np.tile(problem.start, (96, 1)), waypoint, "scatter")
     z = z[found]
-    before = knots.depth(z, waypoint)
-    pushed = knots.clear(z, waypoint)
-    after = knots.depth(pushed, waypoint)
+    before = sampler.compute_shortfall(z, waypoint)
+    pushed = sampler.push_clear(z, waypoint)
+    after = sampler.compute_shortfall(pushed, waypoint)
     assert np.count_nonzero(after <= 0.0) >= np.count_nonzero(before <= 0.0) + 5
     residual, _ = problem.transcription.pose_solvers[0].evaluate(
         pushed[after <= 0.0], problem.targets[0]
@@ -81,11 +81,11 @@ def test_what_is_pushed_is_further_out_and_still_there() -> None:
 
 
 def test_what_is_free_stays_where_it_is() -> None:
-    problem, knots = drawn([vkc.Grasp("door")], door_scene())
-    z, found = knots.knot(np.tile(problem.start, (96, 1)), problem.segments, "scatter")
-    free = z[found][knots.depth(z[found], problem.segments) <= 0.0]
+    problem, sampler = drawn([vkc.Grasp("door")], door_scene())
+    z, found = sampler.sample(np.tile(problem.start, (96, 1)), problem.segments, "scatter")
+    free = z[found][sampler.compute_shortfall(z[found], problem.segments) <= 0.0]
     assert len(free) > 3
-    np.testing.assert_allclose(knots.clear(free, problem.segments), free, atol=0.05)
+    np.testing.assert_allclose(sampler.push_clear(free, problem.segments), free, atol=0.05)
 
 
 @dataclass
@@ -98,24 +98,26 @@ class Scattered:
     """
 
     problem: vkc.TrajectoryProblem
-    knots: Knots
+    sampler: KeyframeSampler
     z: np.ndarray
 
     def cleared(self, **changes: Any) -> np.ndarray:
         """Return what they are cleared to, with other arguments than usual."""
-        solver, target = self.knots.solver(0)
+        solver, target = self.sampler.get_pose_solver(0)
         lower, upper = (
             np.tile(limits[-1], (len(self.z), 1))
             for limits in (self.problem.lower, self.problem.upper)
         )
-        fields = {"lower": lower, "upper": upper, "weights": self.knots.weights, **changes}
-        return clear_out(self.problem, self.z, self.problem.segments, solver, target, **fields)
+        fields = {"lower": lower, "upper": upper, "weights": self.sampler.weights, **changes}
+        return resolve_collisions(
+            self.problem, self.z, self.problem.segments, solver, target, **fields
+        )
 
     def free(self) -> np.ndarray:
         """Return which of them need not be moved, shape (B,)."""
-        solver, target = self.knots.solver(0)
+        solver, target = self.sampler.get_pose_solver(0)
         residual, _ = solver.evaluate(self.z, target)
-        return (self.knots.depth(self.z, self.problem.segments) <= 0.0) & (
+        return (self.sampler.compute_shortfall(self.z, self.problem.segments) <= 0.0) & (
             np.abs(residual).max(axis=1) < 1e-4
         )
 
@@ -123,15 +125,15 @@ class Scattered:
 @pytest.fixture(scope="module")
 def scattered() -> Scattered:
     scene = vkc.load_scene("init_1").with_held({"stick": "grip"}).with_start(base=[1.2, 1.0, 1.0])
-    problem, knots = drawn([vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))], scene)
-    z, found = knots.knot(np.tile(problem.start, (96, 1)), problem.segments, "scatter")
-    return Scattered(problem, knots, z[found])
+    problem, sampler = drawn([vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))], scene)
+    z, found = sampler.sample(np.tile(problem.start, (96, 1)), problem.segments, "scatter")
+    return Scattered(problem, sampler, z[found])
 
 
 @pytest.fixture(scope="module")
 def cleared(scattered: Scattered) -> Scattered:
     return dataclasses.replace(
-        scattered, z=scattered.knots.clear(scattered.z, scattered.problem.segments)
+        scattered, z=scattered.sampler.push_clear(scattered.z, scattered.problem.segments)
     )
 
 
@@ -184,31 +186,31 @@ def test_searches_that_share_what_they_know_find_what_they_would_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem = program_of(door_scene(), [vkc.Grasp("door", "handle_free")])
-    known, waypoint = Known(), int(problem.ends[0])
+    known, waypoint = KeyframeCache(), int(problem.ends[0])
     before = np.tile(problem.start, (8, 1))
 
-    def found(knots: Knots) -> list[np.ndarray]:
-        drawn = [knots.knot(before, waypoint, "scatter") for _ in range(2)]
+    def found(sampler: KeyframeSampler) -> list[np.ndarray]:
+        drawn = [sampler.sample(before, waypoint, "scatter") for _ in range(2)]
         z = np.concatenate([z for z, _ in drawn])
         return [
             z,
             np.concatenate([ok for _, ok in drawn]),
-            knots.depth(z, waypoint),
-            knots.clear(z, waypoint),
-            knots.rng.random(3),
+            sampler.compute_shortfall(z, waypoint),
+            sampler.push_clear(z, waypoint),
+            sampler.rng.random(3),
         ]
 
     alone, first = (
-        found(Knots(problem, np.random.default_rng(0))),
-        found(Knots(problem, np.random.default_rng(0), known)),
+        found(KeyframeSampler(problem, np.random.default_rng(0))),
+        found(KeyframeSampler(problem, np.random.default_rng(0), known)),
     )
 
     def refuse(*_args: Any, **_kwargs: Any) -> None:
         raise AssertionError("asked again")
 
-    for name in ("depth", "clear_out"):
+    for name in ("compute_shortfall", "resolve_collisions"):
         monkeypatch.setattr(f"vkc_pin.planning.initialization.keyframes.{name}", refuse)
-    again = found(Knots(problem, np.random.default_rng(0), known))
+    again = found(KeyframeSampler(problem, np.random.default_rng(0), known))
     assert not np.array_equal(alone[0][:8], alone[0][8:])
     for one, other, third in zip(alone, first, again, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)

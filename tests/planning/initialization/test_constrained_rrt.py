@@ -10,11 +10,11 @@ from helpers.small_problems import door_scene, hand_off_the_handle, program_of
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import constrained_rrt as held
-from vkc_pin.planning.initialization.beam_search import Beam
-from vkc_pin.planning.initialization.constrained_rrt import held_path, obstructed
-from vkc_pin.planning.initialization.interpolation import Joiner
-from vkc_pin.planning.initialization.keyframes import Knots, depth
-from vkc_pin.planning.initialization.rrt import STEP, TRIES
+from vkc_pin.planning.initialization.beam_search import BeamSearch
+from vkc_pin.planning.initialization.constrained_rrt import find_constrained_path, is_obstructed
+from vkc_pin.planning.initialization.interpolation import Interpolator
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, compute_shortfall
+from vkc_pin.planning.initialization.rrt import MAX_EXTENSIONS, STEP
 from vkc_pin.utils.budget import Budget, SpentError
 from vkc_pin.world.scene.scene import Scene
 
@@ -28,14 +28,16 @@ RADIUS = 0.06  # [m] of the ball
 def free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
     """Return the problem of opening the door, knots through its last phase, and its waypoints on straight lines through them."""
     p = program_of(door_scene(), [OPEN], options=FEW)
-    knots = Knots(p, np.random.default_rng(0))
-    found = Beam(knots).search(thorough=True)
-    best = int(np.argmin(np.where(found.trouble == 0.0, found.cost, np.inf)))
+    sampler = KeyframeSampler(p, np.random.default_rng(0))
+    found = BeamSearch(sampler).search(thorough=True)
+    best = int(np.argmin(np.where(found.collision_cost == 0.0, found.cost, np.inf)))
     begin = int(p.ends[MOVE - 1])
-    inside = [k for k, waypoint in enumerate(found.at) if waypoint >= begin]
+    inside = [k for k, waypoint in enumerate(found.waypoints) if waypoint >= begin]
     through, steps = found.paths[best, inside], p.segments - begin
     straight = np.empty((steps, p.chain.size))
-    Joiner(knots, None, None)._straight(straight, through, [found.at[k] - begin for k in inside])  # type: ignore[arg-type]
+    Interpolator(sampler, None, None)._fill_straight(
+        straight, through, [found.waypoints[k] - begin for k in inside]
+    )  # type: ignore[arg-type]
     return p, through, straight
 
 
@@ -59,27 +61,30 @@ def blocked() -> vkc.TrajectoryProblem:
     return program_of(scene, [OPEN], options=FEW)
 
 
-def search(seed: int, *, tries: int = TRIES) -> np.ndarray | None:
+def search(seed: int, *, tries: int = MAX_EXTENSIONS) -> np.ndarray | None:
     _, through, straight = free_door()
-    return held_path(
-        Knots(blocked(), np.random.default_rng(seed)), MOVE, through, len(straight), tries
+    return find_constrained_path(
+        KeyframeSampler(blocked(), np.random.default_rng(seed)), MOVE, through, len(straight), tries
     )
 
 
-def overlap(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
+def penetration(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
     return float(
-        (depth(p, rows, p.contacts.find_waypoint(MOVE), reach=0.0) - p.options.dist_safe).max()
+        (
+            compute_shortfall(p, rows, p.contacts.find_waypoint(MOVE), reach=0.0)
+            - p.options.dist_safe
+        ).max()
     )
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_they_lead_around_what_is_in_the_way_with_the_handle_in_the_hand(seed: int) -> None:
     p, through, straight = free_door()
-    assert overlap(blocked(), straight) > 0.02, "the ball is not in the way"
+    assert penetration(blocked(), straight) > 0.02, "the ball is not in the way"
     rows = search(seed)
     assert rows is not None
     assert rows.shape == straight.shape
-    assert overlap(blocked(), rows) <= 5e-3  # waypoints are between nodes
+    assert penetration(blocked(), rows) <= 5e-3  # waypoints are between nodes
     hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
     for row in rows:
         assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
@@ -94,12 +99,12 @@ def test_they_lead_around_what_is_in_the_way_with_the_handle_in_the_hand(seed: i
 
 def test_what_is_free_is_not_obstructed_and_neither_is_what_begins_in_collision() -> None:
     p, through, straight = free_door()
-    assert overlap(p, straight) <= 0.0
-    assert not obstructed(Knots(p, np.random.default_rng(0)), MOVE, through, straight)
-    knots, inside = Knots(blocked(), np.random.default_rng(0)), through.copy()
-    assert obstructed(knots, MOVE, through, straight)
+    assert penetration(p, straight) <= 0.0
+    assert not is_obstructed(KeyframeSampler(p, np.random.default_rng(0)), MOVE, through, straight)
+    sampler, inside = KeyframeSampler(blocked(), np.random.default_rng(0)), through.copy()
+    assert is_obstructed(sampler, MOVE, through, straight)
     inside[0] = straight[len(straight) // 2]
-    assert not obstructed(knots, MOVE, inside, straight), "no tree leads out of things"
+    assert not is_obstructed(sampler, MOVE, inside, straight), "no tree leads out of things"
 
 
 def test_without_tries_nothing_is_found() -> None:
@@ -120,7 +125,7 @@ def test_a_budget_ends_the_search() -> None:
 
 def finder(p: vkc.TrajectoryProblem, seed: int = 0) -> held._Search:
     return held._Search(
-        Knots(p, np.random.default_rng(seed)), MOVE, p.segments - int(p.ends[MOVE - 1])
+        KeyframeSampler(p, np.random.default_rng(seed)), MOVE, p.segments - int(p.ends[MOVE - 1])
     )
 
 
@@ -128,8 +133,8 @@ def test_between_two_waypoints_the_door_is_between_them() -> None:
     p, through, _ = free_door()
     own, hinge = finder(p), p.chain.index("door.hinge")
     at = np.array([own.begin, own.begin + 7.0, own.begin + 7.25, own.begin + 8.0, own.end])
-    z, closed = own.close(np.tile(through[2], (5, 1)), at)
-    angles = own.knots.objects[:, hinge]
+    z, closed = own.project(np.tile(through[2], (5, 1)), at)
+    angles = own.sampler.object_motion[:, hinge]
     whole = [
         0.0,
         angles[own.begin + 6],
@@ -149,16 +154,18 @@ def test_between_two_waypoints_the_door_is_between_them() -> None:
 def test_a_path_becomes_no_longer_and_keeps_its_ends() -> None:
     _, through, _ = free_door()
     own = finder(blocked(), 5)
-    path = own.run(through, TRIES)
+    path = own.run(through, MAX_EXTENSIONS)
     assert path is not None
-    short = own.shortened(path)
-    before, after = (float(own.apart(each.z[1:], each.z[:-1]).sum()) for each in (path, short))
+    short = own.shorten(path)
+    before, after = (
+        float(own.compute_distances(each.z[1:], each.z[:-1]).sum()) for each in (path, short)
+    )
     assert after < before
     for each in (path, short):
         np.testing.assert_array_equal(each.z[0], through[0])
         assert (each.at[0], each.at[-1]) == (own.begin, own.end)
-        assert own.apart(each.z[1:], each.z[:-1]).max() <= 2.0 * STEP + 1e-9
-        assert own.free(each.z).all()
+        assert own.compute_distances(each.z[1:], each.z[:-1]).max() <= 2.0 * STEP + 1e-9
+        assert own.are_free(each.z).all()
     np.testing.assert_array_equal(short.z[-1], path.z[-1])
 
 
@@ -169,9 +176,9 @@ def test_a_path_that_cannot_be_closed_somewhere_gives_no_waypoints(
     """The base has to stand where no arm reaches the handle from."""
     _, through, _ = free_door()
     own = finder(blocked(), 5)
-    path = own.run(through, TRIES)
+    path = own.run(through, MAX_EXTENSIONS)
     assert path is not None
-    limits = own.knots.limits
+    limits = own.sampler.compute_limits
 
     def beyond(z: np.ndarray, waypoint: int) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = limits(z, waypoint)
@@ -179,17 +186,17 @@ def test_a_path_that_cannot_be_closed_somewhere_gives_no_waypoints(
         return lower, upper
 
     if out:
-        monkeypatch.setattr(own.knots, "limits", beyond)
-    assert (own.spread(path, own.end - own.begin) is None) == out
+        monkeypatch.setattr(own.sampler, "compute_limits", beyond)
+    assert (own.resample(path, own.end - own.begin) is None) == out
 
 
 def test_what_was_chosen_at_the_grasp_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples hold as it was grasped; here by what the base's x is, which none of them has."""
     p, through, _ = free_door()
-    assert len(finder(p).drawn(through, finder(p).end)) > 0
-    monkeypatch.setattr(Knots, "chosen", lambda self, waypoint: [0])
+    assert len(finder(p).sample_free(through, finder(p).end)) > 0
+    monkeypatch.setattr(KeyframeSampler, "find_grasp_columns", lambda self, waypoint: [0])
     own = finder(p)
-    assert len(own.drawn(through, own.end)) == 0
-    z, closed = own.close(through[1:] + 0.01, np.full(len(through) - 1, own.end))
+    assert len(own.sample_free(through, own.end)) == 0
+    z, closed = own.project(through[1:] + 0.01, np.full(len(through) - 1, own.end))
     assert closed.any()
     np.testing.assert_array_equal(z[:, 0], through[1:, 0] + 0.01)

@@ -11,8 +11,8 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import base_routes as folding
-from vkc_pin.planning.initialization.base_routes import Routes, folded_arms
-from vkc_pin.planning.initialization.keyframes import depth
+from vkc_pin.planning.initialization.base_routes import BaseRoutes, find_folded_arms
+from vkc_pin.planning.initialization.keyframes import compute_shortfall
 
 TASKS = {  # scene and steps, in the last phase of which something is carried
     "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),
@@ -66,7 +66,7 @@ def reach(load: str, z: np.ndarray, *, base: bool = False) -> tuple[np.ndarray, 
 @pytest.mark.parametrize("load", TASKS)
 def test_it_is_much_narrower_than_at_home(load: str) -> None:
     p = problem(load)
-    arm = folded_arms(p, len(p.task.phases) - 1, resting(load))[0]
+    arm = find_folded_arms(p, len(p.task.phases) - 1, resting(load))[0]
     low, high = reach(load, with_arm(load, arm))
     low_home, high_home = reach(load, resting(load))
     assert max(high[1], -low[1]) < 0.7 * max(high_home[1], -low_home[1])
@@ -80,7 +80,7 @@ def test_it_is_much_narrower_than_at_home(load: str) -> None:
 def test_they_keep_within_limits_and_away_from_themselves(load: str, number: int) -> None:
     p = problem(load)
     chain, robot = p.chain, p.chain.robot
-    z = with_arm(load, folded_arms(p, len(p.task.phases) - 1, resting(load))[number])
+    z = with_arm(load, find_folded_arms(p, len(p.task.phases) - 1, resting(load))[number])
     assert np.all((z >= chain.lower) & (z <= chain.upper))
     data, shapes = robot.model.createData(), robot.collision.createData()
     q = robot.coordinates.q(z[: robot.coordinates.size])
@@ -100,21 +100,21 @@ def test_what_stands_does_not_count() -> None:
     p = problem("nothing")
     z = resting("nothing")
     z[:2] = 0.0, 1.25
-    assert depth(p, z[None], 1)[0] > 0.1
-    assert depth(p, z[None], 1, standing=False)[0] == 0.0
+    assert compute_shortfall(p, z[None], 1)[0] > 0.1
+    assert compute_shortfall(p, z[None], 1, standing=False)[0] == 0.0
 
 
 def test_it_is_the_same_every_time() -> None:
     p = problem("stick")
     np.testing.assert_array_equal(
-        folded_arms(p, 1, resting("stick")), folded_arms(p, 1, resting("stick"))
+        find_folded_arms(p, 1, resting("stick")), find_folded_arms(p, 1, resting("stick"))
     )
 
 
 def test_where_nothing_is_free_the_arm_stays_at_home(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(folding, "depth", lambda _, z, *__, **___: np.ones(len(z)))
+    monkeypatch.setattr(folding, "compute_shortfall", lambda _, z, *__, **___: np.ones(len(z)))
     np.testing.assert_array_equal(
-        folded_arms(problem("nothing"), 0, resting("nothing")),
+        find_folded_arms(problem("nothing"), 0, resting("nothing")),
         [problem("nothing").chain.robot.home],
     )
 
@@ -123,7 +123,7 @@ def test_where_nothing_is_free_the_arm_stays_at_home(monkeypatch: pytest.MonkeyP
 def test_the_others_reach_no_further_over_the_floor_than_the_first_or_the_base(load: str) -> None:
     """By boxes of coal's; what the package takes is a little larger."""
     p = problem(load)
-    arms = folded_arms(p, len(p.task.phases) - 1, resting(load))
+    arms = find_folded_arms(p, len(p.task.phases) - 1, resting(load))
     assert len(arms) > 10
     own, first = (
         np.max(np.abs(reach(load, with_arm(load, arms[0]), base=base)), axis=0)
@@ -139,12 +139,15 @@ def test_the_others_reach_no_further_over_the_floor_than_the_first_or_the_base(l
 def test_the_nearest_is_that_by_way_of_which_it_is_least_far() -> None:
     """Joints that turn wound up are the same arm, but elsewhere."""
     p = problem("cup")
-    routes, arms = Routes(p), folded_arms(p, 1, Routes(p)._resting())
-    np.testing.assert_array_equal(routes.folded_arm(1), arms[0])
+    routes, arms = (
+        BaseRoutes(p),
+        find_folded_arms(p, 1, BaseRoutes(p)._make_resting_configuration()),
+    )
+    np.testing.assert_array_equal(routes.get_folded_arm(1), arms[0])
     metric, rng = p.chain.metric[3:9], np.random.default_rng(0)
     for _ in range(20):
         first, last = rng.uniform(p.chain.lower[3:9], p.chain.upper[3:9], (2, 6))
-        near = routes.nearest_folded_arm(1, first, last)
+        near = routes.find_nearest_folded_arm(1, first, last)
         assert np.all((near >= p.chain.lower[3:9]) & (near <= p.chain.upper[3:9]))
         turns = (near - arms) / (2.0 * np.pi)
         assert np.abs(turns - np.round(turns)).max(axis=1).min() < 1e-9, "it is none of them"

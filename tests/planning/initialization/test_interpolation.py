@@ -15,12 +15,12 @@ from helpers.small_problems import door_scene, hand_off_the_handle, program_of
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import interpolation as joining
-from vkc_pin.planning.initialization.approach_paths import Approach
-from vkc_pin.planning.initialization.base_routes import Routes
-from vkc_pin.planning.initialization.beam_search import Beam
-from vkc_pin.planning.initialization.interpolation import DrivenPaths, Joiner, Paths, RrtPaths
-from vkc_pin.planning.initialization.keyframes import Knots, smooth
-from vkc_pin.planning.initialization.rrt import TRIES
+from vkc_pin.planning.initialization.approach_paths import ApproachPaths
+from vkc_pin.planning.initialization.base_routes import BaseRoutes
+from vkc_pin.planning.initialization.beam_search import BeamSearch
+from vkc_pin.planning.initialization.interpolation import AStarPaths, Interpolator, Paths, RrtPaths
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
+from vkc_pin.planning.initialization.rrt import MAX_EXTENSIONS
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 OPEN = vkc.Actuate("door", {"hinge": 1.2})
@@ -31,19 +31,19 @@ ROBOT = 9  # x, y and yaw of the base, six joints of the arm
 def door() -> tuple[vkc.TrajectoryProblem, np.ndarray, tuple[int, ...]]:
     """Return the problem of opening the door, and knots of it and when they are."""
     p = program_of(door_scene(), [OPEN], options=FEW)
-    found = Beam(Knots(p, np.random.default_rng(0))).search(thorough=True)
-    best = int(np.argmin(np.where(found.trouble == 0.0, found.cost, np.inf)))
-    assert found.trouble[best] == 0.0
-    return p, found.paths[best], tuple(found.at)
+    found = BeamSearch(KeyframeSampler(p, np.random.default_rng(0))).search(thorough=True)
+    best = int(np.argmin(np.where(found.collision_cost == 0.0, found.cost, np.inf)))
+    assert found.collision_cost[best] == 0.0
+    return p, found.paths[best], tuple(found.waypoints)
 
 
-def joiner(p: vkc.TrajectoryProblem, paths: Paths | None = None) -> Joiner:
-    knots = Knots(p, np.random.default_rng(0))
-    return Joiner(knots, Approach(knots), paths)
+def interpolator(p: vkc.TrajectoryProblem, paths: Paths | None = None) -> Interpolator:
+    sampler = KeyframeSampler(p, np.random.default_rng(0))
+    return Interpolator(sampler, ApproachPaths(sampler), paths)
 
 
 def trees(p: vkc.TrajectoryProblem, seed: int = 0) -> RrtPaths:
-    return RrtPaths(Knots(p, np.random.default_rng(seed)), Routes(p))
+    return RrtPaths(KeyframeSampler(p, np.random.default_rng(seed)), BaseRoutes(p))
 
 
 class Say:
@@ -53,13 +53,13 @@ class Say:
         self,
         way: Callable[[np.ndarray, np.ndarray, int], np.ndarray | None],
         *,
-        careful: bool = False,
+        checks_approach: bool = False,
     ) -> None:
-        self.careful, self.made = careful, way
+        self.checks_approach, self.made = checks_approach, way
         self.asked: list[tuple[int, np.ndarray, np.ndarray, int, bool]] = []
         self.turns: list[bool] = []  # whether headings may end whole turns further
 
-    def path(
+    def find_path(
         self,
         phase: int,
         first: np.ndarray,
@@ -102,7 +102,7 @@ def holds_the_handle(z: np.ndarray) -> None:
 def test_straight_through_the_knots_and_closed_where_it_is_held() -> None:
     p, knots, at_ = door()
     given = knots.copy()
-    z = joiner(p).join(knots, list(at_))
+    z = interpolator(p).interpolate(knots, list(at_))
     assert z is not None
     np.testing.assert_array_equal(knots, given)  # those of others, too
     assert z.shape == (p.segments, p.chain.size)
@@ -119,9 +119,11 @@ def test_straight_through_the_knots_and_closed_where_it_is_held() -> None:
 
 def test_where_nothing_is_on_the_way_the_profile_is_smooth() -> None:
     p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
-    z = joiner(p).join(np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments])
+    z = interpolator(p).interpolate(np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments])
     assert z is not None
-    np.testing.assert_allclose(z[:, :3], np.outer(smooth(p.segments), [2.0, 1.0, 0.5]), atol=1e-12)
+    np.testing.assert_allclose(
+        z[:, :3], np.outer(sample_smoothstep(p.segments), [2.0, 1.0, 0.5]), atol=1e-12
+    )
 
 
 # --- along what somebody says
@@ -131,7 +133,7 @@ def test_where_nothing_is_on_the_way_the_profile_is_smooth() -> None:
 def test_a_way_is_asked_for_where_nothing_is_held_and_between_straight_ways() -> None:
     p, knots, at_ = door()
     ways = Say(turning(0.0))
-    z = joiner(p, ways).join(knots, list(at_))
+    z = interpolator(p, ways).interpolate(knots, list(at_))
     assert z is not None
     ((phase, first, last, steps, reaches),) = ways.asked
     assert (phase, reaches, ways.turns) == (0, True, [True])
@@ -149,8 +151,8 @@ def test_a_way_is_asked_for_where_nothing_is_held_and_between_straight_ways() ->
 @pytest.mark.parametrize("turns", [-1, 1, 2])
 def test_what_follows_goes_on_from_a_way_that_ends_with_whole_turns(turns: int) -> None:
     p, knots, at_ = door()
-    plain = joiner(p, Say(turning(0.0))).join(knots, list(at_))
-    wound = joiner(p, Say(turning(turns * 2 * np.pi))).join(knots, list(at_))
+    plain = interpolator(p, Say(turning(0.0))).interpolate(knots, list(at_))
+    wound = interpolator(p, Say(turning(turns * 2 * np.pi))).interpolate(knots, list(at_))
     assert plain is not None
     assert wound is not None
     reach = int(p.ends[0])
@@ -170,7 +172,9 @@ def test_a_way_may_end_whole_turns_further_unless_the_goal_says_how_far_to_turn(
     """What the way says is taken as it is: whoever finds it knows where there is room to turn."""
     p = program_of(hall(), [vkc.GoTo(2.0, 1.0, yaw)])
     ways = Say(turning(0.0))
-    z = joiner(p, ways).join(np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments])
+    z = interpolator(p, ways).interpolate(
+        np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments]
+    )
     assert ways.turns == [turns]
     assert z is not None
     np.testing.assert_allclose(
@@ -188,7 +192,7 @@ def test_after_a_phase_whose_arm_ends_elsewhere_the_next_begins_there() -> None:
         return way
 
     ways, knots = Say(lifting), np.array([p.start, at(p, (2.0, 1.0, 0.5)), at(p, (0.0, 1.0, 0.5))])
-    z = joiner(p, ways).join(knots, [0, *p.ends.tolist()])
+    z = interpolator(p, ways).interpolate(knots, [0, *p.ends.tolist()])
     assert z is not None
     assert [(phase, reaches) for phase, *_, reaches in ways.asked] == [(0, False), (1, False)]
     middle = int(p.ends[0])
@@ -204,15 +208,15 @@ def test_where_there_is_no_way_it_is_said_once_for_each_phase() -> None:
     ways = Say(
         lambda first, last, steps: turning(0.0)(first, last, steps) if allowed.pop(0) else None
     )
-    join = joiner(p, ways)
+    join = interpolator(p, ways)
 
     def through(x: float) -> np.ndarray | None:
-        return join.join(
+        return join.interpolate(
             np.array([p.start, at(p, (x, 1.0, 0.5)), at(p, (0.0, 1.0, 0.5))]), [0, *p.ends.tolist()]
         )
 
     assert through(2.0) is None
-    assert join.blocked == ["go to: found no way for the base from (0.00, 0.00) to (2.00, 1.00)"]
+    assert join.blocked == ["go to: found no path for the base from (0.00, 0.00) to (2.00, 1.00)"]
     allowed += [None]
     assert through(1.9) is None, "another place, the same phase"
     assert len(join.blocked) == 1
@@ -223,16 +227,16 @@ def test_where_there_is_no_way_it_is_said_once_for_each_phase() -> None:
 
 def test_phases_that_are_called_differently_have_a_line_each() -> None:
     both = program_of(door_scene(), [vkc.GoTo(0.0, 0.0), OPEN], options=FEW)
-    found = Beam(Knots(both, np.random.default_rng(0))).search(thorough=False)
+    found = BeamSearch(KeyframeSampler(both, np.random.default_rng(0))).search(thorough=False)
     allowed: list[Any] = [None, True, None]
-    join = joiner(
+    join = interpolator(
         both,
         Say(
             lambda first, last, steps: turning(0.0)(first, last, steps) if allowed.pop(0) else None
         ),
     )
     for _ in range(2):
-        assert join.join(found.paths[0], found.at) is None
+        assert join.interpolate(found.paths[0], found.waypoints) is None
     assert [line.split(":")[0] for line in join.blocked] == ["go to", "reach door.handle"]
 
 
@@ -241,17 +245,18 @@ def test_phases_that_are_called_differently_have_a_line_each() -> None:
 
 
 @pytest.mark.parametrize(
-    ("careful", "depth", "kept"), [(False, 0.015, True), (True, 0.015, False), (True, 0.005, True)]
+    ("careful", "depth", "kept"),
+    [(False, 0.015, True), (True, 0.015, False), (True, 0.005, True)],
 )
 def test_a_careful_way_leaves_out_what_hits_something(
     careful: bool, depth: float, kept: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """More than half of the margin, 0.02; then the way leads to the grasp itself."""
     p, knots, at_ = door()
-    ways = Say(turning(0.0, ROBOT), careful=careful)
-    join = joiner(p, ways)
-    monkeypatch.setattr(join.knots, "depth", lambda z, _: np.full(len(z), depth))
-    z = join.join(knots, list(at_))
+    ways = Say(turning(0.0, ROBOT), checks_approach=careful)
+    join = interpolator(p, ways)
+    monkeypatch.setattr(join.sampler, "compute_shortfall", lambda z, _: np.full(len(z), depth))
+    z = join.interpolate(knots, list(at_))
     assert z is not None
     ((_, _, last, steps, _),) = ways.asked
     reach = int(p.ends[0])
@@ -272,8 +277,8 @@ def test_a_careful_way_leaves_out_what_hits_something(
 
 def test_only_trees_are_careful() -> None:
     p, _, _ = door()
-    assert trees(p).careful
-    assert not DrivenPaths(Routes(p)).careful
+    assert trees(p).checks_approach
+    assert not AStarPaths(BaseRoutes(p)).checks_approach
 
 
 # --- around, and with base and arm
@@ -282,37 +287,37 @@ def test_only_trees_are_careful() -> None:
 
 def test_around_is_the_way_of_the_base_with_a_straight_arm() -> None:
     p = walled(1.6)
-    routes, end = Routes(p), at(p, (4.0, 1.5, 0.0))
+    routes, end = BaseRoutes(p), at(p, (4.0, 1.5, 0.0))
     end[3:] += 0.2
-    z = joiner(p, DrivenPaths(routes)).join(np.array([p.start, end]), [0, p.segments])
+    z = interpolator(p, AStarPaths(routes)).interpolate(np.array([p.start, end]), [0, p.segments])
     assert z is not None
-    expected = routes.path(0, p.start[:3], end[:3], p.segments)
+    expected = routes.find_path(0, p.start[:3], end[:3], p.segments)
     assert expected is not None
     assert abs(expected[-1, 2]) < 1e-9, "no whole turns here"
     np.testing.assert_allclose(z[:, :3], expected, atol=1e-9)
     np.testing.assert_allclose(
-        z[:, 3:], p.start[3:] + np.outer(smooth(p.segments), np.full(6, 0.2)), atol=1e-9
+        z[:, 3:], p.start[3:] + np.outer(sample_smoothstep(p.segments), np.full(6, 0.2)), atol=1e-9
     )
 
 
 class Winding:
-    """Routes on which the base turns so many times too often, steadily."""
+    """BaseRoutes on which the base turns so many times too often, steadily."""
 
     def __init__(self, turns: int) -> None:
         self.turns = turns
 
-    def path(self, phase: int, start: np.ndarray, goal: np.ndarray, steps: int) -> np.ndarray:
+    def find_path(self, phase: int, start: np.ndarray, goal: np.ndarray, steps: int) -> np.ndarray:
         end = goal + np.array([0.0, 0.0, self.turns * 2 * np.pi])
         return np.asarray(start + np.outer(np.arange(1, steps + 1) / steps, end - start))
 
 
 @pytest.mark.parametrize("wound", [-1, 0, 1, 2])
 def test_around_unwinds_where_the_goal_says_how_far_to_turn(wound: int) -> None:
-    ways = DrivenPaths(Winding(wound))  # type: ignore[arg-type]
+    ways = AStarPaths(Winding(wound))  # type: ignore[arg-type]
     first, last, share = np.zeros(ROBOT), np.zeros(ROBOT), np.arange(1, 21) / 20
     last[:3] = 2.0, 1.0, 0.5
     for turns, yaw in ((True, 0.5 + wound * 2 * np.pi), (False, 0.5)):
-        way = ways.path(0, first, last, 20, turns=turns, reaches=True)
+        way = ways.find_path(0, first, last, 20, turns=turns, reaches=True)
         assert way is not None
         np.testing.assert_allclose(way, np.outer(share, [2.0, 1.0, yaw]), atol=1e-9)
 
@@ -320,9 +325,9 @@ def test_around_unwinds_where_the_goal_says_how_far_to_turn(wound: int) -> None:
 def test_trees_lead_base_and_arm_through_a_narrow_gate() -> None:
     p = gated(NARROW)
     ends = np.array([p.start, at(p, GOAL)])
-    assert joiner(p, DrivenPaths(Routes(p))).join(ends, [0, p.segments]) is None
-    straight = joiner(p).join(ends, [0, p.segments])
-    z = joiner(p, trees(p)).join(ends, [0, p.segments])
+    assert interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(ends, [0, p.segments]) is None
+    straight = interpolator(p).interpolate(ends, [0, p.segments])
+    z = interpolator(p, trees(p)).interpolate(ends, [0, p.segments])
     assert straight is not None
     assert z is not None
     hit, grazed = (
@@ -341,12 +346,12 @@ def test_with_what_is_to_be_reached_the_arm_of_a_tree_ends_there() -> None:
     end[4] += 0.1
     grown = trees(p)
     for reaches in (True, False):
-        way = grown.path(0, p.start, end, 30, turns=True, reaches=reaches)
+        way = grown.find_path(0, p.start, end, 30, turns=True, reaches=reaches)
         assert way is not None
         assert way.shape == (30, ROBOT)
         np.testing.assert_allclose(way[-1, :3], GOAL, atol=1e-9)  # there is no reason to turn round
-        near = grown.routes.nearest_folded_arm(0, p.start[3:], end[3:])
-        allowed = [end[3:], p.start[3:], p.chain.robot.home, grown.routes.folded_arm(0), near][
+        near = grown.routes.find_nearest_folded_arm(0, p.start[3:], end[3:])
+        allowed = [end[3:], p.start[3:], p.chain.robot.home, grown.routes.get_folded_arm(0), near][
             : 1 if reaches else None
         ]
         assert min(np.abs(way[-1, 3:] - arm).max() for arm in allowed) < 1e-9
@@ -359,7 +364,7 @@ def test_trees_turn_as_far_as_the_goal_says_where_there_is_room(wound: int, seed
     p = gated(NARROW)
     end = at(p, GOAL)
     end[2] += wound * 2 * np.pi
-    way = trees(p, seed).path(0, p.start, end, 60, turns=False, reaches=True)
+    way = trees(p, seed).find_path(0, p.start, end, 60, turns=False, reaches=True)
     assert way is not None
     np.testing.assert_allclose(way[-1], end, atol=1e-9)
     z = np.tile(p.start, (60, 1))
@@ -371,8 +376,8 @@ def test_trees_turn_as_far_as_the_goal_says_where_there_is_room(wound: int, seed
 
 def test_trees_find_nothing_where_there_is_nothing() -> None:
     p = gated(0.0)
-    join = joiner(p, trees(p))
-    assert join.join(np.array([p.start, at(p, GOAL)]), [0, p.segments]) is None
+    join = interpolator(p, trees(p))
+    assert join.interpolate(np.array([p.start, at(p, GOAL)]), [0, p.segments]) is None
     assert len(join.blocked) == 1
 
 
@@ -395,20 +400,20 @@ def test_trees_that_failed_try_less_until_they_succeed_again(
 
     monkeypatch.setattr(joining, "connect", connect)
     for number, phase in enumerate([0, 0, 1, 0, 0, 0, 0, 0]):
-        monkeypatch.setattr(ways.routes, "guide", lambda *_: np.zeros((2, 3)))
+        monkeypatch.setattr(ways.routes, "find_guide_path", lambda *_: np.zeros((2, 3)))
         for name in ("folded_arm", "nearest_folded_arm"):
             monkeypatch.setattr(ways.routes, name, lambda *_: p.start[3:ROBOT])
-        way = ways.path(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
+        way = ways.find_path(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
         assert (way is not None) == (number == 5)
     assert tries == [
-        TRIES,
-        TRIES // 2,
-        TRIES,
-        TRIES // 4,
-        TRIES // 8,
-        TRIES // 16,
-        TRIES,
-        TRIES // 2,
+        MAX_EXTENSIONS,
+        MAX_EXTENSIONS // 2,
+        MAX_EXTENSIONS,
+        MAX_EXTENSIONS // 4,
+        MAX_EXTENSIONS // 8,
+        MAX_EXTENSIONS // 16,
+        MAX_EXTENSIONS,
+        MAX_EXTENSIONS // 2,
     ]
 
 
@@ -419,15 +424,15 @@ def test_trees_that_failed_where_something_is_held_try_less_too_but_where_none_g
     ways, tries, found = trees(p), list[int](), iter([False, False, True, False])
     blocked = iter([False, True, False, True, False, False, True, True])
 
-    def path(*given: Any) -> np.ndarray | None:
+    def held(*given: Any) -> np.ndarray | None:
         tries.append(given[-1])
         return through if next(found) else None
 
-    monkeypatch.setattr(joining, "obstructed", lambda *_: next(blocked))
-    monkeypatch.setattr(joining, "held_path", path)
-    led = [ways.held(2, through, through) is not None for _ in range(8)]
+    monkeypatch.setattr(joining, "is_obstructed", lambda *_: next(blocked))
+    monkeypatch.setattr(joining, "find_constrained_path", held)
+    led = [ways.find_constrained_path(2, through, through) is not None for _ in range(8)]
     assert led == [False] * 6 + [True, False]
-    assert tries == [TRIES, TRIES // 2, TRIES // 4, TRIES]
+    assert tries == [MAX_EXTENSIONS, MAX_EXTENSIONS // 2, MAX_EXTENSIONS // 4, MAX_EXTENSIONS]
 
 
 def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robot_ends(
@@ -435,16 +440,16 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
 ) -> None:
     """A door that opens in the second half of its time alone, and another posture in the end, from which the next phase leads."""
     p = program_of(door_scene(), [OPEN, vkc.GoTo(-1.0, 0.5)], options=FEW)
-    own = Knots(p, np.random.default_rng(0))
-    found = Beam(own).search(thorough=True)
+    own = KeyframeSampler(p, np.random.default_rng(0))
+    found = BeamSearch(own).search(thorough=True)
     knots, move = found.paths[int(np.argmin(found.cost))], int(p.ends[2])
-    begin, hinge, at_ = int(p.ends[1]), p.chain.index("door.hinge"), found.at.index(move)
-    others = found.paths[found.trouble < 1e3, at_]
+    begin, hinge, at_ = int(p.ends[1]), p.chain.index("door.hinge"), found.waypoints.index(move)
+    others = found.paths[found.collision_cost < 1e3, at_]
     other = others[int(np.abs(others - knots[at_])[:, :ROBOT].max(axis=1).argmax())]
     assert np.abs(other - knots[at_])[:3].max() > 0.05, "they all end in the same place"
     asked, firsts = list[tuple[int, int]](), list[np.ndarray]()
 
-    def path(
+    def held(
         _: RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray
     ) -> np.ndarray | None:
         asked.append((phase, len(straight)))
@@ -465,9 +470,9 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
             :, :ROBOT
         ]
 
-    monkeypatch.setattr(RrtPaths, "held", path)
-    monkeypatch.setattr(RrtPaths, "path", way)
-    z = joiner(p, trees(p)).join(knots, list(found.at))
+    monkeypatch.setattr(RrtPaths, "find_constrained_path", held)
+    monkeypatch.setattr(RrtPaths, "find_path", way)
+    z = interpolator(p, trees(p)).interpolate(knots, list(found.waypoints))
     assert z is not None
     assert asked == [(1, begin - int(p.ends[0])), (2, move - begin)]
     np.testing.assert_allclose(z[begin + (move - begin) // 2 - 1, hinge], 0.0, atol=1e-9)
@@ -478,11 +483,11 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
         )
     assert z[move - 1, hinge] == pytest.approx(1.2)
     np.testing.assert_allclose(z[move - 1], other, atol=1e-3)
-    there = Approach(own).after(other, p.task.phases[3], p.task.phases[2])
+    there = ApproachPaths(own).find_retreat_end(other, p.task.phases[3], p.task.phases[2])
     np.testing.assert_allclose(
         firsts[-1],
         there[0]
-        if len(there) and own.depth(there, p.contacts.find_waypoint(3))[0] < 0.01
+        if len(there) and own.compute_shortfall(there, p.contacts.find_waypoint(3))[0] < 0.01
         else other,
     )
 
@@ -491,7 +496,7 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
     def never(*_: Any, **__: Any) -> Any:
         raise AssertionError("a base that cannot drive needs no way")
 
-    monkeypatch.setattr(Routes, "guide", never)
+    monkeypatch.setattr(BaseRoutes, "find_guide_path", never)
     beam = {
         "name": "beam",
         "type": "cylinder",
@@ -504,11 +509,11 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
     )
     first, last = p.start.copy(), p.start.copy()
     first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
-    way = trees(p).path(0, first, last, 60, turns=False, reaches=True)
+    way = trees(p).find_path(0, first, last, 60, turns=False, reaches=True)
     assert way is not None
     np.testing.assert_array_equal(way[:, :3], np.tile(first[:3], (60, 1)))
     np.testing.assert_allclose(way[-1], last, atol=1e-12)
-    straight = first + np.outer(smooth(60), last - first)
+    straight = first + np.outer(sample_smoothstep(60), last - first)
     hit, grazed = (
         p.contacts.evaluate(z, np.ones(60, int), reach=0.1).compute_violation()
         for z in (straight, way)
@@ -520,7 +525,9 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
 def test_a_way_of_trees_stays_free_where_the_goal_says_how_far_to_turn() -> None:
     """The guide drives backwards through the gate, which would end a whole turn further."""
     p = program_of(gated(NARROW).scene, [vkc.GoTo(*GOAL[:2], -3.1)])
-    z = joiner(p, trees(p)).join(np.array([p.start, at(p, (*GOAL[:2], -3.1))]), [0, p.segments])
+    z = interpolator(p, trees(p)).interpolate(
+        np.array([p.start, at(p, (*GOAL[:2], -3.1))]), [0, p.segments]
+    )
     assert z is not None
     np.testing.assert_allclose(z[-1, 2], -3.1, atol=1e-9)
     assert p.evaluate_contacts(z, reach=0.1).compute_violation() < p.options.dist_safe + 0.02

@@ -9,13 +9,13 @@ from helpers.small_problems import SHORT, all_pairs, door_scene, hand_off_the_ha
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.keyframes import (
-    SCATTER,
-    Knots,
-    Known,
-    depth,
-    follow_objects,
-    scatter,
-    smooth,
+    SAMPLE_COUNT,
+    KeyframeCache,
+    KeyframeSampler,
+    compute_shortfall,
+    interpolate_object_joints,
+    sample_goal_configurations,
+    sample_smoothstep,
 )
 
 OPEN = vkc.Actuate("door", {"hinge": 1.2})
@@ -31,29 +31,31 @@ def drive() -> vkc.TrajectoryProblem:
     return vkc.build(door_scene(), [vkc.GoTo(0.3, 0.2)], options=SHORT)
 
 
-def knots(problem: vkc.TrajectoryProblem, seed: int = 0, known: Known | None = None) -> Knots:
-    return Knots(problem, np.random.default_rng(seed), known)
+def knots(
+    problem: vkc.TrajectoryProblem, seed: int = 0, known: KeyframeCache | None = None
+) -> KeyframeSampler:
+    return KeyframeSampler(problem, np.random.default_rng(seed), known)
 
 
 def test_the_profile_starts_and_ends_at_rest() -> None:
-    s = np.concatenate([[0.0], smooth(100)])
+    s = np.concatenate([[0.0], sample_smoothstep(100)])
     assert s[-1] == 1.0
     assert (np.diff(s) > 0).all()
     np.testing.assert_allclose(s + s[::-1], 1.0)  # the same from both ends
     assert max(s[1], 1.0 - s[-2]) < 1e-3
     assert np.diff(s).max() == pytest.approx(1.5 / 100, rel=1e-3)
-    np.testing.assert_array_equal(smooth(1), [1.0])
+    np.testing.assert_array_equal(sample_smoothstep(1), [1.0])
 
 
 def test_objects_run_to_their_goals_phase_by_phase(problem: vkc.TrajectoryProblem) -> None:
-    z = follow_objects(problem, np.tile(problem.start, (problem.segments, 1)))
+    z = interpolate_object_joints(problem, np.tile(problem.start, (problem.segments, 1)))
     reach, turn, move = problem.ends.tolist()
     hinge, knob = (z[:, problem.chain.index(f"door.{name}")] for name in ("hinge", "knob"))
     assert (hinge[:turn] == 0.0).all()
     assert (knob[:reach] == 0.0).all()
     assert hinge[move - 1] == pytest.approx(1.2)
-    np.testing.assert_allclose(hinge[turn:], 1.2 * smooth(move - turn))
-    np.testing.assert_allclose(knob[reach:turn], knob[turn - 1] * smooth(turn - reach))
+    np.testing.assert_allclose(hinge[turn:], 1.2 * sample_smoothstep(move - turn))
+    np.testing.assert_allclose(knob[reach:turn], knob[turn - 1] * sample_smoothstep(turn - reach))
     np.testing.assert_array_equal(z[:, :9], np.tile(problem.start[:9], (problem.segments, 1)))
 
 
@@ -63,19 +65,20 @@ def test_the_hand_is_at_the_handle_wherever_that_is(
 ) -> None:
     search = knots(problem)
     grasp = int(problem.ends[0])
-    first, found = search.knot(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    first, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
     assert found.sum() > 10
     for waypoint in (grasp, grasp + 1, problem.segments):
-        z, found = search.knot(first, waypoint, how)
+        z, found = search.sample(first, waypoint, how)
         hinge, knob = (
-            search.objects[waypoint - 1, problem.chain.index(f"door.{name}")]
+            search.object_motion[waypoint - 1, problem.chain.index(f"door.{name}")]
             for name in ("hinge", "knob")
         )
         assert found.any()
         for row in z[found]:
             assert hand_off_the_handle(door_scene(), row[:9], hinge, knob) < 2e-4
         np.testing.assert_array_equal(
-            z[:, search.driven], np.tile(search.objects[waypoint - 1, search.driven], (len(z), 1))
+            z[:, search.object_columns],
+            np.tile(search.object_motion[waypoint - 1, search.object_columns], (len(z), 1)),
         )
         arms = slice(3, 9)
         assert (z[found, arms] >= problem.lower[waypoint - 1, arms] - 1e-9).all()
@@ -84,48 +87,48 @@ def test_the_hand_is_at_the_handle_wherever_that_is(
 
 def test_tracking_stays_near_and_scattering_does_not(problem: vkc.TrajectoryProblem) -> None:
     search, grasp = knots(problem), int(problem.ends[0])
-    z, found = search.knot(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    z, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
     steps = {}
     for how in ("scatter", "track", "shake"):
-        after, there = search.knot(z[found], grasp + 1, how)
+        after, there = search.sample(z[found], grasp + 1, how)
         steps[how] = np.median(np.abs(after - z[found])[there, 3:9].max(axis=1))
     assert steps["track"] < steps["shake"] < steps["scatter"]
 
 
 def test_where_nothing_must_hold_robots_stay(drive: vkc.TrajectoryProblem) -> None:
     search = knots(drive)
-    assert search.pose_at(1) is None
+    assert search.find_pose(1) is None
     before = np.tile(drive.start, (3, 1)) + np.arange(3)[:, None] * 1e-3
-    z, found = search.knot(before, 1, "track")
+    z, found = search.sample(before, 1, "track")
     assert found.all()
     np.testing.assert_array_equal(z, before)
-    assert search.clear(z, 1) is z
+    assert search.push_clear(z, 1) is z
 
 
 def test_what_is_known_is_not_worked_out_again(
     problem: vkc.TrajectoryProblem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And with the same random numbers all is as if it had been."""
-    known, grasp, start = Known(), int(problem.ends[0]), np.tile(problem.start, (16, 1))
+    known, grasp, start = KeyframeCache(), int(problem.ends[0]), np.tile(problem.start, (16, 1))
     one, other, alone = knots(problem, 3, known), knots(problem, 3, known), knots(problem, 3)
-    first = one.knot(start, grasp, "scatter")
-    depths = one.depth(first[0], grasp)
-    monkeypatch.setattr(Knots, "_shaken", None)
+    first = one.sample(start, grasp, "scatter")
+    depths = one.compute_shortfall(first[0], grasp)
+    monkeypatch.setattr(KeyframeSampler, "_perturb_arms", None)
     monkeypatch.setattr("vkc_pin.planning.initialization.keyframes.depth", None)
-    for values, same in zip(first, other.knot(start, grasp, "scatter"), strict=True):
+    for values, same in zip(first, other.sample(start, grasp, "scatter"), strict=True):
         np.testing.assert_array_equal(values, same)
     assert one.rng.bit_generator.state == other.rng.bit_generator.state
-    np.testing.assert_array_equal(other.depth(first[0][::-1], grasp), depths[::-1])
+    np.testing.assert_array_equal(other.compute_shortfall(first[0][::-1], grasp), depths[::-1])
     monkeypatch.undo()
-    np.testing.assert_array_equal(alone.knot(start, grasp, "scatter")[0], first[0])
+    np.testing.assert_array_equal(alone.sample(start, grasp, "scatter")[0], first[0])
     assert alone.rng.bit_generator.state == one.rng.bit_generator.state
-    assert not np.array_equal(knots(problem, 4).knot(start, grasp, "scatter")[0], first[0])
+    assert not np.array_equal(knots(problem, 4).sample(start, grasp, "scatter")[0], first[0])
 
 
 def test_depth_is_the_largest_shortfall_of_any_pair(problem: vkc.TrajectoryProblem) -> None:
     """Against Pinocchio's and coal's distances of all pairs, without culling."""
     search, grasp = knots(problem), int(problem.ends[0])
-    z, _ = search.knot(np.tile(problem.start, (24, 1)), grasp, "scatter")
+    z, _ = search.sample(np.tile(problem.start, (24, 1)), grasp, "scatter")
     part, model = problem.contacts.phases[0], problem.chain.model
     geometry, data = all_pairs(part), model.createData()
     shapes, pairs = pin.GeometryData(geometry), np.arange(len(part.pairs))
@@ -136,29 +139,29 @@ def test_depth_is_the_largest_shortfall_of_any_pair(problem: vkc.TrajectoryProbl
         distances = np.array([result.min_distance for result in shapes.distanceResults])
         expected.append(max(0.0, float((margins - distances).max())))
     assert min(expected) < 0.01 < max(expected)
-    np.testing.assert_allclose(depth(problem, z, grasp), expected, atol=1e-5)
+    np.testing.assert_allclose(compute_shortfall(problem, z, grasp), expected, atol=1e-5)
 
 
 def test_what_is_known_to_be_free_is_what_must_hold_there(problem: vkc.TrajectoryProblem) -> None:
     search, grasp = knots(problem), int(problem.ends[0])
-    z, found = search.knot(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    z, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
     away = z[found] + 0.01 * np.eye(problem.chain.size)[0]  # a centimetre from the handle
-    assert (search.depth(away, grasp) <= 0.0).any()
-    assert not search.knows_free(grasp)
-    depths = search.depth(z[found], grasp)
+    assert (search.compute_shortfall(away, grasp) <= 0.0).any()
+    assert not search.has_free_keyframe(grasp)
+    depths = search.compute_shortfall(z[found], grasp)
     assert 0 < np.count_nonzero(depths > 0.0) < len(depths)
-    assert search.knows_free(grasp)
-    assert not search.knows_free(grasp + 1)
+    assert search.has_free_keyframe(grasp)
+    assert not search.has_free_keyframe(grasp + 1)
     other = knots(problem)
-    other.depth(z[found][depths > 0.0], grasp)
-    assert not other.knows_free(grasp)
+    other.compute_shortfall(z[found][depths > 0.0], grasp)
+    assert not other.has_free_keyframe(grasp)
 
 
 def test_scatter_tells_what_does_not_fit(problem: vkc.TrajectoryProblem) -> None:
-    drawn = scatter(problem, int(problem.ends[0]), np.random.default_rng(0))
+    drawn = sample_goal_configurations(problem, int(problem.ends[0]), np.random.default_rng(0))
     assert drawn is not None
     z, residuals = drawn
-    assert z.shape == (SCATTER, problem.chain.size)
+    assert z.shape == (SAMPLE_COUNT, problem.chain.size)
     for row, residual in zip(z, residuals, strict=True):
         off = hand_off_the_handle(door_scene(), row[:9], 0.0, 0.0)
         assert (off < 3e-4) == (
@@ -168,10 +171,12 @@ def test_scatter_tells_what_does_not_fit(problem: vkc.TrajectoryProblem) -> None
 
 
 def test_scatter_where_the_base_must_be(drive: vkc.TrajectoryProblem) -> None:
-    assert scatter(drive, 1, np.random.default_rng(0)) is None, "nothing must hold there"
-    placed = scatter(drive, drive.segments, np.random.default_rng(0))
+    assert sample_goal_configurations(drive, 1, np.random.default_rng(0)) is None, (
+        "nothing must hold there"
+    )
+    placed = sample_goal_configurations(drive, drive.segments, np.random.default_rng(0))
     assert placed is not None
-    np.testing.assert_allclose(placed[0][:, :2], np.tile([0.3, 0.2], (SCATTER, 1)), atol=1e-9)
+    np.testing.assert_allclose(placed[0][:, :2], np.tile([0.3, 0.2], (SAMPLE_COUNT, 1)), atol=1e-9)
     assert (placed[1] == 0.0).all()
     assert np.ptp(placed[0][:, 2]) > 1.0, "at any heading"
 
@@ -182,7 +187,11 @@ def test_moving_costs_what_it_does_in_searches(problem: vkc.TrajectoryProblem) -
         vkc.load_scene("init_3"), [vkc.Touch("stick.tip", (-1.0, 3.9, 0.1))], options=SHORT
     )
     weights = dict(
-        zip(free.chain.names, Knots(free, np.random.default_rng(0)).weights.tolist(), strict=True)
+        zip(
+            free.chain.names,
+            KeyframeSampler(free, np.random.default_rng(0)).weights.tolist(),
+            strict=True,
+        )
     )
     assert weights["base_x"] == 1.0 / free.chain.robot.lever
     assert weights["base_yaw"] == weights["elbow_joint"] == 1.0

@@ -18,10 +18,15 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import interpolation as joining
 from vkc_pin.planning.initialization import methods as initialization
-from vkc_pin.planning.initialization.beam_search import Beam, Found
-from vkc_pin.planning.initialization.initial_guess import Seed
-from vkc_pin.planning.initialization.keyframes import scatter
-from vkc_pin.planning.initialization.methods import _POOR, INITIALIZATIONS, _in_turn, initialize
+from vkc_pin.planning.initialization.beam_search import BeamSearch, SearchResult
+from vkc_pin.planning.initialization.initial_guess import InitialGuess
+from vkc_pin.planning.initialization.keyframes import sample_goal_configurations
+from vkc_pin.planning.initialization.methods import (
+    _MAX_GOOD_PENETRATION,
+    INITIALIZATIONS,
+    _interleave,
+    initialize,
+)
 from vkc_pin.world.models.coordinates import wrap_angle
 
 OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
@@ -163,9 +168,9 @@ def test_of_many_random_places_the_one_with_the_least_merit_is_taken(
     drive = program_of(hall(), [vkc.Reach((2.0, 1.5, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
 
     def merits(places: int) -> list[float]:
-        monkeypatch.setattr(initialization, "_PLACES", places)
+        monkeypatch.setattr(initialization, "_PLACE_SAMPLES", places)
         _, *others = initialize(drive, "stationary", 0, count=4)
-        return [initialization._merit(drive, seed.z, drive.segments) for seed in others]
+        return [initialization._compute_merit(drive, seed.z, drive.segments) for seed in others]
 
     assert max(merits(128)) < min(merits(1))
 
@@ -200,7 +205,7 @@ def test_a_fixed_base_stays_in_every_seed() -> None:
 def test_scattered_configurations_are_where_they_say() -> None:
     target = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0), np.array([1.5, 0.5, 0.9]))
     reach = program_of(hall(), [vkc.Reach(target)], options=SHORT)
-    found = scatter(reach, reach.segments, np.random.default_rng(0))
+    found = sample_goal_configurations(reach, reach.segments, np.random.default_rng(0))
     assert found is not None
     z, residual = found
     assert np.count_nonzero(residual < 1e-4) > len(z) / 2
@@ -221,17 +226,21 @@ def test_nothing_to_scatter() -> None:
     free = program_of(
         door_scene(), [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)], options=SHORT
     )
-    last = scatter(free, free.segments, np.random.default_rng(0))
+    last = sample_goal_configurations(free, free.segments, np.random.default_rng(0))
     assert last is not None
     z, residual = last
     np.testing.assert_allclose(z[:, :2], 0.0)
     assert np.all(residual == 0.0)
     middle = int(free.ends[-1]) - 1  # on the way, nothing is asked for
-    assert scatter(free, middle, np.random.default_rng(0)) is None
+    assert sample_goal_configurations(free, middle, np.random.default_rng(0)) is None
 
 
 Overlaps = list[float | None]
-FINE, POOR, LOST = 0.9 * _POOR, 1.1 * _POOR, 4.4 * _POOR
+FINE, POOR, LOST = (
+    0.9 * _MAX_GOOD_PENETRATION,
+    1.1 * _MAX_GOOD_PENETRATION,
+    4.4 * _MAX_GOOD_PENETRATION,
+)
 
 
 class Looked:
@@ -240,13 +249,17 @@ class Looked:
     def __init__(self, straight: Overlaps, around: Overlaps, trees: Overlaps) -> None:
         self.said: list[str] = []
         kinds = {"s": straight, "a": around, "t": trees}
-        for seed in _in_turn(*(self._seeds(kind, overlaps) for kind, overlaps in kinds.items())):
+        for seed in _interleave(*(self._seeds(kind, overlaps) for kind, overlaps in kinds.items())):
             self.said.append(seed.name.upper())
 
-    def _seeds(self, kind: str, overlaps: Overlaps) -> Iterator[Seed | None]:
-        for number, overlap in enumerate(overlaps):
+    def _seeds(self, kind: str, overlaps: Overlaps) -> Iterator[InitialGuess | None]:
+        for number, penetration in enumerate(overlaps):
             self.said.append(f"{kind}{number}")
-            yield None if overlap is None else Seed(f"{kind}{number}", np.zeros((1, 1)), overlap)
+            yield (
+                None
+                if penetration is None
+                else InitialGuess(f"{kind}{number}", np.zeros((1, 1)), penetration)
+            )
 
 
 @pytest.mark.parametrize(
@@ -295,21 +308,23 @@ def test_every_seed_is_yielded_once_and_none_before_it_is_looked_for(
     seeds = [
         f"{kind}{k}"
         for kind, found in kinds
-        for k, overlap in enumerate(found)
-        if overlap is not None
+        for k, penetration in enumerate(found)
+        if penetration is not None
     ]
     assert sorted(said) == sorted([*looked, *map(str.upper, seeds)])
     assert all(said.index(name) < said.index(name.upper()) for name in seeds)
-    overlap = {f"{kind}{k}".upper(): found[k] for kind, found in kinds for k in range(len(found))}
+    penetration = {
+        f"{kind}{k}".upper(): found[k] for kind, found in kinds for k in range(len(found))
+    }
     for at, name in enumerate(said):
-        if name in overlap:
+        if name in penetration:
             known = [
                 other.upper()
                 for other in said[:at]
-                if other.islower() and overlap[other.upper()] is not None
+                if other.islower() and penetration[other.upper()] is not None
             ]
-            left = [overlap[other] for other in known if other not in said[:at]]
-            assert overlap[name] == min(left), "the best of those that wait comes first"
+            left = [penetration[other] for other in known if other not in said[:at]]
+            assert penetration[name] == min(left), "the best of those that wait comes first"
 
 
 def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
@@ -347,8 +362,10 @@ def test_trees_make_a_seed_through_a_narrow_gate(width: float) -> None:
     assert notes == []
     assert seed.name == "rrt"
     short = gate.evaluate_contacts(seed.z, reach=0.1).compute_shortfall(gate.segments)
-    assert seed.overlap == pytest.approx(max(short.max() - gate.options.dist_safe, 0.0), abs=1e-9)
-    assert seed.overlap < _POOR
+    assert seed.penetration == pytest.approx(
+        max(short.max() - gate.options.dist_safe, 0.0), abs=1e-9
+    )
+    assert seed.penetration < _MAX_GOOD_PENETRATION
     assert short.max() < gate.options.dist_safe + 0.01
     np.testing.assert_allclose(seed.z[-1, :3], GOAL, atol=1e-9)
     if width == TIGHT:  # in the other gate the arm at home just fits, if it may graze
@@ -360,21 +377,21 @@ def test_trees_make_a_seed_through_a_narrow_gate(width: float) -> None:
 def test_in_turn_trees_come_first_where_the_others_hit_things() -> None:
     found = list(initialize(gated(NARROW), "auto", 0, count=2))
     assert [seed.name for seed in found[:2]] == ["rrt", "interpolated"]
-    assert found[0].overlap < _POOR < found[1].overlap
+    assert found[0].penetration < _MAX_GOOD_PENETRATION < found[1].penetration
 
 
-@pytest.mark.parametrize("hopeless", [True, False])
+@pytest.mark.parametrize("is_blocked", [True, False])
 def test_trees_grow_unless_a_goal_is_blocked_of_which_no_search_knows_better(
-    hopeless: bool,
+    is_blocked: bool,
 ) -> None:
     asked: list[Sequence[int]] = []
 
     def answer(phases: Sequence[int]) -> bool:
         asked.append(phases)
-        return hopeless
+        return is_blocked
 
-    names = {seed.name for seed in initialize(gated(NARROW), "auto", 0, hopeless=answer)}
-    assert ("rrt" in names) == (not hopeless)
+    names = {seed.name for seed in initialize(gated(NARROW), "auto", 0, is_infeasible=answer)}
+    assert ("rrt" in names) == (not is_blocked)
     assert asked == [[]], "the searches before have come to the goal, where the robot is free"
 
 
@@ -400,7 +417,7 @@ def test_where_there_is_no_way_trees_make_no_seed() -> None:
     assert len(notes) == 1
     plan = vkc.plan(gated(0.0).scene, [vkc.GoTo(*GOAL)], initialization="rrt")
     assert plan.status == "infeasible"
-    assert "no way for the base, proven" in plan.report()
+    assert "no path for the base, proven" in plan.report()
 
 
 def test_a_motion_through_the_narrow_gate() -> None:
@@ -425,14 +442,14 @@ def test_searches_are_quick_first_and_for_trees_careful_and_backwards_in_turn(
 ) -> None:
     """Nothing that is found is tolerable: only for trees that is a reason not to use what a thorough search finds."""
     asked: list[tuple[bool, bool, bool]] = []
-    search = Beam.search
+    search = BeamSearch.search
 
-    def watch(beam: Beam, *, thorough: bool, backwards: bool = False) -> Found:
-        asked.append((thorough, backwards, beam.careful))
+    def watch(beam: BeamSearch, *, thorough: bool, backwards: bool = False) -> SearchResult:
+        asked.append((thorough, backwards, beam.for_narrow_passages))
         return search(beam, thorough=thorough, backwards=backwards)
 
-    monkeypatch.setattr(Beam, "search", watch)
-    monkeypatch.setattr(Beam, "tolerable", lambda *_: False)
+    monkeypatch.setattr(BeamSearch, "search", watch)
+    monkeypatch.setattr(BeamSearch, "is_acceptable", lambda *_: False)
     found = seeds(method, count=2)
     if method == "rrt":
         assert asked == [(False, False, True), (True, True, True), (True, False, True)]
@@ -454,18 +471,18 @@ def test_searches_are_quick_first_and_for_trees_careful_and_backwards_in_turn(
 def test_trees_search_again_in_the_direction_that_led_somewhere(
     ways: str, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, found = list[str](), Found(np.zeros((0, 1, 9)), np.zeros(0), np.zeros(0), [0])
+    asked, found = list[str](), SearchResult(np.zeros((0, 1, 9)), np.zeros(0), np.zeros(0), [0])
 
-    def search(_: Beam, *, thorough: bool, backwards: bool = False) -> Found:
+    def search(_: BeamSearch, *, thorough: bool, backwards: bool = False) -> SearchResult:
         asked.append("b" if backwards else "f")
         return found
 
-    def tolerable(*_: object) -> bool:
+    def is_acceptable(*_: object) -> bool:
         return ("backwards" if asked[-1] == "b" else "forwards") in ways
 
-    monkeypatch.setattr(Beam, "search", search)
-    monkeypatch.setattr(Beam, "tolerable", tolerable)
-    monkeypatch.setattr(initialization._Rrt, "_best", lambda *_: None)
+    monkeypatch.setattr(BeamSearch, "search", search)
+    monkeypatch.setattr(BeamSearch, "is_acceptable", is_acceptable)
+    monkeypatch.setattr(initialization._RrtSearch, "_select_best", lambda *_: None)
     assert seeds("rrt", count=4) == []
     assert "".join(asked) == expected
 
@@ -474,25 +491,31 @@ class Watched:
     """Notes what beams find: for ways of the base alone, and, with care, for trees."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.found: list[tuple[str, Found]] = []
-        search = Beam.search
+        self.found: list[tuple[str, SearchResult]] = []
+        search = BeamSearch.search
 
-        def watch(beam: Beam, *, thorough: bool, backwards: bool = False) -> Found:
+        def watch(beam: BeamSearch, *, thorough: bool, backwards: bool = False) -> SearchResult:
             found = search(beam, thorough=thorough, backwards=backwards)
-            kind = "rrt" if beam.careful else "interpolated" if beam.routes is None else "astar"
+            kind = (
+                "rrt"
+                if beam.for_narrow_passages
+                else "interpolated"
+                if beam.routes is None
+                else "astar"
+            )
             self.found.append((kind, found))
             return found
 
-        monkeypatch.setattr(Beam, "search", watch)
+        monkeypatch.setattr(BeamSearch, "search", watch)
 
     @property
     def kinds(self) -> list[str]:
         return [kind for kind, _ in self.found]
 
 
-def grasps(found: Found) -> np.ndarray:
+def grasps(found: SearchResult) -> np.ndarray:
     """Return where the robot may stand and have its arm when it grasps, shape (B, 9)."""
-    return found.paths[:, found.at.index(int(problem().ends[0])), :9]
+    return found.paths[:, found.waypoints.index(int(problem().ends[0])), :9]
 
 
 def test_trees_search_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -513,18 +536,18 @@ def test_where_the_arm_goes_far_round_trees_grow_from_other_grasps_too_and_the_l
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As many as are compared, if it goes far round from all of them; the first alone, if it does not."""
-    joined, join = list[np.ndarray](), joining.Joiner.join
+    joined, join = list[np.ndarray](), joining.Interpolator.interpolate
 
-    def joins(self: joining.Joiner, through: np.ndarray, at: list[int]) -> np.ndarray | None:
+    def joins(self: joining.Interpolator, through: np.ndarray, at: list[int]) -> np.ndarray | None:
         z = join(self, through, at)
         joined.extend([] if z is None else [z])
         return z
 
-    monkeypatch.setattr(joining.Joiner, "join", joins)
+    monkeypatch.setattr(joining.Interpolator, "interpolate", joins)
     (first,) = initialize(problem(), "rrt", 0)
     assert len(joined) == 1
     joined.clear()
-    monkeypatch.setattr(initialization, "far_round", lambda *_: True)
+    monkeypatch.setattr(initialization, "has_arm_detour", lambda *_: True)
     (best,) = initialize(problem(), "rrt", 0)
     assert 1 < len(joined) <= initialization._COMPARED_PATHS
     np.testing.assert_array_equal(joined[0], first.z)
@@ -545,11 +568,11 @@ def test_of_every_kind_so_many_seeds_are_asked_for(
 ) -> None:
     asked: dict[str, int] = {}
 
-    def seeds(one: Any, most: int) -> Iterator[Seed]:
+    def seeds(one: Any, most: int) -> Iterator[InitialGuess]:
         asked[one.method] = most
         return iter([])
 
-    monkeypatch.setattr(initialization._SeedSearch, "seeds", seeds)
+    monkeypatch.setattr(initialization._GuessSearch, "generate", seeds)
     assert list(initialize(problem(), "auto", 0, count=count)) == []
     assert asked == {"interpolated": count, "astar": count, "rrt": count}
 

@@ -16,8 +16,8 @@ from hypothesis.extra import numpy as some
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization import rrt as trees
-from vkc_pin.planning.initialization.base_routes import Routes
-from vkc_pin.planning.initialization.rrt import connect, spread
+from vkc_pin.planning.initialization.base_routes import BaseRoutes
+from vkc_pin.planning.initialization.rrt import connect, resample_path
 from vkc_pin.utils.budget import Budget, SpentError
 from vkc_pin.utils.optional_imports import compiled_module
 
@@ -34,14 +34,14 @@ SEEDS = st.integers(0, 2**32 - 1)
 def gate() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
     """Return a problem in which only a folded arm fits through, a path of the base, and postures."""
     problem = gated(TIGHT)
-    routes = Routes(problem)
-    guide = routes.guide(0, problem.start[:3], np.array(GOAL), 80)
+    routes = BaseRoutes(problem)
+    guide = routes.find_guide_path(0, problem.start[:3], np.array(GOAL), 80)
     assert guide is not None
-    return problem, guide, np.array([problem.start[3:], routes.folded_arm(0)])
+    return problem, guide, np.array([problem.start[3:], routes.get_folded_arm(0)])
 
 
 def through(
-    seed: int, ends: np.ndarray | None = None, *, tries: int = trees.TRIES
+    seed: int, ends: np.ndarray | None = None, *, tries: int = trees.MAX_EXTENSIONS
 ) -> np.ndarray | None:
     problem, guide, arms = gate()
     ends = at(problem, GOAL)[None] if ends is None else ends
@@ -82,7 +82,7 @@ def test_what_a_coarse_search_overlooks_a_finer_one_does_not(
 ) -> None:
     worst = []
     for steps in ((3.0, 3.0), (3.0, 0.04)):
-        monkeypatch.setattr(trees, "_STEPS", steps)
+        monkeypatch.setattr(trees, "_STEP_SIZES", steps)
         path = through(3)
         assert path is not None
         worst.append(missing(gate()[0], finely(path)).max())
@@ -100,11 +100,11 @@ def test_joints_that_turn_there_and_back_for_nothing_stay_where_they_are() -> No
     last[-1] += 0.4
     search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)
     path = np.array([first, middle, last])
-    straight = search.straightened(path)
+    straight = search.straighten(path)
     np.testing.assert_array_equal(straight[0], first)
     np.testing.assert_allclose(straight[-1], last, atol=1e-12)
     assert np.abs(np.diff(straight[:, -1])).sum() == pytest.approx(0.4, abs=1e-6)
-    assert search.free(straight)
+    assert search.is_free(straight)
 
 
 @settings(max_examples=4, deadline=None)
@@ -116,7 +116,7 @@ def test_straight_ways_are_free_and_no_longer(seed: int) -> None:
     search = trees._Search(
         problem, 0, problem.start, guide, arms, np.random.default_rng(seed), 0.04
     )
-    again = search.straightened(path)
+    again = search.straighten(path)
     assert length(again) <= length(path) + 1e-9
     np.testing.assert_allclose(again[[0, -1]], path[[0, -1]], atol=1e-12)
     is_a_way(problem, again)
@@ -137,7 +137,7 @@ def test_the_arm_goes_far_round_where_a_third_of_its_way_is_none_of_the_straight
     z[middle:, 3] += np.interp(
         np.arange(1, turn + 1), [0, turn // 2, turn], [0.0, there, there - back]
     )
-    assert trees.far_round(problem, z) == far
+    assert trees.has_arm_detour(problem, z) == far
 
 
 @pytest.mark.parametrize("finer", [True, False])
@@ -147,7 +147,7 @@ def test_what_hits_things_between_configurations_that_were_looked_at_is_no_path(
     straight = np.array([gate()[0].start, at(gate()[0], GOAL)])
 
     def run(search: trees._Search, ends: np.ndarray, most: int) -> np.ndarray | None:
-        return straight if search.step == trees._STEPS[0] or finer else None
+        return straight if search.step == trees._STEP_SIZES[0] or finer else None
 
     monkeypatch.setattr(trees._Search, "run", run)
     path = through(0)
@@ -167,12 +167,12 @@ def test_paths_are_straightened_again_where_the_arm_goes_far_round_as_long_as_th
         asked.append(times)
         return path[0] + (0.9 if len(asked) <= 3 else 1.0) * (path - path[0])
 
-    monkeypatch.setattr(search, "_evened", evened)
-    monkeypatch.setattr(trees, "_detour", lambda path, metric: detour)
+    monkeypatch.setattr(search, "_shorten_partially", evened)
+    monkeypatch.setattr(trees, "_compute_detour", lambda path, metric: detour)
     path = np.tile(problem.start[:SIZE], (2, 1))
     path[1, 3] += 1.0
-    search.straightened(path)
-    assert asked == [0, *[trees._STRAIGHTENINGS] * passes]
+    search.straighten(path)
+    assert asked == [0, *[trees._SHORTCUT_ROUNDS] * passes]
 
 
 def test_a_detour_is_the_share_of_a_path_that_the_arm_goes_beyond_its_straight_way() -> None:
@@ -181,11 +181,11 @@ def test_a_detour_is_the_share_of_a_path_that_the_arm_goes_beyond_its_straight_w
     path[1:, 0] += [0.5, 0.0]
     path[1:, 4] += [0.3, 0.1]
     driven, turned = problem.chain.metric[[0, 4]]  # what a metre and a radian count
-    assert trees._detour(path, metric) == pytest.approx(
+    assert trees._compute_detour(path, metric) == pytest.approx(
         0.4 * turned / (1.0 * driven + 0.5 * turned)
     )
-    assert trees._detour(path[[0, 2]], metric) == pytest.approx(0.0)
-    assert trees._detour(path[:1], metric) == 0.0
+    assert trees._compute_detour(path[[0, 2]], metric) == pytest.approx(0.0)
+    assert trees._compute_detour(path[:1], metric) == 0.0
 
 
 def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
@@ -284,7 +284,8 @@ def test_who_is_there_already_stays() -> None:
     assert path is not None
     np.testing.assert_array_equal(path, np.tile(problem.start, (len(path), 1)))
     np.testing.assert_array_equal(
-        spread(path, 5, problem.chain.metric[: path.shape[1]]), np.tile(problem.start, (5, 1))
+        resample_path(path, 5, problem.chain.metric[: path.shape[1]]),
+        np.tile(problem.start, (5, 1)),
     )
 
 
@@ -354,7 +355,7 @@ def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> Non
     for seed in range(3):
         short = through(seed)
         with monkeypatch.context() as patch:
-            patch.setattr(trees._Search, "_shortened", lambda _, path: path)
+            patch.setattr(trees._Search, "_shorten", lambda _, path: path)
             plain = through(seed)
         assert short is not None
         assert plain is not None
@@ -374,7 +375,7 @@ def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> Non
 def search(seed: int = 0) -> trees._Search:
     problem, guide, arms = gate()
     return trees._Search(
-        problem, 0, problem.start, guide, arms, np.random.default_rng(seed), trees._STEPS[0]
+        problem, 0, problem.start, guide, arms, np.random.default_rng(seed), trees._STEP_SIZES[0]
     )
 
 
@@ -391,7 +392,7 @@ def test_a_line_is_free_up_to_the_last_place_before_the_first_that_is_blocked() 
         rows = a + np.arange(1, count + 1)[:, None] / count * (b - a)
         blocked = np.flatnonzero(missing(problem, rows) > finder.allowed)
         shares.append(blocked[0] / count if len(blocked) else 1.0)
-        assert finder.along(a, b) == shares[-1]
+        assert finder.compute_free_share(a, b) == shares[-1]
     assert (min(shares), max(shares)) == (0.0, 1.0)
     assert len(set(shares)) > 5
 
@@ -400,7 +401,7 @@ def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
     """Each as long as can be, and free half-way between its configurations, too."""
     problem, guide, arms = gate()
     allowed = GRAZE * problem.options.dist_safe + 1e-9
-    through_gate, all_ = [], search().runs
+    through_gate, all_ = [], search().free_runs
     for arm in arms:
         rows = np.column_stack([guide, np.tile(arm, (len(guide), 1))])
         free, between = (
@@ -434,8 +435,8 @@ def test_a_tree_that_gets_to_a_run_takes_in_all_of_it() -> None:
     problem, _, _ = gate()
     for seed in range(3):
         one = search(seed)
-        run = max(one.runs, key=len)
-        one.runs, one.poses, one.arms = [run], problem.start[None, :3], problem.start[None, 3:]
+        run = max(one.free_runs, key=len)
+        one.free_runs, one.poses, one.arms = [run], problem.start[None, :3], problem.start[None, 3:]
         end = run[-1].copy()
         end[3:] += 0.05
         path = raw(one, end[None], 200)
@@ -452,10 +453,10 @@ def test_a_tree_that_gets_to_a_run_takes_in_all_of_it() -> None:
 def test_a_tree_that_is_stopped_before_a_run_does_not_take_it_in() -> None:
     problem, _, arms = gate()
     one = search()
-    one.runs = [np.tile(np.append([2.0, 1.5, 0.0], arms[0]), (3, 1))]  # in the wall
-    path = raw(one, at(problem, GOAL)[None], trees.TRIES)
+    one.free_runs = [np.tile(np.append([2.0, 1.5, 0.0], arms[0]), (3, 1))]  # in the wall
+    path = raw(one, at(problem, GOAL)[None], trees.MAX_EXTENSIONS)
     assert len(path)
-    assert not (path == one.runs[0][0]).all(axis=1).any()
+    assert not (path == one.free_runs[0][0]).all(axis=1).any()
     is_a_way(problem, path)
 
 
@@ -465,7 +466,7 @@ def test_free_runs_alone_lead_through_the_gate(found: bool) -> None:
     problem, _, _ = gate()
     for seed in range(3):
         one = search(seed)
-        one.runs = one.runs if found else []
+        one.free_runs = one.free_runs if found else []
         one.poses, one.arms = problem.start[None, :3], problem.start[None, 3:]
         path = raw(one, at(problem, GOAL)[None], 60)
         assert (len(path) > 0) == found
@@ -481,7 +482,7 @@ def test_what_searches_look_at_counts_as_effort() -> None:
         one = search()
         assert one._trees
         before = budget.used
-        assert one.free(np.array([problem.start, problem.start + 0.01 * np.eye(SIZE)[3]]))
+        assert one.is_free(np.array([problem.start, problem.start + 0.01 * np.eye(SIZE)[3]]))
         assert budget.used == before + 1
     assert whole > 500
     with Budget(effort=whole // 2).running(), pytest.raises(SpentError):
@@ -495,8 +496,8 @@ def test_compiled_trees_refuse_what_does_not_fit() -> None:
         lambda: one._trees.run(rows[:, 1:], rows, 1),
         lambda: one._trees.run(rows, rows, 1),
         lambda: one._trees.run(rows[:1], rows[:0], 1),
-        lambda: one._trees.along(rows[:1]),
-        lambda: one._trees.along(rows[:, :3]),
+        lambda: one._trees.compute_free_share(rows[:1]),
+        lambda: one._trees.compute_free_share(rows[:, :3]),
         lambda: one._trees.evened(rows[:0], 0, 0.0),
     ):
         with pytest.raises(ValueError, match=r"robot's coordinates|one configuration|two ends"):
@@ -508,8 +509,8 @@ def test_compiled_trees_refuse_what_does_not_fit() -> None:
         one.upper,
         one.poses[:2],
         one.arms,
-        np.concatenate(one.runs),
-        [len(run) for run in one.runs],
+        np.concatenate(one.free_runs),
+        [len(run) for run in one.free_runs],
     ]
 
     def made(**changed: object) -> None:
@@ -564,7 +565,7 @@ def walk(path: np.ndarray, far: float) -> np.ndarray:
 @settings(max_examples=60, deadline=None)
 @given(PATHS, st.integers(1, 30))
 def test_spread_goes_along_the_path_to_its_end(path: np.ndarray, steps: int) -> None:
-    rows = spread(path, steps, METRE)
+    rows = resample_path(path, steps, METRE)
     assert rows.shape == (steps, SIZE)
     np.testing.assert_allclose(rows[-1], path[-1], rtol=0.0, atol=1e-9)
     share = np.arange(1, steps + 1) / steps
@@ -579,7 +580,7 @@ def test_spread_is_slow_at_both_ends() -> None:
         1.0,
         2.0,
     )  # a metre of the base counts as much as two radians of the arm
-    rows = np.vstack([path[:1], spread(path, 20, METRE)])
+    rows = np.vstack([path[:1], resample_path(path, 20, METRE)])
     steps = np.linalg.norm(np.diff(rows, axis=0) * METRE, axis=1)
     assert max(steps[0], steps[-1]) < 0.15 * steps.max()
     np.testing.assert_allclose(rows[10], path[1], atol=1e-9)

@@ -165,11 +165,13 @@ def test_a_step_is_refused_that_makes_more_of_any_kind_missing(kind: str) -> Non
         found = Infeasibility(
             after, loop.found.pose_offsets, loop.found.excess, loop.found.rate_excess
         )
-        promise = (
+        predicted_penalty = (
             loop.merit.compute_penalty(loop.found, clearance=True) - 2.0
         )  # as much as this kind is worth
-        trial = Trial(**{**fields, "objective": 0.0, "found": found, "promise": promise})  # type: ignore[arg-type]
-        assert loop.judge(trial, *loop.prices(trial)) == expected
+        trial = Trial(
+            **{**fields, "objective": 0.0, "found": found, "predicted_penalty": predicted_penalty}
+        )  # type: ignore[arg-type]
+        assert loop.is_acceptable(trial, *loop.compute_penalties(trial)) == expected
 
 
 def test_weights_grow_where_something_is_missing() -> None:

@@ -16,7 +16,7 @@ from helpers.small_problems import SHORT, door_scene, full_scene, program_of, ra
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import load_scene
@@ -597,7 +597,7 @@ def test_a_program_with_all_kinds_of_rows_is_feasible_where_it_is_set_up(
 def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> None:
     """As the trajectory is played, with the pauses in which a gripper closes; where a hand holds nothing, its choice is moot."""
     z, dt = random_path(two_grasps), SHORT.dt
-    trajectory = as_trajectory(two_grasps, z, np.full(two_grasps.segments, dt))
+    trajectory = make_trajectory(two_grasps, z, np.full(two_grasps.segments, dt))
     steps, changes = two_grasps.rates(z)
     assert steps.shape == (two_grasps.segments, two_grasps.chain.size)
     assert changes.shape == (
@@ -653,7 +653,7 @@ def test_bounds_on_rates_are_the_limits(two_grasps: TrajectoryProblem) -> None:
 def test_rate_violation_is_the_worst_excess(two_grasps: TrajectoryProblem, scale: float) -> None:
     z = random_path(two_grasps, scale=scale)
     timing = two_grasps.timing_for(two_grasps.still)
-    trajectory = as_trajectory(two_grasps, z, timing.dt)
+    trajectory = make_trajectory(two_grasps, z, timing.dt)
     velocity = np.abs(trajectory.velocities()) / two_grasps.chain.velocity
     acceleration = np.abs(trajectory.accelerations()) / two_grasps.chain.acceleration
     expected = max(velocity.max(), acceleration.max()) - 1.0
@@ -693,7 +693,7 @@ def test_a_way_that_is_too_long_gets_more_time() -> None:
     np.testing.assert_allclose(
         timing.acceleration, problem.chain.acceleration * of_rows[:, None] ** 2
     )
-    motion = as_trajectory(problem, z, timing.dt)
+    motion = make_trajectory(problem, z, timing.dt)
     moving = np.abs(np.diff(motion.positions[:, 0])) > 0
     np.testing.assert_allclose(np.diff(motion.times)[moving], timing.dt[first])
     assert np.abs(motion.velocities()[:, 0]).max() <= problem.chain.velocity[0]

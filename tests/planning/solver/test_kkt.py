@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.planning.solver.subproblem import linear_solver
+from vkc_pin.planning.solver.subproblem import make_linear_solver_options
 from vkc_pin.utils.optional_imports import compiled_module
 
 KKT = compiled_module("vkc_pin.planning.solver._kkt")
-OWN = linear_solver()
+OWN = make_linear_solver_options()
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 

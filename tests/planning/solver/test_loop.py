@@ -18,8 +18,8 @@ from vkc_pin.planning.nlp.timing import Timing
 from vkc_pin.planning.solver import loop as solver
 from vkc_pin.planning.solver import trust_region
 from vkc_pin.planning.solver.loop import Solution, solve
-from vkc_pin.planning.solver.segment_planes import collisions_between
-from vkc_pin.planning.solver.tunnelling import Passage
+from vkc_pin.planning.solver.segment_planes import find_segment_contacts
+from vkc_pin.planning.solver.tunnelling import Crossing
 from vkc_pin.utils.budget import Budget
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
@@ -134,9 +134,9 @@ def test_a_trust_region_goes_on_with_what_it_is_given() -> None:
     given = np.linspace(0.01, 0.3, 40)
     region = trust_region.TrustRegion(40, 10, given)
     np.testing.assert_array_equal(region.radius, given)
-    region.settle()
+    region.limit()
     np.testing.assert_array_equal(region.radius, np.minimum(given, trust_region.SETTLE_RADIUS))
-    region.restart()
+    region.reset()
     np.testing.assert_array_equal(given, np.linspace(0.01, 0.3, 40))  # it is another's
 
 
@@ -162,7 +162,7 @@ def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
         np.testing.assert_array_equal(radius, kept)
 
 
-def missing(clearance: float, other: float = 0.0) -> Infeasibility:
+def make_infeasibility(clearance: float, other: float = 0.0) -> Infeasibility:
     amounts = {kind: np.zeros(40) for kind in Merit(1.0).weights}
     amounts["clearance"][:], amounts["poses"][:] = clearance, other
     return Infeasibility(amounts, np.zeros((40, 0, 7)), np.zeros(0), np.zeros(0))
@@ -179,11 +179,11 @@ class Scripted:
         step: float | None = None,
         other: float = 0.0,
     ) -> None:
-        self.step, self.other, self.crossed, self.passages = (
+        self.step, self.other, self.crossed, self.crossings = (
             step,
             other,
-            list[Passage](),
-            list[Passage](),
+            list[Crossing](),
+            list[Crossing](),
         )
         self.problem, self.z, self.is_done = (
             SimpleNamespace(drift=lambda _: drift),
@@ -191,22 +191,23 @@ class Scripted:
             done,
         )
         self.solution = Solution(np.zeros((40, 1)), np.full(40, 0.25))
-        self.merit, self.found = Merit(200.0), missing(0.5, other)
+        self.merit, self.found = Merit(200.0), make_infeasibility(0.5, other)
         self.objective, self.rounds, self.radii = 10.0, iter(rounds), list[np.ndarray]()
 
     def try_step(self, radius: np.ndarray) -> trust_region.Trial:
         self.radii.append(radius.copy())
         objective, shortfall, self.taken = next(self.rounds)
-        found = missing(shortfall, self.other)
+        found = make_infeasibility(shortfall, self.other)
         contacts = SimpleNamespace(
-            compute_clearance=lambda: -shortfall, compute_violation=lambda: shortfall
+            compute_compute_compute_clearance=lambda: -shortfall,
+            compute_compute_compute_violation=lambda: shortfall,
         )
         return dataclasses.replace(
             blank_trial(40),
             z=np.zeros((40, 1)),
             objective=objective,
-            found=found,
-            promise=self.merit.compute_penalty(
+            infeasibility=found,
+            predicted_penalty=self.merit.compute_penalty(
                 found, clearance=True
             ),  # just what came: nobody narrows the trust region
             pose_error=0.0,
@@ -214,19 +215,21 @@ class Scripted:
             contacts=contacts,  # type: ignore[arg-type]
         )
 
-    def judge(self, _: trust_region.Trial, *prices: np.ndarray) -> bool:
+    def is_acceptable(self, _: trust_region.Trial, *penalties: np.ndarray) -> bool:
         return self.taken
 
-    def prices(self, trial: trust_region.Trial) -> tuple[np.ndarray, np.ndarray]:
-        return solver._Loop.prices(self, dataclasses.replace(trial, passages=self.crossed))  # type: ignore[arg-type]
+    def compute_penalties(self, trial: trust_region.Trial) -> tuple[np.ndarray, np.ndarray]:
+        return solver._Loop.compute_penalties(
+            self, dataclasses.replace(trial, crossings=self.crossed)
+        )  # type: ignore[arg-type]
 
     def accept(self, trial: trust_region.Trial) -> None:
-        self.objective, self.found = trial.objective, trial.found
+        self.objective, self.found = trial.objective, trial.infeasibility
 
-    def done(self, _: trust_region.Trial) -> bool:
+    def has_converged(self, _: trust_region.Trial) -> bool:
         return self.is_done
 
-    def grow(self) -> bool:
+    def raise_penalties(self) -> bool:
         return self.merit.increase_weights(self.found, 1e-3)
 
 
@@ -267,7 +270,9 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
     seed = next(initialize(problem, "astar", 0)).z
     solution, small = solve(problem, seed), 0
     for row, after in itertools.pairwise(solution.history):
-        nearly = trust_region.CLOSE_ENOUGH <= row.shortfall < solver.NEARLY  # and not yet free
+        nearly = (
+            trust_region.CLEARANCE_TOLERANCE <= row.shortfall < solver.NEARLY_FEASIBLE
+        )  # and not yet free
         if row.accepted and nearly and row.pose_error < TOLERANCE:
             assert after.radius <= trust_region.SETTLE_RADIUS
             assert after.step <= trust_region.SETTLE_RADIUS * (1 + 1e-6)
@@ -334,7 +339,7 @@ def test_a_motion_that_nearly_held_is_one_to_compare_with(
 ) -> None:
     """The first motion at which everything holds is hardly better than it; one that was far from free says nothing."""
     monkeypatch.setattr(
-        Scripted, "done", lambda _, trial: trial.contacts.compute_violation() == 0.0
+        Scripted, "has_converged", lambda _, trial: trial.contacts.compute_violation() == 0.0
     )
     solution = scripted(
         (8.0, shortfall, True), (7.9, 0.0, True), (7.8, 0.0, True), (5.0, 0.0, True), step=1.0
@@ -368,14 +373,17 @@ def test_motions_that_stay_far_from_free_are_given_up_soon(monkeypatch: pytest.M
     solution = solve(problem, seed)
     assert (solution.status, solution.converged) == ("not converged", False)
     assert solution.rounds < FEW.max_outer
-    assert problem.evaluate_contacts(solution.z, reach=0.1).compute_violation() > solver.NEARLY
+    assert (
+        problem.evaluate_contacts(solution.z, reach=0.1).compute_violation()
+        > solver.NEARLY_FEASIBLE
+    )
     assert solve(problem, seed, rounds=2).rounds == 2
 
 
 def test_where_something_would_be_carried_through_waypoints_may_move_less() -> None:
     """Whatever the merit says: it has no say in that."""
     loop = Scripted((1.0, 0.0, False))
-    loop.crossed = [Passage((3, 5), 12, 13)]
+    loop.crossed = [Crossing((3, 5), 12, 13)]
     region = trust_region.TrustRegion(40, 10)
     before = region.radius.copy()
     solver._iterate(loop, region, None, 1)  # type: ignore[arg-type]
@@ -398,22 +406,22 @@ def test_nothing_is_carried_through_anything(monkeypatch: pytest.MonkeyPatch) ->
     bow = straight(problem, 3.2).copy()
     bow[:, 1] -= 1.3 * np.sin(np.linspace(0.0, np.pi, len(bow) + 1)[1:])
     assert problem.evaluate_contacts(bow, reach=0.02).compute_violation() == 0.0
-    assert not collisions_between(problem, bow).passages
+    assert not find_segment_contacts(problem, bow).crossings
     seen: list[tuple[bool, bool]] = []
-    judge = solver._Loop.judge
+    judge = solver._Loop.is_acceptable
 
-    def watch(loop, trial, *prices):  # type: ignore[no-untyped-def]
-        accepted = judge(loop, trial, *prices)
-        seen.append((bool(trial.passages), accepted))
+    def watch(loop, trial, *penalties):  # type: ignore[no-untyped-def]
+        accepted = judge(loop, trial, *penalties)
+        seen.append((bool(trial.crossings), accepted))
         return accepted
 
-    monkeypatch.setattr(solver._Loop, "judge", watch)
+    monkeypatch.setattr(solver._Loop, "is_acceptable", watch)
     solution = solve(problem, bow)
     assert (True, True) not in seen
     assert solution.converged
     assert solution.z[:, 1].min() < -0.42  # still on the other side of the post
     feasible(problem, solution)
-    monkeypatch.setattr(solver, "new", lambda *_: [])  # as if it did not matter
+    monkeypatch.setattr(solver, "find_new_crossings", lambda *_: [])  # as if it did not matter
     seen.clear()
     solve(problem, bow)
     assert (True, True) in seen, "nothing was carried through: choose a harder problem"
@@ -435,20 +443,22 @@ def test_the_merit_falls_from_one_accepted_step_to_the_next(
     """While weights and times stay: f and what all that is missing costs. No round promises more than staying would cost."""
     problem = round_a_pillar()
     merits: list[tuple[float, float, bool]] = []
-    judge = solver._Loop.judge
+    judge = solver._Loop.is_acceptable
 
-    def watch(loop, trial, *prices):  # type: ignore[no-untyped-def]
+    def watch(loop, trial, *penalties):  # type: ignore[no-untyped-def]
         before, after = (
             loop.merit.compute_penalty(found, clearance=True).sum()
-            for found in (loop.found, trial.found)
+            for found in (loop.found, trial.infeasibility)
         )
-        accepted = judge(loop, trial, *prices)
+        accepted = judge(loop, trial, *penalties)
         merits.append((loop.objective + before, trial.objective + after, accepted))
-        assert trial.promise.min() > -1e-6
-        assert trial.objective + trial.promise.sum() <= (loop.objective + before) * (1.0 + 1e-4)
+        assert trial.predicted_penalty.min() > -1e-6
+        assert trial.objective + trial.predicted_penalty.sum() <= (loop.objective + before) * (
+            1.0 + 1e-4
+        )
         return accepted
 
-    monkeypatch.setattr(solver._Loop, "judge", watch)
+    monkeypatch.setattr(solver._Loop, "is_acceptable", watch)
     solve(problem, straight(problem, 3.2))
     assert any(accepted for _, _, accepted in merits)
     for before, after, accepted in merits:
@@ -465,15 +475,15 @@ def test_what_a_round_promises_comes_true_where_steps_are_small(radius: float) -
     loop = solver._Loop(problem, seed.z, options.penalty)
     loop.begin()
     trial = loop.try_step(np.full(problem.segments, radius))
-    before, after = (prices.sum() for prices in loop.prices(trial))
+    before, after = (penalties.sum() for penalties in loop.compute_penalties(trial))
     assert after < before
-    assert trial.promise.sum() == pytest.approx(after, abs=0.01 * (before - after))
+    assert trial.predicted_penalty.sum() == pytest.approx(after, abs=0.01 * (before - after))
 
 
 def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounds go on for a shorter motion; if they fail, the feasible one is returned."""
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
-    done = solver._Loop.done
+    done = solver._Loop.has_converged
     kept: list[np.ndarray] = []
 
     def first_only(loop, trial):  # type: ignore[no-untyped-def]
@@ -482,8 +492,8 @@ def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -
         kept.append(trial.z.copy())
         return True
 
-    monkeypatch.setattr(solver, "WORTHWHILE", -np.inf)  # never content with the first
-    monkeypatch.setattr(solver._Loop, "done", first_only)
+    monkeypatch.setattr(solver, "MIN_IMPROVEMENT", -np.inf)  # never content with the first
+    monkeypatch.setattr(solver._Loop, "has_converged", first_only)
     solution = solve(problem, seed)
     assert solution.converged
     np.testing.assert_array_equal(solution.z, kept[0])

@@ -16,10 +16,10 @@ from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
 from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit
 from vkc_pin.planning.solver import loop as module
 from vkc_pin.planning.solver.loop import _Loop, solve
-from vkc_pin.planning.solver.segment_planes import Between
+from vkc_pin.planning.solver.segment_planes import SegmentContacts
 from vkc_pin.planning.solver.solution import Solution
-from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
-from vkc_pin.planning.solver.tunnelling import Passage
+from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
+from vkc_pin.planning.solver.tunnelling import Crossing
 from vkc_pin.utils.budget import SpentError
 
 N = 8
@@ -32,7 +32,7 @@ def contact(distance: float, margin: float = 0.02, waypoint: int = 0) -> Contact
     )
 
 
-def missing(**amounts: float) -> Infeasibility:
+def make_infeasibility(**amounts: float) -> Infeasibility:
     rows = {kind: np.zeros(N) for kind in Merit(1.0).weights}
     for kind, amount in amounts.items():
         rows[kind][3] = amount
@@ -65,9 +65,9 @@ def test_all_is_clear_if_it_is_at_the_waypoints_and_between(
     short: float, free: bool, clear: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at, between, crossed = (
-        contact(0.02 - short * CLOSE_ENOUGH),
+        contact(0.02 - short * CLEARANCE_TOLERANCE),
         contact(0.5, 0.4),
-        [Passage((1, 2), 3, 4)],
+        [Crossing((1, 2), 3, 4)],
     )
     asked: list[tuple[float, int]] = []
 
@@ -82,9 +82,9 @@ def test_all_is_clear_if_it_is_at_the_waypoints_and_between(
         solution=SimpleNamespace(timings={"coal": 1.0}),
     )
     monkeypatch.setattr(
-        module, "collisions_between", lambda problem, z: Between(between, free, crossed)
+        module, "find_segment_contacts", lambda problem, z: SegmentContacts(between, free, crossed)
     )
-    found, told, passages = loop.contacts(np.zeros((N, 2)))
+    found, told, passages = loop.find_contacts(np.zeros((N, 2)))
     assert (told, passages, asked) == (clear, crossed, [(0.25, 4)])
     assert sorted(found.distance.tolist()) == sorted([*at.distance.tolist(), 0.5])
     assert 1.0 < loop.solution.timings["coal"] < 1.5  # what it took, once more
@@ -104,13 +104,14 @@ def test_a_passage_makes_the_waypoints_around_its_segments_too_dear(
     """Segment k ends at row k of z_1..z_N and begins at the one before."""
     loop = parts(
         merit=Merit(10.0),
-        found=missing(poses=0.009, clearance=0.5),
-        passages=[Passage((1, 2), 0, 7)],
+        found=make_infeasibility(poses=0.009, clearance=0.5),
+        crossings=[Crossing((1, 2), 0, 7)],
     )
     trial: Any = SimpleNamespace(
-        found=missing(rolling=0.2), passages=[Passage((1, 2), 5, 5), Passage((1, 3), first, last)]
+        infeasibility=make_infeasibility(rolling=0.2),
+        crossings=[Crossing((1, 2), 5, 5), Crossing((1, 3), first, last)],
     )
-    before, after = loop.prices(trial)
+    before, after = loop.compute_penalties(trial)
     assert np.flatnonzero(np.isinf(after)).tolist() == dear
     assert before.tolist() == pytest.approx([0.0] * 3 + [5.09] + [0.0] * 4)
     assert after[~np.isinf(after)].sum() == pytest.approx(0.0 if 3 in dear else 2.0)
@@ -118,17 +119,21 @@ def test_a_passage_makes_the_waypoints_around_its_segments_too_dear(
 
 @pytest.mark.parametrize(("poses", "counts"), [(0.009, True), (0.011, False), (1.0, False)])
 def test_of_what_is_no_motion_yet_passages_say_nothing(poses: float, counts: bool) -> None:
-    loop = parts(merit=Merit(1.0), found=missing(poses=poses), passages=[])
-    trial: Any = SimpleNamespace(found=missing(), passages=[Passage((1, 2), 2, 2)])
-    assert np.isinf(loop.prices(trial)[1]).any() == counts
+    loop = parts(merit=Merit(1.0), found=make_infeasibility(poses=poses), crossings=[])
+    trial: Any = SimpleNamespace(
+        infeasibility=make_infeasibility(), crossings=[Crossing((1, 2), 2, 2)]
+    )
+    assert np.isinf(loop.compute_penalties(trial)[1]).any() == counts
 
 
 def test_what_was_promised_and_what_came_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Decreases of f and of what is missing, and the merit before."""
     given: list[tuple[float, ...]] = []
-    monkeypatch.setattr(module, "judge", lambda *numbers: given.append(numbers) or True)
-    trial: Any = SimpleNamespace(objective=7.0, promise=np.array([0.25, 0.5]))
-    assert parts(objective=10.0).judge(trial, np.array([1.0, 2.0]), np.array([0.5, 0.75]))
+    monkeypatch.setattr(
+        module, "is_step_acceptable", lambda *numbers: given.append(numbers) or True
+    )
+    trial: Any = SimpleNamespace(objective=7.0, predicted_penalty=np.array([0.25, 0.5]))
+    assert parts(objective=10.0).is_acceptable(trial, np.array([1.0, 2.0]), np.array([0.5, 0.75]))
     assert given == [(3.0 + 3.0 - 0.75, 3.0 + 3.0 - 1.25, 13.0)]
 
 
@@ -166,28 +171,28 @@ def gone_on(
     )
     loop = parts(
         problem=problem,
-        found=missing(poses=others),
+        found=make_infeasibility(poses=others),
         rates=rates,
         timing=Clock("old", left=left),
         solution=SimpleNamespace(z="old", dt="old"),
-        subproblem=SimpleNamespace(forget=lambda: done.append("forget")),
-        look=lambda: done.append("look"),
+        subproblem=SimpleNamespace(reset_multipliers=lambda: done.append("forget")),
+        evaluate_iterate=lambda: done.append("look"),
     )
     trial: Any = SimpleNamespace(
         z="new",
         contacts=contact(0.02 - short),
-        found=missing(),
-        passages=["p"],
+        infeasibility=make_infeasibility(),
+        crossings=["p"],
         objective=3.0,
         pose_error=0.25,
-        rate=rate,
+        rate_excess=rate,
     )
     loop.accept(trial)
-    assert (loop.z, loop.at, loop.found, loop.passages) == (
+    assert (loop.z, loop.at, loop.found, loop.crossings) == (
         trial.z,
         trial.contacts,
-        trial.found,
-        trial.passages,
+        trial.infeasibility,
+        trial.crossings,
     )
     assert (loop.objective, loop.pose_error, loop.solution.z) == (3.0, 0.25, "new")
     assert loop.solution.dt == loop.timing.dt
@@ -235,7 +240,7 @@ def test_where_time_does_not_help_limits_on_rates_become_rows() -> None:
     ("change", "done"),
     [
         ({}, True),
-        ({"satisfied": False}, False),
+        ({"succeeded": False}, False),
         ({"clear": False}, False),
         ({"pose_error": 0.9 * TOLERANCE, "over": 0.9 * TOLERANCE}, True),
         ({"pose_error": 1.5 * TOLERANCE}, False),
@@ -243,27 +248,27 @@ def test_where_time_does_not_help_limits_on_rates_become_rows() -> None:
     ],
 )
 def test_it_is_done_where_everything_holds(change: dict[str, Any], done: bool) -> None:
-    told = {"satisfied": True, "clear": True, "pose_error": 0.0, "over": 0.0, **change}
+    told = {"succeeded": True, "clear": True, "pose_error": 0.0, "over": 0.0, **change}
     problem = SimpleNamespace(pace=lambda z: ("fast", "faster"))
     loop = parts(
         problem=problem, pose_error=told["pose_error"], timing=Clock("now", over=told["over"])
     )
     trial: Any = SimpleNamespace(
-        z=np.zeros((N, 2)), satisfied=told["satisfied"], clear=told["clear"]
+        z=np.zeros((N, 2)), succeeded=told["succeeded"], is_clear=told["clear"]
     )
-    assert loop.done(trial) == done
+    assert loop.has_converged(trial) == done
 
 
 @pytest.mark.parametrize(
-    ("short", "grows"), [(0.9 * CLOSE_ENOUGH, False), (1.1 * CLOSE_ENOUGH, True)]
+    ("short", "grows"), [(0.9 * CLEARANCE_TOLERANCE, False), (1.1 * CLEARANCE_TOLERANCE, True)]
 )
 def test_only_what_is_missing_becomes_dearer_and_multipliers_are_forgotten(
     short: float, grows: bool
 ) -> None:
     done: list[str] = []
-    subproblem = SimpleNamespace(forget=lambda: done.append("forget"))
-    loop = parts(subproblem=subproblem, merit=Merit(2.0), found=missing(clearance=short))
-    assert loop.grow() == grows
+    subproblem = SimpleNamespace(reset_multipliers=lambda: done.append("forget"))
+    loop = parts(subproblem=subproblem, merit=Merit(2.0), found=make_infeasibility(clearance=short))
+    assert loop.raise_penalties() == grows
     assert loop.merit.weights["clearance"] == (8.0 if grows else 2.0)
     assert done == ["forget"]
 
@@ -279,7 +284,7 @@ def test_only_what_is_missing_becomes_dearer_and_multipliers_are_forgotten(
 def test_steps_that_are_too_long_are_no_lack_of_progress_where_hardly_any_clearance_is_missing(
     short: float, accepted: bool, rounds: int
 ) -> None:
-    found = missing(clearance=short, poses=0.1)
+    found = make_infeasibility(clearance=short, poses=0.1)
     row = {
         "objective": 1.0,
         "pose_error": 0.1,
@@ -292,12 +297,14 @@ def test_steps_that_are_too_long_are_no_lack_of_progress_where_hardly_any_cleara
         objective=1.0,
         merit=Merit(2.0),
         try_step=lambda radius: SimpleNamespace(**row),
-        prices=lambda trial: (np.zeros(N), np.zeros(N)),
-        judge=lambda *_: accepted,
+        compute_penalties=lambda trial: (np.zeros(N), np.zeros(N)),
+        is_acceptable=lambda *_: accepted,
         accept=lambda trial: None,
-        done=lambda trial: False,
+        has_converged=lambda trial: False,
     )
-    region: Any = SimpleNamespace(radius=np.ones(N), adapt=lambda *_: None, stuck=lambda *_: False)
+    region: Any = SimpleNamespace(
+        radius=np.ones(N), adapt=lambda *_: None, has_stalled=lambda *_: False
+    )
     module._iterate(loop, region, None, 12)
     assert loop.solution.rounds == rounds
 
@@ -320,13 +327,13 @@ def test_what_is_clearly_in_something_is_said_to_be_astray(
     monkeypatch.setattr(
         module, "_iterate", lambda loop, region, callback, rounds: asked.append((callback, rounds))
     )
-    monkeypatch.setattr(_Loop, "contacts", lambda loop, z: (make_empty_contacts(), True, []))
+    monkeypatch.setattr(_Loop, "find_contacts", lambda loop, z: (make_empty_contacts(), True, []))
     monkeypatch.setattr(
         vkc.TrajectoryProblem, "evaluate_contacts", lambda self, z, **how: contact(0.02 - short)
     )
     solution = solve(problem, problem.still)
     assert (solution.status, solution.converged) == ("not converged", False)
-    assert solution.astray == pytest.approx(astray)
+    assert solution.shortfall == pytest.approx(astray)
     assert asked == [(None, 7)]
     solve(problem, problem.still, rounds=3)
     assert asked[-1] == (None, 3)
@@ -346,7 +353,7 @@ def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(
         raise SpentError("time limit")
 
     monkeypatch.setattr(module, "_iterate", ended)
-    monkeypatch.setattr(_Loop, "contacts", lambda loop, z: (make_empty_contacts(), True, []))
+    monkeypatch.setattr(_Loop, "find_contacts", lambda loop, z: (make_empty_contacts(), True, []))
     monkeypatch.setattr(
         vkc.TrajectoryProblem, "evaluate_contacts", lambda self, z, **how: contact(-1.0)
     )
@@ -354,7 +361,7 @@ def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(
     assert (solution.status, solution.converged) == (
         ("converged", True) if good else ("time limit", False)
     )
-    assert solution.astray == 0.0
+    assert solution.shortfall == 0.0
     np.testing.assert_array_equal(solution.z, kept[0] if good else problem.clip(problem.still))
     assert (solution.dt is kept[1]) == good
 

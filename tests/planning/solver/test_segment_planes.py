@@ -9,7 +9,13 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.segment_planes import CLOSE, KEEP, Between, collisions_between, merge
+from vkc_pin.planning.solver.segment_planes import (
+    REFINEMENT_RANGE,
+    SEGMENT_MARGIN,
+    SegmentContacts,
+    find_segment_contacts,
+    merge_contacts,
+)
 
 ARM = [np.pi, -1.2, 1.9, -0.7, np.pi / 2, 0.0]  # stretched out ahead of the base
 WIDTH = 2.0  # [m] the base drives sideways
@@ -53,7 +59,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     )  # it went round the post
 
     problem, _ = straight(scene)
-    nothing, free, passed = collisions_between(
+    nothing, free, passed = find_segment_contacts(
         problem, np.tile(problem.start, (problem.segments, 1))
     )
     assert free
@@ -61,8 +67,8 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     assert nothing.compute_violation() == 0.0
     nothing = nothing.select(np.zeros(0, int))
     monkeypatch.setattr(
-        "vkc_pin.planning.solver.loop.collisions_between",
-        lambda problem, z: Between(nothing, True, []),
+        "vkc_pin.planning.solver.loop.find_segment_contacts",
+        lambda problem, z: SegmentContacts(nothing, True, []),
     )
     blind = vkc.plan(scene, steps, options=FEW, initialization="interpolated")
     assert not blind.success
@@ -80,7 +86,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
 def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
     problem, z = straight(past_a_post())
     assert problem.evaluate_contacts(z, reach=0.02).compute_clearance() == np.inf
-    found = collisions_between(problem, z).contacts
+    found = find_segment_contacts(problem, z).contacts
     labels = problem.contacts.phases[0].labels
     assert {labels[j] for j in found.pair[:, 1]} == {"post"}
     assert all(labels[i].startswith("gripper") for i in found.pair[:, 0])
@@ -92,21 +98,23 @@ def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
 
 def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
     problem, z = straight(past_a_post())
-    found = collisions_between(problem, z).contacts
+    found = find_segment_contacts(problem, z).contacts
     states = sub_states(problem, z, 2, 400)
-    dense = problem.contacts.evaluate(states, np.full(len(states), 3), reach=KEEP + CLOSE)
+    dense = problem.contacts.evaluate(
+        states, np.full(len(states), 3), reach=SEGMENT_MARGIN + REFINEMENT_RANGE
+    )
     pairs = np.unique(found.pair, axis=0)
     assert len(pairs) > 1
     for pair in pairs:
         deepest = dense.distance[(dense.pair == pair).all(axis=1)].min()
         missing = (found.margin - found.distance)[(found.pair == pair).all(axis=1)]
-        np.testing.assert_allclose(missing, KEEP - deepest, atol=1e-3)
+        np.testing.assert_allclose(missing, SEGMENT_MARGIN - deepest, atol=1e-3)
 
 
 def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
     """Moving both waypoints by ε along the normal moves the sub-state's distance by ε, up to ε²."""
     problem, z = straight(past_a_post())
-    found = collisions_between(problem, z).contacts
+    found = find_segment_contacts(problem, z).contacts
     index = int(np.argmax(found.margin - found.distance))
     pair, normal = found.pair[index], found.normal[index]
 
@@ -119,7 +127,9 @@ def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
         contacts = problem.contacts.evaluate(states, np.full(len(states), 3), reach=0.1)
         return float(contacts.distance[(contacts.pair == pair).all(axis=1)].min())
 
-    value = found.margin[index] - KEEP  # n·(b − a) there, lifted by what is missing: v + KEEP − d
+    value = (
+        found.margin[index] - SEGMENT_MARGIN
+    )  # n·(b − a) there, lifted by what is missing: v + SEGMENT_MARGIN − d
     assert value == pytest.approx(found.distance[index] - depth(0.0), abs=1e-3)
     for lift in (1e-3, 4e-3):
         horizontal = float(normal[:2] @ normal[:2])
@@ -129,37 +139,37 @@ def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
 def test_a_start_that_is_close_to_something_may_leave_it() -> None:
     wall = {"name": "wall", "type": "box", "size": [0.1, 2.0, 0.5], "position": [0.546, 0.0, 0.25]}
     scene = hall(obstacles=[wall])
-    assert 0.0 < scene.start_clearance() < KEEP
+    assert 0.0 < scene.start_clearance() < SEGMENT_MARGIN
     problem = program_of(scene, [vkc.GoTo(-1.0, 0.0, 0.0)], options=FEW)
     away = through(
         scene, scene.start, moved(scene.start, x=-1.0), steps=FEW.reach_waypoints
     ).positions[1:]
-    assert len(collisions_between(problem, away).contacts.waypoint) == 0
+    assert len(find_segment_contacts(problem, away).contacts.waypoint) == 0
     into = through(
         scene, scene.start, moved(scene.start, x=1.0), steps=FEW.reach_waypoints
     ).positions[1:]
-    assert 0 in collisions_between(problem, into).contacts.waypoint
+    assert 0 in find_segment_contacts(problem, into).contacts.waypoint
 
 
 def test_merged_contacts_are_in_order() -> None:
     problem, z = straight(past_a_post())
-    found = collisions_between(problem, z).contacts
+    found = find_segment_contacts(problem, z).contacts
     near = problem.evaluate_contacts(z, reach=0.3)
-    both = merge(near, found)
+    both = merge_contacts(near, found)
     assert len(both.waypoint) == len(near.waypoint) + len(found.waypoint)
     assert np.all(np.diff(both.waypoint) >= 0)
     missing = both.distance - both.margin
     for row in np.unique(both.waypoint):
         assert np.all(np.diff(missing[both.waypoint == row]) >= 0)
     shuffled = dataclasses.replace(both).select(np.random.default_rng(0).permutation(len(missing)))
-    np.testing.assert_array_equal(merge(shuffled).waypoint, both.waypoint)
+    np.testing.assert_array_equal(merge_contacts(shuffled).waypoint, both.waypoint)
 
 
 def test_standing_still_has_nothing_in_between() -> None:
     problem, _ = straight(hall().with_start(arm=ARM))
     assert (
         len(
-            collisions_between(
+            find_segment_contacts(
                 problem, np.tile(problem.start, (problem.segments, 1))
             ).contacts.waypoint
         )

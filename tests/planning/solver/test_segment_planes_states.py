@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts
 from vkc_pin.planning.solver.segment_planes import (
-    CLOSE,
-    CLOSE_ENOUGH,
-    FINER,
-    KEEP,
+    CLEARANCE_TOLERANCE,
+    REFINEMENT,
+    REFINEMENT_RANGE,
+    SEGMENT_MARGIN,
     SPACING,
-    _deepest,
-    collisions_between,
-    merge,
+    _select_deepest,
+    find_segment_contacts,
+    merge_contacts,
 )
 
 POST = {
@@ -51,7 +51,7 @@ def contacts(
 def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The middles of pieces that are no longer than `SPACING`; then `FINER` in each of those that something is near."""
+    """The middles of pieces that are no longer than `SPACING`; then `REFINEMENT` in each of those that something is near."""
     scene = hall(obstacles=[POST])
     problem = program_of(scene, [vkc.GoTo(0.0, 3.0)], options=vkc.Options(reach_waypoints=4))
     ways = np.array([0.0, 0.5, 0.5, 1.51, 3.0])  # [m] aside; in the second it stands still
@@ -68,11 +68,11 @@ def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(
         return found
 
     monkeypatch.setattr(ContactModel, "evaluate", noted)
-    collisions_between(problem, z)
+    find_segment_contacts(problem, z)
     (states, waypoints, reach, near), (finer, ends, again, _) = asked
-    assert reach == again == KEEP + CLOSE
+    assert reach == again == SEGMENT_MARGIN + REFINEMENT_RANGE
     counts = [25, 1, 51, 75]
-    assert (SPACING, FINER) == (0.02, 4)
+    assert (SPACING, REFINEMENT) == (0.02, 4)
     np.testing.assert_array_equal(waypoints, np.repeat([1, 2, 3, 4], counts))
     shares = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
     path = problem.waypoints(z)
@@ -82,10 +82,10 @@ def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(
     assert 0 < len(rows) < len(states)
     piece = np.arange(len(states)) - np.repeat(np.cumsum(counts) - counts, counts)
     shares = (
-        (piece[rows][:, None] + (np.arange(FINER) + 0.5) / FINER)
+        (piece[rows][:, None] + (np.arange(REFINEMENT) + 0.5) / REFINEMENT)
         / np.repeat(counts, counts)[rows][:, None]
     ).ravel()
-    np.testing.assert_array_equal(ends, np.repeat(waypoints[rows], FINER))
+    np.testing.assert_array_equal(ends, np.repeat(waypoints[rows], REFINEMENT))
     np.testing.assert_allclose(
         finer, path[ends - 1] + shares[:, None] * (path[ends] - path[ends - 1]), atol=1e-12
     )
@@ -96,14 +96,18 @@ def test_contacts_at_both_ends_stand_for_what_is_between() -> None:
     scene = hall(obstacles=[POST])
     problem = program_of(scene, [vkc.GoTo(0.0, 3.0)], options=vkc.Options(reach_waypoints=3))
     z = np.array([moved(scene.start, y=y) for y in (1.0, 2.0, 3.0)])
-    found = collisions_between(problem, z).contacts
+    found = find_segment_contacts(problem, z).contacts
     assert set(found.waypoint.tolist()) == {0, 1, 2}
     np.testing.assert_allclose(
         found.distance, np.einsum("ci,ci->c", found.normal, found.second - found.first), atol=1e-12
     )
     labels = problem.contacts.phases[0].labels
     base = [k for k in range(len(found.waypoint)) if labels[found.pair[k, 0]] == "base_link"]
-    ends = {int(found.waypoint[k]): k for k in base if found.margin[k] - found.distance[k] > KEEP}
+    ends = {
+        int(found.waypoint[k]): k
+        for k in base
+        if found.margin[k] - found.distance[k] > SEGMENT_MARGIN
+    }
     assert {0, 1} <= set(ends)
     first, last = ends[0], ends[1]
     np.testing.assert_array_equal(found.second[first], found.second[last])  # the post stands
@@ -128,10 +132,10 @@ def test_what_is_far_enough_between(gap: float, free: bool) -> None:
     )
     problem = program_of(scene, [vkc.GoTo(2.0, 0.0)], options=vkc.Options(reach_waypoints=3))
     here = scene.start_clearance()
-    y = here - gap * CLOSE_ENOUGH
+    y = here - gap * CLEARANCE_TOLERANCE
     z = np.array([moved(scene.start, x=x, y=y) for x in (0.5, 1.0, 1.5)])
-    between = collisions_between(problem, z)
-    assert between.free == free
+    between = find_segment_contacts(problem, z)
+    assert between.is_free == free
     assert between.contacts.compute_violation() > 0.0
 
 
@@ -145,7 +149,7 @@ def test_of_each_segment_and_pair_the_deepest_is_kept(
     segment = np.array([0, 0, 1, 2, 2, 3])
     states, both = (np.array([row[k] for row in rows], int) for k in (0, 1))
     distance = np.array([row[2] for row in rows])
-    found = _deepest(contacts(states.reshape(-1), both.reshape(-1, 2), distance), segment)
+    found = _select_deepest(contacts(states.reshape(-1), both.reshape(-1, 2), distance), segment)
     least: dict[tuple[int, ...], float] = {}
     for state, pair, depth in rows:
         key = (int(segment[state]), *pair)
@@ -166,6 +170,6 @@ def test_merged_contacts_come_by_waypoint_and_those_first_that_fall_shortest() -
         np.array([0.5, 0.2, 0.1]),
         np.array([0.4, 0.3, 0.0]),
     )
-    joined = merge(one, other)
+    joined = merge_contacts(one, other)
     assert joined.waypoint.tolist() == [0, 0, 0, 1, 1]
     assert joined.pair[:, 1].tolist() == [3, 5, 1, 4, 2]

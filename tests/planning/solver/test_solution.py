@@ -9,7 +9,7 @@ from vkc_pin.planning.solver.solution import Solution
 
 def test_nothing_has_happened_yet() -> None:
     one, other = (Solution(np.zeros((2, 1)), np.ones(2)) for _ in range(2))
-    assert (one.converged, one.status, one.astray, one.radius) == (
+    assert (one.converged, one.status, one.shortfall, one.radius) == (
         False,
         "not converged",
         0.0,

@@ -41,28 +41,31 @@ def test_it_promises_no_more_than_a_motion_within_the_region_keeps(
     """Without obstacles near the model is exact but for Ipopt's tolerance: what is left comes true."""
     state = loop(kind)
     state.rates = rates
-    state.look()
+    state.evaluate_iterate()
     radius = np.full(state.problem.segments, size)
     step = state.subproblem.solve(
         state.z, state.at, state.found, state.merit, state.timing, radius, rates=rates
     )
     assert np.all(np.abs(step.z - state.z) <= size * (1 + 1e-6))
     assert np.all((step.z >= state.problem.lower - 1e-6) & (step.z <= state.problem.upper + 1e-6))
-    assert np.all((step.shares >= 0.0) & (step.shares <= 1.0))
-    weights, found = state.merit.weights, state.missing(step.z, state.contacts(step.z)[0])
+    assert np.all((step.relaxation >= 0.0) & (step.relaxation <= 1.0))
+    weights, found = (
+        state.merit.weights,
+        state.compute_infeasibility(step.z, state.find_contacts(step.z)[0]),
+    )
     before, after = state.objective, state.problem.objective(step.z, state.timing.dt)
     others = state.merit.compute_penalty(state.found, clearance=False)
     promised = before + state.merit.compute_penalty(state.found, clearance=True).sum() - after
-    promised -= (weights["clearance"] * step.slack + others * step.shares).sum()
+    promised -= (weights["clearance"] * step.slack + others * step.relaxation).sum()
     assert promised >= -1e-3
-    left = others @ step.shares
+    left = others @ step.relaxation
     assert state.merit.compute_penalty(found, clearance=False).sum() <= left + 1e-2 * max(1.0, left)
     if kind == "there":
-        assert not step.shares.any()
-        assert step.satisfied
+        assert not step.relaxation.any()
+        assert step.succeeded
     else:
         assert promised > 1.0
-        assert size > 0.1 or (step.shares > 0.5).any(), "a small step does not get there"
+        assert size > 0.1 or (step.relaxation > 0.5).any(), "a small step does not get there"
 
 
 def test_multipliers_are_of_the_round_before() -> None:
@@ -71,7 +74,7 @@ def test_multipliers_are_of_the_round_before() -> None:
     counts = []
     for forget in (False, False, True):
         if forget:
-            state.subproblem.forget()
+            state.subproblem.reset_multipliers()
         before = state.solution.iterations
         state.subproblem.solve(
             state.z, state.at, state.found, state.merit, state.timing, radius, rates=False

@@ -62,7 +62,9 @@ class Made:
             upper=UPPER,
             start="start",
             target_matrix=lambda: "targets",
-            contacts=SimpleNamespace(compute_planes=lambda z, at, slots: ("planes", "offsets")),
+            contacts=SimpleNamespace(
+                compute_compute_planes=lambda z, at, slots: ("planes", "offsets")
+            ),
             row_bounds=lambda timing: (
                 f"low {timing and timing.dt}",
                 f"high {timing and timing.dt}",
@@ -72,7 +74,11 @@ class Made:
             rolling=SimpleNamespace(gears=lambda path: ("gears", path)),
             waypoints=lambda z: "path",
         )
-        monkeypatch.setattr(module, "linear_solver", lambda: {"ipopt.linear_solver": "own"})
+        monkeypatch.setattr(
+            module,
+            "make_linear_solver_options",
+            lambda: {"ipopt.linear_solver": "own"},
+        )
         self.solution = Solution(Z, np.ones(N))
         self.subproblem = Subproblem(problem, self.solution)
 
@@ -206,7 +212,7 @@ def test_multipliers_are_taken_over_only_from_one_exact_round_to_the_next(made: 
         assert (asked.get("lam_x0"), asked.get("lam_g0")) == (
             (f"x{before}", f"g{before}") if before else (None, None)
         )
-    made.subproblem.forget()
+    made.subproblem.reset_multipliers()
     made.solve(poses=exact)
     assert "lam_x0" not in made.ipopt.asked[-1]
     assert kinds[made.ipopt.how[-1]["ipopt.mu_init"]] == "cold"
@@ -219,8 +225,8 @@ def test_what_becomes_of_the_answer(made: Made, success: bool) -> None:
     step = made.solve(poses=[0.0, 0.0, 0.0])
     np.testing.assert_array_equal(step.z, [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
     np.testing.assert_array_equal(step.slack, [0.75, 0.0, 0.0])
-    np.testing.assert_array_equal(step.shares, [0.75, 1.0, 0.0])
-    assert step.satisfied is success
+    np.testing.assert_array_equal(step.relaxation, [0.75, 1.0, 0.0])
+    assert step.succeeded is success
 
 
 def test_iterations_and_times_add_up(made: Made) -> None:

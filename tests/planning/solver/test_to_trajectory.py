@@ -10,7 +10,7 @@ from helpers.carrying import STICK, lifted, room, stand, table
 from helpers.small_problems import SHORT, door_scene, program_of, random_configurations
 
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Release, Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -38,7 +38,7 @@ def unfolded(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Tra
     z = random_configurations(
         problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
     )
-    return z, as_trajectory(problem, z, problem.timing_for(problem.still).dt)
+    return z, make_trajectory(problem, z, problem.timing_for(problem.still).dt)
 
 
 def pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -55,7 +55,7 @@ def made(
         ),
         scene=SimpleNamespace(holds=holds),
     )
-    motion = as_trajectory(problem, path[1:].copy(), 1.0 + np.arange(count))
+    motion = make_trajectory(problem, path[1:].copy(), 1.0 + np.arange(count))
     assert motion.names == names
     assert motion.robot_size == 3
     return motion, path

@@ -10,24 +10,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.planning.solver.trust_region import (
-    CLOSE_ENOUGH,
+    CLEARANCE_TOLERANCE,
     FIRST_RADIUS,
     SETTLE_RADIUS,
     Trial,
     TrustRegion,
-    judge,
+    is_step_acceptable,
 )
 
 SEGMENTS, BLOCK = 30, 10  # three blocks
 
 
-def trial(promise: Any = 0.0, *, step: Any = 0.1) -> Trial:
+def trial(predicted_penalty: Any = 0.0, *, step: Any = 0.1) -> Trial:
     """Return where a round led: what the planes promised would be left, and how far it went."""
     rows = [
-        np.broadcast_to(np.asarray(values, float), (SEGMENTS,)).copy() for values in (promise, step)
+        np.broadcast_to(np.asarray(values, float), (SEGMENTS,)).copy()
+        for values in (predicted_penalty, step)
     ]
     fields = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
-    return Trial(**{**fields, "promise": rows[0], "step": rows[1]})  # type: ignore[arg-type]
+    return Trial(**{**fields, "predicted_penalty": rows[0], "step": rows[1]})  # type: ignore[arg-type]
 
 
 @settings(max_examples=100, deadline=None)
@@ -35,7 +36,7 @@ def trial(promise: Any = 0.0, *, step: Any = 0.1) -> Trial:
 def test_a_step_is_accepted_that_keeps_enough_of_its_promise(
     promised: float, actual: float, merit: float
 ) -> None:
-    accepted = judge(promised, actual, merit)
+    accepted = is_step_acceptable(promised, actual, merit)
     if promised >= 1e-4 * max(1.0, merit):
         assert accepted == (actual > 0.05 * promised)
     else:  # nothing was to be had: it may not become worse
@@ -51,7 +52,7 @@ def test_blocks_are_alike_in_size() -> None:
 
 
 def test_each_block_learns_from_what_happened_in_it() -> None:
-    """The first kept its promise and went to the region's edge, the second broke it, in the third nothing was to be done."""
+    """The radius grows in the first block, shrinks in the second and stays in the third."""
     region, before = TrustRegion(SEGMENTS, BLOCK), np.zeros(SEGMENTS)
     before[:20] = 2.0
     after, step = np.zeros(SEGMENTS), np.full(SEGMENTS, FIRST_RADIUS)
@@ -82,28 +83,28 @@ def test_radii_stay_positive_and_one_to_a_block(seed: int) -> None:
         TrustRegion(SEGMENTS, BLOCK, np.repeat([0.5, 1e-3, 1e-6], 10)),
     )
     for _ in range(20):
-        before, promise, after, step = rng.uniform(0.0, 2.0, (4, SEGMENTS))
-        region.adapt(before, after, trial(promise, step=step), bool(rng.integers(2)))
+        before, predicted_penalty, after, step = rng.uniform(0.0, 2.0, (4, SEGMENTS))
+        region.adapt(before, after, trial(predicted_penalty, step=step), bool(rng.integers(2)))
         assert (region.radius >= 1e-6).all()
         assert all(np.ptp(region.radius[region.block == b]) == 0.0 for b in range(3))
 
 
 def test_stuck_is_where_something_is_in_the_way_and_does_not_move() -> None:
     region, shortfall = TrustRegion(SEGMENTS, BLOCK), np.zeros(SEGMENTS)
-    shortfall[12] = 2 * CLOSE_ENOUGH
+    shortfall[12] = 2 * CLEARANCE_TOLERANCE
     step = np.full(SEGMENTS, 0.1)
-    assert not region.stuck(trial(step=step), shortfall)
-    step[12] = CLOSE_ENOUGH / 2
-    assert region.stuck(trial(step=step), shortfall)
-    shortfall[15] = 2 * CLOSE_ENOUGH  # which moves
-    assert not region.stuck(trial(step=step), shortfall)
-    assert not region.stuck(
+    assert not region.has_stalled(trial(step=step), shortfall)
+    step[12] = CLEARANCE_TOLERANCE / 2
+    assert region.has_stalled(trial(step=step), shortfall)
+    shortfall[15] = 2 * CLEARANCE_TOLERANCE  # which moves
+    assert not region.has_stalled(trial(step=step), shortfall)
+    assert not region.has_stalled(
         trial(step=step), np.zeros(SEGMENTS)
     )  # nothing in the way: all must have stopped
-    assert region.stuck(trial(step=0.0), np.zeros(SEGMENTS))
-    region.settle()
+    assert region.has_stalled(trial(step=0.0), np.zeros(SEGMENTS))
+    region.limit()
     np.testing.assert_array_equal(region.radius, SETTLE_RADIUS)
-    region.restart()
+    region.reset()
     np.testing.assert_array_equal(region.radius, FIRST_RADIUS)
 
 

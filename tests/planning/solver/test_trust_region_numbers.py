@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from vkc_pin.planning.solver.trust_region import (
-    CLOSE_ENOUGH,
+    ACTIVE_FRACTION,
+    CLEARANCE_TOLERANCE,
     FIRST_RADIUS,
-    INSIDE,
-    NO_MATTER,
+    NEGLIGIBLE_CHANGE,
     SETTLE_RADIUS,
     SHRINK,
     Trial,
     TrustRegion,
-    judge,
+    is_step_acceptable,
 )
 
 
@@ -31,20 +31,30 @@ def adapted(
 ) -> list[float]:
     """Return the radii of two blocks of two waypoints each, of which so much was promised and came; in units of the radius."""
     region = TrustRegion(4, 2, np.full(4, radius))
-    before, promise, after = np.full(4, 100.0), np.full(4, 100.0), np.full(4, 100.0)
-    promise[::2] -= np.array(promised)  # all of it at one waypoint of a block
+    before, predicted_penalty, after = np.full(4, 100.0), np.full(4, 100.0), np.full(4, 100.0)
+    predicted_penalty[::2] -= np.array(promised)  # all of it at one waypoint of a block
     after[1::2] -= np.array(actual)  # and what came of it at the other
     fields: dict[str, Any] = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
     steps = np.zeros(4)
     steps[1::2] = radius * np.array(step)
-    region.adapt(before, after, Trial(**{**fields, "promise": promise, "step": steps}), accepted)
+    region.adapt(
+        before,
+        after,
+        Trial(**{**fields, "predicted_penalty": predicted_penalty, "step": steps}),
+        accepted,
+    )
     assert region.radius[0] == region.radius[1]
     assert region.radius[2] == region.radius[3]
     return [float(value) / radius for value in region.radius[::2]]
 
 
 def test_what_kept_its_promise_at_the_edge_becomes_wider() -> None:
-    for step, wider in ((1.0, True), (1.01 * INSIDE, True), (0.99 * INSIDE, False), (0.1, False)):
+    for step, wider in (
+        (1.0, True),
+        (1.01 * ACTIVE_FRACTION, True),
+        (0.99 * ACTIVE_FRACTION, False),
+        (0.1, False),
+    ):
         assert adapted([10.0, 10.0], [10.0, 10.0], [step, 0.0]) == [
             pytest.approx(1.5 if wider else 1.0),
             1.0,
@@ -55,8 +65,8 @@ def test_seven_tenths_of_a_promise_are_enough() -> None:
     """And a little less, in what does not matter."""
     for share, wider in (
         (7.1, True),
-        (7.0 - 0.9 * NO_MATTER, True),
-        (7.0 - 1.1 * NO_MATTER, False),
+        (7.0 - 0.9 * NEGLIGIBLE_CHANGE, True),
+        (7.0 - 1.1 * NEGLIGIBLE_CHANGE, False),
         (12.0, True),
     ):
         assert adapted([10.0, 10.0], [share, 5.0], [1.0, 1.0]) == [
@@ -69,7 +79,7 @@ def test_what_came_to_less_than_a_quarter_becomes_narrower() -> None:
     for share, narrower in ((2.4, True), (2.6, False), (-3.0, True)):
         expected = SHRINK * 0.8 if narrower else 1.0
         assert adapted([10.0, 10.0], [share, 5.0], [0.8, 0.8]) == [pytest.approx(expected), 1.0]
-    for missing, narrower in ((0.9 * NO_MATTER, False), (1.1 * NO_MATTER, True)):
+    for missing, narrower in ((0.9 * NEGLIGIBLE_CHANGE, False), (1.1 * NEGLIGIBLE_CHANGE, True)):
         expected = SHRINK * 0.8 if narrower else 1.0
         assert adapted([0.1, 0.0], [0.1 - missing, 0.0], [0.8, 0.8]) == [
             pytest.approx(expected),
@@ -117,31 +127,31 @@ def test_radii_do_not_vanish() -> None:
     ],
 )
 def test_what_is_accepted(promised: float, actual: float, merit: float, accepted: bool) -> None:
-    assert judge(promised, actual, merit) == accepted
+    assert is_step_acceptable(promised, actual, merit) == accepted
 
 
 def test_where_nothing_moves_any_more() -> None:
     """Either as the region is too small, or as the step was; at all waypoints at which something is in the way."""
     fields: dict[str, Any] = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
 
-    def stuck(radius: list[float], step: list[float], short: list[float]) -> bool:
-        region = TrustRegion(3, 1, CLOSE_ENOUGH * np.array(radius))
-        trial = Trial(**{**fields, "step": CLOSE_ENOUGH * np.array(step)})
-        return region.stuck(trial, CLOSE_ENOUGH * np.array(short))
+    def has_stalled(radius: list[float], step: list[float], short: list[float]) -> bool:
+        region = TrustRegion(3, 1, CLEARANCE_TOLERANCE * np.array(radius))
+        trial = Trial(**{**fields, "step": CLEARANCE_TOLERANCE * np.array(step)})
+        return region.has_stalled(trial, CLEARANCE_TOLERANCE * np.array(short))
 
-    assert stuck([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 0.0])
-    assert stuck([9.0, 9.0, 9.0], [9.0, 0.9, 9.0], [0.0, 1.1, 0.0])
-    assert not stuck([9.0, 1.1, 9.0], [9.0, 1.1, 9.0], [0.0, 1.1, 0.0])
-    assert not stuck([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 1.1])
-    assert not stuck([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0])
-    assert stuck([0.9, 0.9, 0.9], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0])
+    assert has_stalled([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 0.0])
+    assert has_stalled([9.0, 9.0, 9.0], [9.0, 0.9, 9.0], [0.0, 1.1, 0.0])
+    assert not has_stalled([9.0, 1.1, 9.0], [9.0, 1.1, 9.0], [0.0, 1.1, 0.0])
+    assert not has_stalled([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 1.1])
+    assert not has_stalled([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0])
+    assert has_stalled([0.9, 0.9, 0.9], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0])
 
 
 def test_smaller_steps_and_beginning_again() -> None:
     region = TrustRegion(3, 1, np.array([0.01, SETTLE_RADIUS, 0.3]))
-    region.settle()
+    region.limit()
     np.testing.assert_array_equal(region.radius, [0.01, SETTLE_RADIUS, SETTLE_RADIUS])
-    region.restart()
+    region.reset()
     np.testing.assert_array_equal(region.radius, [FIRST_RADIUS] * 3)
 
 

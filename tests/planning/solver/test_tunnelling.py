@@ -9,8 +9,8 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.segment_planes import collisions_between
-from vkc_pin.planning.solver.tunnelling import Passage, new
+from vkc_pin.planning.solver.segment_planes import find_segment_contacts
+from vkc_pin.planning.solver.tunnelling import Crossing, find_new_crossings
 
 STEPS = 8
 FEW = vkc.Options(reach_waypoints=STEPS)
@@ -35,14 +35,14 @@ def post(x: float, y: float = 0.0, radius: float = 0.02) -> dict[str, object]:
 
 def pairs(problem: TrajectoryProblem, z: np.ndarray) -> set[tuple[str, str]]:
     labels = problem.contacts.phases[0].labels
-    return {(labels[a], labels[b]) for (a, b), _, _ in collisions_between(problem, z).passages}
+    return {(labels[a], labels[b]) for (a, b), _, _ in find_segment_contacts(problem, z).crossings}
 
 
 @pytest.mark.parametrize("y", [0.0, 0.1, -0.2])
 def test_the_base_goes_through_a_post(y: float) -> None:
     problem, z = past(4.0, post(2.0, y))
     assert ("base_link", "post") in pairs(problem, z)
-    found = collisions_between(problem, z).passages
+    found = find_segment_contacts(problem, z).crossings
     length = 4.0 / STEPS
     for _, first, last in found:
         assert first <= 2.0 / length <= last + 1
@@ -54,16 +54,16 @@ def test_what_is_dipped_into_is_none() -> None:
     problem, z = past(1.6, post(2.0))
     there_and_back = np.concatenate([z[1::2], z[1::2][::-1]])
     there_and_back[-1] = problem.start
-    assert collisions_between(problem, there_and_back).contacts.compute_violation() > 0.05
+    assert find_segment_contacts(problem, there_and_back).contacts.compute_violation() > 0.05
     assert ("base_link", "post") not in pairs(problem, there_and_back)
 
 
 def test_what_is_grazed_is_none() -> None:
     """Past the front corner of the base, on the same side before and after."""
     problem, z = past(4.0, post(2.0, 0.37, radius=0.04))
-    between = collisions_between(problem, z)
+    between = find_segment_contacts(problem, z)
     assert between.contacts.compute_violation() > 0.0
-    assert not between.free
+    assert not between.is_free
     assert ("base_link", "post") not in pairs(problem, z)
 
 
@@ -71,13 +71,13 @@ def test_what_is_free_and_what_does_not_come_out_again() -> None:
     problem, z = past(4.0, post(2.0, 2.0))
     assert pairs(problem, z) == set()
     problem, z = past(1.6, post(2.0))
-    assert not collisions_between(problem, z).free
+    assert not find_segment_contacts(problem, z).is_free
     assert ("base_link", "post") not in pairs(problem, z)
 
 
 def test_only_pairs_that_did_not_before_are_new() -> None:
-    first, moved_on, other = Passage((1, 2), 3, 4), Passage((1, 2), 5, 6), Passage((1, 3), 3, 4)
-    assert new([moved_on], [first]) == []
-    assert new([first, other], [moved_on]) == [other]
-    assert new([first], []) == [first]
-    assert new([], [first]) == []
+    first, moved_on, other = Crossing((1, 2), 3, 4), Crossing((1, 2), 5, 6), Crossing((1, 3), 3, 4)
+    assert find_new_crossings([moved_on], [first]) == []
+    assert find_new_crossings([first, other], [moved_on]) == [other]
+    assert find_new_crossings([first], []) == [first]
+    assert find_new_crossings([], [first]) == []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.planning.solver.tunnelling import Passage, passages
+from vkc_pin.planning.solver.tunnelling import Crossing, find_crossings
 
 S = 8
 SEGMENTS = np.array([0, 0, 0, 1, 1, 2, 3, 3])
@@ -45,15 +45,15 @@ def overlaps(*where: tuple[int, int, int], depth: float = 0.01) -> Contacts:
     return Contacts(rows[:, 0], rows[:, 1:], numbers, numbers, vectors, vectors, vectors)
 
 
-def found(contacts: Contacts, back: set[int], **how: Any) -> list[Passage]:
+def found(contacts: Contacts, back: set[int], **how: Any) -> list[Crossing]:
     made: Any = Made(back, **how)
-    return passages(made, np.arange(float(S))[:, None], SEGMENTS, contacts)
+    return find_crossings(made, np.arange(float(S))[:, None], SEGMENTS, contacts)
 
 
 def test_it_comes_out_on_the_other_side() -> None:
     """From the segment of the state before to that of the state after."""
-    assert found(overlaps((3, 0, 1), (4, 0, 1)), {5, 6, 7}) == [Passage((0, 1), 0, 2)]
-    assert found(overlaps((5, 0, 1)), {6, 7}) == [Passage((0, 1), 1, 3)]
+    assert found(overlaps((3, 0, 1), (4, 0, 1)), {5, 6, 7}) == [Crossing((0, 1), 0, 2)]
+    assert found(overlaps((5, 0, 1)), {6, 7}) == [Crossing((0, 1), 1, 3)]
     assert found(overlaps((3, 0, 1), (4, 0, 1)), set()) == []
     assert (
         found(overlaps((3, 0, 1), (4, 0, 1)), {3, 4}) == []
@@ -64,7 +64,7 @@ def test_it_comes_out_on_the_other_side() -> None:
 def test_what_begins_or_ends_inside_is_none(state: int) -> None:
     back = set(range(state + 1, S))
     expected = (
-        [Passage((0, 1), int(SEGMENTS[state - 1]), int(SEGMENTS[state + 1]))]
+        [Crossing((0, 1), int(SEGMENTS[state - 1]), int(SEGMENTS[state + 1]))]
         if 0 < state < S - 1
         else []
     )
@@ -74,8 +74,8 @@ def test_what_begins_or_ends_inside_is_none(state: int) -> None:
 def test_each_time_it_overlaps_is_one_of_its_own() -> None:
     """Out between the two states 2 and 4, and back through the other way."""
     twice = overlaps((2, 0, 1), (4, 0, 1), (5, 0, 1))
-    assert found(twice, {3}) == [Passage((0, 1), 0, 1), Passage((0, 1), 1, 3)]
-    assert found(twice, {6, 7}) == [Passage((0, 1), 1, 3)]
+    assert found(twice, {3}) == [Crossing((0, 1), 0, 1), Crossing((0, 1), 1, 3)]
+    assert found(twice, {6, 7}) == [Crossing((0, 1), 1, 3)]
     assert found(overlaps((2, 0, 1), (3, 0, 1), (4, 0, 1), (5, 0, 1)), {3}) == []
 
 
@@ -83,22 +83,22 @@ def test_each_time_it_overlaps_is_one_of_its_own() -> None:
 def test_another_pair_is_another_overlap(other: tuple[int, int]) -> None:
     """Though it begins where the first ends."""
     both = found(overlaps((2, 0, 1), (3, *other)), {3})
-    assert both == [Passage((0, 1), 0, 1)]
+    assert both == [Crossing((0, 1), 0, 1)]
     both = found(overlaps((2, 0, 1), (3, *other)), {4, 5, 6, 7})
-    assert both == [Passage(other, 0, 1)]
+    assert both == [Crossing(other, 0, 1)]
 
 
 def test_pairs_that_overlap_at_the_same_states_do_not_mix() -> None:
     both = overlaps(
         *((row, 0, k) for row in (2, 3, 4) for k in (1, 2)), *((row, 1, 2) for row in (2, 3, 4))
     )
-    assert found(both, {5, 6, 7}) == [Passage(pair, 0, 2) for pair in ((0, 1), (0, 2), (1, 2))]
+    assert found(both, {5, 6, 7}) == [Crossing(pair, 0, 2) for pair in ((0, 1), (0, 2), (1, 2))]
 
 
 def test_what_overlaps_from_one_phase_to_the_next_is_none() -> None:
     """Shapes are others then."""
     contacts = overlaps((4, 0, 1))
-    assert found(contacts, {5, 6, 7}, boundary=3) == [Passage((0, 1), 1, 2)]
+    assert found(contacts, {5, 6, 7}, boundary=3) == [Crossing((0, 1), 1, 2)]
     assert found(contacts, {5, 6, 7}, boundary=2) == []
 
 

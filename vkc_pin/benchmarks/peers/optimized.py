@@ -24,7 +24,7 @@ from vkc_pin.benchmarks.peers.found import Clock, Found
 from vkc_pin.benchmarks.peers.sampled import ranges
 from vkc_pin.benchmarks.peers.tasks import Given, ends
 from vkc_pin.errors import InputError
-from vkc_pin.planning.initialization.keyframes import smooth
+from vkc_pin.planning.initialization.keyframes import sample_smoothstep
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 
@@ -78,7 +78,7 @@ def plan_by_trajopt(
                 "joints": files.joints,
                 "seed": (
                     problem.start
-                    + np.append(0.0, smooth(segments))[:, None] * (row - problem.start)
+                    + np.append(0.0, sample_smoothstep(segments))[:, None] * (row - problem.start)
                 ).tolist(),
                 "lower": lower.tolist(),
                 "upper": upper.tolist(),

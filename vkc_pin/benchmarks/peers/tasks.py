@@ -10,7 +10,7 @@ import numpy as np
 from vkc_pin.benchmarks.problems.poses import pose_among, pose_over, random_start
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.initialization.keyframes import depth, scatter
+from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_goal_configurations
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.rooms.random_room import sample_layout
@@ -88,7 +88,7 @@ def given(task: str, seed: int, number: int) -> Given:
                 scene.with_start(base=robot[:3], arm=robot[3:]).with_held({task: attachment}), steps
             )
             held = problem_of(own)
-            if depth(held, held.start[None], 1)[0] <= 0.0 and len(_free(held, rng)):
+            if compute_shortfall(held, held.start[None], 1)[0] <= 0.0 and len(_free(held, rng)):
                 return own
     raise InputError(
         "nothing holds it",
@@ -144,8 +144,8 @@ def _exact(problem: TrajectoryProblem, z: Floats, row: int) -> tuple[Floats, Boo
 
 def _free(problem: TrajectoryProblem, rng: np.random.Generator) -> Floats:
     """Return random configurations at the last waypoint, where it should be and free, in the order they were drawn."""
-    drawn = scatter(problem, problem.segments, rng)
+    drawn = sample_goal_configurations(problem, problem.segments, rng)
     assert drawn is not None  # all of these tasks have a pose at the end
     z, error = drawn
     z = z[error < TOLERANCE]
-    return np.asarray(z[depth(problem, z, problem.segments) <= 0.0])
+    return np.asarray(z[compute_shortfall(problem, z, problem.segments) <= 0.0])

@@ -15,7 +15,7 @@ from vkc_pin.importing.proposals.hand import hand_of
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
 from vkc_pin.options import Options
-from vkc_pin.planning.diagnosis.diagnosis import explain
+from vkc_pin.planning.diagnosis.diagnosis import diagnose_goals
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.furniture.catalogue import KINDS, random_object
 from vkc_pin.procedural.rooms import parts
@@ -210,7 +210,7 @@ def _blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None
     problem = TrajectoryProblem(
         scene, compile_task(scene, [step], options), options, (), cache=cache
     )
-    return next((goal.text for goal in explain(problem, seed)), None)
+    return next((goal.text for goal in diagnose_goals(problem, seed)), None)
 
 
 def _asked(scene: Scene, proposals: Proposals) -> list[Actuate]:

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.planning.base_paths.reachable_floor import Cells, Discs, taken
+from vkc_pin.planning.base_paths.reachable_floor import CellGrid, InscribedDiscs, find_blocked_cells
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -49,10 +49,10 @@ def free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
     ]
     for placed in scene.objects.values():
         standing += make_world_shapes(placed)
-    cells = Cells.over(low, high, _CELL)
+    cells = CellGrid.over(low, high, _CELL)
     free = np.ones(cells.shape, bool)
-    for wall in Discs(list_placed_shapes(base)).walls(list_placed_shapes(standing)):
-        window, own = taken(cells, wall, 0.0)
+    for wall in InscribedDiscs(list_placed_shapes(base)).make_walls(list_placed_shapes(standing)):
+        window, own = find_blocked_cells(cells, wall, 0.0)
         free[window] &= ~own
     regions, count = ndimage.label(free)
     middles = np.stack(np.broadcast_arrays(*cells.centers()), axis=-1)

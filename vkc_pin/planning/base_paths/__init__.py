@@ -1,1 +1,1 @@
-"""Paths of the base on the floor, by A*; knows shapes and coal, nothing else."""
+"""Plans paths of the base on the floor with A*; depends on shapes and coal only."""

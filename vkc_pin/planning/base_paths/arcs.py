@@ -1,8 +1,8 @@
-"""Paths that a base on wheels can drive: corners joined by arcs, which is what straight drives and turns in place are, too.
+"""Computes paths that a base on wheels can drive: corners connected by arcs.
 
-From one corner to the next a pose (x, y, yaw) moves with a constant twist. Along such an arc the
-chord between any two poses points where the base heads half-way between them, so that steps of any
-size neither slip nor, by more than the arc itself, turn.
+Straight drives and turns in place are arcs, too. From one corner to the next a pose (x, y, yaw)
+moves with a constant twist. The chord between two poses of an arc points along the heading half-way
+between them, so steps of any size neither slip nor turn by more than the arc itself.
 """
 
 from __future__ import annotations
@@ -12,41 +12,45 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from vkc_pin.planning.base_paths.motion_primitives import wrapped
-from vkc_pin.planning.base_paths.reeds_shepp import lengths_of, shortest_words
+from vkc_pin.planning.base_paths import reeds_shepp
+from vkc_pin.planning.base_paths.motion_primitives import wrap_angle
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["Curves", "between", "nearest_arc", "spread_along"]
+__all__ = ["Curves", "find_nearest_arc", "interpolate_arcs", "sample_path"]
 
-_WIDER = 1.02  # of the least radius: the chords of a step of 0.7 rad are 2 % shorter than the arc
-_TRIED = 81  # turns, from which the best is taken
-_MOST = 0.8  # [rad] by which an arc may turn less or more than asked for
+_RADIUS_FACTOR = 1.02  # chords of steps of 0.7 rad are 2 % shorter than their arcs
+_TURN_SAMPLES = 81  # turns that are compared
+_MAX_TURN_CHANGE = 0.8  # [rad] largest deviation from the requested turn
 _SAME = 1e-9
-_PLACES = 0.5  # [m] between places on a path, at most
-_LOOK = 0.1  # [m] between poses of a curve that are looked at
+_PLACE_SPACING = 0.5  # [m] largest spacing of places on a path
+_CHECK_SPACING = 0.1  # [m] spacing of collision checks along a curve
 
 
 class Curves:
-    """The curves by which a base on wheels gets from one pose to another where nothing is in the way.
+    """Shortest curves of a base on wheels between poses, without obstacles.
 
     Args:
-        radius: The least radius of its turns [m]; 0: it turns in place, drives straight, and turns
-            in place again. Otherwise curves are the shortest of Reeds and Shepp.
-        turning: How many metres of driving a radian of turning is worth [m/rad].
+        radius: Smallest turning radius [m]. 0: turn in place, drive straight, turn in place.
+            Otherwise: Reeds-Shepp curves.
+        turning: Cost of turning, relative to driving [m/rad].
     """
 
     def __init__(self, radius: float, turning: float) -> None:
-        self.radius, self.turning = _WIDER * radius, turning
+        self.radius, self.turning = _RADIUS_FACTOR * radius, turning
 
-    def lengths(self, first: Floats, last: Floats) -> tuple[Floats, Floats]:
-        """Return how far curves from poses to others, both (B, 3), lead [m] and turn [rad], shape (B,) each."""
+    def compute_lengths(self, first: Floats, last: Floats) -> tuple[Floats, Floats]:
+        """Return lengths [m] and turns [rad] of curves between poses, both (B, 3); (B,) each."""
         if self.radius > 0.0:
-            return lengths_of(_seen(first, last, self.radius), self.radius)
+            goals = _express_in_start_frame(first, last, self.radius)
+            return reeds_shepp.compute_lengths(goals, self.radius)
         turns = [np.abs(one) + np.abs(two) for one, two in self._turns(first, last)]
         return np.hypot(*(last - first)[:, :2].T), np.minimum(*turns)
 
-    def corners(self, first: Floats, last: Floats) -> Floats:
-        """Return the corners of the curve from one pose to another, both (3,), shape (K, 3): at the last all but whole turns."""
+    def compute_corners(self, first: Floats, last: Floats) -> Floats:
+        """Return the corners of the curve between two poses, (3,) each, shape (K, 3).
+
+        The final heading equals that of `last` up to full turns.
+        """
         if self.radius <= 0.0:
             (turn, rest) = min(
                 self._turns(first[None], last[None]), key=lambda turns: float(np.abs(turns).sum())
@@ -60,12 +64,11 @@ class Curves:
             ]
         else:
             found = [first]
-            for length, angle in shortest_words(
-                _seen(first[None], last[None], self.radius)[0], self.radius
-            ):
-                found.append(moved(found[-1], length, angle))
+            goal = _express_in_start_frame(first[None], last[None], self.radius)[0]
+            for length, angle in reeds_shepp.find_shortest_path_pieces(goal, self.radius):
+                found.append(advance(found[-1], length, angle))
             if len(found) > 1:
-                found[-1] = np.array([*last[:2], found[-1][2] + wrapped(last[2] - found[-1][2])])
+                found[-1] = np.array([*last[:2], found[-1][2] + wrap_angle(last[2] - found[-1][2])])
         return np.array(
             [
                 pose
@@ -74,56 +77,67 @@ class Curves:
             ]
         )
 
-    def through(self, path: Floats, free: Callable[[Floats], bool]) -> Floats:
-        """Return the corners of curves along a path with turns in place, shape (K, 3), as few as are free, the first as it is.
+    def fit(self, path: Floats, free: Callable[[Floats], bool]) -> Floats:
+        """Return the corners of collision-free curves along a path with turns in place.
 
-        From where it has come to, a curve leads to the furthest place on the path to which one is
-        free, or else to the next, free or not. Places are the middles of its straight parts, and
-        others on them.
+        Each curve leads to the furthest place on the path to which one is free, or else to the
+        next place, free or not. Places are on the straight parts of the path.
 
         Args:
-            path: Its corners, shape (L, 3).
-            free: Whether the base is, at a pose of shape (3,).
+            path: Corners of the path, shape (L, 3).
+            free: Function that returns whether a pose, shape (3,), is free.
+
+        Returns:
+            Corners of the curves, shape (K, 3); the first is that of the path.
         """
         lengths = np.hypot(*np.diff(path[:, :2], axis=0).T)
-        places = [between(a[None], b[None], np.array([s]))[0] for a, b, s in _on(path, lengths)]
+        places = [
+            interpolate_arcs(a[None], b[None], np.array([s]))[0]
+            for a, b, s in _sample_places(path, lengths)
+        ]
         places.append(path[-1])
         corners, k = path[:1], 0
         while k < len(places):
             for last in range(len(places) - 1, k - 1, -1):
-                curve = self.corners(corners[-1], places[last])
+                curve = self.compute_corners(corners[-1], places[last])
                 if last == k or all(
-                    map(free, spread_along(curve, _looks(curve), turning=self.turning)[:-1])
+                    map(free, sample_path(curve, _count_checks(curve), turning=self.turning)[:-1])
                 ):
                     corners, k = np.vstack([corners, curve[1:]]), last + 1
                     break
         return corners
 
     def _turns(self, first: Floats, last: Floats) -> list[tuple[Floats, Floats]]:
-        """Return the turns before and after driving straight ahead, and those before and after driving straight back."""
+        """Return the turns before and after a straight drive, ahead and backwards."""
         dx, dy = (last - first)[:, :2].T
         near = np.hypot(dx, dy) < _SAME
         there = np.where(near, first[:, 2], np.arctan2(dy, dx))
         found = []
         for back in (0.0, np.pi):
-            before = np.where(near, 0.0, wrapped(there + back - first[:, 2]))
-            found.append((before, wrapped(last[:, 2] - first[:, 2] - before)))
+            before = np.where(near, 0.0, wrap_angle(there + back - first[:, 2]))
+            found.append((before, wrap_angle(last[:, 2] - first[:, 2] - before)))
         return found
 
 
-def moved(pose: Floats, length: float, turn: float) -> Floats:
-    """Return the pose, shape (3,), at the end of an arc of a length [m, back < 0] that turns by an angle [rad]."""
+def advance(pose: Floats, length: float, turn: float) -> Floats:
+    """Return the pose, (3,), at the end of an arc of given length [m, back < 0] and turn [rad]."""
     chord, heading = length * np.sinc(turn / (2 * np.pi)), pose[2] + turn / 2
     return np.array(
         [pose[0] + chord * np.cos(heading), pose[1] + chord * np.sin(heading), pose[2] + turn]
     )
 
 
-def between(first: Floats, last: Floats, share: Floats) -> Floats:
-    """Return the poses at shares of the way between poses with a constant twist; all (B, 3), shares (B,)."""
+def interpolate_arcs(first: Floats, last: Floats, share: Floats) -> Floats:
+    """Interpolate between poses with constant twists.
+
+    Args:
+        first: First poses, shape (B, 3).
+        last: Last poses, shape (B, 3).
+        share: Interpolation parameters from 0 to 1, shape (B,).
+    """
     turn = (last - first)[:, 2]
-    # Chords of shares s of an arc that turns by δ are sin(s·δ/2) / sin(δ/2) of its own, and turned
-    # by (s − 1)·δ/2.
+    # The chord of a share s of an arc that turns by δ is sin(s·δ/2) / sin(δ/2) times the arc's own,
+    # turned by (s − 1)·δ/2.
     ratio = share * np.sinc(share * turn / (2 * np.pi)) / np.sinc(turn / (2 * np.pi))
     cos, sin = ratio * np.cos((share - 1.0) * turn / 2), ratio * np.sin((share - 1.0) * turn / 2)
     dx, dy = (last - first)[:, :2].T
@@ -136,17 +150,17 @@ def between(first: Floats, last: Floats, share: Floats) -> Floats:
     )
 
 
-def nearest_arc(first: Floats, last: Floats, *, radius: float, turning: float) -> Floats:
-    """Return the poses nearest to `last` to which an arc leads from `first`, both (B, 3).
+def find_nearest_arc(first: Floats, last: Floats, *, radius: float, turning: float) -> Floats:
+    """Find the poses nearest to `last` that an arc from `first` reaches, shape (B, 3).
 
     Args:
-        first: Where arcs begin.
-        last: Where they should end.
-        radius: Their least radius [m].
-        turning: How many metres an error of a radian counts [m/rad].
+        first: Start poses, shape (B, 3).
+        last: Desired poses, shape (B, 3).
+        radius: Smallest turning radius [m].
+        turning: Weight of heading errors [m/rad].
     """
     asked = (last - first)[:, 2:]
-    off = np.linspace(-_MOST, _MOST, _TRIED)
+    off = np.linspace(-_MAX_TURN_CHANGE, _MAX_TURN_CHANGE, _TURN_SAMPLES)
     turn = np.concatenate([asked + off, 0.0 * asked], axis=1)
     dx, dy = (last - first)[:, 0:1], (last - first)[:, 1:2]
     heading = first[:, 2:] + turn / 2
@@ -164,13 +178,16 @@ def nearest_arc(first: Floats, last: Floats, *, radius: float, turning: float) -
     return np.asarray(first + step)
 
 
-def spread_along(corners: Floats, steps: int, *, turning: float) -> Floats:
-    """Return `steps` poses along a path, shape (steps, 3), without its first: slow at both ends, and one at each corner.
+def sample_path(corners: Floats, steps: int, *, turning: float) -> Floats:
+    """Sample poses along a path of arcs, slow at both ends, with one at each corner if possible.
 
     Args:
-        corners: Of the path, shape (K, 3).
-        steps: How many.
-        turning: How many metres of driving take as long as turning by one radian [m/rad].
+        corners: Corners of the path, shape (K, 3).
+        steps: Number of poses.
+        turning: Cost of turning, relative to driving [m/rad].
+
+    Returns:
+        Poses without the first corner, shape (steps, 3).
     """
     change = np.diff(corners, axis=0)
     if not len(change):
@@ -184,40 +201,39 @@ def spread_along(corners: Floats, steps: int, *, turning: float) -> Floats:
     if steps < len(change):
         at = np.interp(profile[1:], passed, np.arange(len(passed)))
     else:
-        when = _whole(np.interp(passed, profile, s) * steps, steps)
+        when = _round_ascending(np.interp(passed, profile, s) * steps, steps)
         legs = enumerate(itertools.pairwise(when.tolist()))
         at = np.concatenate(
             [np.interp(profile[a + 1 : b + 1], profile[[a, b]], [k, k + 1.0]) for k, (a, b) in legs]
         )
     piece = np.minimum(np.ceil(at - _SAME).astype(int), len(change)) - 1
-    return between(corners[piece], corners[piece + 1], at - piece)
+    return interpolate_arcs(corners[piece], corners[piece + 1], at - piece)
 
 
-def _on(path: Floats, lengths: Floats) -> Iterator[tuple[Floats, Floats, float]]:
-    """Yield places on the straight parts of a path: between which corners, and at which share of the way."""
+def _sample_places(path: Floats, lengths: Floats) -> Iterator[tuple[Floats, Floats, float]]:
+    """Yield places on the straight parts of a path: two corners, and the share between them."""
     for a, b, length in zip(path, path[1:], lengths, strict=False):
-        count = int(np.ceil(length / _PLACES)) if length > _SAME else 0
+        count = int(np.ceil(length / _PLACE_SPACING)) if length > _SAME else 0
         yield from ((a, b, (k + 0.5) / count) for k in range(count))
 
 
-def _looks(curve: Floats) -> int:
-    """Return at how many poses a curve is looked at."""
-    return 1 + int(np.hypot(*np.diff(curve[:, :2], axis=0).T).sum() / _LOOK)
+def _count_checks(curve: Floats) -> int:
+    """Return the number of poses at which a curve is checked."""
+    return 1 + int(np.hypot(*np.diff(curve[:, :2], axis=0).T).sum() / _CHECK_SPACING)
 
 
-def _whole(when: Floats, steps: int) -> Ints:
-    """Return ascending whole numbers near `when`, ascending itself, from 0 to `steps`, no two of them equal."""
+def _round_ascending(when: Floats, steps: int) -> Ints:
+    """Round ascending numbers to distinct integers from 0 to `steps`."""
     order = np.arange(len(when))
-    found = np.maximum.accumulate(
-        np.rint(when).astype(int) - order
-    )  # each at least 1 after the one before
+    # Each is at least 1 above its predecessor.
+    found = np.maximum.accumulate(np.rint(when).astype(int) - order)
     found = np.minimum(found, steps - order[-1]) + order
     found[0] = 0
     return found
 
 
-def _seen(first: Floats, last: Floats, radius: float) -> Floats:
-    """Return poses as poses see them, both (B, 3), in units of a radius."""
+def _express_in_start_frame(first: Floats, last: Floats, radius: float) -> Floats:
+    """Return poses `last` relative to `first`, both (B, 3), in units of a radius."""
     (dx, dy), yaw = (last - first)[:, :2].T, first[:, 2]
     x, y = np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx
-    return np.column_stack([x / radius, y / radius, wrapped(last[:, 2] - yaw)])
+    return np.column_stack([x / radius, y / radius, wrap_angle(last[:, 2] - yaw)])

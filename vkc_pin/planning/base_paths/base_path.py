@@ -1,4 +1,4 @@
-"""The path of the mobile base from a start to the best of several goals: straight drives with turns between them."""
+"""Plans the base's path from a start to the best of several goals: straight drives and turns."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.grid import BaseGrid
-from vkc_pin.planning.base_paths.lattice_search import cheapest
-from vkc_pin.planning.base_paths.motion_primitives import Drive, Ground, wrapped
+from vkc_pin.planning.base_paths.lattice_search import find_cheapest_path
+from vkc_pin.planning.base_paths.motion_primitives import Drive, SearchSpace, wrap_angle
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["BasePath", "poses_along", "shortest_path"]
+__all__ = ["BasePath", "sample_poses", "shortest_path"]
 
-_KNOT = 0.5  # [m] between places where the path may be shortened
+_SHORTCUT_SPACING = 0.5  # [m] spacing of the points between which shortcuts are tried
 _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class BasePath:
-    """A path of the base: straight drives, forwards or backwards, with turns in place between them.
+    """Base path of straight drives, forwards or backwards, with turns in place between them.
 
     Attributes:
-        poses: x, y [m] and yaw [rad, continuous] where a drive or turn begins or ends; from the
-            start to the goal, shape (K, 3).
-        goal: Which goal it reaches.
-        cost: Metres driven, backwards times `BACKWARDS`, sideways next to start or goal times
-            `SIDEWAYS`, plus radians turned times `BaseGrid.turning`, plus the goal's extra cost
-            [m].
+        poses: x, y [m] and continuous yaw [rad] at the ends of drives and turns, from the start to
+            the goal, shape (K, 3).
+        goal: Number of the goal that it reaches.
+        cost: Length driven, backwards times `BACKWARDS`, sideways next to start or goal times
+            `SIDEWAYS`, plus the angle turned times `BaseGrid.turning`, plus the goal's additional
+            cost [m].
     """
 
     poses: Floats
@@ -46,19 +46,19 @@ def shortest_path(
     costs: Sequence[float] | Floats | None = None,
     smooth: bool = True,
 ) -> BasePath | None:
-    """Return the cheapest path from the start to one of the goals, or None if there is none.
+    """Find the cheapest path from the start to one of the goals, or None if there is none.
 
-    A blocked start can be left; goals that are blocked are not reached. Nothing here is random.
+    A blocked start can be left; blocked goals are not reached. The result is deterministic.
 
     Args:
-        grid: Where the base fits.
-        start: x, y, yaw [m, rad].
-        goals: The same for each goal, shape (G, 3).
-        costs: What reaching each goal costs beside the path, shape (G,) [m]; None: nothing.
-        smooth: Shorten the path over the grid where it turns more often than needed.
+        grid: Grid of free base poses.
+        start: x, y [m] and yaw [rad].
+        goals: Goal poses, shape (G, 3).
+        costs: Additional cost of each goal, shape (G,) [m]. Default: none.
+        smooth: Whether to shorten the path where it turns more often than necessary.
 
     Raises:
-        InputError: Shapes do not fit, or a number is not finite.
+        InputError: A shape is wrong, or a number is not finite.
     """
     begin, ends = np.asarray(start, float), np.asarray(goals, float)
     extra = np.zeros(len(ends)) if costs is None else np.asarray(costs, float)
@@ -70,29 +70,32 @@ def shortest_path(
         if value.shape != shape or not np.all(np.isfinite(value)):
             expected = f"finite numbers, shape {shape}"
             raise InputError(
-                "not what the search needs", field=field, expected=expected, got=value.tolist()
+                "wrong shape or values", field=field, expected=expected, got=value.tolist()
             )
     if np.any(extra < 0.0):
         raise InputError(
             "a cost is negative", field="costs", expected="numbers >= 0", got=extra.tolist()
         )
-    ground = Ground(grid, begin, ends)
-    found = cheapest(ground, extra)
+    space = SearchSpace(grid, begin, ends)
+    found = find_cheapest_path(space, extra)
     if found is None:
         return None
     _, goal, drives, yaw = found
     if smooth:
-        drives, yaw = _shortened(ground, drives, yaw)
-    return _assembled(ground, drives, yaw, goal, float(extra[goal]))
+        drives, yaw = _shorten(space, drives, yaw)
+    return _assemble(space, drives, yaw, goal, float(extra[goal]))
 
 
-def poses_along(path: BasePath, steps: int, *, turning: float) -> Floats:
-    """Return `steps` poses along a path, without its start, the last at its goal: slow at both ends, shape (steps, 3) [m, rad].
+def sample_poses(path: BasePath, steps: int, *, turning: float) -> Floats:
+    """Sample poses along a path without its start, slow at both ends, the last at its goal.
 
     Args:
-        path: The path.
-        steps: How many poses, at least 1.
-        turning: How many metres of driving take as long as turning by one radian [m/rad].
+        path: Base path.
+        steps: Number of poses, at least 1.
+        turning: Cost of turning, relative to driving [m/rad].
+
+    Returns:
+        Poses, shape (steps, 3) [m, rad].
     """
     if steps < 1:
         raise InputError("no waypoints", field="steps", expected="at least 1", got=steps)
@@ -107,25 +110,34 @@ def poses_along(path: BasePath, steps: int, *, turning: float) -> Floats:
     return poses
 
 
-def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[Drive], float]:
-    """Return drives, and the yaw at the goal, that go straight between places on the path where that is free and cheaper."""
-    forced = 0 if ground.leaving is None else 1  # the first drive leaves what the base stands in
-    result, yaw = drives[:forced], drives[0].yaw if forced else float(ground.start[2])
+def _shorten(space: SearchSpace, drives: list[Drive], last: float) -> tuple[list[Drive], float]:
+    """Replace drives by straight shortcuts where those are free and cheaper.
+
+    Args:
+        space: Search space.
+        drives: Drives of the path.
+        last: Yaw at the goal [rad].
+
+    Returns:
+        Drives, and the yaw at the goal [rad].
+    """
+    forced = 0 if space.exit_margins is None else 1  # the first drive leaves a blocked start
+    result, yaw = drives[:forced], drives[0].yaw if forced else float(space.start[2])
     rest = []
     for drive in drives[forced:]:
-        knots = np.linspace(drive.a, drive.b, 1 + max(1, int(drive.length / _KNOT)))
-        rest += [Drive(a, b, drive.yaw) for a, b in itertools.pairwise(knots)]
+        points = np.linspace(drive.a, drive.b, 1 + max(1, int(drive.length / _SHORTCUT_SPACING)))
+        rest += [Drive(a, b, drive.yaw) for a, b in itertools.pairwise(points)]
     while rest:
         yaws = np.array([yaw, *(drive.yaw for drive in rest), last])
-        turns = ground.grid.turning * np.abs(np.diff(yaws))
-        # Up to the end of each drive, turned as the path goes on there.
+        turns = space.grid.turning * np.abs(np.diff(yaws))
+        # Cost up to the end of each drive, including the turn to the next.
         cost = turns[0] + np.cumsum([drive.cost for drive in rest] + turns[1:])
         best, low, high = None, 1, len(rest)
         tried = high
         while low < tried:
             turns_to, limit = float(yaws[tried + 1]), float(cost[tried - 1])
-            straight = _straight(
-                ground, rest[0].a, rest[tried - 1].b, before=yaw, after=turns_to, limit=limit
+            straight = _find_shortcut(
+                space, rest[0].a, rest[tried - 1].b, before=yaw, after=turns_to, limit=limit
             )
             if straight is None:
                 high = tried - 1
@@ -135,63 +147,71 @@ def _shortened(ground: Ground, drives: list[Drive], last: float) -> tuple[list[D
         after = float(yaws[low + 1])
         drive, end = best or (rest[0], after)
         result.append(drive)
-        # The same turns from there on, counted from an equal angle.
+        # The same turns from there on, relative to an equivalent angle.
         rest = [Drive(other.a, other.b, other.yaw + end - after) for other in rest[low:]]
         yaw, last = drive.yaw, last + end - after
     return result, last
 
 
-def _straight(
-    ground: Ground, a: Floats, b: Floats, *, before: float, after: float, limit: float
+def _find_shortcut(
+    space: SearchSpace, a: Floats, b: Floats, *, before: float, after: float, limit: float
 ) -> tuple[Drive, float] | None:
-    """Return a straight drive, and the yaw after turning at its end, if these, and the turn before it, cost less than `limit`."""
+    """Return a straight drive between points, and the yaw after it, if it is free and cheap.
+
+    Args:
+        space: Search space.
+        a: Start, shape (2,) [m].
+        b: End, shape (2,) [m].
+        before: Yaw before the first turn [rad].
+        after: Yaw after the last turn, up to full turns [rad].
+        limit: Cost of drive and turns that must not be reached [m].
+    """
     found = []
     if np.hypot(*(b - a)) < _SAME:
         return None
     for backwards in (0.0, np.pi):
-        yaw = float(before + wrapped(np.arctan2(b[1] - a[1], b[0] - a[0]) + backwards - before))
-        drive, end = Drive(a, b, yaw), float(yaw + wrapped(after - yaw))
+        yaw = float(before + wrap_angle(np.arctan2(b[1] - a[1], b[0] - a[0]) + backwards - before))
+        drive, end = Drive(a, b, yaw), float(yaw + wrap_angle(after - yaw))
         found.append(
             (
-                drive.cost + ground.grid.turning * (abs(yaw - before) + abs(end - yaw)),
+                drive.cost + space.grid.turning * (abs(yaw - before) + abs(end - yaw)),
                 backwards,
                 drive,
                 end,
             )
         )
     cost, _, drive, end = min(found)
-    return (
-        (drive, end)
-        if cost < limit - _SAME and ground.likely(drive) and ground.swept(before, drive, end)
-        else None
+    is_useful = (
+        cost < limit - _SAME and space.looks_free(drive) and space.is_sweep_free(before, drive, end)
     )
+    return (drive, end) if is_useful else None
 
 
-def _assembled(
-    ground: Ground, drives: list[Drive], last: float, goal: int, extra: float
+def _assemble(
+    space: SearchSpace, drives: list[Drive], last: float, goal: int, extra: float
 ) -> BasePath:
-    """Return the path through `drives`, which ends at the yaw `last` [rad]."""
+    """Make a path of drives, merging those in line; `last` is the yaw at the goal [rad]."""
     merged: list[Drive] = []
     for drive in drives:
-        joined = Drive(merged[-1].a, drive.b, drive.yaw) if merged else drive
+        combined = Drive(merged[-1].a, drive.b, drive.yaw) if merged else drive
         if (
             merged
             and merged[-1].yaw == drive.yaw
-            and joined.length >= merged[-1].length + drive.length - _SAME
+            and combined.length >= merged[-1].length + drive.length - _SAME
         ):
-            merged[-1] = joined
+            merged[-1] = combined
         else:
             merged.append(drive)
-    turns = float(np.rint((last - ground.goals[goal, 2]) / (2 * np.pi)))
-    end = ground.goals[goal] + [0.0, 0.0, 2 * np.pi * turns]
-    poses = [ground.start]
+    turns = float(np.rint((last - space.goals[goal, 2]) / (2 * np.pi)))
+    end = space.goals[goal] + [0.0, 0.0, 2 * np.pi * turns]
+    poses = [space.start]
     for pose in [
         *(np.array([*place, drive.yaw]) for drive in merged for place in (drive.a, drive.b)),
         end,
     ]:
         if np.abs(pose - poses[-1]).max() > _SAME:
             poses.append(pose)
-    poses = [*poses[:-1], end] if len(poses) > 1 else [ground.start, end]
+    poses = [*poses[:-1], end] if len(poses) > 1 else [space.start, end]
     turned = sum(abs(b[2] - a[2]) for a, b in itertools.pairwise(poses))
-    cost = sum(drive.cost for drive in drives) + ground.grid.turning * turned + extra
+    cost = sum(drive.cost for drive in drives) + space.grid.turning * turned + extra
     return BasePath(np.array(poses), goal, float(cost))

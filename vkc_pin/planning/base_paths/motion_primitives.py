@@ -1,7 +1,7 @@
-"""How the mobile base moves between two places: it turns, drives straight, turns; what that costs, and where it is free.
+"""Defines how the base moves between two places, what that costs, and where it is free.
 
-It drives ahead or backwards. Only next to the start and the goals, where furniture may leave no
-room to turn, it may slide.
+The base turns, drives straight ahead or backwards, and turns. Only next to the start and the goals,
+where furniture may leave no space to turn, it may drive sideways.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ import numpy as np
 from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = ["BACKWARDS", "SIDEWAYS", "UNIT", "Connections", "Drive", "Ground", "wrapped"]
+__all__ = ["BACKWARDS", "SIDEWAYS", "UNIT", "Connections", "Drive", "SearchSpace", "wrap_angle"]
 
 BACKWARDS = 1.2
-"""What a metre driven backwards costs [m]."""
+"""Cost of a metre driven backwards [m]."""
 SIDEWAYS = 5.0
-"""What a metre costs on which the base slides instead of turning, near the start or a goal where it has no room to turn [m]."""
+"""Cost of a metre driven sideways, near the start or a goal where the base cannot turn [m]."""
 UNIT = 1e-6
-"""Costs on the grid are whole numbers of this [m], so that equal paths cost exactly the same."""
+"""Unit of costs on the grid [m]: they are integers, so that equal paths cost exactly the same."""
 
-# [m] from the start, and from the goals, to the cells where the path over the grid begins and ends
+# [m] from the start and the goals to the cells at which the path over the grid begins and ends
 _ENTRY = 0.6
-_CELL = 0.1  # [m]: where cells are smaller, so is the distance to them
-_LEAVE = 1.0  # [m]: so far a blocked start may be left in one go, if it overlaps something
-_AWAY = 10.0  # what a metre costs on which the base leaves what it overlaps
-_TRY = np.pi / 16  # [rad] of turning, tried step by step
+_FULL_CELL = 0.1  # [m] size below which cells shrink this range, too
+_EXIT_RANGE = 1.0  # [m] range of the first drive from a start in collision
+_EXIT_COST = 10.0  # cost of a metre of that drive
+_TURN_STEP = np.pi / 16  # [rad] increment by which turning ranges are checked
 _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A straight drive from a to b in the world, shape (2,) [m], at one yaw [rad]."""
+    """A straight drive from a to b in the world, shape (2,) [m], at a constant yaw [rad]."""
 
     a: Floats
     b: Floats
@@ -43,12 +43,12 @@ class Drive:
 
     @property
     def length(self) -> float:
-        """How long it is [m]."""
+        """Length [m]."""
         return float(np.hypot(self.b[0] - self.a[0], self.b[1] - self.a[1]))
 
     @property
     def cost(self) -> float:
-        """What it costs without turns [m]."""
+        """Cost without turns [m]."""
         ahead, length = float((self.b - self.a) @ (np.cos(self.yaw), np.sin(self.yaw))), self.length
         if abs(ahead) < (1.0 - _SAME) * length:
             return SIDEWAYS * length
@@ -57,13 +57,13 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """Of a pose with cells around it: turn, drive or slide straight, turn; arrays over the connections.
+    """Connections between a pose and cells around it: turn, drive straight, turn.
 
     Attributes:
-        cell: As i·cells + j.
-        heading: In the cell.
-        yaw: While driving [rad].
-        cost: [UNIT].
+        cell: Cells as i·cells + j, shape (C,).
+        heading: Headings in the cells, shape (C,).
+        yaw: Yaws while driving, shape (C,) [rad].
+        cost: Costs, shape (C,) [UNIT].
     """
 
     cell: Ints
@@ -72,20 +72,23 @@ class Connections:
     cost: Ints
 
     def select(self, which: Bools) -> Connections:
-        """Return some of them."""
+        """Return the connections selected by a mask, shape (C,)."""
         return Connections(self.cell[which], self.heading[which], self.yaw[which], self.cost[which])
 
 
-class Ground:
-    """Where the base may move in one search: near its start and its goals, only the base counts, elsewhere what it carries, too.
+class SearchSpace:
+    """Free space of one search.
+
+    Near the start and the goals only the base counts, elsewhere also arm and load.
 
     Attributes:
         near: For each cell, a place (0: start, then the goals) that it is near, shape (cells,
             cells); -1: none.
-        stuck: Where the base, or what counts of what it carries, is known to be blocked, shape
+        blocked: Where the base, or the relevant part of its load, is known to be blocked, shape
             (cells, cells, HEADINGS).
-        leaving: Margins kept when leaving the start, if that is blocked; see `BaseGrid.leaving`.
-        haste: What a metre costs when leaving the start.
+        exit_margins: Margins kept when leaving a blocked start; see
+            `BaseGrid.compute_exit_margins`.
+        exit_cost: Cost of a metre when leaving the start.
     """
 
     def __init__(self, grid: BaseGrid, start: Floats, goals: Floats) -> None:
@@ -94,37 +97,50 @@ class Ground:
         self._places = places if grid.near > 0.0 else places[:0]
         self.near = np.full((grid.cells, grid.cells), -1)
         for place, (x, y) in enumerate(self._places.tolist()):
-            self.near[tuple(grid.around(x, y, grid.near).T)] = place
-        self.stuck = grid.stuck | (grid.stuck_carrying & (self.near < 0)[..., None])
-        self.leaving = grid.leaving(*start)
-        self.haste = 1.0 if self.leaving is None or np.all(np.isfinite(self.leaving)) else _AWAY
+            self.near[tuple(grid.find_cells_within(x, y, grid.near).T)] = place
+        self.blocked = grid.blocked | (grid.carried_blocked & (self.near < 0)[..., None])
+        self.exit_margins = grid.compute_exit_margins(*start)
+        is_clear = self.exit_margins is None or np.all(np.isfinite(self.exit_margins))
+        self.exit_cost = 1.0 if is_clear else _EXIT_COST
 
-    def clear(self, pose: Floats) -> bool:
-        """Return whether the base is free at a pose."""
-        return self.grid.clear(*pose, reaching=self._reaching(pose[:2]))
+    def is_pose_free(self, pose: Floats) -> bool:
+        """Return whether a pose, shape (3,), is free."""
+        return self.grid.is_pose_free(*pose, reaching=self._is_near_end(pose[:2]))
 
-    def turned(self, at: Floats, start: float, end: float, margins: Floats | None = None) -> bool:
-        """Return whether the base can turn at a place from one yaw to another."""
-        return self.grid.turned(at, start, end, reaching=self._reaching(at), margins=margins)
-
-    def driven(self, drive: Drive, margins: Floats | None = None) -> bool:
-        """Return whether the base can drive there."""
-        return self.grid.base.driven(drive.a, drive.b, drive.yaw, margins) and all(
-            self.grid.carried.driven(a, b, drive.yaw) for a, b in self._outside(drive)
+    def is_turn_free(
+        self, at: Floats, start: float, end: float, margins: Floats | None = None
+    ) -> bool:
+        """Return whether the base can turn in place from one yaw to another."""
+        return self.grid.is_turn_free(
+            at, start, end, reaching=self._is_near_end(at), margins=margins
         )
 
-    def swept(
+    def is_drive_free(self, drive: Drive, margins: Floats | None = None) -> bool:
+        """Return whether a straight drive is free."""
+        return self.grid.base.is_drive_free(drive.a, drive.b, drive.yaw, margins) and all(
+            self.grid.carried.is_drive_free(a, b, drive.yaw)
+            for a, b in self._split_outside_ends(drive)
+        )
+
+    def is_sweep_free(
         self, before: float, drive: Drive, after: float, margins: Floats | None = None
     ) -> bool:
-        """Return whether the base can turn to a drive from one yaw, drive, and turn to another; `margins` up to there."""
+        """Return whether a drive and the turns before and after it are free.
+
+        Args:
+            before: Yaw before the first turn [rad].
+            drive: Straight drive.
+            after: Yaw after the last turn [rad].
+            margins: Margins of the first turn and the drive, shape (S,) [m]. Default: the grid's.
+        """
         return (
-            self.turned(drive.a, before, drive.yaw, margins)
-            and self.turned(drive.b, drive.yaw, after)
-            and self.driven(drive, margins)
+            self.is_turn_free(drive.a, before, drive.yaw, margins)
+            and self.is_turn_free(drive.b, drive.yaw, after)
+            and self.is_drive_free(drive, margins)
         )
 
-    def likely(self, drive: Drive) -> bool:
-        """Return whether none of the cells that a drive crosses is known to be blocked at about its heading."""
+    def looks_free(self, drive: Drive) -> bool:
+        """Return whether no cell along a drive is known to be blocked near its heading."""
         grid = self.grid
         count = int(np.hypot(*((drive.b - drive.a) / grid.step))) + 2
         cells = (
@@ -132,14 +148,14 @@ class Ground:
             .astype(int)
             .clip(0, grid.cells - 1)
         )
-        heading = int(np.abs(wrapped(grid.yaws - drive.yaw)).argmin())
-        return not self.stuck[cells[:, 0], cells[:, 1], heading].any()
+        heading = int(np.abs(wrap_angle(grid.yaws - drive.yaw)).argmin())
+        return not self.blocked[cells[:, 0], cells[:, 1], heading].any()
 
-    def _reaching(self, at: Floats) -> bool:
+    def _is_near_end(self, at: Floats) -> bool:
         return bool(np.any(np.hypot(*(self._places - at).T) <= self.grid.near))
 
-    def _outside(self, drive: Drive) -> Iterator[tuple[Floats, Floats]]:
-        """Yield the parts of a drive that are not near the start or a goal."""
+    def _split_outside_ends(self, drive: Drive) -> Iterator[tuple[Floats, Floats]]:
+        """Yield the parts of a drive that are near neither the start nor a goal."""
         along, from_place = drive.b - drive.a, drive.a - self._places
         # |a + t·along − place|² = near², a quadratic in t.
         square, mixed = float(along @ along), from_place @ along
@@ -163,105 +179,123 @@ class Ground:
                 yield drive.a + done * along, drive.a + min(begin, 1.0) * along
             done = max(done, end)
 
-    def starts(self) -> Connections:
+    def get_starts(self) -> Connections:
         """Return the connections from the start to the cells around it."""
         found = self._connections(
-            self.start, 1.0, _LEAVE if self.haste > 1.0 else _ENTRY, self.haste
+            self.start, 1.0, _EXIT_RANGE if self.exit_cost > 1.0 else _ENTRY, self.exit_cost
         )
-        # A search from the goals would find out last, after it has looked everywhere else.
-        return found.select(self.turnable(self.start, found, self.leaving))
+        # Checked first: a search from the goals would find out last.
+        return found.select(self.find_turnable(self.start, found, self.exit_margins))
 
-    def ends(self, goal: int) -> Connections:
+    def get_ends(self, goal: int) -> Connections:
         """Return the connections to a goal from the cells around it."""
         return self._connections(self.goals[goal], -1.0, _ENTRY, 1.0)
 
-    def _connections(self, pose: Floats, sign: float, radius: float, haste: float) -> Connections:
-        """Return those from a pose (`sign` 1), or to it (-1), within a radius [m], where a metre costs `haste`."""
+    def _connections(
+        self, pose: Floats, sign: float, radius: float, cost_factor: float
+    ) -> Connections:
+        """Return connections from a pose (`sign` 1) or to it (-1).
+
+        Args:
+            pose: Pose, shape (3,).
+            sign: Direction of the connections.
+            radius: Range [m].
+            cost_factor: Cost of a metre.
+        """
         grid = self.grid
         step = float(grid.step.max())
-        cells = grid.around(
-            float(pose[0]), float(pose[1]), max(radius * min(1.0, step / _CELL), 1.5 * step)
+        cells = grid.find_cells_within(
+            float(pose[0]), float(pose[1]), max(radius * min(1.0, step / _FULL_CELL), 1.5 * step)
         )
         offset = sign * (grid.origin + cells * grid.step - pose[:2])
         length = np.hypot(*offset.T)
         ahead = np.where(length > _SAME, np.arctan2(offset[:, 1], offset[:, 0]), pose[2])
         yaw = np.concatenate([ahead, ahead + np.pi, np.full(len(cells), pose[2])])
-        heading = np.abs(wrapped(yaw[:, None] - grid.yaws)).argmin(axis=1)
-        turned = np.abs(wrapped(yaw - pose[2])) + np.abs(wrapped(yaw - grid.yaws[heading]))
+        heading = np.abs(wrap_angle(yaw[:, None] - grid.yaws)).argmin(axis=1)
+        turned = np.abs(wrap_angle(yaw - pose[2])) + np.abs(wrap_angle(yaw - grid.yaws[heading]))
         cost = (
-            haste * np.concatenate([length, BACKWARDS * length, SIDEWAYS * length])
+            cost_factor * np.concatenate([length, BACKWARDS * length, SIDEWAYS * length])
             + grid.turning * turned
         )
         found = Connections(
             np.tile(cells @ [grid.cells, 1], 3), heading, yaw, np.rint(cost / UNIT).astype(int)
         )
-        return found.select(~self.stuck.reshape(-1, len(grid.yaws))[found.cell, heading])
+        return found.select(~self.blocked.reshape(-1, len(grid.yaws))[found.cell, heading])
 
-    def turnable(
+    def find_turnable(
         self, pose: Floats, connections: Connections, margins: Floats | None = None
     ) -> Bools:
-        """Return for which connections the base can turn at the pose between its yaw and theirs, up to a few degrees more."""
+        """Return for which connections the base can turn at the pose to their yaw, shape (C,).
+
+        The turning range is overestimated by at most a few degrees.
+        """
         key = (
             pose.tobytes(),
-            self._reaching(pose[:2]),
+            self._is_near_end(pose[:2]),
             None if margins is None else margins.tobytes(),
         )
-        if key not in self.grid.turns:  # one start, or goal, has paths to many
-            self.grid.turns[key] = (
-                self._turns(pose, 1.0, margins) + _TRY,
-                self._turns(pose, -1.0, margins) + _TRY,
+        if key not in self.grid.turn_limits:  # a start or goal belongs to many searches
+            self.grid.turn_limits[key] = (
+                self._measure_turn(pose, 1.0, margins) + _TURN_STEP,
+                self._measure_turn(pose, -1.0, margins) + _TURN_STEP,
             )
-        left, right = self.grid.turns[key]
-        turn = wrapped(connections.yaw - pose[2])
+        left, right = self.grid.turn_limits[key]
+        turn = wrap_angle(connections.yaw - pose[2])
         return (turn < left) & (turn > -right)
 
-    def _turns(self, pose: Floats, side: float, margins: Floats | None) -> float:
-        """Return how far the base can turn at a pose to the left (`side` 1) or right (-1), up to half a turn [rad]."""
+    def _measure_turn(self, pose: Floats, side: float, margins: Floats | None) -> float:
+        """Return how far the base can turn left (`side` 1) or right (-1), at most π [rad]."""
         turned = 0.0
-        while turned < np.pi and self.turned(
-            pose[:2], pose[2] + side * turned, pose[2] + side * (turned + _TRY), margins
+        while turned < np.pi and self.is_turn_free(
+            pose[:2], pose[2] + side * turned, pose[2] + side * (turned + _TURN_STEP), margins
         ):
-            turned += _TRY
+            turned += _TURN_STEP
         return turned
 
-    def begin(self, connections: Connections, number: int) -> tuple[Drive, float]:
-        """Return the drive of a connection from the start, and the yaw in its cell."""
-        yaw = float(self.start[2] + wrapped(connections.yaw[number] - self.start[2]))
+    def get_start_drive(self, connections: Connections, number: int) -> tuple[Drive, float]:
+        """Return the drive of a connection from the start, and the yaw in its cell [rad]."""
+        yaw = float(self.start[2] + wrap_angle(connections.yaw[number] - self.start[2]))
         drive = Drive(self.start[:2], self.center(connections.cell[number]), yaw)
         return drive, float(
-            drive.yaw + wrapped(self.grid.yaws[connections.heading[number]] - drive.yaw)
+            drive.yaw + wrap_angle(self.grid.yaws[connections.heading[number]] - drive.yaw)
         )
 
-    def end(
+    def get_goal_drive(
         self, connections: Connections, number: int, goal: int, yaw: float
     ) -> tuple[Drive, float]:
-        """Return the drive of a connection to a goal from its cell, where the base has a yaw, and the yaw at the goal."""
+        """Return the drive of a connection to a goal from a cell with given yaw, and the goal's yaw."""
         pose = self.goals[goal]
         drive = Drive(
             self.center(connections.cell[number]),
             pose[:2],
-            float(yaw + wrapped(connections.yaw[number] - yaw)),
+            float(yaw + wrap_angle(connections.yaw[number] - yaw)),
         )
-        return drive, float(drive.yaw + wrapped(pose[2] - drive.yaw))
+        return drive, float(drive.yaw + wrap_angle(pose[2] - drive.yaw))
 
-    def direct(self, goal: int, how: int) -> tuple[Drive, float] | None:
-        """Return the straight drive from the start to a goal, ahead (0), backwards (1) or sideways (2), and the yaw there.
+    def get_direct_drive(self, goal: int, how: int) -> tuple[Drive, float] | None:
+        """Return the straight drive from the start to a goal, and the yaw at the goal.
 
-        None if it is too long for this: sideways, or from a blocked start.
+        Args:
+            goal: Number of the goal.
+            how: 0: ahead, 1: backwards, 2: sideways.
+
+        Returns:
+            Drive and yaw [rad]; None if it is too long, sideways or from a blocked start.
         """
         a, b, yaw = self.start[:2], self.goals[goal, :2], float(self.start[2])
         if how < 2 and np.hypot(*(b - a)) > _SAME:
-            yaw += float(wrapped(np.arctan2(b[1] - a[1], b[0] - a[0]) + np.pi * how - yaw))
+            yaw += float(wrap_angle(np.arctan2(b[1] - a[1], b[0] - a[0]) + np.pi * how - yaw))
         drive = Drive(a, b, yaw)
-        if drive.length > (_ENTRY if how == 2 else np.inf if self.leaving is None else _LEAVE):
+        limit = _ENTRY if how == 2 else np.inf if self.exit_margins is None else _EXIT_RANGE
+        if drive.length > limit:
             return None
-        return drive, float(yaw + wrapped(self.goals[goal, 2] - yaw))
+        return drive, float(yaw + wrap_angle(self.goals[goal, 2] - yaw))
 
     def center(self, cell: int) -> Floats:
         """Return the centre of a cell, given as i·cells + j, shape (2,) [m]."""
         return np.array(self.grid.center(*divmod(int(cell), self.grid.cells)))
 
 
-def wrapped(angle: Any) -> Any:
-    """Return an angle, or an array of them, between -π and π."""
+def wrap_angle(angle: Any) -> Any:
+    """Wrap an angle, or an array of angles, to [-π, π)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi

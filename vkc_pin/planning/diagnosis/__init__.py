@@ -1,1 +1,1 @@
-"""Why a task cannot be done, as far as that is known."""
+"""Explains why a task cannot be solved."""

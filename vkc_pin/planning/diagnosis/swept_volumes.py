@@ -1,4 +1,4 @@
-"""What a joint of an object takes its links into on the way to where it is to go, whoever moves it."""
+"""Proves that an object's link collides on the way to its goal, whoever moves it."""
 
 from __future__ import annotations
 
@@ -12,28 +12,30 @@ from vkc_pin.world.scene.clearance_exemptions import PlacedShapes, find_clearanc
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.task.phases import Phase
 
-__all__ = ["swept"]
+__all__ = ["find_swept_collisions"]
 
-_SURE = 1e-3  # [m] of overlap: more than validation lets pass
-_VALUES = 200  # of a joint between begin and goal
+_CERTAIN_OVERLAP = 1e-3  # [m] more than validation accepts
+_SAMPLES = 200  # joint values between start and goal
 
 
-def swept(problem: TrajectoryProblem) -> list[str]:
-    """Return why joints of objects cannot get to where a task wants them, for certain; no line at all proves nothing.
+def find_swept_collisions(problem: TrajectoryProblem) -> list[str]:
+    """Explain which object joints certainly cannot reach their goals.
 
-    A link that one joint alone moves is, on any motion, in all places between begin and goal, and
-    so in what stands there.
+    A link that depends on a single joint passes all positions between start and goal on any motion.
+
+    Returns:
+        Explanations; none if nothing is proven.
     """
     for phase in problem.task.phases:
         for coordinate in phase.values:
-            text = _hit(problem, phase, coordinate)
+            text = _find_collision(problem, phase, coordinate)
             if text:
-                return [f"{phase.name}: no way for {coordinate}, {PROVEN}{text}"]
+                return [f"{phase.name}: no path for {coordinate}, {PROVEN}{text}"]
     return []
 
 
-def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
-    """Return what a joint takes a link into in a phase; empty if nothing is certain."""
+def _find_collision(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
+    """Return which link a joint moves into what in a phase; empty if no collision is certain."""
     scene, (name, _, joint) = problem.scene, coordinate.partition(".")
     placed = scene.objects[name]
     if placed.object.free:
@@ -42,7 +44,7 @@ def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
         phase.initial_values[coordinate],
         float(np.clip(phase.values[coordinate], *problem.limits(coordinate))),
     )
-    values = np.linspace(begin, end, _VALUES)
+    values = np.linspace(begin, end, _SAMPLES)
     fixed = {owner: one for owner, one in scene.objects.items() if not one.object.free}
     standing, known = (
         PlacedShapes(scene, fixed),
@@ -62,7 +64,7 @@ def _hit(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
     others = {label for label in others if not standing.find_joints(label)} | set(
         scene.obstacle_labels
     ) - {FLOOR}
-    deepest, text = -_SURE, ""
+    deepest, text = -_CERTAIN_OVERLAP, ""
     index = placed.object.coordinates.index(joint)
     for label in links:
         for other in sorted(others & standing.find_links_near_sweep(label, index, values)):

@@ -1,1 +1,1 @@
-"""Trajectories for the solver to start from."""
+"""Generates initial guesses for the solver."""

@@ -1,4 +1,4 @@
-"""Pushes single configurations out of collision while what must hold there goes on holding, many at once."""
+"""Moves configurations out of collision while their pose constraint stays satisfied."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["clear_out"]
+__all__ = ["resolve_collisions"]
 
-_CLEARING_ROUNDS = 10  # Gauss-Newton steps at most
+_CLEARING_ROUNDS = 10  # maximum number of Gauss-Newton steps
 _DAMPING = 3e-4  # added to the diagonal of the normal equations
 
 
-def clear_out(
+def resolve_collisions(
     problem: TrajectoryProblem,
     z: Floats,
     waypoint: int,
@@ -27,23 +27,25 @@ def clear_out(
     upper: Floats,
     weights: Floats,
 ) -> Floats:
-    """Return configurations that are further from collision than `z`, as far as a few damped Gauss-Newton steps get them.
+    """Move configurations out of collision with a few damped Gauss-Newton steps.
 
-    Each step asks for the residuals of the pose to vanish and for the contacts that fall short of
-    their margins to keep them, linearised: with the witness points fixed in their bodies the
-    gradient of a distance d = n·(b − a) is n·(∂b − ∂a). It aims at `Options.dist_safe` more than
-    the margins, looks at `Options.contact_slots` contacts, the nearest, and is no longer than
-    `MAX_STEP`.
+    Each step drives the residuals of the pose to zero and violated contacts to their margins, both
+    linearized: with the witness points fixed in their bodies, the gradient of a distance
+    d = n·(b − a) is n·(∂b − ∂a). It aims at `Options.dist_safe` beyond the margins, considers the
+    `Options.contact_slots` nearest contacts, and is limited to `MAX_STEP`.
 
     Args:
-        problem: Whose contacts count.
+        problem: Problem.
         z: Configurations that satisfy the pose, shape (B, n).
-        waypoint: The waypoint they are for.
-        solver: Of the pose.
-        target: Of the pose.
-        lower: Limits, shape (B, n).
-        upper: Limits, shape (B, n).
-        weights: What moving a coordinate costs, shape (n,).
+        waypoint: Their waypoint.
+        solver: Inverse kinematics of the pose.
+        target: Target of the pose.
+        lower: Lower limits, shape (B, n).
+        upper: Upper limits, shape (B, n).
+        weights: Weight of each coordinate, shape (n,).
+
+    Returns:
+        The configurations, which may still be in collision, shape (B, n).
     """
     z, done, options = z.copy(), np.zeros(len(z), bool), problem.options
     extra, slots = options.dist_safe, options.contact_slots
@@ -58,7 +60,7 @@ def clear_out(
         short = contacts.compute_shortfall(len(at))
         residual, pose_rows = solver.evaluate(z[at], target)
         done[at] = (short <= 0.0) & (np.abs(residual).max(axis=1) < TOLERANCE)
-        # Gradients of the nearest distances, and by how much they should grow [m].
+        # Gradients of the nearest distances, and their required increase [m].
         rows, growth = np.zeros((len(at), slots, z.shape[1])), np.zeros((len(at), slots))
         rows[contacts.waypoint, contacts.slot] = problem.contacts.compute_gradients(z[at], contacts)
         growth[contacts.waypoint, contacts.slot] = np.maximum(

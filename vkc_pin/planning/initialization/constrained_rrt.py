@@ -1,9 +1,9 @@
-"""The robot's path while something fixed is held, by random trees on the manifold on which the hand stays where it holds.
+"""Finds paths of closed-chain phases with constrained RRT on the closure manifold.
 
 Two trees whose steps are projected to the manifold (Berenson, Srinivasa, Ferguson and Kuffner,
-*Manipulation planning on constraint manifolds*, ICRA 2009) grow towards random configurations that
-are on it. How far the objects' joints are on the way that the task has for them is one more
-coordinate: a door may wait until the arm is out of its frame.
+*Manipulation planning on constraint manifolds*, ICRA 2009) grow towards random configurations on
+it. The progress of the object joints along their given motion is one more coordinate: a door may
+wait until the arm is out of its frame.
 """
 
 from __future__ import annotations
@@ -12,208 +12,243 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.planning.initialization.keyframes import SCATTER, Knots, depth
-from vkc_pin.planning.initialization.rrt import STEP, spread
+from vkc_pin.planning.initialization.keyframes import (
+    SAMPLE_COUNT,
+    KeyframeSampler,
+    compute_shortfall,
+)
+from vkc_pin.planning.initialization.rrt import STEP, resample_path
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = ["held_path", "obstructed"]
+__all__ = ["find_constrained_path", "is_obstructed"]
 
 
-def obstructed(knots: Knots, phase: int, through: Floats, straight: Floats) -> bool:
-    """Return whether something is in the straight way through a phase, and trees may lead around it.
+def is_obstructed(sampler: KeyframeSampler, phase: int, through: Floats, straight: Floats) -> bool:
+    """Return whether straight lines through a phase are in collision and trees may help.
 
-    Not where the base drives on wheels, whose arcs trees do not know, or where the robot overlaps
-    things as the phase begins.
+    Trees do not help a base with wheels, whose arcs they ignore, or a phase that starts in
+    collision.
 
     Args:
-        knots: Of the problem.
-        phase: The phase's number, in which something fixed is held.
-        through: Configurations at its begin, within and at its end, shape (K, n).
-        straight: Its waypoints on straight lines through them, shape (steps, n).
+        sampler: Keyframe sampler of the problem.
+        phase: Number of the phase, with a closed chain.
+        through: Configurations at its keyframes, shape (K, n).
+        straight: Waypoints on straight lines through them, shape (steps, n).
     """
-    if knots.curves is not None:
+    if sampler.curves is not None:
         return False
-    search = _Search(knots, phase, len(straight))
-    closed, _ = search.close(straight, np.arange(search.begin + 1.0, search.end + 1.0))
-    return not search.free(closed).all() and bool(search.free(through[:1]).all())
+    search = _Search(sampler, phase, len(straight))
+    closed, _ = search.project(straight, np.arange(search.begin + 1.0, search.end + 1.0))
+    return not search.are_free(closed).all() and bool(search.are_free(through[:1]).all())
 
 
-def held_path(knots: Knots, phase: int, through: Floats, steps: int, tries: int) -> Floats | None:
-    """Return waypoints of a phase in which something fixed is held, closed, from the first of some configurations.
+def find_constrained_path(
+    sampler: KeyframeSampler, phase: int, through: Floats, steps: int, tries: int
+) -> Floats | None:
+    """Find waypoints of a closed-chain phase from the first of some configurations.
 
     Args:
-        knots: Of the problem, whose base does not drive on wheels.
-        phase: The phase's number.
-        through: Configurations at its begin, within and at its end, shape (K, n).
-        steps: How many waypoints the phase has.
-        tries: How often trees may grow until they meet.
+        sampler: Keyframe sampler of the problem, whose base has no steered wheels.
+        phase: Number of the phase.
+        through: Configurations at its keyframes, shape (K, n).
+        steps: Number of waypoints of the phase.
+        tries: Maximum number of tree extensions.
 
     Returns:
-        The waypoints, shape (steps, n), which overlap nothing but may end elsewhere; None if none
-        are found.
+        Collision-free waypoints, shape (steps, n), which may end at another configuration; None if
+        no path was found.
 
     Raises:
-        SpentError: The effort of planning is spent.
+        SpentError: The planning budget is exhausted.
     """
-    search = _Search(knots, phase, steps)
+    search = _Search(sampler, phase, steps)
     path = search.run(through, tries)
-    return None if path is None else search.spread(search.shortened(path), steps)
+    return None if path is None else search.resample(search.shorten(path), steps)
 
 
 class _Path(NamedTuple):
-    """Configurations, shape (P, n), and the waypoints, not whole numbers, as whose the objects' joints are there, shape (P,)."""
+    """Configurations, shape (P, n), and their progress as fractional waypoints, shape (P,)."""
 
     z: Floats
     at: Floats
 
 
 class _Tree:
-    """Configurations, each with the waypoint as whose the objects' joints are there, and the node that it grew from."""
+    """Tree of configurations, each with its progress (a fractional waypoint) and its parent."""
 
     def __init__(self, z: Floats, at: Floats) -> None:
         self.z, self.at, self.parents = z, at, np.full(len(z), -1)
 
     def add(self, z: Floats, at: Floats, parents: Ints) -> Ints:
-        """Add nodes; return their numbers."""
+        """Add nodes; return their indices."""
         self.z, self.at = np.concatenate([self.z, z]), np.concatenate([self.at, at])
         self.parents = np.concatenate([self.parents, parents])
         return np.arange(len(self.z) - len(z), len(self.z))
 
-    def branch(self, node: int) -> _Path:
-        """Return the way from a node to its root."""
-        way = [node]
-        while self.parents[way[-1]] >= 0:
-            way.append(int(self.parents[way[-1]]))
-        return _Path(self.z[way], self.at[way])
+    def trace_to_root(self, node: int) -> _Path:
+        """Return the path from a node to its root."""
+        nodes = [node]
+        while self.parents[nodes[-1]] >= 0:
+            nodes.append(int(self.parents[nodes[-1]]))
+        return _Path(self.z[nodes], self.at[nodes])
 
 
 class _Search:
-    """Looks for paths through one phase, which has so many waypoints.
+    """Searches paths through one phase.
 
     Attributes:
-        begin: The waypoint at which the phase before ends.
-        end: The phase's last waypoint.
+        begin: Last waypoint of the phase before.
+        end: Last waypoint of the phase.
     """
 
-    def __init__(self, knots: Knots, phase: int, steps: int) -> None:
-        self.knots, self.problem = knots, knots.problem
+    def __init__(self, sampler: KeyframeSampler, phase: int, steps: int) -> None:
+        self.sampler, self.problem = sampler, sampler.problem
         self.end = int(self.problem.ends[phase])
         self.begin = self.end - steps
         self.waypoint = self.problem.contacts.find_waypoint(phase)
-        pose = knots.pose_at(self.end)
-        assert pose is not None, "what is held closes the chain"
-        self.solver, self.target = knots.solver(pose)
-        before = self.problem.start if self.begin == 0 else knots.objects[self.begin - 1]
-        self.moved = np.vstack([before, knots.objects[self.begin : self.end]])[:, knots.driven]
-        self.chosen = knots.chosen(self.end)
+        pose = sampler.find_pose(self.end)
+        assert pose is not None, "a grasped articulated object closes the chain"
+        self.solver, self.target = sampler.get_pose_solver(pose)
+        before = self.problem.start if self.begin == 0 else sampler.object_motion[self.begin - 1]
+        self.object_motion = np.vstack([before, sampler.object_motion[self.begin : self.end]])[
+            :, sampler.object_columns
+        ]
+        self.grasp_columns = sampler.find_grasp_columns(self.end)
 
-    def close(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
-        """Return the nearest configurations with the objects as they are at waypoints, in the hand, and which of them are."""
-        z, driven = z.copy(), self.knots.driven
+    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
+        """Project configurations, shape (B, n), to the closure manifold.
+
+        Args:
+            z: Configurations.
+            at: Their progress, shape (B,); it determines the object joints.
+
+        Returns:
+            Projected configurations, and a mask of those that satisfy the closure.
+        """
+        z, columns = z.copy(), self.sampler.object_columns
         whole = np.arange(self.begin, self.end + 1)
-        z[:, driven] = np.column_stack([np.interp(at, whole, column) for column in self.moved.T])
-        lower, upper = self.knots.limits(z, self.waypoint)
-        lower[:, driven] = upper[:, driven] = z[:, driven]
+        z[:, columns] = np.column_stack(
+            [np.interp(at, whole, column) for column in self.object_motion.T]
+        )
+        lower, upper = self.sampler.compute_limits(z, self.waypoint)
+        lower[:, columns] = upper[:, columns] = z[:, columns]
         return self.solver.solve(
             z,
             self.target,
             lower=lower,
             upper=upper,
-            weights=self.knots.weights,
+            weights=self.sampler.weights,
             tolerance=TOLERANCE,
         )
 
-    def free(self, z: Floats) -> Bools:
-        """Return which configurations overlap nothing, shape (B,): the solver pushes apart what is too close."""
-        return depth(self.problem, z, self.waypoint, reach=0.0) <= self.problem.options.dist_safe
+    def are_free(self, z: Floats) -> Bools:
+        """Return which configurations are nearly collision-free, shape (B,): the solver does the rest."""
+        return (
+            compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
+            <= self.problem.options.dist_safe
+        )
 
-    def apart(self, z: Floats, other: Floats) -> Floats:
-        """Return how far configurations are from others in the metric of searches."""
-        return np.asarray(np.linalg.norm((z - other) * self.knots.weights, axis=-1))
+    def compute_distances(self, z: Floats, other: Floats) -> Floats:
+        """Return distances between configurations in the metric of searches."""
+        return np.asarray(np.linalg.norm((z - other) * self.sampler.weights, axis=-1))
 
-    def drawn(self, through: Floats, waypoint: int) -> Floats:
-        """Return random configurations at a waypoint that hold what is held, as it was grasped, and overlap nothing."""
-        before, found = through[np.arange(SCATTER // 4) % len(through)], []
+    def sample_free(self, through: Floats, waypoint: int) -> Floats:
+        """Sample collision-free configurations at a waypoint with the grasp of the first one."""
+        before, found = through[np.arange(SAMPLE_COUNT // 4) % len(through)], []
         for how in ("scatter", "shake"):
-            z, closed = self.knots.knot(before, waypoint, how)
-            found.append(z[closed & (z[:, self.chosen] == through[0, self.chosen]).all(axis=1)])
+            z, closed = self.sampler.sample(before, waypoint, how)
+            found.append(
+                z[closed & (z[:, self.grasp_columns] == through[0, self.grasp_columns]).all(axis=1)]
+            )
         z = np.concatenate(found)
-        return z[self.free(z)] if len(z) else z
+        return z[self.are_free(z)] if len(z) else z
 
     def run(self, through: Floats, tries: int) -> _Path | None:
-        """Return a path from the first of some configurations to the end of the phase; None if trees do not meet."""
-        ends = np.vstack([through[-1:], self.drawn(through, self.end)])
-        ends = ends[self.free(ends)]
+        """Find a path from the first configuration to the end of the phase; None if there is none."""
+        ends = np.vstack([through[-1:], self.sample_free(through, self.end)])
+        ends = ends[self.are_free(ends)]
         one, other = (
             _Tree(through[:1], np.array([float(self.begin)])),
             _Tree(ends, np.full(len(ends), float(self.end))),
         )
         forwards, grown, tips = True, 0, np.zeros(1, int)
         while len(ends) and grown < tries:
-            path = self.meet(one, other, tips)
+            path = self.try_connect(one, other, tips)
             if path is not None:
                 return path if forwards else _Path(path.z[::-1], path.at[::-1])
             forwards, one, other = not forwards, other, one
-            waypoint = int(self.knots.rng.integers(self.begin + 1, self.end + 1))
-            goals = self.drawn(through, waypoint)
+            waypoint = int(self.sampler.rng.integers(self.begin + 1, self.end + 1))
+            goals = self.sample_free(through, waypoint)
             tips = np.unique(self.grow(one, goals, np.full(len(goals), float(waypoint))))
             grown += max(len(goals), 1)
         return None
 
-    def meet(self, tree: _Tree, other: _Tree, tips: Ints) -> _Path | None:
-        """Grow the other tree towards nodes of one; return the path from root to root if they meet."""
+    def try_connect(self, tree: _Tree, other: _Tree, tips: Ints) -> _Path | None:
+        """Grow `other` towards the `tips` of `tree`; return the connecting path if they meet."""
         if not len(tips):
             return None
         reached = self.grow(other, tree.z[tips], tree.at[tips])
-        gaps = self.apart(other.z[reached], tree.z[tips])
+        gaps = self.compute_distances(other.z[reached], tree.z[tips])
         best = int(np.argmin(gaps))
         if gaps[best] > STEP:
             return None
-        here, there = tree.branch(int(tips[best])), other.branch(int(reached[best]))
+        here, there = tree.trace_to_root(int(tips[best])), other.trace_to_root(int(reached[best]))
         return _Path(np.vstack([here.z[::-1], there.z]), np.concatenate([here.at[::-1], there.at]))
 
     def grow(self, tree: _Tree, goals: Floats, at: Floats) -> Ints:
-        """Grow a tree towards configurations at waypoints, step by step as far as it goes; return where each way ends, (B,)."""
-        ends = np.array([int(np.argmin(self.apart(tree.z, goal))) for goal in goals], int)
+        """Grow a tree step by step towards goals; return the last node of each branch, shape (B,)."""
+        ends = np.array(
+            [int(np.argmin(self.compute_distances(tree.z, goal))) for goal in goals], int
+        )
         going = np.arange(len(goals))
         while len(going):
-            left = self.apart(tree.z[ends[going]], goals[going])
+            left = self.compute_distances(tree.z[ends[going]], goals[going])
             going, left = going[left > STEP], left[left > STEP]
             here, share = ends[going], STEP / left
-            moved, closed = self.close(
+            moved, closed = self.project(
                 tree.z[here] + share[:, None] * (goals[going] - tree.z[here]),
                 now := tree.at[here] + share * (at[going] - tree.at[here]),
             )
-            nearer = left - self.apart(moved, goals[going])
-            good = closed & (self.apart(moved, tree.z[here]) <= 2.0 * STEP) & (nearer > STEP / 4.0)
-            good[good] = self.free(moved[good])
+            nearer = left - self.compute_distances(moved, goals[going])
+            good = (
+                closed
+                & (self.compute_distances(moved, tree.z[here]) <= 2.0 * STEP)
+                & (nearer > STEP / 4.0)
+            )
+            good[good] = self.are_free(moved[good])
             going = going[good]
             ends[going] = tree.add(moved[good], now[good], here[good])
         return ends
 
-    def shortened(self, path: _Path) -> _Path:
-        """Return a path that goes straight, but for closures, between random places on it where nothing is in the way."""
+    def shorten(self, path: _Path) -> _Path:
+        """Shortcut a path between random points on it, with steps projected to the manifold."""
         for _ in range(len(path.z)):
-            first, last = sorted(self.knots.rng.integers(len(path.z), size=2))
-            count = int(np.ceil(self.apart(path.z[first], path.z[last]) / STEP))
+            first, last = sorted(self.sampler.rng.integers(len(path.z), size=2))
+            count = int(np.ceil(self.compute_distances(path.z[first], path.z[last]) / STEP))
             if not 1 < count < last - first:
                 continue
             share = np.arange(1, count)[:, None] / count
             at = path.at[first] + share[:, 0] * (path.at[last] - path.at[first])
-            between, closed = self.close(path.z[first] + share * (path.z[last] - path.z[first]), at)
-            way = np.vstack([path.z[first], between, path.z[last]])
-            gaps, before = self.apart(way[1:], way[:-1]), path.z[first : last + 1]
-            shorter = (
-                gaps.max() <= 2.0 * STEP and gaps.sum() < self.apart(before[1:], before[:-1]).sum()
+            middle, closed = self.project(
+                path.z[first] + share * (path.z[last] - path.z[first]), at
             )
-            if closed.all() and shorter and self.free(between).all():
-                z = np.vstack([path.z[: first + 1], between, path.z[last:]])
+            shortcut = np.vstack([path.z[first], middle, path.z[last]])
+            gaps = self.compute_distances(shortcut[1:], shortcut[:-1])
+            before = path.z[first : last + 1]
+            shorter = (
+                gaps.max() <= 2.0 * STEP
+                and gaps.sum() < self.compute_distances(before[1:], before[:-1]).sum()
+            )
+            if closed.all() and shorter and self.are_free(middle).all():
+                z = np.vstack([path.z[: first + 1], middle, path.z[last:]])
                 path = _Path(z, np.concatenate([path.at[: first + 1], at, path.at[last:]]))
         return path
 
-    def spread(self, path: _Path, steps: int) -> Floats | None:
-        """Return waypoints along a path, shape (steps, n), slow at both ends; None if one of them cannot be closed."""
-        rows = spread(np.column_stack([path.z, path.at]), steps, np.append(self.knots.weights, 0.0))
-        rows, closed = self.close(rows[:, :-1], rows[:, -1])
+    def resample(self, path: _Path, steps: int) -> Floats | None:
+        """Resample a path to `steps` waypoints, slow at both ends; None if a projection fails."""
+        rows = resample_path(
+            np.column_stack([path.z, path.at]), steps, np.append(self.sampler.weights, 0.0)
+        )
+        rows, closed = self.project(rows[:, :-1], rows[:, -1])
         return rows if closed.all() else None

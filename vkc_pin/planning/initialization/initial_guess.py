@@ -1,4 +1,4 @@
-"""Trajectories for the solver to start from, and what problems of some of the same phases hand on to them."""
+"""Defines initial guesses for the solver, and makes them from solutions of parts of a task."""
 
 from __future__ import annotations
 
@@ -12,50 +12,49 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import PhaseKey
 from vkc_pin.world.trajectory.splicing import fill_missing_values
 
-__all__ = ["PhaseWaypoints", "Seed", "perturbed", "seed_of"]
+__all__ = ["InitialGuess", "PhaseWaypoints", "make_initial_guess", "perturb"]
 
-# [m] and [rad] trust region at first: what is nearly free already is improved in smaller steps
+# [m], [rad] initial trust region: a nearly feasible guess is improved in smaller steps
 _WARM_RADIUS = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Seed:
-    """A trajectory to start from.
+class InitialGuess:
+    """Initial guess of a trajectory.
 
     Attributes:
-        name: The method, and the number of the try if it is not the first.
+        name: Initialization method, with the number of the attempt from the second on.
         z: z_1..z_N, shape (N, n).
-        overlap: The most that a waypoint lacks of its clearance beyond `Options.dist_safe` [m]; NaN
-            if nobody looked.
-        radius: How far the solver believes planes at first, shape (N,); None: as usual.
+        penetration: Largest clearance shortfall at a waypoint beyond `Options.dist_safe` [m]; NaN
+            if unknown.
+        radius: Initial trust-region radii, shape (N,) [m] or [rad]. Default: the solver's.
     """
 
     name: str
     z: Floats
-    overlap: float = float("nan")
+    penetration: float = float("nan")
     radius: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseWaypoints:
-    """Waypoints of phases that follow one another.
+    """Waypoints of consecutive phases.
 
     Attributes:
-        phases: What happens in the phases.
-        names: Of the n coordinates.
-        waypoints: Their waypoints, for each phase, from its first, which is the last of the phase
-            before, to its last.
-        seed: The name of the seed that led to them.
+        phases: Keys of the phases.
+        names: Names of the n coordinates.
+        waypoints: Waypoints of each phase, from the last one of the phase before to its own last.
+        initialization: Name of the initial guess that led to them.
     """
 
     phases: tuple[PhaseKey, ...]
     names: tuple[str, ...]
     waypoints: tuple[Floats, ...]
-    seed: str
+    initialization: str
 
 
-def seed_of(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> Seed:
-    """Return the waypoints of `parts`, one after the other, as those of the whole problem, however many these are."""
+def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> InitialGuess:
+    """Concatenate waypoints of parts of a task to an initial guess for the whole task."""
     chain = problem.chain
     z = np.full((problem.segments, chain.size), np.nan)
     begin = number = 0
@@ -63,27 +62,25 @@ def seed_of(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> Seed
         count = len(part.phases)
         phases = problem.task.phases[number : number + count]
         if part.phases != tuple(phase.key for phase in phases):
-            # only to let go of something the robot stands still for a while; here that has no phase
-            # of its own
+            # A phase that only waits for the gripper to open is no phase of the whole task.
             continue
         number += count
-        known = [
-            k for k, name in enumerate(part.names) if name in chain.names
-        ]  # the rest belongs to what is held no more
+        # The other coordinates belong to objects that are no longer attached.
+        known = [k for k, name in enumerate(part.names) if name in chain.names]
         columns = [chain.index(part.names[k]) for k in known]
         for phase, waypoints in zip(phases, part.waypoints, strict=True):
-            z[begin : begin + phase.segments, columns] = _resampled(
+            z[begin : begin + phase.segments, columns] = _resample(
                 waypoints[:, known], phase.segments
             )
             begin += phase.segments
     z = fill_missing_values(z)
-    z = np.where(np.isnan(z), problem.start, z)  # no part moves it
-    name = ", ".join(part.seed for part in parts) + ", then all at once"
-    return Seed(name, z, radius=np.full(problem.segments, _WARM_RADIUS))
+    z = np.where(np.isnan(z), problem.start, z)  # coordinates that no part moves
+    name = ", ".join(part.initialization for part in parts) + ", then all at once"
+    return InitialGuess(name, z, radius=np.full(problem.segments, _WARM_RADIUS))
 
 
-def _resampled(waypoints: Floats, segments: int) -> Floats:
-    """Return `segments` waypoints after the first along those given, shape (K, n)."""
+def _resample(waypoints: Floats, segments: int) -> Floats:
+    """Resample waypoints, shape (K, n), to `segments` waypoints after the first."""
     if len(waypoints) == segments + 1:
         return waypoints[1:]
     at = np.linspace(0.0, len(waypoints) - 1, segments + 1)[1:]
@@ -92,10 +89,17 @@ def _resampled(waypoints: Floats, segments: int) -> Floats:
     )
 
 
-def perturbed(
+def perturb(
     problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator
 ) -> Floats:
-    """Return a seed with smooth noise on the robot's coordinates: half waves in time, of amplitudes as their lengths squared."""
+    """Add smooth noise to the robot's coordinates: sine half-waves with amplitudes ∝ length².
+
+    Args:
+        problem: Problem.
+        z: z_1..z_N, shape (N, n).
+        deviation: Standard deviation of the noise [m] or [rad].
+        rng: Random number generator.
+    """
     robot, waves = problem.chain.robot.coordinates.size, np.arange(1, len(z) + 1)
     shape = np.sin(np.pi * np.outer(waves / (len(z) + 1), waves)) / waves**2
     noise = (

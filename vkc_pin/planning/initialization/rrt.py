@@ -1,8 +1,8 @@
-"""A path of base and arm together from one configuration to another, by two random trees that grow towards each other.
+"""Finds paths of base and arm between two configurations with RRT-Connect.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is drawn near a
-path that it could drive, the arm near postures it is likely to need there, so that narrow passages
-are found soon.
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is sampled near a
+guide path, the arm near postures that are likely to be needed there, so that narrow passages are
+found quickly.
 """
 
 from __future__ import annotations
@@ -14,34 +14,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vkc_pin.planning.initialization.keyframes import depth, smooth
+from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_smoothstep
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import spend
 from vkc_pin.utils.optional_imports import compiled_module
 
-__all__ = ["STEP", "TRIES", "connect", "far_round", "spread"]
+__all__ = ["MAX_EXTENSIONS", "STEP", "connect", "has_arm_detour", "resample_path"]
 
-TRIES = 1500
-"""How often a tree may grow until they meet."""
+MAX_EXTENSIONS = 1500
+"""Maximum number of tree extensions."""
 STEP = 0.15
-"""Between configurations that are looked at, in the metric of searches: [rad] of a joint."""
+"""Distance between collision checks, in the metric of searches: [rad] of a joint."""
 
-_STEPS = (
-    STEP,
-    0.04,
-)  # of one search after the other: the latter where the former overlooked something
-# times that the arm and each of its joints are tried to be straightened between random places
-_STRAIGHTENINGS = 11
-# share of a path's length that is to be saved by it, or by all of that once more where the arm goes
-# far round
-_WORTH = 1e-3
-_DETOUR = (
-    1 / 3
-    # share of a path that the arm goes beyond its straight way, up to which no other one is looked for
-)
-_BESIDE_PATH = 0.1  # [m] and [rad] standard deviation, at most, of bases beside their path
-_AROUND = 0.4  # [m] and [rad] standard deviation, at most, of bases around the ends, and of arms
+# of successive searches: the second if the first one missed a collision
+_STEP_SIZES = (STEP, 0.04)
+_SHORTCUT_ROUNDS = 11  # partial shortcuts per coordinate between random points
+# relative saving in length that a shortcut needs, or a further round of shortcuts
+_MIN_SAVING = 1e-3
+# share of a path by which the arm may exceed its straight path before another one is searched for
+_MAX_DETOUR = 1 / 3
+_PATH_SPREAD = 0.1  # [m], [rad] largest standard deviation of base samples from the guide path
+_END_SPREAD = 0.4  # [m], [rad] largest standard deviation of base samples at the ends, and of arms
 
 
 def connect(
@@ -53,58 +47,61 @@ def connect(
     poses: Floats,
     arms: Floats,
     rng: np.random.Generator,
-    tries: int = TRIES,
+    tries: int = MAX_EXTENSIONS,
 ) -> Floats | None:
-    """Return configurations of the robot, straight between which hardly anything is hit, shape (K, m), or None if none are found.
+    """Find a nearly collision-free path of the robot.
 
     Args:
-        problem: Whose robot and phase it is.
-        phase: In which nothing fixed is held.
-        first: Where the path begins, shape (n,); what is not the robot stays so.
-        ends: Where it may end, shape (E, m).
-        poses: x, y [m] and yaw [rad] on a path that the base may take, shape (P, 3).
-        arms: Postures that are likely to be needed, shape (A, m - 3) [m] and [rad].
-        rng: Random numbers.
-        tries: How often a tree may grow.
+        problem: Problem.
+        phase: Number of the phase, an open one.
+        first: Start configuration, shape (n,); coordinates outside the robot stay constant.
+        ends: Possible end configurations, shape (E, m).
+        poses: x, y [m] and yaw [rad] along a guide path of the base, shape (P, 3).
+        arms: Arm postures that are likely to be needed, shape (A, m - 3) [m] or [rad].
+        rng: Random number generator.
+        tries: Maximum number of tree extensions.
+
+    Returns:
+        Corners of the path, shape (K, m); None if no path was found.
     """
-    coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEPS)
+    coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEP_SIZES)
     path = coarse.run(ends, tries)
-    if path is not None and not fine.free(path):
+    if path is not None and not fine.is_free(path):
         path = fine.run(ends, tries)
-    return None if path is None else fine.straightened(path)
+    return None if path is None else fine.straighten(path)
 
 
-def far_round(problem: TrajectoryProblem, z: Floats) -> bool:
-    """Return whether the arm goes far round in a phase of a motion, z_1..z_N of shape (N, n), in which nothing fixed is held."""
+def has_arm_detour(problem: TrajectoryProblem, z: Floats) -> bool:
+    """Return whether the arm takes a detour in an open phase of a motion z_1..z_N, shape (N, n)."""
     rows, metric = (
         problem.waypoints(z)[:, : problem.chain.robot.coordinates.size],
         problem.chain.metric,
     )
     spans = zip(problem.task.phases, itertools.pairwise([0, *problem.ends.tolist()]), strict=True)
-    ways = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.closed(phase)]
-    return any(_detour(way, metric[: way.shape[1]]) > _DETOUR for way in ways)
+    paths = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.closed(phase)]
+    return any(_compute_detour(path, metric[: path.shape[1]]) > _MAX_DETOUR for path in paths)
 
 
-def _detour(path: Floats, metric: Floats) -> float:
-    """Return which share of a path of the robot, shape (K, m), the arm goes beyond its straight way, in a metric, shape (m,)."""
+def _compute_detour(path: Floats, metric: Floats) -> float:
+    """Return the share of a robot path, shape (K, m), by which the arm exceeds its straight path."""
     base, arm = np.split(path * metric, [3], axis=1)
-    way, driven = (
+    length, driven = (
         np.abs(np.diff(arm, axis=0)).sum(),
         np.linalg.norm(np.diff(base, axis=0), axis=1).sum(),
     )
-    return float((way - np.abs(arm[-1] - arm[0]).sum()) / max(way + driven, 1e-12))
+    return float((length - np.abs(arm[-1] - arm[0]).sum()) / max(length + driven, 1e-12))
 
 
-def spread(path: Floats, steps: int, metric: Floats) -> Floats:
-    """Return `steps` configurations along a path, shape (K, m), without its first: slow at both ends, shape (steps, m)."""
+def resample_path(path: Floats, steps: int, metric: Floats) -> Floats:
+    """Resample a path, shape (K, m), to `steps` rows without its first, slow at both ends."""
     lengths = np.linalg.norm(np.diff(path, axis=0) * metric, axis=1)
     passed = np.concatenate([[0.0], np.cumsum(lengths + 1e-12)])
-    at = passed[-1] * smooth(steps)
+    at = passed[-1] * sample_smoothstep(steps)
     return np.column_stack([np.interp(at, passed, column) for column in path.T])
 
 
 class _Search:
-    """Looks for paths in one phase, in which nothing fixed is held; what takes long is compiled (`_trees.cpp`)."""
+    """Searches paths in one open phase; expensive parts are compiled (`_trees.cpp`)."""
 
     def __init__(
         self,
@@ -126,24 +123,23 @@ class _Search:
         )
         self.size = problem.chain.robot.coordinates.size
         self.waypoint = problem.contacts.find_waypoint(phase)
-        self.allowed = (
-            problem.options.dist_safe
-        )  # all of a margin may be missing: the solver pushes that apart
+        # Shortfalls up to the margin are allowed: the solver resolves them.
+        self.allowed = problem.options.dist_safe
         self.weights = problem.chain.metric[: self.size]
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
         self.lower, self.upper = np.ascontiguousarray(limits.T)
 
     def run(self, ends: Floats, tries: int) -> Floats | None:
-        """Return the path to one of `ends`."""
-        short = self._depth(ends)
-        ends = ends[short <= max(self.allowed, short.min())]
-        path = self._trees.run(_array(self.first[None, : self.size]), _array(ends), tries)
+        """Find a path to one of `ends`, shape (E, m); None if there is none."""
+        shortfall = self._compute_shortfall(ends)
+        ends = ends[shortfall <= max(self.allowed, shortfall.min())]
+        path = self._trees.run(_as_rows(self.first[None, : self.size]), _as_rows(ends), tries)
         self._spend()
-        return self._shortened(path) if len(path) else None
+        return self._shorten(path) if len(path) else None
 
     @cached_property
-    def runs(self) -> list[Floats]:
-        """The parts of the base's path that are free with each of the arms, each shape (R, m)."""
+    def free_runs(self) -> list[Floats]:
+        """Collision-free sections of the guide path with each of the arms, shape (R, m) each."""
         runs = []
         for arm in self.arms:
             rows = np.clip(
@@ -151,8 +147,8 @@ class _Search:
                 self.lower,
                 self.upper,
             )
-            between = (rows[1:] + rows[:-1]) / 2
-            free = self._depth(np.concatenate([rows, between])) <= self.allowed
+            middles = (rows[1:] + rows[:-1]) / 2
+            free = self._compute_shortfall(np.concatenate([rows, middles])) <= self.allowed
             begin = None
             for k in range(len(rows)):
                 if begin is None and free[k]:
@@ -166,7 +162,7 @@ class _Search:
 
     @cached_property
     def _lines(self) -> Any:
-        """Looks at straight lines."""
+        """Collision checker of straight lines."""
         contacts, weights = self.problem.contacts, self.weights
         return contacts.make_line_checker(
             self.first,
@@ -179,68 +175,71 @@ class _Search:
 
     @cached_property
     def _trees(self) -> Any:
-        """Grows trees, and straightens what they find."""
-        runs = np.concatenate(self.runs) if self.runs else np.empty((0, self.size))
-        rows = map(_array, (self.weights, self.lower, self.upper, self.poses, self.arms, runs))
+        """Compiled trees and shortcuts."""
+        runs = np.concatenate(self.free_runs) if self.free_runs else np.empty((0, self.size))
+        rows = map(_as_rows, (self.weights, self.lower, self.upper, self.poses, self.arms, runs))
         lengths, seed = (
-            np.array([len(run) for run in self.runs], np.int64),
+            np.array([len(run) for run in self.free_runs], np.int64),
             int(self.rng.integers(2**63)),
         )
         module = compiled_module("vkc_pin.planning.initialization._trees")
-        return module.Trees(self._lines, *rows, lengths, _BESIDE_PATH, _AROUND, seed)
+        return module.Trees(self._lines, *rows, lengths, _PATH_SPREAD, _END_SPREAD, seed)
 
     def _spend(self) -> None:
         spend(self._lines.looked())
 
-    def free(self, path: Floats) -> bool:
-        """Return whether hardly anything is hit along a path, shape (K, m)."""
-        return all(self.along(a, b) == 1.0 for a, b in itertools.pairwise(path))
+    def is_free(self, path: Floats) -> bool:
+        """Return whether a path, shape (K, m), is nearly collision-free."""
+        return all(self.compute_free_share(a, b) == 1.0 for a, b in itertools.pairwise(path))
 
-    def along(self, a: Floats, b: Floats) -> float:
-        """Return what share of the straight line from `a` to `b`, both (m,), is free."""
-        share = float(self._trees.along(_array([a, b])))
+    def compute_free_share(self, a: Floats, b: Floats) -> float:
+        """Return the collision-free share of the straight line from `a` to `b`, both (m,)."""
+        share = float(self._trees.along(_as_rows([a, b])))
         self._spend()
         return share
 
-    def _depth(self, rows: Floats) -> Floats:
-        """Return how far the robot, shape (B, m), falls short of its margins where it overlaps something, shape (B,) [m]."""
+    def _compute_shortfall(self, rows: Floats) -> Floats:
+        """Return the clearance shortfall of overlapping pairs for robot rows, shape (B, m): (B,) [m]."""
         z = np.tile(self.first, (len(rows), 1))
         z[:, : self.size] = rows
-        return depth(self.problem, z, self.waypoint, reach=0.0)
+        return compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
 
-    def _shortened(self, path: Floats) -> Floats:
-        """Return a path that goes straight between random places on it, as many as it has, where nothing is in the way."""
-        path = self._trees.shortened(_array(path))
+    def _shorten(self, path: Floats) -> Floats:
+        """Shortcut a path between random points on it, as many times as it has rows."""
+        path = self._trees.shortened(_as_rows(path))
         self._spend()
         return path
 
-    def straightened(self, path: Floats) -> Floats:
-        """Return a path on which the arm, and each of its joints alone, moves evenly between two places where nothing hinders it.
+    def straighten(self, path: Floats) -> Floats:
+        """Straighten the motion of the arm, and of each joint alone, where that is collision-free.
 
-        What leads through a passage with another posture takes all joints along; straight lines of
-        all coordinates seldom undo that, and the solver cannot, since things are between. So
-        coordinates are taken apart (partial shortcuts: Geraerts and Overmars, IJRR 2007), at first
-        all along the path, then between random places on it; where the arm goes far round, as long
-        as that is worth it.
+        A path through a narrow passage with another posture moves all joints. Straight lines in all
+        coordinates seldom undo that, and the solver cannot, because obstacles are in between. So
+        coordinates are treated separately (partial shortcuts: Geraerts and Overmars, IJRR 2007),
+        first along the whole path, then between random points on it. Detours of the arm are treated
+        repeatedly as long as that pays off.
         """
-        length, path = np.inf, self._evened(path, 0)
-        while self.length(path) < (1.0 - _WORTH) * length:
-            length, path = self.length(path), self._evened(path, _STRAIGHTENINGS)
-            if _detour(path, self.weights) <= _DETOUR:
+        length, path = np.inf, self._shorten_partially(path, 0)
+        while self.compute_length(path) < (1.0 - _MIN_SAVING) * length:
+            length, path = (
+                self.compute_length(path),
+                self._shorten_partially(path, _SHORTCUT_ROUNDS),
+            )
+            if _compute_detour(path, self.weights) <= _MAX_DETOUR:
                 break
         return path
 
-    def _evened(self, path: Floats, times: int) -> Floats:
-        """Return a path tried to be straightened all along it (`times` 0), or so many times between random places on it."""
-        path = self._trees.evened(_array(path), times, _WORTH)
+    def _shorten_partially(self, path: Floats, times: int) -> Floats:
+        """Apply partial shortcuts, along the whole path (`times` 0) or between random points."""
+        path = self._trees.evened(_as_rows(path), times, _MIN_SAVING)
         self._spend()
         return path
 
-    def length(self, path: Floats) -> float:
-        """Return how long a path is, shape (K, m)."""
+    def compute_length(self, path: Floats) -> float:
+        """Return the length of a path, shape (K, m)."""
         return float(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1).sum())
 
 
-def _array(rows: ArrayLike) -> Floats:
-    """Return rows as compiled code takes them."""
+def _as_rows(rows: ArrayLike) -> Floats:
+    """Return rows as a contiguous array, as the compiled code expects it."""
     return np.ascontiguousarray(rows, float)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vkc_pin.planning.base_paths.arcs import between
+from vkc_pin.planning.base_paths.arcs import interpolate_arcs
 from vkc_pin.planning.retiming.jerk_limits import limit_jerk
 from vkc_pin.planning.retiming.limits import Limits
 from vkc_pin.planning.retiming.spline_path import fit_path
@@ -122,7 +122,7 @@ def _subdivide(positions: Floats, places: Ints, rolling: RollingLimits) -> Float
     if rolling.is_omnidirectional or len(points) == len(positions):
         return points
     step = np.minimum(at.astype(int), len(positions) - 2)
-    points[:, :3] = between(positions[step, :3], positions[step + 1, :3], at - step)
+    points[:, :3] = interpolate_arcs(positions[step, :3], positions[step + 1, :3], at - step)
     return points
 
 

@@ -1,4 +1,4 @@
-"""Ipopt inside the loop of witness planes, and what comes out."""
+"""Solves trajectory problems with Ipopt in a loop over witness planes."""
 
 from vkc_pin.planning.solver.loop import solve
 

@@ -1,4 +1,4 @@
-"""The sequential witness-plane loop: subproblems in a trust region, judged by an exact ℓ1 merit function."""
+"""Runs the witness-plane loop: trust-region subproblems, globalized by an exact ℓ1 merit function."""
 
 from __future__ import annotations
 
@@ -10,181 +10,196 @@ import numpy as np
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.segment_planes import collisions_between, merge
+from vkc_pin.planning.solver.segment_planes import find_segment_contacts, merge_contacts
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.subproblem import Subproblem
 from vkc_pin.planning.solver.trust_region import (
+    ACTIVE_FRACTION,
     BLOCK_TIME,
-    CLOSE_ENOUGH,
-    INSIDE,
+    CLEARANCE_TOLERANCE,
     Trial,
     TrustRegion,
-    judge,
+    is_step_acceptable,
 )
-from vkc_pin.planning.solver.tunnelling import Passage, new
+from vkc_pin.planning.solver.tunnelling import Crossing, find_new_crossings
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import ENDINGS, SpentError, spend
 
 __all__ = ["solve"]
 
-# [m], [rad] of clearance, or of closures, goals and grasps, that is missing of a motion that nearly
-# holds
-NEARLY = 0.01
-# rounds in which what is missing must fall; accepted ones, where hardly any clearance is missing
+# [m], [rad] violation of clearance, or of closures, goals and grasps, up to which a trajectory
+# counts as nearly feasible
+NEARLY_FEASIBLE = 0.01
+# rounds within which the infeasibility must decrease; near feasibility only accepted rounds count
 PROGRESS_ROUNDS = 5
-PROGRESS = 0.7  # share of what was missing to which it must fall, or the motion is given up
-WORTHWHILE = (
-    0.05  # relative decrease of the objective for which a feasible motion is improved further
-)
+PROGRESS = 0.7  # factor by which the infeasibility must decrease in these rounds
+MIN_IMPROVEMENT = 0.05  # relative decrease of the objective that justifies further rounds
 
 
 class _Loop:
-    """The state between rounds: the current waypoints, their contacts, what does not hold there, and weights."""
+    """State between rounds: waypoints, contacts, infeasibility and penalty weights."""
 
-    def __init__(self, problem: TrajectoryProblem, seed: Floats, weight: float) -> None:
+    def __init__(self, problem: TrajectoryProblem, guess: Floats, weight: float) -> None:
         self.problem, self.options = problem, problem.options
-        self.z = problem.clip(seed)
+        self.z = problem.clip(guess)
         self.timing = problem.timing_for(self.z)
         self.rates = False
         self.merit = Merit(weight)
         self.solution = Solution(self.z, self.timing.dt)
         self.subproblem = Subproblem(problem, self.solution)
-        self.feasible: tuple[Floats, Floats] | None = (
-            None  # the last motion at which everything held
-        )
+        # The last feasible waypoints and their time steps.
+        self.feasible: tuple[Floats, Floats] | None = None
 
     def begin(self) -> None:
-        """Find what is close and what does not hold at the seed."""
-        self.at, _, self.passages = self.contacts(self.z)
-        self.look()
+        """Evaluate contacts, infeasibility and objective at the initial guess."""
+        self.at, _, self.crossings = self.find_contacts(self.z)
+        self.evaluate_iterate()
 
-    def look(self) -> None:
-        """Find anew what does not hold at the current waypoints, and what they cost."""
-        self.found = self.missing(self.z, self.at)
+    def evaluate_iterate(self) -> None:
+        """Evaluate infeasibility, objective and pose error at the current waypoints."""
+        self.found = self.compute_infeasibility(self.z, self.at)
         self.objective = self.problem.objective(self.z, self.timing.dt)
         self.pose_error = self.problem.row_error(self.z, self.timing.dt)
 
-    def missing(self, z: Floats, at: Contacts) -> Infeasibility:
-        """Return what does not hold at waypoints."""
+    def compute_infeasibility(self, z: Floats, at: Contacts) -> Infeasibility:
+        """Return the constraint violations at waypoints, shape (N, n), with given contacts."""
         return measure_infeasibility(self.problem, z, self.timing, at, rates=self.rates)
 
-    def contacts(self, z: Floats) -> tuple[Contacts, bool, list[Passage]]:
-        """Return what is close at the waypoints and between them, whether all is far enough, and what goes through each other."""
+    def find_contacts(self, z: Floats) -> tuple[Contacts, bool, list[Crossing]]:
+        """Find contacts at waypoints and within segments.
+
+        Args:
+            z: z_1..z_N, shape (N, n).
+
+        Returns:
+            Contacts; whether all clearances hold; pairs that pass through each other.
+        """
         begin = time.perf_counter()
         found = self.problem.evaluate_contacts(
             z, reach=self.options.contact_reach, nearest=self.options.contact_slots
         )
-        between = collisions_between(self.problem, z)
+        segments = find_segment_contacts(self.problem, z)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        clear = between.free and found.compute_violation() < CLOSE_ENOUGH
-        return merge(found, between.contacts), clear, between.passages
+        is_clear = segments.is_free and found.compute_violation() < CLEARANCE_TOLERANCE
+        return merge_contacts(found, segments.contacts), is_clear, segments.crossings
 
     def try_step(self, radius: Floats) -> Trial:
-        """Solve within `radius` of the current waypoints, and look at what is really there."""
-        z, slack, shares, satisfied = self.subproblem.solve(
+        """Solve the subproblem within `radius`, shape (N,), and evaluate the trial point."""
+        z, slack, relaxation, succeeded = self.subproblem.solve(
             self.z, self.at, self.found, self.merit, self.timing, radius, rates=self.rates
         )
-        contacts, clear, passed = self.contacts(z)
-        promise = (
+        contacts, is_clear, crossings = self.find_contacts(z)
+        predicted_penalty = (
             self.merit.weights["clearance"] * slack
-            + self.merit.compute_penalty(self.found, clearance=False) * shares
+            + self.merit.compute_penalty(self.found, clearance=False) * relaxation
         )
         return Trial(
             z=z,
-            promise=promise,
+            predicted_penalty=predicted_penalty,
             objective=self.problem.objective(z, self.timing.dt),
             pose_error=self.problem.row_error(z, self.timing.dt),
-            found=self.missing(z, contacts),
+            infeasibility=self.compute_infeasibility(z, contacts),
             contacts=contacts,
-            clear=clear,
-            passages=passed,
-            rate=self.timing.compute_violation(*self.problem.pace(z)),
+            is_clear=is_clear,
+            crossings=crossings,
+            rate_excess=self.timing.compute_violation(*self.problem.pace(z)),
             step=np.abs(z - self.z).max(axis=1),
-            satisfied=satisfied,
+            succeeded=succeeded,
         )
 
-    def prices(self, trial: Trial) -> tuple[Floats, Floats]:
-        """Return what all that is missing costs at every waypoint, before a round and where it led, shape (N,) each.
+    def compute_penalties(self, trial: Trial) -> tuple[Floats, Floats]:
+        """Return the penalty at each waypoint for iterate and trial, shape (N,) each.
 
-        It is infinite where a pair goes through each other that did not before. Of what is no
-        motion yet that says nothing.
+        The trial's penalty is infinite where a pair newly passes through each other, once the poses
+        are nearly feasible. Before, the waypoints do not describe a motion yet.
         """
         before, after = (
-            self.merit.compute_penalty(found, clearance=True) for found in (self.found, trial.found)
+            self.merit.compute_penalty(found, clearance=True)
+            for found in (self.found, trial.infeasibility)
         )
-        if self.found.amounts["poses"].max() < NEARLY:
-            for passage in new(trial.passages, self.passages):
-                after[max(passage.first - 1, 0) : passage.last + 1] = np.inf
+        if self.found.amounts["poses"].max() < NEARLY_FEASIBLE:
+            for crossing in find_new_crossings(trial.crossings, self.crossings):
+                after[max(crossing.first - 1, 0) : crossing.last + 1] = np.inf
         return before, after
 
-    def judge(self, trial: Trial, before: Floats, after: Floats) -> bool:
-        """Return whether enough of the promised decrease came true to accept a step; `before` and `after`: see `prices`."""
-        missing, gain = float(before.sum()), self.objective - trial.objective
-        return judge(
-            gain + missing - float(trial.promise.sum()),
-            gain + missing - float(after.sum()),
-            self.objective + missing,
+    def is_acceptable(self, trial: Trial, before: Floats, after: Floats) -> bool:
+        """Return whether the actual merit reduction is large enough to accept a step.
+
+        Args:
+            trial: Trial point.
+            before: Penalties of the iterate, shape (N,); see `compute_penalties`.
+            after: Penalties of the trial, shape (N,).
+        """
+        penalty, gain = float(before.sum()), self.objective - trial.objective
+        return is_step_acceptable(
+            gain + penalty - float(trial.predicted_penalty.sum()),
+            gain + penalty - float(after.sum()),
+            self.objective + penalty,
         )
 
     def accept(self, trial: Trial) -> None:
-        """Go on from `trial`."""
-        far = self.found.max_violation > TOLERANCE
-        self.z, self.at, self.found, self.passages = (
+        """Make `trial` the iterate; adapt time steps and rate limits to it."""
+        was_infeasible = self.found.max_violation > TOLERANCE
+        self.z, self.at, self.found, self.crossings = (
             trial.z,
             trial.contacts,
-            trial.found,
-            trial.passages,
+            trial.infeasibility,
+            trial.crossings,
         )
         self.objective, self.pose_error = trial.objective, trial.pose_error
         self.solution.z = trial.z
-        if far and not self.rates:  # what was no motion yet says little about how long one takes
+        # Infeasible waypoints are a poor estimate of how long the motion takes.
+        if was_infeasible and not self.rates:
             self.timing = self.problem.timing_for(self.z)
             self.solution.dt = self.timing.dt
-            self.look()
-        nearly = trial.contacts.compute_violation() < NEARLY
-        if nearly and trial.rate > TOLERANCE:  # before, limits on rates only cost time
+            self.evaluate_iterate()
+        nearly_clear = trial.contacts.compute_violation() < NEARLY_FEASIBLE
+        if nearly_clear and trial.rate_excess > TOLERANCE:  # earlier, rate limits only cost time
             pace = self.problem.pace(trial.z)
             self.timing = self.timing.stretch(*pace)
             self.solution.dt = self.timing.dt
             if not self.rates and self.timing.compute_violation(*pace) > TOLERANCE:
                 self.rates = True
-                self.subproblem.forget()
-            self.look()
+                self.subproblem.reset_multipliers()
+            self.evaluate_iterate()
 
-    def done(self, trial: Trial) -> bool:
-        """Return whether everything holds at the waypoints of a step just accepted, and nothing collides between them."""
+    def has_converged(self, trial: Trial) -> bool:
+        """Return whether an accepted trial satisfies all constraints, also within segments."""
         return (
-            trial.satisfied
-            and trial.clear
+            trial.succeeded
+            and trial.is_clear
             and self.pose_error < TOLERANCE
             and self.timing.compute_violation(*self.problem.pace(trial.z)) <= TOLERANCE
         )
 
-    def grow(self) -> bool:
-        """Make dearer what is missing; return whether anything could be."""
-        self.subproblem.forget()
-        return self.merit.increase_weights(self.found, CLOSE_ENOUGH)
+    def raise_penalties(self) -> bool:
+        """Raise the penalty weights of violated constraints; return whether any was raised."""
+        self.subproblem.reset_multipliers()
+        return self.merit.increase_weights(self.found, CLEARANCE_TOLERANCE)
 
 
 def solve(
     problem: TrajectoryProblem,
-    seed: Floats,
+    guess: Floats,
     *,
     callback: Callable[[Iteration], None] | None = None,
     rounds: int | None = None,
     radius: Floats | None = None,
 ) -> Solution:
-    """Return the trajectory that the witness-plane loop reaches from `seed`, or the best iterate when the budget is at its end.
+    """Solve a problem with the witness-plane loop, starting from an initial guess.
 
     Args:
-        problem: What to solve.
-        seed: z_1..z_N, shape (N, n).
+        problem: Problem to solve.
+        guess: Initial guess z_1..z_N, shape (N, n).
         callback: Called after every round.
-        rounds: At most so many rounds; None: `Options.max_outer`.
-        radius: How far planes are believed at first, shape (N,): `Solution.radius` where another
-            solution goes on.
+        rounds: Maximum number of rounds. Default: `Options.max_outer`.
+        radius: Initial trust-region radius at each waypoint, shape (N,) [m] or [rad]. Pass
+            `Solution.radius` to continue another solution.
+
+    Returns:
+        The solution, or the best iterate when the budget is exhausted.
     """
-    loop = _Loop(problem, seed, problem.options.penalty)
+    loop = _Loop(problem, guess, problem.options.penalty)
     solution = loop.solution
     region = TrustRegion(problem.segments, problem.options.steps(BLOCK_TIME), radius)
     try:
@@ -192,15 +207,14 @@ def solve(
         _iterate(loop, region, callback, loop.options.max_outer if rounds is None else rounds)
     except SpentError as end:
         solution.status = "converged" if solution.converged else str(end)
-    if (
-        loop.feasible is not None
-    ):  # rounds after the first feasible one only made it shorter, or failed to
+    # Rounds after the first feasible one only try to shorten the trajectory.
+    if loop.feasible is not None:
         solution.z, solution.dt = loop.feasible
     elif solution.status not in ENDINGS:
-        short = problem.evaluate_contacts(
+        shortfall = problem.evaluate_contacts(
             solution.z, reach=problem.options.largest_margin, nearest=1
         ).compute_violation()
-        solution.astray = short if short > NEARLY else 0.0
+        solution.shortfall = shortfall if shortfall > NEARLY_FEASIBLE else 0.0
     solution.radius = region.radius
     return solution
 
@@ -208,16 +222,16 @@ def solve(
 def _iterate(
     loop: _Loop, region: TrustRegion, callback: Callable[[Iteration], None] | None, rounds: int
 ) -> None:
-    """Run rounds until everything holds or nothing helps any more."""
+    """Run rounds until the trajectory is feasible and short, or progress stalls."""
     solution, started = loop.solution, time.perf_counter()
-    missing, since = loop.found.total, 0  # what was missing when rounds were last counted
-    short, nearly = loop.found.amounts["clearance"], _nearly(loop.found)
-    good = float("inf")  # objective of the last motion at which everything held
+    reference, since = loop.found.total, 0  # infeasibility when rounds were last counted
+    shortfall, nearly = loop.found.amounts["clearance"], _is_nearly_feasible(loop.found)
+    best = float("inf")  # objective of the last feasible trajectory
     for _ in range(rounds):
         spend()
         trial = loop.try_step(region.radius)
-        before, after = loop.prices(trial)
-        accepted = loop.judge(trial, before, after)
+        before, after = loop.compute_penalties(trial)
+        accepted = loop.is_acceptable(trial, before, after)
         solution.rounds += 1
         row = Iteration(
             round=solution.rounds,
@@ -237,40 +251,40 @@ def _iterate(
             callback(row)
         used = region.radius
         if accepted:
-            last = loop.objective if nearly else good
+            last = loop.objective if nearly else best
             loop.accept(trial)
-            if done := loop.done(trial):
-                good = trial.objective
-                if (
-                    loop.problem.drift(trial.z) <= 1.0
-                ):  # that waypoints are too far apart along an arc no round can help
+            if converged := loop.has_converged(trial):
+                best = trial.objective
+                # Waypoints that are too far apart on an arc cannot be repaired by more rounds.
+                if loop.problem.drift(trial.z) <= 1.0:
                     solution.converged, solution.status, loop.feasible = (
                         True,
                         "converged",
                         (trial.z, solution.dt),
                     )
-                improved = good < (1.0 - WORTHWHILE) * last
-                if not improved or (trial.step < INSIDE * used).all():
+                improved = best < (1.0 - MIN_IMPROVEMENT) * last
+                if not improved or (trial.step < ACTIVE_FRACTION * used).all():
                     break
         region.adapt(before, after, trial, accepted)
-        since += (
-            accepted or short.max() >= NEARLY
-        )  # refused steps narrow the region, which has an end
-        if (
-            not PROGRESS * missing < loop.found.total <= missing
-        ):  # more is missing where the objective fell instead
-            missing, since = loop.found.total, 0
+        # Near feasibility, rejected rounds are not counted: they shrink the radius, which ends the
+        # loop by itself.
+        since += accepted or shortfall.max() >= NEARLY_FEASIBLE
+        # The infeasibility may also grow, where the objective decreased instead.
+        if not PROGRESS * reference < loop.found.total <= reference:
+            reference, since = loop.found.total, 0
         if since >= PROGRESS_ROUNDS:
             break
-        short, nearly = loop.found.amounts["clearance"], _nearly(loop.found)
-        if accepted and not done and nearly:
-            region.settle()
-        if region.stuck(trial, short):
-            if short.max() >= NEARLY or not loop.grow():
+        shortfall, nearly = loop.found.amounts["clearance"], _is_nearly_feasible(loop.found)
+        if accepted and not converged and nearly:
+            region.limit()
+        if region.has_stalled(trial, shortfall):
+            if shortfall.max() >= NEARLY_FEASIBLE or not loop.raise_penalties():
                 break
-            region.restart()
+            region.reset()
 
 
-def _nearly(found: Infeasibility) -> bool:
-    """Return whether everything holds but for a little clearance."""
-    return bool(found.amounts["clearance"].max() < NEARLY) and found.max_violation < TOLERANCE
+def _is_nearly_feasible(found: Infeasibility) -> bool:
+    """Return whether all constraints hold except for a small clearance violation."""
+    return (
+        bool(found.amounts["clearance"].max() < NEARLY_FEASIBLE) and found.max_violation < TOLERANCE
+    )

@@ -1,4 +1,4 @@
-"""Continuous refinement: what collides between two waypoints becomes planes at both of them."""
+"""Turns collisions between waypoints into witness planes at both ends of the segment."""
 
 from __future__ import annotations
 
@@ -8,53 +8,53 @@ import numpy as np
 
 from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
-from vkc_pin.planning.solver.tunnelling import Passage, passages
+from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
+from vkc_pin.planning.solver.tunnelling import Crossing, find_crossings
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["Between", "collisions_between", "merge"]
+__all__ = ["SegmentContacts", "find_segment_contacts", "merge_contacts"]
 
-SPACING = 0.02  # [m] or [rad] between the states looked at first, in the coordinate that moves most
-KEEP = 1e-2  # [m] clearance asked for between waypoints
-CLOSE = 0.015  # [m] beyond `KEEP` within which a state is looked at closer
-FINER = 4  # states there instead of one
+SPACING = 0.02  # [m] or [rad] between the first samples, in the coordinate that moves most
+SEGMENT_MARGIN = 1e-2  # [m] clearance required between waypoints
+REFINEMENT_RANGE = 0.015  # [m] beyond `SEGMENT_MARGIN` within which samples are refined
+REFINEMENT = 4  # samples that replace one
 
 
-class Between(NamedTuple):
-    """What is close between waypoints.
+class SegmentContacts(NamedTuple):
+    """Close pairs between waypoints.
 
     Attributes:
-        contacts: At z_1..z_N. Their margin exceeds their distance by what is missing in between, or
-            falls below it by what is to spare: they guard against what is close already.
-        free: Whether no sub-state is closer than `CLOSE_ENOUGH`.
-        passages: What goes through each other.
+        contacts: Equivalent contacts at z_1..z_N. Margin minus distance is the clearance that the
+            segment lacks; it is negative for pairs that are close but far enough apart.
+        is_free: Whether no sample is closer than `CLEARANCE_TOLERANCE`.
+        crossings: Pairs that pass through each other.
     """
 
     contacts: Contacts
-    free: bool
-    passages: list[Passage]
+    is_free: bool
+    crossings: list[Crossing]
 
 
-def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
-    """Return contacts at waypoints that stand for closeness inside the segments around them.
+def find_segment_contacts(problem: TrajectoryProblem, z: Floats) -> SegmentContacts:
+    """Find close pairs within segments and express them as contacts at the adjacent waypoints.
 
-    At a sub-state (1 − s)·z_t + s·z_{t+1} with distance d < KEEP (or than the pair's margin, where
-    that is less), the witness points, fixed in their bodies, are carried to both waypoints. There
-    n·(b − a) has some value v; asking for v + KEEP − d at both lifts the sub-state by KEEP − d, to
-    first order. Of each segment and pair only the deepest sub-state counts.
+    At a sample (1 − s)·z_t + s·z_{t+1} with distance d < m, m being `SEGMENT_MARGIN` or the pair's
+    margin if that is less, the witness points, fixed in their bodies, are transferred to both
+    waypoints. There n·(b − a) has some value v. Requiring v + m − d at both waypoints lifts the
+    sample by m − d, to first order. Only the deepest sample of each segment and pair counts.
 
     Args:
-        problem: The problem.
+        problem: Problem.
         z: z_1..z_N, shape (N, n).
     """
     path, contacts = problem.waypoints(z), problem.contacts.with_released_objects(z)
     counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
     segment = np.repeat(np.arange(len(z)), counts)
     piece = np.arange(len(segment)) - np.searchsorted(segment, segment)
-    # The middles of the pieces first, and of pieces that something is close to the rest.
-    middles, waypoints = _states(path, segment, (piece + 0.5) / counts[segment])
-    near = contacts.evaluate(middles, waypoints, reach=KEEP + CLOSE)
-    passed = passages(contacts, middles, segment, near)
+    # Check the middle of each piece first, and refine only the pieces that are close to something.
+    middles, waypoints = _interpolate_states(path, segment, (piece + 0.5) / counts[segment])
+    near = contacts.evaluate(middles, waypoints, reach=SEGMENT_MARGIN + REFINEMENT_RANGE)
+    crossings = find_crossings(contacts, middles, segment, near)
     rows = np.unique(near.waypoint)
     segment, begin, length = (
         segment[rows],
@@ -62,14 +62,16 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
         1 / counts[segment[rows]],
     )
     if not len(rows):
-        return Between(make_empty_contacts(), True, [])
-    segment = np.repeat(segment, FINER)
-    s = (begin[:, None] + length[:, None] * (np.arange(FINER) + 0.5) / FINER).ravel()
-    states, waypoints = _states(path, segment, s)
-    found = _deepest(contacts.evaluate(states, waypoints, reach=KEEP + CLOSE), segment)
-    # A start that is close to something leaves it as it can: only what collides on the way counts.
+        return SegmentContacts(make_empty_contacts(), True, [])
+    segment = np.repeat(segment, REFINEMENT)
+    s = (begin[:, None] + length[:, None] * (np.arange(REFINEMENT) + 0.5) / REFINEMENT).ravel()
+    states, waypoints = _interpolate_states(path, segment, s)
+    found = _select_deepest(
+        contacts.evaluate(states, waypoints, reach=SEGMENT_MARGIN + REFINEMENT_RANGE), segment
+    )
+    # The start may be close to something, so only collisions count in the first segment.
     found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
-    keep = np.minimum(KEEP, found.margin)
+    margin = np.minimum(SEGMENT_MARGIN, found.margin)
     joints = contacts.get_joints(found.pair)
     rotations, translations = contacts.compute_placements(states[found.waypoint])
     ends = problem.chain.joint_placements(path)
@@ -86,29 +88,28 @@ def collisions_between(problem: TrajectoryProblem, z: Floats) -> Between:
                 np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j]
             )
         value = np.einsum("ci,ci->c", found.normal, points[1] - points[0])
-        inside = waypoint > 0  # the start cannot be moved
+        inside = waypoint > 0  # the start is fixed
         part = Contacts(
             waypoint - 1,
             found.pair,
             value,
-            value + keep - found.distance,
+            value + margin - found.distance,
             found.normal,
             points[0],
             points[1],
         )
         parts.append(part.select(np.flatnonzero(inside)))
-    return Between(
-        merge(*parts), bool(np.all(found.distance >= np.minimum(CLOSE_ENOUGH, keep))), passed
-    )
+    is_free = bool(np.all(found.distance >= np.minimum(CLEARANCE_TOLERANCE, margin)))
+    return SegmentContacts(merge_contacts(*parts), is_free, crossings)
 
 
-def _states(path: Floats, segment: Ints, s: Floats) -> tuple[Floats, Ints]:
-    """Return the states at 0 < s < 1 of segments, and the waypoints whose phases they belong to."""
+def _interpolate_states(path: Floats, segment: Ints, s: Floats) -> tuple[Floats, Ints]:
+    """Return states at 0 < s < 1 of segments, and the waypoints that determine their phases."""
     share = s[:, None]
     return (1 - share) * path[segment] + share * path[segment + 1], segment + 1
 
 
-def _deepest(found: Contacts, segment: Ints) -> Contacts:
+def _select_deepest(found: Contacts, segment: Ints) -> Contacts:
     """Return the contact of smallest distance for each segment and pair."""
     shapes = int(found.pair.max(initial=0)) + 1
     keys = (segment[found.waypoint] * shapes + found.pair[:, 0]) * shapes + found.pair[:, 1]
@@ -116,9 +117,9 @@ def _deepest(found: Contacts, segment: Ints) -> Contacts:
     return found.select(order[np.diff(keys[order], prepend=-1) > 0])
 
 
-def merge(*parts: Contacts) -> Contacts:
-    """Return all contacts of `parts`, per waypoint those first that fall shortest of their margins."""
-    joined = Contacts(
+def merge_contacts(*parts: Contacts) -> Contacts:
+    """Concatenate contacts and sort them by waypoint, largest margin violation first."""
+    merged = Contacts(
         *(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True))
     )
-    return joined.select(np.lexsort((joined.distance - joined.margin, joined.waypoint)))
+    return merged.select(np.lexsort((merged.distance - merged.margin, merged.waypoint)))

@@ -1,4 +1,4 @@
-"""What the solver reports while it runs, and what it returns."""
+"""Defines the records of the solver: one per round, and the solution."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ __all__ = ["Iteration", "Solution"]
 
 @dataclass(frozen=True)
 class Iteration:
-    """One round of the witness-plane loop, as the callback sees it.
+    """One round of the witness-plane loop, as passed to the callback.
 
     Attributes:
-        round: Counted from 1.
+        round: Number of the round, from 1.
         iterations: Ipopt iterations so far.
         objective: f of eq. 1.
         clearance: Smallest distance at waypoints [m]; infinite if nothing is within reach.
-        shortfall: What is missing to the clearance that is asked for [m].
-        pose_error: Largest residual of closure and goals, [m] or [rad], and of own constraints,
-            1e-3 being their tolerance.
-        step: Largest change of a coordinate in this round.
-        radius: Trust region of this round.
-        penalty: Weight of the clearance slack.
-        accepted: Whether the loop goes on from here, or tries a shorter step.
-        time: Since the solver began [s].
+        shortfall: Largest violation of a required clearance [m].
+        pose_error: Largest residual of closures and goals, [m] or [rad], and of user constraints,
+            scaled to a tolerance of 1e-3.
+        step: Largest coordinate change in this round [m] or [rad].
+        radius: Largest trust-region radius of this round [m] or [rad].
+        penalty: Penalty weight of the clearance slacks [1/m].
+        accepted: Whether the step was accepted.
+        time: Time since the solver started [s].
     """
 
     round: int
@@ -43,19 +43,18 @@ class Iteration:
 
 @dataclass
 class Solution:
-    """What the solver found; whether it is a success only `validation` can say.
+    """Result of the solver. Only `validation` decides whether it is a success.
 
     Attributes:
-        z: z_1..z_N, shape (N, n), the best iterate.
-        dt: Time of every step of it [s], shape (N,).
-        converged: Whether the loop ended by its own criteria.
+        z: Best iterate z_1..z_N, shape (N, n).
+        dt: Its time steps, shape (N,) [s].
+        converged: Whether the loop met its own convergence criteria.
         status: "converged", "not converged", or one of `budget.ENDINGS`.
-        astray: Of one that did not converge, by how much the worst pair at a waypoint falls short
-            of its margin [m], if that is so much that `validation` cannot accept it; otherwise 0.
-        radius: How far planes were believed in the end, shape (N,).
-        rounds, iterations: Of the outer loop and of Ipopt.
-        timings: Seconds in "coal", "casadi" (evaluation_time functions) and "ipopt" (all the rest of
-            it).
+        shortfall: Largest clearance violation at a waypoint [m] of a solution that did not
+            converge, if it is too large for `validation` to accept; otherwise 0.
+        radius: Final trust-region radii, shape (N,) [m] or [rad].
+        rounds, iterations: Numbers of outer rounds and of Ipopt iterations.
+        timings: Time in "coal", "casadi" (function evaluation) and "ipopt" (the rest of Ipopt) [s].
         history: One `Iteration` per round.
     """
 
@@ -63,7 +62,7 @@ class Solution:
     dt: Floats
     converged: bool = False
     status: str = "not converged"
-    astray: float = 0.0
+    shortfall: float = 0.0
     radius: Floats | None = None
     rounds: int = 0
     iterations: int = 0

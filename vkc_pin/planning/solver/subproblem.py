@@ -1,4 +1,4 @@
-"""The program of one round, with fixed planes and in a trust region, and Ipopt on it."""
+"""Builds the subproblem of one round, with fixed planes and a trust region, and solves it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vkc_pin.planning.solver.solution import Solution
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import compiled_module
 
-__all__ = ["Step", "Subproblem", "linear_solver"]
+__all__ = ["Step", "Subproblem", "make_linear_solver_options"]
 
 _IPOPT: Mapping[str, Any] = {
     "ipopt.print_level": 0,
@@ -45,8 +45,8 @@ _ROUGH: Mapping[str, Any] = {
 }
 
 
-def linear_solver() -> dict[str, Any]:
-    """Return the options with which Ipopt has its systems factored by `_kkt`, which it speaks to as to HSL's MA27.
+def make_linear_solver_options() -> dict[str, Any]:
+    """Return the options that make Ipopt use `_kkt`, through the interface of HSL's MA27.
 
     Raises:
         BuildError: The module cannot be imported.
@@ -55,32 +55,32 @@ def linear_solver() -> dict[str, Any]:
         "ipopt.linear_solver": "ma27",
         "ipopt.hsllib": compiled_module("vkc_pin.planning.solver._kkt").__file__,
         "ipopt.linear_system_scaling": "none",
-        "ipopt.ma27_la_init_factor": 1.0,  # what is factored is not in Ipopt's arrays
+        "ipopt.ma27_la_init_factor": 1.0,  # the factorization is not stored in Ipopt's arrays
     }
 
 
 class Step(NamedTuple):
-    """Where a subproblem leads.
+    """Solution of a subproblem.
 
     Attributes:
         z: z_1..z_N, shape (N, n).
-        slack: What the planes let be missing of clearance at every waypoint, shape (N,) [m].
-        shares: The share that stays of what was missing else, shape (N,).
-        satisfied: Whether Ipopt was.
+        slack: Clearance violation at each waypoint according to the planes, shape (N,) [m].
+        relaxation: Fraction of the other violations that remains, shape (N,).
+        succeeded: Whether Ipopt reported success.
     """
 
     z: Floats
     slack: Floats
-    shares: Floats
-    satisfied: bool
+    relaxation: Floats
+    succeeded: bool
 
 
 class Subproblem:
-    """Ipopt on the programs of one problem, round after round.
+    """Solves the subproblems of one problem with Ipopt, with warm starts from round to round.
 
     Args:
-        problem: The problem.
-        solution: Where iterations and times are counted.
+        problem: Problem.
+        solution: Record of iterations and times.
     """
 
     def __init__(self, problem: TrajectoryProblem, solution: Solution) -> None:
@@ -88,8 +88,8 @@ class Subproblem:
         self._targets = problem.target_matrix()
         self._multipliers: dict[str, Any] = {}
 
-    def forget(self) -> None:
-        """Begin the next round without the multipliers of the last: rows or weights are others."""
+    def reset_multipliers(self) -> None:
+        """Discard the last multipliers, which do not fit changed rows or penalty weights."""
         self._multipliers = {}
 
     def solve(
@@ -103,16 +103,16 @@ class Subproblem:
         *,
         rates: bool,
     ) -> Step:
-        """Return the minimum of the merit's model in the trust region.
+        """Minimize the model of the merit function in the trust region.
 
         Args:
-            z: The iterate, z_1..z_N, shape (N, n).
-            at: What is close there.
-            found: What does not hold there.
-            merit: The weights.
-            timing: How long steps take.
-            radius: Of the trust region at every waypoint, shape (N,).
-            rates: Whether limits on velocity and acceleration are rows.
+            z: Iterate z_1..z_N, shape (N, n).
+            at: Contacts of the iterate.
+            found: Constraint violations of the iterate.
+            merit: Merit function with its penalty weights.
+            timing: Time steps.
+            radius: Trust-region radius at each waypoint, shape (N,) [m] or [rad].
+            rates: Whether velocity and acceleration limits are constraints.
         """
         problem, t = self.problem, self.problem.transcription
         begin = time.perf_counter()
@@ -124,20 +124,19 @@ class Subproblem:
         )
         bounds = problem.row_bounds(timing if rates else None)
         relaxed = found.max_violation > TOLERANCE
-        if (
-            relaxed
-        ):  # on the way: the rows of the round before were others, and its end need not be exact
-            self.forget()
-        how = _ROUGH if relaxed else _WARM if self._multipliers else {}
+        # While rows are relaxed, those of the last round differ and its solution need not be exact.
+        if relaxed:
+            self.reset_multipliers()
+        mode = _ROUGH if relaxed else _WARM if self._multipliers else {}
         options = {
             "ipopt.max_iter": problem.options.max_iterations,
-            **linear_solver(),
+            **make_linear_solver_options(),
             **_IPOPT,
-            **how,
+            **mode,
         }
         solver = t.solver(rates=rates, options=options)
         penalties = merit.compute_penalty(found, clearance=False)
-        shares = np.where(relaxed & (penalties > 0.0), 1.0, 0.0)
+        relaxation = np.where(relaxed & (penalties > 0.0), 1.0, 0.0)
         parameters = t.parameter_vector(
             problem.start,
             planes,
@@ -151,12 +150,13 @@ class Subproblem:
             relaxation_weights=penalties,
             gears=problem.rolling.compute_gears(problem.waypoints(z)),
         )
-        short = compute_shortfalls(at, t.segments, t.slots)
-        room = np.where(short > 0.0, np.inf, 0.0)  # what keeps its margin now must go on keeping it
+        shortfall = compute_shortfalls(at, t.segments, t.slots)
+        # Planes whose margin holds get no slack: it must hold after the step, too.
+        slack_limit = np.where(shortfall > 0.0, np.inf, 0.0)
         arguments = {
-            "x0": t.pack(z, short, shares),
+            "x0": t.pack(z, shortfall, relaxation),
             "lbx": t.pack(lower),
-            "ubx": t.pack(upper, room, shares),
+            "ubx": t.pack(upper, slack_limit, relaxation),
             "lbg": bounds[0],
             "ubg": bounds[1],
             "p": np.concatenate([parameters, found.rate_excess]),
@@ -169,5 +169,6 @@ class Subproblem:
         self.solution.iterations += int(solver.stats["iter_count"])
         self._multipliers = {"lam_x0": result["lam_x"], "lam_g0": result["lam_g"]}
         x = result["x"].reshape(t.segments, t.width)
-        slack, shares = np.maximum(x[:, t.n : -1].sum(axis=1), 0.0), np.clip(x[:, -1], 0.0, 1.0)
-        return Step(x[:, : t.n], slack, shares, bool(solver.stats["success"]))
+        slack = np.maximum(x[:, t.n : -1].sum(axis=1), 0.0)
+        relaxation = np.clip(x[:, -1], 0.0, 1.0)
+        return Step(x[:, : t.n], slack, relaxation, bool(solver.stats["success"]))

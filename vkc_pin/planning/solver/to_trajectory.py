@@ -1,4 +1,4 @@
-"""From waypoints of the program to a motion over time: with the pauses in which the hand closes and opens."""
+"""Converts waypoints to a trajectory over time, with pauses while the gripper opens or closes."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["as_trajectory"]
+__all__ = ["make_trajectory"]
 
 
-def as_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajectory:
-    """Return z_1..z_N, shape (N, n), as a trajectory; where something is grasped or let go, the robot waits for the gripper.
+def make_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajectory:
+    """Convert waypoints to a trajectory with pauses for grasping and releasing.
 
     Args:
-        problem: Whose waypoints they are.
-        z: The waypoints.
-        dt: Time of every step, shape (N,) [s].
+        problem: Problem of the waypoints.
+        z: z_1..z_N, shape (N, n).
+        dt: Time steps, shape (N,) [s].
     """
     waypoints, wait = problem.waypoints(z), problem.options.grasp_time
-    _settle_choices(problem, waypoints)
+    _hold_grasp_coordinates(problem, waypoints)
     rows, times = [0], [0.0]
     phases: list[PhaseSpan] = []
     begin = 0
@@ -46,8 +46,8 @@ def as_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajecto
     return Trajectory(problem.chain.names, np.array(times), waypoints[rows], tuple(phases), robot)
 
 
-def _settle_choices(problem: TrajectoryProblem, waypoints: Floats) -> None:
-    """Give the freedom of a grasp, which means nothing while nothing is held, the value it has next, or else had last."""
+def _hold_grasp_coordinates(problem: TrajectoryProblem, waypoints: Floats) -> None:
+    """Set grasp coordinates that are inactive to their next active value, or else their last."""
     starts = [0, *problem.ends[:-1]]
     for hold, names in problem.chain.virtual.items():
         active = np.zeros(len(waypoints), bool)

@@ -1,4 +1,4 @@
-"""Trials and the trust region: how far the witness planes are believed, and how that is learned from round to round."""
+"""Adapts the trust-region radius of each waypoint to the ratio of actual to predicted reduction."""
 
 from __future__ import annotations
 
@@ -8,67 +8,68 @@ import numpy as np
 
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.merit import Infeasibility
-from vkc_pin.planning.solver.tunnelling import Passage
+from vkc_pin.planning.solver.tunnelling import Crossing
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["Trial", "TrustRegion", "judge"]
+__all__ = ["Trial", "TrustRegion", "is_step_acceptable"]
 
-BLOCK_TIME = 2.5  # [s] of motion that share a radius, at `Options.dt` a waypoint
-FIRST_RADIUS = 0.5  # [m] and [rad] of the trust region at first, and after weights have grown
-# share of the radius: steps that end within it were not held back (Ipopt ends a little inside its
-# bounds)
-INSIDE = 0.9
-SETTLE_RADIUS = 0.05  # [m] and [rad] in which planes are as good as distances
-SHRINK = 0.4  # of the radius, or of the step if that was shorter, where a promise did not come true
-NO_MATTER = 0.4  # of the merit, in a block: 8 mm of shortfall at the weight that it has at first
-# [m] shortfall at a waypoint, clearance between waypoints, and steps ([rad], too), that do not
-# matter
-CLOSE_ENOUGH = 5e-4
+BLOCK_TIME = 2.5  # [s] of motion that share a radius, at one waypoint per `Options.dt`
+FIRST_RADIUS = 0.5  # [m], [rad] initial radius, also after the penalty weights were raised
+# fraction of the radius above which a step counts as limited by the trust region (Ipopt ends a
+# little inside its bounds)
+ACTIVE_FRACTION = 0.9
+SETTLE_RADIUS = 0.05  # [m], [rad] within which the planes approximate the distances well
+SHRINK = 0.4  # factor on the smaller of radius and step where the prediction was poor
+# merit change in a block that is ignored: 8 mm of shortfall at the initial penalty weight
+NEGLIGIBLE_CHANGE = 0.4
+# [m] shortfall at a waypoint, clearance within segments, and steps (also [rad]) that are negligible
+CLEARANCE_TOLERANCE = 5e-4
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Where a round led, one Ipopt solve with fixed planes, and what is really there.
+    """Trial point of a round: the solution of the subproblem with fixed planes, evaluated exactly.
 
     Attributes:
         z: z_1..z_N, shape (N, n).
-        promise: What all that is missing would cost at every waypoint, were the planes the
-            distances, shape (N,).
+        predicted_penalty: Penalty at each waypoint that the subproblem predicts, shape (N,).
         objective: f of eq. 1.
         pose_error: Largest residual, see `TrajectoryProblem.row_error`.
-        found: What does not hold there.
-        contacts: What is close there.
-        clear: Whether everything is far enough from each other, between waypoints, too.
-        passages: What goes through each other between waypoints.
-        rate: Largest excess over a limit on velocity or acceleration, relative to it.
-        step: The largest change of a coordinate at every waypoint, shape (N,).
-        satisfied: Whether Ipopt was.
+        infeasibility: Constraint violations.
+        contacts: Close pairs.
+        is_clear: Whether all clearances hold, also within segments.
+        crossings: Pairs that pass through each other between waypoints.
+        rate_excess: Largest violation of a velocity or acceleration limit, relative to the limit.
+        step: Largest coordinate change at each waypoint, shape (N,) [m] or [rad].
+        succeeded: Whether Ipopt reported success.
     """
 
     z: Floats
-    promise: Floats
+    predicted_penalty: Floats
     objective: float
     pose_error: float
-    found: Infeasibility
+    infeasibility: Infeasibility
     contacts: Contacts
-    clear: bool
-    passages: list[Passage]
-    rate: float
+    is_clear: bool
+    crossings: list[Crossing]
+    rate_excess: float
     step: Floats
-    satisfied: bool
+    succeeded: bool
 
 
 class TrustRegion:
-    """How far waypoints may move in a round: the same for all of a block, so that trouble in one place does not hold up others.
+    """Trust-region radii of the waypoints.
+
+    Waypoints of a block share a radius, so that a difficult passage does not slow down the others.
 
     Args:
         segments: N, the number of waypoints.
-        length: How many of them make a block, about.
-        radius: Of each waypoint at first, shape (N,) [m] and [rad]; None: `FIRST_RADIUS`.
+        length: Approximate number of waypoints per block.
+        radius: Initial radii, shape (N,) [m] or [rad]. Default: `FIRST_RADIUS`.
 
     Attributes:
-        block: The block of each waypoint, shape (N,).
-        radius: Of each waypoint, shape (N,) [m] and [rad].
+        block: Block number of each waypoint, shape (N,).
+        radius: Radius at each waypoint, shape (N,) [m] or [rad].
     """
 
     def __init__(self, segments: int, length: int, radius: Floats | None = None) -> None:
@@ -76,53 +77,62 @@ class TrustRegion:
         self.radius = np.full(segments, FIRST_RADIUS) if radius is None else radius.copy()
 
     def adapt(self, before: Floats, after: Floats, trial: Trial, accepted: bool) -> None:
-        """Widen blocks where what was promised came true, narrow those where it did not.
+        """Widen blocks in which the prediction was good, shrink those in which it was poor.
 
         Args:
-            before: What all that is missing cost at every waypoint before the round, shape (N,).
-            after: What it costs now.
-            trial: Where the round led.
-            accepted: Whether it goes on from there.
+            before: Penalties of the iterate, shape (N,).
+            after: Penalties of the trial, shape (N,).
+            trial: Trial point.
+            accepted: Whether the trial was accepted.
         """
         blocks = int(self.block[-1]) + 1
-        promised, actual, step = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks)
-        np.add.at(promised, self.block, before - trial.promise)
+        predicted, actual, step = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks)
+        np.add.at(predicted, self.block, before - trial.predicted_penalty)
         np.add.at(actual, self.block, before - after)
         np.maximum.at(step, self.block, trial.step)
-        worse = (promised - actual > NO_MATTER) & (actual < 0.25 * promised)
-        if not accepted and not worse.any():
-            worse[:] = True
+        poor = (predicted - actual > NEGLIGIBLE_CHANGE) & (actual < 0.25 * predicted)
+        if not accepted and not poor.any():
+            poor[:] = True
         radius = np.array([self.radius[self.block == b][0] for b in range(blocks)])
-        good = (actual > 0.7 * promised - NO_MATTER) & accepted & (step > INSIDE * radius)
+        good = (
+            (actual > 0.7 * predicted - NEGLIGIBLE_CHANGE)
+            & accepted
+            & (step > ACTIVE_FRACTION * radius)
+        )
         factor = np.where(good, 1.5, 1.0)
-        radius = np.where(worse, SHRINK * np.minimum(radius, step), radius * factor)
+        radius = np.where(poor, SHRINK * np.minimum(radius, step), radius * factor)
         self.radius = np.maximum(radius, 1e-6)[self.block]
 
-    def settle(self) -> None:
-        """Let waypoints move so little that planes are as good as distances."""
+    def limit(self) -> None:
+        """Limit the radii to `SETTLE_RADIUS`, within which the planes are accurate."""
         self.radius = np.minimum(self.radius, SETTLE_RADIUS)
 
-    def stuck(self, trial: Trial, shortfall: Floats) -> bool:
-        """Return whether nothing moves any more, by what is close enough, where something is in the way."""
-        bad = shortfall > CLOSE_ENOUGH
-        if not bad.any():
-            bad[:] = True
-        return bool((np.minimum(self.radius, trial.step)[bad] < CLOSE_ENOUGH).all())
+    def has_stalled(self, trial: Trial, shortfall: Floats) -> bool:
+        """Return whether the waypoints that lack clearance no longer move.
 
-    def restart(self) -> None:
-        """Begin again."""
+        Args:
+            trial: Last trial point.
+            shortfall: Clearance violation at each waypoint, shape (N,) [m].
+        """
+        violated = shortfall > CLEARANCE_TOLERANCE
+        if not violated.any():
+            violated[:] = True
+        return bool((np.minimum(self.radius, trial.step)[violated] < CLEARANCE_TOLERANCE).all())
+
+    def reset(self) -> None:
+        """Reset all radii to `FIRST_RADIUS`."""
         self.radius = np.full(len(self.radius), FIRST_RADIUS)
 
 
-def judge(promised: float, actual: float, merit: float) -> bool:
-    """Return whether to accept where a round led.
+def is_step_acceptable(predicted: float, actual: float, merit: float) -> bool:
+    """Return whether to accept a step.
 
     Args:
-        promised: The decrease that the planes promised.
-        actual: What came of it.
-        merit: The merit before.
+        predicted: Predicted reduction of the merit function.
+        actual: Actual reduction.
+        merit: Merit of the iterate.
     """
     negligible = 1e-4 * max(1.0, abs(merit))
-    if promised < negligible:
+    if predicted < negligible:
         return actual >= -negligible
-    return actual > 0.05 * promised
+    return actual > 0.05 * predicted

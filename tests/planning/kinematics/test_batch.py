@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.planning.kinematics.batch import _KEPT, BatchFunction
+from vkc_pin.planning.kinematics.batch import _MAX_BUFFERS, BatchFunction
 
 
 def make() -> ca.Function:
@@ -61,7 +61,7 @@ def test_results_are_the_callers_own() -> None:
 
 def test_sizes_may_change_from_call_to_call() -> None:
     function, rng = BatchFunction(make()), np.random.default_rng(0)
-    for batch in [*range(1, 2 * _KEPT), 3, 1, 2 * _KEPT - 1, 3]:
+    for batch in [*range(1, 2 * _MAX_BUFFERS), 3, 1, 2 * _MAX_BUFFERS - 1, 3]:
         x, y = rng.normal(size=(batch, 3)), rng.normal(size=(batch, 2))
         np.testing.assert_allclose(function(x, y)[0], one_by_one(x, y)[0], rtol=0.0, atol=1e-14)
 

@@ -316,18 +316,18 @@ def test_a_missing_extension_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, arm: pin.Model
 ) -> None:
     monkeypatch.setitem(sys.modules, "vkc_pin.planning.kinematics._cpin", None)
-    backends._extension.cache_clear()
+    backends._import_extension.cache_clear()
     with pytest.raises(BuildError, match=r"apt install g\+\+"):
-        backends.compiled("joint_placements", arm)
-    backends._extension.cache_clear()
+        backends.build_compiled("joint_placements", arm)
+    backends._import_extension.cache_clear()
 
 
 def test_backend_is_upstreams_where_it_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name in ((types.ModuleType("pinocchio.casadi"), "upstream"), (None, "compiled")):
         monkeypatch.setitem(sys.modules, "pinocchio.casadi", module)
-        cpin._backend.cache_clear()
+        cpin._get_backend.cache_clear()
         assert cpin.backend_name() == name
-    cpin._backend.cache_clear()
+    cpin._get_backend.cache_clear()
 
 
 @pytest.mark.skipif(
@@ -346,7 +346,7 @@ def test_upstream_equals_compiled(arm: pin.Model) -> None:
     ):
         one, other = (
             backend(name, arm, *arguments)(*inputs).full()
-            for backend in (backends.upstream, backends.compiled)
+            for backend in (backends.build_upstream, backends.build_compiled)
         )
         np.testing.assert_allclose(one, other, atol=TOLERANCE)
 

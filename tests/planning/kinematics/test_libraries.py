@@ -11,7 +11,7 @@ import pytest
 
 from vkc_pin.planning.kinematics import libraries
 from vkc_pin.planning.kinematics.libraries import BUILD, VARIABLE, Libraries
-from vkc_pin.planning.kinematics.machine_code import work
+from vkc_pin.planning.kinematics.machine_code import compile_jobs
 from vkc_pin.utils.disk_cache import TEMPORARY
 
 LIBRARY = bytes(range(256)) * 40
@@ -20,7 +20,7 @@ LIBRARY = bytes(range(256)) * 40
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
     monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
-    found = Libraries.here()
+    found = Libraries.open_default()
     assert found is not None
     return found
 
@@ -46,7 +46,7 @@ def age(path: Path, seconds: float) -> None:
 
 def test_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def here() -> Path | None:
-        found = Libraries.here()
+        found = Libraries.open_default()
         return found.path if found else None
 
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
@@ -81,10 +81,10 @@ def test_a_folder_in_which_others_may_write_is_not_used(
             (0o702, False),
         ):
             path.chmod(mode)
-            assert (Libraries.here() is not None) == used, oct(mode)
+            assert (Libraries.open_default() is not None) == used, oct(mode)
         path.chmod(0o700)
     monkeypatch.setattr(os, "geteuid", lambda: folder.path.stat().st_uid + 1)
-    assert Libraries.here() is None, "it is somebody else's"
+    assert Libraries.open_default() is None, "it is somebody else's"
 
 
 def test_what_is_no_folder_is_not_used(
@@ -99,20 +99,20 @@ def test_what_is_no_folder_is_not_used(
         Path("/proc/nowhere"),
     ):
         monkeypatch.setenv(VARIABLE, str(place))
-        assert Libraries.here() is None, place
+        assert Libraries.open_default() is None, place
     (tmp_path / "around").mkdir(mode=0o700)
     (tmp_path / "around" / "vkc_pin").symlink_to(folder.path)
     monkeypatch.setenv(VARIABLE, str(tmp_path / "around"))
-    assert Libraries.here() is None
+    assert Libraries.open_default() is None
 
 
 def test_what_was_published_is_found(folder: Libraries) -> None:
     assert not folder.exists(A)
     assert folder.find(A) is None
-    folder.try_out(A)
-    assert folder.failed(A)
+    folder.mark_attempt(A)
+    assert folder.has_failed(A)
     folder.publish(A, LIBRARY)
-    assert not folder.failed(A)
+    assert not folder.has_failed(A)
     assert folder.exists(A)
     path = folder.find(A)
     assert path is not None
@@ -155,30 +155,30 @@ def test_a_library_that_others_may_have_written_is_not_used(
 
 
 def test_wishes(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert folder.jobs() == []
-    assert folder.ask(B, b"what")
-    assert folder.ask(A, b"more")
-    assert folder.ask(B, b"again"), (
+    assert folder.list_jobs() == []
+    assert folder.request(B, b"what")
+    assert folder.request(A, b"more")
+    assert folder.request(B, b"again"), (
         "somebody should see to it, if only because the first who should is dead"
     )
-    assert folder.jobs() == [A, B]
-    assert folder.job(B) == b"what"
+    assert folder.list_jobs() == [A, B]
+    assert folder.read_job(B) == b"what"
     (folder.path / f"{B}.job").chmod(0o606)
     with pytest.raises(PermissionError, match="others"):
-        folder.job(B)
-    monkeypatch.setattr(libraries, "_JOBS", 2)
-    assert not folder.ask(C, b"too many")
-    assert folder.jobs() == [A, B]
+        folder.read_job(B)
+    monkeypatch.setattr(libraries, "_MAX_JOBS", 2)
+    assert not folder.request(C, b"too many")
+    assert folder.list_jobs() == [A, B]
 
 
 def test_what_failed_is_tried_again_after_a_day(folder: Libraries) -> None:
-    folder.try_out(A)
-    assert not folder.ask(A, b"what")
+    folder.mark_attempt(A)
+    assert not folder.request(A, b"what")
     age(folder.path / f"{A}.failed", 80000)
-    assert not folder.ask(A, b"what")
+    assert not folder.request(A, b"what")
     age(folder.path / f"{A}.failed", 90000)
-    assert folder.ask(A, b"what")
-    assert folder.job(A) == b"what"
+    assert folder.request(A, b"what")
+    assert folder.read_job(A) == b"what"
 
 
 def test_libraries_that_were_not_used_for_long_go_first(
@@ -188,11 +188,11 @@ def test_libraries_that_were_not_used_for_long_go_first(
         folder.publish(key, LIBRARY)
         age(folder.path / f"{key}.so", 1000 - 100 * index)
     assert folder.find(A) is not None, "used now"
-    monkeypatch.setattr(libraries, "_FILES", 4)
-    folder.tidy()
+    monkeypatch.setattr(libraries, "_MAX_FILES", 4)
+    folder.evict()
     assert names(folder) == [f"{A}.so", f"{C}.so", f"{D}.so", f"{E}.so"]
-    monkeypatch.setattr(libraries, "_BYTES", 2.5 * len(LIBRARY))
-    folder.tidy()
+    monkeypatch.setattr(libraries, "_MAX_BYTES", 2.5 * len(LIBRARY))
+    folder.evict()
     assert names(folder) == [f"{A}.so", f"{E}.so"]
 
 
@@ -207,12 +207,12 @@ def test_what_dead_processes_left_goes_after_a_day(folder: Libraries) -> None:
     build = Path(tempfile.mkdtemp(dir=folder.path, prefix=BUILD))
     (build / "f.c").write_bytes(b"")
     folder.publish(A, LIBRARY)
-    folder.tidy()
+    folder.evict()
     everything = names(folder)
     assert len(everything) == 6
     for name in everything:
         age(folder.path / name, 90000)
-    folder.tidy()
+    folder.evict()
     assert names(folder) == [f"{A}.so", "lock"]
 
 
@@ -253,8 +253,8 @@ FOREIGN = (
 
 def test_tidying_leaves_files_of_others(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both in the folder that the variable names, and in the cache's own folder."""
-    monkeypatch.setattr(libraries, "_FILES", 2)
-    monkeypatch.setattr(libraries, "_BYTES", 100)
+    monkeypatch.setattr(libraries, "_MAX_FILES", 2)
+    monkeypatch.setattr(libraries, "_MAX_BYTES", 100)
     for place in (folder.path.parent, folder.path):
         for name in FOREIGN:
             (place / name).parent.mkdir(parents=True, exist_ok=True)
@@ -263,15 +263,15 @@ def test_tidying_leaves_files_of_others(folder: Libraries, monkeypatch: pytest.M
             age(path, 1e6)
     before = tree(folder.path.parent)
     assert len(before) > 2 * len(FOREIGN)
-    folder.tidy()
+    folder.evict()
     assert tree(folder.path.parent) == before
-    assert folder.jobs() == [], "none of them is compiled, and removed after that"
+    assert folder.list_jobs() == [], "none of them is compiled, and removed after that"
 
 
 def test_tidying_does_not_follow_links(
     folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(libraries, "_FILES", 0)
+    monkeypatch.setattr(libraries, "_MAX_FILES", 0)
     (tmp_path / "outside" / "deep").mkdir(parents=True)
     (tmp_path / "outside" / "deep" / "file").write_text("mine")
     build = Path(tempfile.mkdtemp(dir=folder.path, prefix=BUILD))
@@ -286,7 +286,7 @@ def test_tidying_does_not_follow_links(
         os.utime(link, (0.0, 0.0), follow_symlinks=False)
     age(build, 90000)
     before = tree(tmp_path / "outside")
-    folder.tidy()
+    folder.evict()
     assert tree(tmp_path / "outside") == before
     assert not build.exists()
     assert names(folder) == sorted(link.name for link in links[:3])
@@ -302,11 +302,11 @@ def test_compiling_with_a_folder_that_has_other_files(
     for path in around.rglob("*"):
         age(path, 1e6)
     before = tree(around)
-    assert Libraries.here() is not None
-    folder.ask(A, b"not a job")
+    assert Libraries.open_default() is not None
+    folder.request(A, b"not a job")
     lock = folder.lock()
     assert lock is not None
-    work(str(folder.path), lock)
+    compile_jobs(str(folder.path), lock)
     os.close(lock)
     assert names(folder) == [f"{A}.failed", "lock"], "it was tried"
     after = tree(around)
@@ -323,9 +323,9 @@ def test_one_compiles_at_a_time(folder: Libraries) -> None:
     folder.unlock(inherited)
     second = folder.lock()
     assert second is not None
-    assert not folder.take(inherited)
+    assert not folder.acquire(inherited)
     os.close(second)
-    assert folder.take(inherited)
+    assert folder.acquire(inherited)
     os.close(inherited)
     third = folder.lock()
     assert third is not None

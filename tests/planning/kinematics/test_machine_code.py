@@ -21,7 +21,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.kinematics import batch, machine_code
 from vkc_pin.planning.kinematics.batch import BatchFunction
 from vkc_pin.planning.kinematics.libraries import VARIABLE, Libraries
-from vkc_pin.planning.kinematics.machine_code import MachineCode, wait, work
+from vkc_pin.planning.kinematics.machine_code import MachineCode, compile_jobs, wait
 from vkc_pin.planning.nlp.transcription import Transcription, transcribe
 from vkc_pin.planning.nlp.waypoint import WaypointFunctions
 from vkc_pin.utils.cache import Cache
@@ -36,7 +36,7 @@ QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
     monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
     monkeypatch.delenv("CC", raising=False)
-    found = Libraries.here()
+    found = Libraries.open_default()
     assert found is not None
     return found
 
@@ -69,7 +69,7 @@ def do(folder: Libraries) -> None:
     """Compile here what was asked for."""
     lock = folder.lock()
     assert lock is not None
-    work(str(folder.path), lock)
+    compile_jobs(str(folder.path), lock)
     os.close(lock)
 
 
@@ -85,15 +85,15 @@ def test_waypoints_are_equal_bit_for_bit(task: str, folder: Libraries) -> None:
     for poses in ((), structure.poses):
         functions = WaypointFunctions(structure.model, structure.slots, poses, Cache())
         given = (functions.value, functions.jacobian, functions.hessian)
-        assert not functions.code.look()
+        assert not functions.code.try_load()
         assert functions.code.functions == given
         assert wait()
-        assert functions.code.look()
+        assert functions.code.try_load()
         for one, other in zip(given, functions.code.functions, strict=True):
             assert other.class_name() == "External"
             assert equal(one, other)
             assert equal(one.map(5), other.map(5), 5)
-    assert folder.jobs() == []
+    assert folder.list_jobs() == []
 
 
 def test_a_program_is_built_anew_when_machine_code_has_come(folder: Libraries) -> None:
@@ -107,7 +107,7 @@ def test_a_program_is_built_anew_when_machine_code_has_come(folder: Libraries) -
     first = transcribe(structure, cache)
     solver = first.solver(rates=True, options=QUIET)
     assert len(first.uncompiled_functions) == 1
-    assert len(folder.jobs()) <= 1
+    assert len(folder.list_jobs()) <= 1
     assert transcribe(structure, cache) is first
     assert wait()
     second = transcribe(structure, cache)
@@ -134,18 +134,18 @@ def test_batches_that_are_used_much_become_machine_code(
     x, y = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
     function = BatchFunction(make())
     expected = [part.tobytes() for part in function(x, y)]
-    assert folder.jobs() == [], "not worth it yet"
-    monkeypatch.setattr(batch, "_WORTH", 30 * make().n_instructions())
+    assert folder.list_jobs() == [], "not worth it yet"
+    monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 30 * make().n_instructions())
     assert [part.tobytes() for part in function(x, y)] == expected
     assert wait()
     assert [part.tobytes() for part in function(x, y)] == expected
-    assert function._code.compiled
+    assert function._code.is_compiled
     assert [part.tobytes() for part in function(x, y)] == expected
     assert function.nbytes > 0
 
 
 def test_another_process_finds_it_even_if_the_first_does_not_stay(folder: Libraries) -> None:
-    code = "from test_machine_code import *; MachineCode(make()).look()"
+    code = "from test_machine_code import *; MachineCode(make()).try_load()"
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
@@ -156,10 +156,10 @@ def test_another_process_finds_it_even_if_the_first_does_not_stay(folder: Librar
         _, said = process.communicate(timeout=120)
         assert process.returncode == 0, said.decode()
         assert said == b""
-    until(lambda: not folder.jobs())
+    until(lambda: not folder.list_jobs())
     assert len(list(folder.path.glob("*.so"))) == 1
     mine = MachineCode(make())
-    assert mine.look()
+    assert mine.try_load()
     assert equal(make(), mine.functions[0])
 
 
@@ -167,24 +167,26 @@ def test_the_process_that_compiles_leaves_no_zombie(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started: list[subprocess.Popen[bytes]] = []
-    run = machine_code._run
-    monkeypatch.setattr(machine_code, "_run", lambda *a: started.append(run(*a)) or started[-1])
-    MachineCode(make()).look()
+    run = machine_code._start_process
+    monkeypatch.setattr(
+        machine_code, "_start_process", lambda *a: started.append(run(*a)) or started[-1]
+    )
+    MachineCode(make()).try_load()
     (process,) = started
     until(lambda: process.returncode is not None)  # somebody asked; we did not
     assert process.returncode == 0
-    assert folder.jobs() == []
+    assert folder.list_jobs() == []
 
 
 def test_threads(folder: Libraries) -> None:
-    MachineCode(make()).look()
+    MachineCode(make()).try_load()
     assert wait()
     right: list[bool] = []
 
     def load() -> None:
         for _ in range(5):
             code = MachineCode(make())
-            right.append(code.look() and equal(make(), code.functions[0], 5))
+            right.append(code.try_load() and equal(make(), code.functions[0], 5))
 
     threads = [threading.Thread(target=load) for _ in range(4)]
     for thread in threads:
@@ -197,10 +199,10 @@ def test_threads(folder: Libraries) -> None:
 def test_functions_that_differ_have_libraries_of_their_own(folder: Libraries) -> None:
     codes = [MachineCode(make(3.0)), MachineCode(make(np.nextafter(3.0, 4.0)))]
     for code in codes:
-        code.look()
+        code.try_load()
     assert wait()
     assert len(list(folder.path.glob("*.so"))) == 2
-    assert all(code.look() for code in codes)
+    assert all(code.try_load() for code in codes)
     assert equal(make(3.0), codes[0].functions[0])
     assert not equal(*(code.functions[0] for code in codes))
 
@@ -210,13 +212,13 @@ def test_the_compiler_may_have_options(
     options: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code = MachineCode(make())
-    code.look()
+    code.try_load()
     monkeypatch.setenv("CC", f"cc {options}")
     other = MachineCode(make())
-    other.look()
+    other.try_load()
     assert wait()
-    assert code.look()
-    assert other.look()
+    assert code.try_load()
+    assert other.try_load()
     assert len(list(folder.path.glob("*.so"))) == 2
     assert equal(code.functions[0], other.functions[0])
 
@@ -227,8 +229,8 @@ def test_without_a_compiler_nothing_is_asked_for(
 ) -> None:
     monkeypatch.setenv("CC", command)
     code = MachineCode(make())
-    assert not code.look()
-    assert folder.jobs() == []
+    assert not code.try_load()
+    assert folder.list_jobs() == []
     assert code.functions[0](1.0, 2.0) is not None
 
 
@@ -249,14 +251,14 @@ def test_a_broken_compiler_is_tried_once(
 ) -> None:
     monkeypatch.setenv("CC", script(tmp_path / "broken", BROKEN[how]))
     code = MachineCode(make())
-    assert not code.look()
+    assert not code.try_load()
     assert wait(), how
-    assert not code.look()
-    assert not code.compiled
+    assert not code.try_load()
+    assert not code.is_compiled
     assert list(folder.path.glob("*.so")) == []
     assert len(list(folder.path.glob("*.failed"))) == 1
-    assert not MachineCode(make()).look()
-    assert folder.jobs() == [], "not again today"
+    assert not MachineCode(make()).try_load()
+    assert folder.list_jobs() == [], "not again today"
 
 
 def test_a_compiler_that_hangs_is_ended(
@@ -267,12 +269,12 @@ def test_a_compiler_that_hangs_is_ended(
         "CC",
         script(tmp_path / "hangs", f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"),
     )
-    monkeypatch.setattr(machine_code, "_LONGEST", 1.0)
-    monkeypatch.setattr(machine_code, "_python", lambda: False)
-    assert not MachineCode(make()).look()
+    monkeypatch.setattr(machine_code, "_COMPILER_TIMEOUT", 1.0)
+    monkeypatch.setattr(machine_code, "_has_python", lambda: False)
+    assert not MachineCode(make()).try_load()
     assert not wait(), "nobody is there to do it"
     do(folder)
-    assert folder.jobs() == []
+    assert folder.list_jobs() == []
     assert len(list(folder.path.glob("*.failed"))) == 1
     until(lambda: ended(int(pid.read_text())))
 
@@ -280,11 +282,11 @@ def test_a_compiler_that_hangs_is_ended(
 def test_what_cannot_be_put_away_is_tried_once(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(machine_code, "_python", lambda: False)
-    MachineCode(make()).look()
+    monkeypatch.setattr(machine_code, "_has_python", lambda: False)
+    MachineCode(make()).try_load()
     monkeypatch.setattr(Libraries, "remove", lambda self, name: None)
     do(folder)
-    assert len(folder.jobs()) == 1
+    assert len(folder.list_jobs()) == 1
 
 
 def test_waiting_has_an_end(
@@ -297,24 +299,24 @@ def test_waiting_has_an_end(
         ),
     )
     code = MachineCode(make())
-    code.look()
+    code.try_load()
     assert not wait(0.2)
     (tmp_path / "go").touch()
     assert wait()
-    assert code.look()
+    assert code.try_load()
 
 
 def test_a_library_that_was_cut_off_is_made_anew(folder: Libraries) -> None:
-    MachineCode(make()).look()
+    MachineCode(make()).try_load()
     assert wait()
     (path,) = folder.path.glob("*.so")
     path.write_bytes(path.read_bytes()[:5000])
     code = MachineCode(make())
-    assert not code.look()
-    assert not code.look()
-    assert not MachineCode(make()).look()
+    assert not code.try_load()
+    assert not code.try_load()
+    assert not MachineCode(make()).try_load()
     assert wait()
-    assert MachineCode(make()).look()
+    assert MachineCode(make()).try_load()
 
 
 @pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
@@ -322,9 +324,9 @@ def test_a_program_with_python_in_it_is_not_started_again(
     executable: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "executable", executable)
-    assert not MachineCode(make()).look()
+    assert not MachineCode(make()).try_load()
     assert not wait()
-    assert len(folder.jobs()) == 1, "another process may see to it"
+    assert len(folder.list_jobs()) == 1, "another process may see to it"
 
 
 def until(done: Callable[[], bool]) -> None:
@@ -364,11 +366,11 @@ def expected() -> list[bytes]:
 def test_plans_are_equal_bit_for_bit(
     folder: Libraries, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch, "_WORTH", 0)  # all that can be compiled is
+    monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 0)  # all that can be compiled is
     planner = vkc.Planner()
     assert planned(planner) == expected, "asks for them"
     assert wait()
-    monkeypatch.setattr(machine_code, "_python", lambda: False)
+    monkeypatch.setattr(machine_code, "_has_python", lambda: False)
     assert list(folder.path.glob("*.failed")) == []
     loaded: list[Any] = []
     external = ca.external

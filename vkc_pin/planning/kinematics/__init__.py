@@ -1,12 +1,12 @@
-"""Pinocchio's algorithms as CasADi functions: their arguments are a model's q, v, a.
+"""Provides Pinocchio's algorithms as CasADi functions of a model's q, v and a.
 
 Every function here takes a numeric `pinocchio.Model` and returns a `casadi.Function` built from SX
-expressions, with exact derivatives of any order. q is Pinocchio's configuration (a planar joint is
-x, y, cos θ, sin θ), v and a are in its tangent space. Entries that vanish at every configuration
+expressions, with exact derivatives of any order. q is Pinocchio's configuration (a planar joint has
+x, y, cos θ, sin θ); v and a are in its tangent space. Entries that vanish at every configuration
 are structural zeros of the result.
 
-Where upstream's `pinocchio.casadi` can be imported (conda-forge), it does the work; otherwise the
-small module that is compiled when this package is installed.
+If upstream's `pinocchio.casadi` can be imported (conda-forge), it builds the functions; otherwise a
+small module does, which is compiled when this package is installed.
 """
 
 from __future__ import annotations
@@ -32,46 +32,50 @@ __all__ = [
     "rnea",
 ]
 
-# The numbers are those of pinocchio.ReferenceFrame.
-_REFERENCES = {"world": 0, "local": 1, "local_world_aligned": 2}
+# values of pinocchio.ReferenceFrame
+_REFERENCE_FRAMES = {"world": 0, "local": 1, "local_world_aligned": 2}
 
 
 @cache
-def _backend() -> Callable[..., casadi.Function]:
-    """Return what does the work, chosen at the first use: importing this package stays quick."""
+def _get_backend() -> Callable[..., casadi.Function]:
+    """Return the backend, chosen at the first use so that importing this package is fast."""
     from vkc_pin.planning.kinematics import backends
 
     try:
         import_module("pinocchio.casadi")
     except ImportError:
-        return backends.compiled
-    return backends.upstream
+        return backends.build_compiled
+    return backends.build_upstream
 
 
 def backend_name() -> str:
-    """Return what does the work here: "upstream" (`pinocchio.casadi`) or "compiled" (this package's own module)."""
-    return _backend().__name__
+    """Return the name of the backend in use.
+
+    Returns:
+        "upstream" (`pinocchio.casadi`) or "compiled" (this package's own module).
+    """
+    return _get_backend().__name__.removeprefix("build_")
 
 
 def joint_placements(model: pin.Model) -> casadi.Function:
     """Return the function q → M of the placements of all joints in the world.
 
     Args:
-        model: The model; nq configuration entries, njoints joints counting the universe.
+        model: The model, with nq configuration entries and njoints joints including the universe.
 
     Returns:
         q, shape (nq, 1) → M, shape (12, njoints - 1). Column i belongs to joint i + 1 (the universe
-        is left out) and stacks the columns of its rotation matrix and its translation [m]: [R[:,
-        0]; R[:, 1]; R[:, 2]; t].
+        is omitted) and stacks the columns of the rotation matrix and the translation [m]: [R[:, 0];
+        R[:, 1]; R[:, 2]; t].
 
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend()("joint_placements", _exact(model))
+    return _get_backend()("joint_placements", _round_quarter_turns(model))
 
 
 def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Function:
-    """Return the function q → M of the placements of chosen frames in the world.
+    """Return the function q → M of the placements of selected frames in the world.
 
     Args:
         model: The model.
@@ -82,14 +86,14 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
 
     Raises:
         UnknownNameError: The model has no such frame.
-        InputError: Several different frames of the model share the name.
+        InputError: Several different frames of the model have this name.
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
     listed: tuple[Any, ...] = items(
         [frames] if isinstance(frames, str) else frames, "frames", "a list of frames"
     )
-    indices = [_frame_index(model, frame, f"frames[{i}]") for i, frame in enumerate(listed)]
-    return _backend()("frame_placements", _exact(model), indices)
+    indices = [_find_frame(model, frame, f"frames[{i}]") for i, frame in enumerate(listed)]
+    return _get_backend()("frame_placements", _round_quarter_turns(model), indices)
 
 
 def frame_jacobian(
@@ -97,14 +101,14 @@ def frame_jacobian(
     frame: str | int,
     reference: Literal["local_world_aligned", "local", "world"] = "local_world_aligned",
 ) -> casadi.Function:
-    """Return the function q → J of the Jacobian of a frame: its spatial velocity is J·v.
+    """Return the function q → J of the Jacobian of a frame; its spatial velocity is J·v.
 
     Args:
         model: The model.
         frame: Name or index of the frame.
-        reference: Where the velocity is expressed: at the frame's origin in world axes
-            ("local_world_aligned"), at the frame's origin in its own axes ("local"), or at the
-            world's origin in world axes ("world").
+        reference: Point and axes of the velocity: frame origin and world axes
+            ("local_world_aligned"), frame origin and frame axes ("local"), or world origin and
+            world axes ("world").
 
     Returns:
         q, shape (nq, 1) → J, shape (6, nv); rows 0-2 linear [m/s], rows 3-5 angular [rad/s] per
@@ -112,16 +116,18 @@ def frame_jacobian(
 
     Raises:
         UnknownNameError: The model has no such frame, or there is no such reference.
-        InputError: Several different frames of the model share the name.
+        InputError: Several different frames of the model have this name.
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    known(reference, _REFERENCES, "reference", "reference")
-    index = _frame_index(model, frame, "frame")
-    return _backend()("frame_jacobian", _exact(model), index, _REFERENCES[reference])
+    known(reference, _REFERENCE_FRAMES, "reference", "reference")
+    index = _find_frame(model, frame, "frame")
+    return _get_backend()(
+        "frame_jacobian", _round_quarter_turns(model), index, _REFERENCE_FRAMES[reference]
+    )
 
 
 def rnea(model: pin.Model) -> casadi.Function:
-    """Return the function (q, v, a) → tau of the inverse dynamics (recursive Newton-Euler).
+    """Return the function (q, v, a) → tau of inverse dynamics (recursive Newton-Euler).
 
     Args:
         model: The model, with inertias.
@@ -133,11 +139,11 @@ def rnea(model: pin.Model) -> casadi.Function:
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend()("rnea", _exact(model))
+    return _get_backend()("rnea", _round_quarter_turns(model))
 
 
 def center_of_mass(model: pin.Model) -> casadi.Function:
-    """Return the function q → com of the centre of mass of the whole model.
+    """Return the function q → com of the centre of mass of the model.
 
     Args:
         model: The model, with inertias.
@@ -148,12 +154,12 @@ def center_of_mass(model: pin.Model) -> casadi.Function:
     Raises:
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    return _backend()("center_of_mass", _exact(model))
+    return _get_backend()("center_of_mass", _round_quarter_turns(model))
 
 
-def _frame_index(model: pin.Model, frame: str | int, field: str) -> int:
-    """Return the index of `frame` in `model.frames`, checked."""
-    names = [f.name for f in _exact(model).frames]
+def _find_frame(model: pin.Model, frame: str | int, field: str) -> int:
+    """Return the checked index of `frame` in `model.frames`."""
+    names = [f.name for f in _round_quarter_turns(model).frames]
     if not isinstance(frame, str):
         number = whole(frame, field, low=-1)
         if not 0 <= number < len(names):
@@ -163,8 +169,8 @@ def _frame_index(model: pin.Model, frame: str | int, field: str) -> int:
     if not found:
         raise UnknownNameError("frame", frame, names, field=field)
     first = model.frames[found[0]]
-    # A URDF gives a joint and its link frames of one name now and then; as long as they coincide,
-    # either will do.
+    # In a URDF a joint and a link may have frames of the same name. As long as they coincide,
+    # either one will do.
     for other in (model.frames[index] for index in found[1:]):
         if other.parentJoint != first.parentJoint or other.placement != first.placement:
             raise InputError(
@@ -173,12 +179,12 @@ def _frame_index(model: pin.Model, frame: str | int, field: str) -> int:
     return found[0]
 
 
-def _exact(model: pin.Model) -> pin.Model:
-    """Return a copy of `model` whose quarter turns are exact.
+def _round_quarter_turns(model: pin.Model) -> pin.Model:
+    """Return a copy of `model` with exact quarter turns in its placements.
 
-    They come as cos(π/2) = 6e-17, and a number that is neither 0 nor ±1 stays in every expression
-    it enters: without this a UR5e on a planar base takes a tenth more. The change is below the
-    rounding of the numeric algorithms.
+    They are stored as cos(π/2) = 6e-17, and a number other than 0 and ±1 stays in every expression
+    that it enters: without rounding, the functions of a UR5e on a planar base take ten per cent
+    longer. The change is below the rounding errors of the numeric algorithms.
     """
     import numpy as np
     import pinocchio as pin

@@ -1,4 +1,5 @@
-// Pinocchio's algorithms on casadi::SX, instantiated for all types of joints: what takes longest to compile in _cpin.
+// Instantiates Pinocchio's algorithms on casadi::SX for all joint types, the slowest part of _cpin
+// to compile.
 
 #include "_cpin.hpp"
 
@@ -15,9 +16,10 @@ void forward_kinematics(const Model & model, Data & data, const Vector & q)
   pinocchio::forwardKinematics(model, data, q);
 }
 
-Data::Matrix6x frame_jacobian(const Model & model, Data & data, const Vector & q, std::size_t frame, int reference)
+Data::Matrix6x frame_jacobian(
+  const Model & model, Data & data, const Vector & q, std::size_t frame, int reference)
 {
-  // With `q` the latter would walk over the joints once more, by templates of its own.
+  // Passing `q` to computeJointJacobians would instantiate another forward pass over the joints.
   pinocchio::forwardKinematics(model, data, q);
   pinocchio::computeJointJacobians(model, data);
   Data::Matrix6x jacobian = Data::Matrix6x::Zero(6, model.nv);
@@ -27,7 +29,8 @@ Data::Matrix6x frame_jacobian(const Model & model, Data & data, const Vector & q
   return jacobian;
 }
 
-void inverse_dynamics(const Model & model, Data & data, const Vector & q, const Vector & v, const Vector & a)
+void inverse_dynamics(
+  const Model & model, Data & data, const Vector & q, const Vector & v, const Vector & a)
 {
   pinocchio::rnea(model, data, q, v, a);
 }

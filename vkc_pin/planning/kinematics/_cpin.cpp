@@ -1,8 +1,8 @@
-// Pinocchio's algorithms on casadi::SX.
+// Python module with Pinocchio's algorithms on casadi::SX.
 //
-// Everything crosses the border to Python as text: a numeric pinocchio::Model comes in as Pinocchio serialises it, a
-// casadi::Function goes out as CasADi serialises it. So this module shares no C++ object with the Python bindings of
-// either library, and need not be built with their compilers.
+// Models and functions are exchanged with Python as text: a pinocchio::Model as serialised by
+// Pinocchio, a casadi::Function as serialised by CasADi. The module shares no C++ objects with the
+// Python bindings of these libraries, and therefore need not be built with the same compilers.
 
 #include "_cpin.hpp"
 
@@ -44,7 +44,7 @@ Vector to_eigen(const SX & column)
 template<typename Matrix>
 SX to_casadi(const Eigen::MatrixBase<Matrix> & matrix)
 {
-  SX result(matrix.rows(), matrix.cols());  // entries that are never set stay structurally zero
+  SX result(matrix.rows(), matrix.cols());  // entries that are not set are structural zeros
   for (Eigen::Index j = 0; j < matrix.cols(); ++j)
     for (Eigen::Index i = 0; i < matrix.rows(); ++i)
     {
@@ -57,7 +57,8 @@ SX to_casadi(const Eigen::MatrixBase<Matrix> & matrix)
 
 SX column(const SE3 & placement)
 {
-  return SX::vertcat({SX::vec(to_casadi(placement.rotation())), to_casadi(placement.translation())});
+  return SX::vertcat(
+    {SX::vec(to_casadi(placement.rotation())), to_casadi(placement.translation())});
 }
 
 std::string pack(
@@ -102,7 +103,8 @@ std::string frame_jacobian(const std::string & text, std::size_t frame, int refe
   const Model model = load(text);
   Data data(model);
   const SX q = SX::sym("q", model.nq);
-  const Data::Matrix6x jacobian = algorithms::frame_jacobian(model, data, to_eigen(q), frame, reference);
+  const Data::Matrix6x jacobian =
+    algorithms::frame_jacobian(model, data, to_eigen(q), frame, reference);
   return pack("frame_jacobian", {q}, to_casadi(jacobian), {"q"}, "J");
 }
 

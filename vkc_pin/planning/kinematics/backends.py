@@ -1,4 +1,7 @@
-"""Builds CasADi functions of Pinocchio's algorithms, with the compiled module or upstream's `pinocchio.casadi`."""
+"""Builds CasADi functions of Pinocchio's algorithms with one of two backends.
+
+These are the compiled module `_cpin` and upstream's `pinocchio.casadi`.
+"""
 
 from __future__ import annotations
 
@@ -6,61 +9,71 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-# CasADi and Pinocchio come first: the compiled module then uses the libraries these packages have
-# loaded, wherever they are installed.
+# CasADi and Pinocchio are imported first, so that the compiled module uses the libraries that these
+# packages have loaded, wherever they are installed.
 import casadi
 import pinocchio as pin
 
 from vkc_pin.errors import BuildError
 from vkc_pin.utils.optional_imports import REBUILD, compiled_module
 
-__all__ = ["check_versions", "compiled", "upstream"]
+__all__ = ["build_compiled", "build_upstream", "check_versions"]
 
 
-def compiled(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
-    """Return the kinematics function of this name; frames and references among its arguments are numbers."""
+def build_compiled(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
+    """Return the named function, built by the compiled module.
+
+    Args:
+        name: Name of the function in `vkc_pin.planning.kinematics`.
+        model: The model.
+        arguments: Its further arguments; frames and references as numbers.
+    """
     return casadi.Function.deserialize(
-        getattr(_extension(), name)(model.saveToString(), *arguments)
+        getattr(_import_extension(), name)(model.saveToString(), *arguments)
     )
 
 
 def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
-    """Check that the compiled module fits what is installed: the same major and minor release of each library.
+    """Check that the compiled module fits the installed libraries, up to the minor release.
 
     Args:
-        built: Package name → version it was compiled against.
-        installed: Package name → version that is installed.
+        built: Package name → version that the module was compiled against.
+        installed: Package name → installed version.
 
     Raises:
         BuildError: A release differs; the message says which, and what to install.
     """
-    wrong = [name for name in built if _release(built[name]) != _release(installed[name])]
-    if wrong:
-        what = " and ".join(
-            f"{name} {built[name]}, but {installed[name]} is installed" for name in wrong
+    mismatched = [
+        name for name in built if _parse_release(built[name]) != _parse_release(installed[name])
+    ]
+    if mismatched:
+        mismatches = " and ".join(
+            f"{name} {built[name]}, but {installed[name]} is installed" for name in mismatched
         )
-        wanted = " ".join(
-            f"'{name}=={'.'.join(map(str, _release(built[name])))}.*'" for name in wrong
+        requirements = " ".join(
+            f"'{name}=={'.'.join(map(str, _parse_release(built[name])))}.*'" for name in mismatched
         )
         raise BuildError(
-            f"vkc_pin.planning.kinematics was compiled against {what}. Either pip install {wanted}, or {REBUILD}"
+            f"vkc_pin.planning.kinematics was compiled against {mismatches}. "
+            f"Either pip install {requirements}, or {REBUILD}"
         )
 
 
-def _release(version: str) -> tuple[int, int]:
-    """Return (major, minor) of `version`, as numbers: text would put 3.10 before 3.9."""
+def _parse_release(version: str) -> tuple[int, int]:
+    """Return (major, minor) of `version` as numbers, since as text 3.10 precedes 3.9."""
     parts = version.split("+")[0].split(".")
     try:
         return int(parts[0]), int(parts[1])
     except (IndexError, ValueError):
         raise BuildError(
-            f"cannot read the version '{version}' of a library that vkc_pin.planning.kinematics needs; {REBUILD}"
+            f"cannot read the version '{version}' of a library that "
+            f"vkc_pin.planning.kinematics needs; {REBUILD}"
         ) from None
 
 
 @cache
-def _extension() -> Any:
-    """Import the compiled module, once, and check that it fits."""
+def _import_extension() -> Any:
+    """Import the compiled module once and check its versions."""
     extension = compiled_module("vkc_pin.planning.kinematics._cpin")
     check_versions(
         {"pin": extension.PINOCCHIO_VERSION, "casadi": extension.CASADI_VERSION},
@@ -69,8 +82,8 @@ def _extension() -> Any:
     return extension
 
 
-def upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
-    """Return the same, made by Pinocchio's own bindings."""
+def build_upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
+    """Return the named function, built by `pinocchio.casadi`; see `build_compiled`."""
     cpin = import_module("pinocchio.casadi")
     symbolic, inputs = cpin.Model(model), {"q": casadi.SX.sym("q", model.nq, 1)}
     data, q = symbolic.createData(), inputs["q"]
@@ -101,5 +114,5 @@ def upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
             for m in placements
         ]
         output, result = casadi.horzcat(casadi.SX(12, 0), *columns), "M"
-    lean = casadi.cse(casadi.sparsify(casadi.SX(output)))
-    return casadi.Function(name, list(inputs.values()), [lean], list(inputs), [result])
+    simplified = casadi.cse(casadi.sparsify(casadi.SX(output)))
+    return casadi.Function(name, list(inputs.values()), [simplified], list(inputs), [result])

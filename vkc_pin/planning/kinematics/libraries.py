@@ -1,4 +1,4 @@
-"""The folder in which compiled functions are kept from process to process: owner-only, checked before use, bounded."""
+"""Stores compiled functions in a folder of the user, checked before loading and bounded in size."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ __all__ = ["BUILD", "VARIABLE", "Libraries"]
 BUILD = ".build-"
 """Start of the names of folders in which libraries are compiled."""
 
-_FILES, _BYTES = (
+_MAX_FILES, _MAX_BYTES = (
     256,
     512 * 2**20,
-)  # libraries that are kept at most, and records; a waypoint's functions take 0.1 MB
-_JOBS = 64  # that wait at most
-# [s] after which what could not be compiled is tried again, and what a dead process left is removed
-_RETRY = 86400.0
-# Names of the files and folders that the package creates here. No others are removed or run.
-_RANDOM = "[a-z0-9_]{8}"  # end of a name of `tempfile`
-_FILE = re.compile(rf"[0-9a-f]{{40}}\.(?:so|json|job|failed)|{re.escape(TEMPORARY)}{_RANDOM}")
-_BUILD = re.compile(re.escape(BUILD) + _RANDOM)
-_DIGEST = (
-    hashlib.sha256().digest_size
-)  # bytes after the end of a library: loaders do not look at them
+)  # Maximum number and size of libraries and records; a waypoint's functions take 0.1 MB.
+_MAX_JOBS = 64  # maximum number of pending jobs
+# [s] after which a failed compilation is retried and the files of dead processes are removed
+_RETRY_DELAY = 86400.0
+# Names of the files and folders that the package creates here. No others are removed or executed.
+_RANDOM_SUFFIX = "[a-z0-9_]{8}"  # suffix of names by `tempfile`
+_FILE_PATTERN = re.compile(
+    rf"[0-9a-f]{{40}}\.(?:so|json|job|failed)|{re.escape(TEMPORARY)}{_RANDOM_SUFFIX}"
+)
+_BUILD_PATTERN = re.compile(re.escape(BUILD) + _RANDOM_SUFFIX)
+_DIGEST_SIZE = hashlib.sha256().digest_size  # bytes appended to a library; loaders ignore them
 
 
 class Libraries:
-    """A folder with libraries `KEY.so`, wishes for more `KEY.job`, and marks `KEY.failed` of what could not be compiled.
+    """A folder with libraries `KEY.so`, requests `KEY.job` and failure marks `KEY.failed`.
 
-    A library ends in a digest of all before it, so that one that was cut off is never loaded: that
-    could kill the process. Files appear whole or not at all. Any number of processes may use the
-    folder at once. What cannot be done raises OSError.
+    A library ends in a digest of its contents, so that a truncated one, which could crash the
+    process, is never loaded. Files are written atomically. Any number of processes may use the
+    folder at once. Operations that fail raise OSError.
 
     Attributes:
         path: The folder.
@@ -49,17 +49,20 @@ class Libraries:
         self.path = path
 
     @classmethod
-    def here(cls) -> Libraries | None:
-        """Return this user's folder, made if need be; None if there is none, or if others might have written in it."""
+    def open_default(cls) -> Libraries | None:
+        """Return this user's folder, created if necessary.
+
+        Returns None if there is none, or if other users might have written to it.
+        """
         path = folder()
         return None if path is None else cls(path)
 
     def exists(self, key: str) -> bool:
-        """Whether there seems to be a library."""
+        """Return whether a file of the library exists."""
         return (self.path / f"{key}.so").is_file()
 
     def find(self, key: str) -> Path | None:
-        """Return a library that may be loaded; one that is damaged is removed."""
+        """Return the path of a valid library, or None; a damaged one is removed."""
         path = self.path / f"{key}.so"
         try:
             with os.fdopen(
@@ -71,58 +74,58 @@ class Libraries:
                 data = stream.read()
         except OSError:
             return None
-        if hashlib.sha256(data[:-_DIGEST]).digest() != data[-_DIGEST:]:
+        if hashlib.sha256(data[:-_DIGEST_SIZE]).digest() != data[-_DIGEST_SIZE:]:
             self.remove(f"{key}.so")
             return None
         with contextlib.suppress(OSError):
-            os.utime(path)  # when it was used last
+            os.utime(path)  # time of last use
         return path
 
-    def ask(self, key: str, job: bytes) -> bool:
-        """Ask for a library; return whether somebody should see to it now."""
-        if self.failed(key):
+    def request(self, key: str, job: bytes) -> bool:
+        """Request the compilation of a library; return whether it is pending now."""
+        if self.has_failed(key):
             return False
-        if key not in (jobs := self.jobs()):
-            if len(jobs) >= _JOBS:
+        if key not in (pending := self.list_jobs()):
+            if len(pending) >= _MAX_JOBS:
                 return False
             self._write(f"{key}.job", job)
         return True
 
-    def jobs(self) -> list[str]:
-        """Return the keys of what was asked for and is not there yet."""
-        found = (path for path in self.path.glob("*.job") if _FILE.fullmatch(path.name))
+    def list_jobs(self) -> list[str]:
+        """Return the keys of pending jobs."""
+        found = (path for path in self.path.glob("*.job") if _FILE_PATTERN.fullmatch(path.name))
         return sorted(path.stem for path in found if path.is_file() and not path.is_symlink())
 
-    def job(self, key: str) -> bytes:
-        """Return what was asked for."""
+    def read_job(self, key: str) -> bytes:
+        """Return the contents of a pending job."""
         path = self.path / f"{key}.job"
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as stream:
             if not only_mine(os.fstat(stream.fileno())):
                 raise PermissionError(f"others may have written {path}")
             return stream.read()
 
-    def failed(self, key: str) -> bool:
-        """Whether it was tried within the last day, without success."""
+    def has_failed(self, key: str) -> bool:
+        """Return whether a compilation failed within the last day."""
         with contextlib.suppress(OSError):
-            return time.time() - (self.path / f"{key}.failed").stat().st_mtime < _RETRY
+            return time.time() - (self.path / f"{key}.failed").stat().st_mtime < _RETRY_DELAY
         return False
 
-    def try_out(self, key: str) -> None:
-        """Note that it is being tried: it has failed unless `publish` follows, even if this process dies of it."""
+    def mark_attempt(self, key: str) -> None:
+        """Mark a compilation as failed until `publish` is called, as it may crash the process."""
         self._write(f"{key}.failed", b"")
 
     def publish(self, key: str, library: bytes) -> None:
-        """Keep a library."""
+        """Store a library."""
         self._write(f"{key}.so", library + hashlib.sha256(library).digest())
         self.remove(f"{key}.failed")
 
     def remove(self, name: str) -> None:
-        """Remove a file, if it is there."""
+        """Remove a file if it exists."""
         with contextlib.suppress(OSError):
             (self.path / name).unlink()
 
-    def tidy(self) -> None:
-        """Remove the least recently used files beyond the limits, and files of processes that died.
+    def evict(self) -> None:
+        """Remove the least recently used files beyond the limits, and files of dead processes.
 
         Only regular files and build folders with names that the package creates are removed.
         """
@@ -130,30 +133,32 @@ class Libraries:
         for path in self.path.iterdir():
             with contextlib.suppress(OSError):
                 status = path.lstat()
-                is_old = now - status.st_mtime > _RETRY
-                if stat.S_ISREG(status.st_mode) and _FILE.fullmatch(path.name):
+                is_old = now - status.st_mtime > _RETRY_DELAY
+                if stat.S_ISREG(status.st_mode) and _FILE_PATTERN.fullmatch(path.name):
                     if path.suffix in (".so", ".json"):
                         libraries.append((status.st_mtime, status.st_size, path))
                     elif is_old:
                         path.unlink()
-                elif stat.S_ISDIR(status.st_mode) and _BUILD.fullmatch(path.name) and is_old:
-                    shutil.rmtree(path)  # does not follow links
+                elif (
+                    stat.S_ISDIR(status.st_mode) and _BUILD_PATTERN.fullmatch(path.name) and is_old
+                ):
+                    shutil.rmtree(path)  # does not follow symbolic links
         size = 0
         for count, (_, nbytes, path) in enumerate(sorted(libraries, reverse=True)):
             size += nbytes
-            if count >= _FILES or size > _BYTES:
+            if count >= _MAX_FILES or size > _MAX_BYTES:
                 self.remove(path.name)
 
     def lock(self) -> int | None:
-        """Return the handle of the lock that whoever compiles has, or None if somebody has it; to be closed.
+        """Return a handle of the compiler lock, to be closed, or None if another process holds it.
 
-        A process that inherits the handle has the lock as well, as long as one of them has it open.
+        A process that inherits the handle holds the lock too, as long as either has it open.
         """
         handle = os.open(
             self.path / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600
         )
         try:
-            if self.take(handle):
+            if self.acquire(handle):
                 return handle
         except OSError:
             os.close(handle)
@@ -161,8 +166,8 @@ class Libraries:
         os.close(handle)
         return None
 
-    def take(self, handle: int) -> bool:
-        """Take the lock, unless somebody has it."""
+    def acquire(self, handle: int) -> bool:
+        """Try to acquire the lock; return whether that succeeded."""
         import fcntl
 
         try:
@@ -172,7 +177,7 @@ class Libraries:
         return True
 
     def unlock(self, handle: int) -> None:
-        """Let go of the lock."""
+        """Release the lock."""
         import fcntl
 
         fcntl.flock(handle, fcntl.LOCK_UN)

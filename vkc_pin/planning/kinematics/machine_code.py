@@ -1,7 +1,7 @@
-"""CasADi functions as machine code: compiled in the background, kept on disk, and equal to the interpreted ones bit for bit.
+"""Compiles CasADi functions in the background; results equal the interpreter's bit for bit.
 
-Nothing waits for a compiler, and nothing fails for want of one: as long as there is no library, the
-functions are those that were given.
+Callers never wait for a compiler and never fail without one: until a library is available, the
+functions are interpreted.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ import numpy as np
 
 from vkc_pin.planning.kinematics.libraries import BUILD, Libraries
 
-__all__ = ["MachineCode", "wait", "work"]
+__all__ = ["MachineCode", "compile_jobs", "wait"]
 
-# No contraction to fused multiplications and additions, the interpreter's own calls of sine and
-# cosine, and nothing that another machine with the same home may lack: results are equal to the
-# last bit. -O2 took 1.4 times as long to compile, for no gain.
+# No fused multiply-add, the interpreter's own sine and cosine, and no instructions that another
+# machine with the same home may lack: results are equal bit for bit. -O2 took 1.4 times as long to
+# compile without making the code faster.
 _FLAGS = (
     "-O1",
     "-ffp-contract=off",
@@ -40,160 +40,175 @@ _FLAGS = (
     "-fPIC",
     "-shared",
 )
-_LONGEST = 600.0  # [s] that a compiler may take; one that has a processor to itself takes 1 to 2
-# at which a library is compared with the interpreter before it is kept; each time it is loaded, at
-# one: 1 ms
-_SAMPLES = 20
-_WORKER = """
+_COMPILER_TIMEOUT = 600.0  # [s], timeout of the compiler, which takes 1 to 2 s on an idle processor
+# Samples at which a library is compared with the interpreter before it is stored. Each time it is
+# loaded, one sample is compared (1 ms).
+_COMPARISON_SAMPLES = 20
+_WORKER_SCRIPT = """
 import os, sys
 os.nice(19)
 sys.path[:] = sys.argv[3:]
-from vkc_pin.planning.kinematics.machine_code import work
-work(sys.argv[1], int(sys.argv[2]))
+from vkc_pin.planning.kinematics.machine_code import compile_jobs
+compile_jobs(sys.argv[1], int(sys.argv[2]))
 """
-_NICE = ("nice", "-n", "19")  # where there is this command, Python itself starts with low priority
-_LOADING = threading.Lock()
+_NICE_COMMAND = ("nice", "-n", "19")  # if available, Python itself starts with low priority
+_LOAD_LOCK = threading.Lock()
 
 
 class MachineCode:
-    """Functions that are compiled together; for one thread at a time, like what keeps it."""
+    """Functions that are compiled together; not thread-safe."""
 
     def __init__(self, *functions: ca.Function) -> None:
-        self._given, self._loaded, self._key, self._over = functions, functions, "", False
+        self._interpreted, self._functions, self._key, self._is_final = (
+            functions,
+            functions,
+            "",
+            False,
+        )
 
     @property
     def functions(self) -> tuple[ca.Function, ...]:
-        """The functions as they were when `look` was last called: those that were given, or compiled ones."""
-        return self._loaded
+        """The functions as of the last `try_load`: interpreted or compiled."""
+        return self._functions
 
     @property
-    def compiled(self) -> bool:
-        """Whether they are machine code."""
-        return self._loaded is not self._given
+    def is_compiled(self) -> bool:
+        """Whether the functions are machine code."""
+        return self._functions is not self._interpreted
 
-    def look(self) -> bool:
-        """Load the library if there is one, or else ask for it; return whether the functions are machine code now.
+    def try_load(self) -> bool:
+        """Load the library if it exists, or else request it; return whether it is loaded.
 
-        The first time takes some milliseconds, to find out its name; after that this is quick.
+        The first call takes some milliseconds to compute the library's name; later calls are fast.
         """
-        if self._over:
-            return self.compiled
+        if self._is_final:
+            return self.is_compiled
         with contextlib.suppress(
             OSError, RuntimeError, ValueError
-        ):  # RuntimeError: CasADi's, and no more threads
-            if (folder := Libraries.here()) is None or (compiler := _compiler()) is None:
+        ):  # RuntimeError: from CasADi, or no thread can be started
+            if (folder := Libraries.open_default()) is None or (
+                compiler := _find_compiler()
+            ) is None:
                 return False
             if not self._key:
-                texts = [function.serialize() for function in self._given]
-                self._key = _key(compiler, texts)
-                if not folder.exists(self._key) and folder.ask(
+                texts = [function.serialize() for function in self._interpreted]
+                self._key = _compute_key(compiler, texts)
+                if not folder.exists(self._key) and folder.request(
                     self._key, json.dumps([compiler, texts]).encode()
                 ):
-                    _start_if_idle(folder)
+                    _start_worker_if_idle(folder)
             if folder.exists(self._key):
-                self._over = True  # tried once: nothing changes after that
+                self._is_final = True  # loading is attempted only once
                 if (path := folder.find(self._key)) is not None and (
-                    loaded := _load(path, self._given)
+                    loaded := _load_library(path, self._interpreted)
                 ):
-                    self._loaded = loaded
-        return self.compiled
+                    self._functions = loaded
+        return self.is_compiled
 
 
 def wait(timeout: float = 600.0) -> bool:
-    """Compile what was asked for so far, in this process or others, and wait until that is done.
+    """Compile all pending functions, of this process and others, and wait until that is done.
 
-    Plan once, then call this: the next plans of that kind begin with machine code. For
-    installations, benchmarks and tests.
+    Plan once, then call this: subsequent plans of that kind start with machine code. It is meant
+    for installations, benchmarks and tests.
 
     Args:
-        timeout: How long to wait at most [s].
+        timeout: Maximum time to wait [s].
 
     Returns:
-        Whether nothing is left to be compiled.
+        Whether no function is left to be compiled.
     """
-    deadline, folder = time.monotonic() + timeout, Libraries.here()
+    deadline, folder = time.monotonic() + timeout, Libraries.open_default()
     if folder is None:
         return False
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-        while jobs := folder.jobs():
-            left = deadline - time.monotonic()
-            process = _start_if_idle(folder)
+        while jobs := folder.list_jobs():
+            remaining = deadline - time.monotonic()
+            process = _start_worker_if_idle(folder)
             if (
                 process is not None
-                and process.wait(max(left, 0.0))
-                and not any(map(folder.failed, jobs))
+                and process.wait(max(remaining, 0.0))
+                and not any(map(folder.has_failed, jobs))
             ):
-                # it does not even start; where it dies of a library, the next one goes on with the
-                # others
+                # the worker does not start; if it dies of one library, the next worker continues
+                # with the others
                 return False
-            if left < 0.0 or not _python():
+            if remaining < 0.0 or not _has_python():
                 return False
-            time.sleep(0.02)  # somebody else may be at it
+            time.sleep(0.02)  # another process may be compiling
         return True
     return False
 
 
-def work(path: str, lock: int) -> None:
-    """Compile what was asked for in a folder, until nothing is left; what a background process runs.
+def compile_jobs(path: str, lock: int) -> None:
+    """Compile the jobs of a folder until none is left; the main function of a background process.
 
     Args:
         path: The folder.
-        lock: Handle of its lock, which this process has; see `Libraries.lock`.
+        lock: Handle of its lock, which this process holds; see `Libraries.lock`.
     """
-    folder, done = Libraries(Path(path)), set[str]()
-    while keys := set(folder.jobs()) - done:
+    folder, finished = Libraries(Path(path)), set[str]()
+    while keys := set(folder.list_jobs()) - finished:
         for key in sorted(keys):
             try:
-                if not folder.exists(key) and not folder.failed(key):
-                    _compile(folder, key)
-            except Exception:  # whatever it was: the mark stays, and the next one has its turn
+                if not folder.exists(key) and not folder.has_failed(key):
+                    _compile_job(folder, key)
+            except Exception:  # the failure mark remains, and the next job is compiled
                 continue
             finally:
                 folder.remove(f"{key}.job")
-        done |= keys
-        folder.tidy()
-        folder.unlock(
-            lock
-        )  # whoever asks from now on sees to it, and whoever asked before relies on this process
-        if not done.issuperset(folder.jobs()) and not folder.take(lock):
+        finished |= keys
+        folder.evict()
+        # Requests from now on start a worker themselves; earlier ones rely on this process.
+        folder.unlock(lock)
+        if not finished.issuperset(folder.list_jobs()) and not folder.acquire(lock):
             return
 
 
-def _compile(folder: Libraries, key: str) -> None:
-    """Compile one job, compare the result with the interpreter here, where it may crash, and keep it."""
-    folder.try_out(key)
-    compiler, texts = json.loads(folder.job(key))
+def _compile_job(folder: Libraries, key: str) -> None:
+    """Compile one job, compare the result with the interpreter, and store it.
+
+    The comparison runs in this process, since it may crash.
+    """
+    folder.mark_attempt(key)
+    compiler, texts = json.loads(folder.read_job(key))
     functions = tuple(ca.Function.deserialize(text) for text in texts)
     with tempfile.TemporaryDirectory(dir=folder.path, prefix=BUILD) as build:
         library, code = Path(build) / "functions.so", ca.CodeGenerator("functions.c")
         for function in functions:
             code.add(function)
         code.generate(f"{build}/")
-        process = _run([*compiler, *_FLAGS, "functions.c", "-o", library.name, "-lm"], Path(build))
+        process = _start_process(
+            [*compiler, *_FLAGS, "functions.c", "-o", library.name, "-lm"], Path(build)
+        )
         try:
-            status = process.wait(_LONGEST)
+            status = process.wait(_COMPILER_TIMEOUT)
         finally:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)  # all that it started
+                os.killpg(process.pid, signal.SIGKILL)  # including its children
             process.wait()
-        if status == 0 and _load(library, functions, _SAMPLES):
+        if status == 0 and _load_library(library, functions, _COMPARISON_SAMPLES):
             folder.publish(key, library.read_bytes())
 
 
-def _load(path: Path, given: tuple[ca.Function, ...], samples: int = 1) -> tuple[ca.Function, ...]:
-    """Return the functions in a library if they are the given ones, or none."""
+def _load_library(
+    path: Path, functions: tuple[ca.Function, ...], samples: int = 1
+) -> tuple[ca.Function, ...]:
+    """Return the functions of a library if they are identical to the given ones, otherwise ()."""
     try:
-        with _LOADING:
-            loaded = tuple(ca.external(function.name(), str(path)) for function in given)
+        with _LOAD_LOCK:
+            loaded = tuple(ca.external(function.name(), str(path)) for function in functions)
         return (
-            loaded if all(_same(*pair, samples) for pair in zip(given, loaded, strict=True)) else ()
+            loaded
+            if all(_is_identical(*pair, samples) for pair in zip(functions, loaded, strict=True))
+            else ()
         )
-    except RuntimeError:  # no library for this machine, or other functions
+    except RuntimeError:  # not a library for this machine, or different functions
         return ()
 
 
-def _same(one: ca.Function, other: ca.Function, samples: int) -> bool:
-    """Whether two functions have the same inputs and outputs, and the same bits come out where they are looked at."""
+def _is_identical(one: ca.Function, other: ca.Function, samples: int) -> bool:
+    """Return whether two functions have equal signatures and bitwise equal results at samples."""
     shapes = [
         [f.sparsity_in(i) for i in range(f.n_in())] + [f.sparsity_out(i) for i in range(f.n_out())]
         for f in (one, other)
@@ -213,8 +228,8 @@ def _same(one: ca.Function, other: ca.Function, samples: int) -> bool:
     return True
 
 
-def _compiler() -> tuple[str, ...] | None:
-    """Return the command of the C compiler, with its full path."""
+def _find_compiler() -> tuple[str, ...] | None:
+    """Return the command of the C compiler with its full path, or None."""
     try:
         name, *options = shlex.split(os.environ.get("CC", "")) or ["cc"]
     except ValueError:
@@ -223,60 +238,63 @@ def _compiler() -> tuple[str, ...] | None:
     return (found, *options) if found else None
 
 
-def _key(compiler: tuple[str, ...], texts: list[str]) -> str:
-    """Return the name of the library of some functions: a digest of all that makes a difference to it."""
+def _compute_key(compiler: tuple[str, ...], texts: list[str]) -> str:
+    """Return the key of a library: a digest of functions, compiler and platform."""
     status, libc = Path(compiler[0]).stat(), None
-    with contextlib.suppress(OSError, ValueError):  # not GNU
+    with contextlib.suppress(OSError, ValueError):  # no GNU C library
         libc = os.confstr("CS_GNU_LIBC_VERSION")
     machine = (platform.system(), platform.machine(), libc)
-    made_by = (
+    toolchain = (
         *compiler,
         str(Path(compiler[0]).resolve()),
         status.st_size,
         status.st_mtime_ns,
         *_FLAGS,
     )
-    digest = hashlib.sha256(json.dumps([made_by, ca.CasadiMeta.version(), machine]).encode())
+    digest = hashlib.sha256(json.dumps([toolchain, ca.CasadiMeta.version(), machine]).encode())
     for text in texts:
         digest.update(hashlib.sha256(text.encode()).digest())
     return digest.hexdigest()[:40]
 
 
-def _start_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
-    """Start a process that compiles, unless one is at it; it outlives this one, and ends when nothing is left to be done."""
-    if not _python() or (lock := folder.lock()) is None:
+def _start_worker_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
+    """Start a background process that compiles all jobs, unless one is running.
+
+    It outlives this process, and ends when no job is left.
+    """
+    if not _has_python() or (lock := folder.lock()) is None:
         return None
-    try:  # the lock goes on to the process
-        nice = _NICE if shutil.which(_NICE[0]) else ()
+    try:  # the process inherits the lock
+        nice = _NICE_COMMAND if shutil.which(_NICE_COMMAND[0]) else ()
         command = [
             *nice,
             sys.executable,
             "-P",
             "-c",
-            _WORKER,
+            _WORKER_SCRIPT,
             str(folder.path),
             str(lock),
             *map(os.path.abspath, sys.path),
         ]
-        process = _run(command, folder.path, lock)
+        process = _start_process(command, folder.path, lock)
     finally:
         os.close(lock)
-    threading.Thread(target=process.wait, daemon=True).start()  # so that it leaves no zombie
+    threading.Thread(target=process.wait, daemon=True).start()  # reaps the process
     return process
 
 
-def _python() -> bool:
-    """Whether there is a Python to start: a program with one in it is not started once more."""
+def _has_python() -> bool:
+    """Return whether the executable is Python and not a program that embeds it."""
     return "python" in Path(sys.executable or "").name.lower()
 
 
-def _run(command: list[str], folder: Path, *handles: int) -> subprocess.Popen[bytes]:
-    """Start a process that hears and says nothing, in a group of its own: Ctrl-C is not for it.
+def _start_process(command: list[str], folder: Path, *handles: int) -> subprocess.Popen[bytes]:
+    """Start a silent process in a process group of its own, so that Ctrl-C does not reach it.
 
-    Not in a session of its own: Linux shares processors out by session first, and lower priority
-    would mean nothing in another.
+    It does not get a session of its own: Linux first divides processor time among sessions, so that
+    low priority would have no effect in another one.
     """
-    no = subprocess.DEVNULL
+    null = subprocess.DEVNULL
     return subprocess.Popen(
-        command, cwd=folder, process_group=0, stdin=no, stdout=no, stderr=no, pass_fds=handles
+        command, cwd=folder, process_group=0, stdin=null, stdout=null, stderr=null, pass_fds=handles
     )

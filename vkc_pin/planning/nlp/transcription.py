@@ -441,7 +441,7 @@ def transcribe(structure: Structure, cache: Cache) -> Transcription:
     """Return the program of `structure`, rebuilt if machine code has become available since."""
     program = cache.get(key := ("program", structure.key), lambda: Transcription(structure, cache))
     if not program.uncompiled_functions or not all(
-        code.look() for code in program.uncompiled_functions
+        code.try_load() for code in program.uncompiled_functions
     ):
         return program
     cache.drop(*key)

@@ -149,9 +149,9 @@ class WaypointFunctions:
         """Switch to machine code if it pays off; return the code that is not available yet."""
         if waypoints < _MIN_WAYPOINTS_TO_COMPILE:
             return []
-        self.code.look()
+        self.code.try_load()
         self.value, self.jacobian, self.hessian = self.code.functions
-        return [] if self.code.compiled else [self.code]
+        return [] if self.code.is_compiled else [self.code]
 
 
 class StepRows:

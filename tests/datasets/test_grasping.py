@@ -52,7 +52,7 @@ def test_none_where_there_is_none() -> None:
     document["obstacles"].append(
         {"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": at}
     )
-    with pytest.warns(UserWarning, match="stand in others"):
+    with pytest.warns(UserWarning, match="overlap other shapes"):
         blocked = Scene.from_document(document, scene.folder)
     step = Actuate("drawer", {"slide": 0.2}, attachment)
     assert grasped(blocked, step, np.random.default_rng(0), Options(), Planner()) is None

@@ -57,7 +57,7 @@ def test_one_hand_cannot_open_a_door_with_a_cup_in_it() -> None:
         (A("fridge", {"hinge": 1.0}), UnknownNameError, "steps[3].object", "refrigerator"),
         (A("refrigerator", {"door": 1.0}), UnknownNameError, "steps[3].joints", "hinge"),
         (G("cup", "handle"), UnknownNameError, "steps[3].attachment", "side"),
-        (P("door", (0, 0, 0)), InputError, "steps[3].object", "stands fixed"),
+        (P("door", (0, 0, 0)), InputError, "steps[3].object", "is fixed in the world"),
         (vkc.Release(), InputError, "steps[3]", "the hand is empty"),
         (G("litter", by="broom.bristles"), InputError, "steps[3].by", "does not carry"),
         ("tidy up", InputError, "steps[3]", "not a step"),

@@ -338,7 +338,7 @@ def test_an_opening_beyond_the_gripper_is_as_near_as_it_gets_and_tells_so(
     )
     said = [str(one.message) for one in told]
     if opening == 0.3:
-        text = "the gripper of 'mine' opens from 0.0 to 80.0 mm, not 300 mm as asked for drawer.grip: it opens to 80.0 mm"
+        text = "the gripper of 'mine' opens from 0.0 to 80.0 mm, not 300 mm as requested for drawer.grip: it opens to 80.0 mm"
         assert said == [f"cheeks: {text}"]
     else:  # what is measured is not that exact
         assert said == []
@@ -348,7 +348,7 @@ def test_a_robot_whose_gripper_does_not_open_tells_so(tmp_path: Path) -> None:
     robot = write_gripper(tmp_path / "plain", gripper="locked_joints: {finger_a_joint: 0.04}\n")
     with pytest.warns(
         UserWarning,
-        match=r"'plain' does not open as asked for \(the start 20 mm, drawer.grip 40 mm\).*`gripper`",
+        match=r"'plain' cannot open as requested \(the start 20 mm, drawer.grip 40 mm\).*`gripper`",
     ):
         scene = between_cheeks(robot, opening=NARROW, start=0.02)
     assert [phase.opening for phase in compile_task(scene, PULL, vkc.Options()).phases] == [

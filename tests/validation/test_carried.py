@@ -778,7 +778,7 @@ def test_a_ball_that_rolls_on_the_tip() -> None:
 def test_a_ball_that_is_dropped_with_the_stick() -> None:
     """Nothing is held through what nobody holds."""
     ball = Hold("ball", "pull", Hold("stick", "grip"), "tip")
-    with pytest.raises(InputError, match="held through what is not held"):
+    with pytest.raises(InputError, match="held through an object that is not held"):
         PhaseSpan("no stick", 0, 1, (ball,))
     data = fetching().motion().to_dict()
     data["phases"][2] |= {"held": {"ball": "pull"}, "by": {"ball": "stick.tip"}}

@@ -251,7 +251,7 @@ def _started(recipe: Recipe, place: _Place, rng: np.random.Generator, goal: Floa
     x, y = np.array(scene.arena).reshape(2, 2)
     anywhere = (rng.uniform([x[0], y[0], -np.pi], [x[1], y[1], np.pi]) for _ in range(_STARTS))
     for base in itertools.islice(
-        scene.start_region.draws(rng) if scene.start_region else anywhere, _STARTS
+        scene.start_region.sample_poses(rng) if scene.start_region else anywhere, _STARTS
     ):
         base = np.round(base, 4)
         if not start.distance[0] <= np.linalg.norm(base[:2] - goal[:2]) <= start.distance[

@@ -13,7 +13,7 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*things that can move stand in others"
+    "ignore:.*movable links overlap other shapes"
 )  # cups in their table, as in real homes
 
 

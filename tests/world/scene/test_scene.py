@@ -143,7 +143,7 @@ def test_sampling_needs_a_region_with_room_in_it(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no start region"):
         none.sample_start(rng)
     full = load(tmp_path, TINY.replace("x: [-1, 1], y: [-1, 1]", "x: [2, 2.1], y: [2, 2.1]"))
-    with pytest.raises(InputError, match="no free place"):
+    with pytest.raises(InputError, match="no collision-free start"):
         full.sample_start(rng)
 
 

@@ -127,8 +127,11 @@ def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
     [
         ("quaternion: [0, 0, 1, 1]", "not a rotation .*length 1, not 1.414"),
         ("quaternion: [0, 0, 1]", "4 values"),
-        ("quaternion: [0, 0, 0, 1], yaw: 0", "two orientations .*one of rpy, yaw and quaternion"),
-        ("quaternion: [0, 0, 0, 1], rpy: [0, 0, 0]", "two orientations"),
+        (
+            "quaternion: [0, 0, 0, 1], yaw: 0",
+            "more than one orientation .*one of rpy, yaw and quaternion",
+        ),
+        ("quaternion: [0, 0, 0, 1], rpy: [0, 0, 0]", "more than one orientation"),
     ],
 )
 def test_wrong_quaternions_are_located(tmp_path: Path, orientation: str, said: str) -> None:

@@ -261,7 +261,7 @@ def test_names_that_do_not_exist(
             {"cane": "grip", "fruit": "pull"},
             {"fruit": "cane.tip", "cane": "fruit.ball"},
             {},
-            "in a circle",
+            "in a cycle",
         ),
         ({"cane": "grip", "front": "handle"}, {"front": "cane.tip"}, {}, "only a free object"),
         (
@@ -344,7 +344,7 @@ def test_holds_that_cannot_be(
             "{cane: {attachment: grip, by: fruit.ball}, fruit: {attachment: pull, by: cane.tip}}",
             InputError,
             "start.held",
-            "in a circle",
+            "in a cycle",
         ),
     ],
 )

@@ -18,7 +18,11 @@ def test_draws_fill_the_region_and_nothing_else(yaw: tuple[float, float] | None)
         low[2], high[2] = yaw
     rng = np.random.default_rng(0)
     drawn = np.array(
-        list(itertools.islice(RegionSchema(x=(-1.0, 3.0), y=(2.0, 2.5), yaw=yaw).draws(rng), 2000))
+        list(
+            itertools.islice(
+                RegionSchema(x=(-1.0, 3.0), y=(2.0, 2.5), yaw=yaw).sample_poses(rng), 2000
+            )
+        )
     )
     assert ((drawn >= low) & (drawn <= high)).all()
     shares = (drawn - low) / (high - low)
@@ -29,7 +33,7 @@ def test_draws_fill_the_region_and_nothing_else(yaw: tuple[float, float] | None)
 
 def test_the_same_numbers_give_the_same_starts() -> None:
     region = RegionSchema(x=(0.0, 1.0), y=(0.0, 1.0))
-    one, other = (next(region.draws(np.random.default_rng(5))) for _ in range(2))
+    one, other = (next(region.sample_poses(np.random.default_rng(5))) for _ in range(2))
     np.testing.assert_array_equal(one, other)
 
 

@@ -112,7 +112,7 @@ def test_a_free_object_is_taken_anew_where_it_stands_only(stands: bool) -> None:
     again = (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
     assert (
         list(generate_alternatives(scene, task, anew=True))
-        == [("litter.grip, taken anew", again)] * stands
+        == [("litter.grip, grasped again", again)] * stands
     )
     assert not list(generate_alternatives(scene, task)), "only where phases may be more"
 

@@ -181,7 +181,7 @@ def test_what_would_have_to_be_pulled_is_refused(
     with pytest.raises(InputError, match=said) as caught:
         compiled(at(begin), {"hinge": end}, face)
     assert caught.value.field == "steps[0].joints"
-    other = "or an attachment to hold it by: handle, handle_free"
+    other = "or an attachment that can be grasped: handle, handle_free"
     assert caught.value.expected == f"{'≥' if way == 'up' else '≤'} {begin:g}, {other}"
 
 
@@ -219,7 +219,9 @@ def test_a_face_whose_joint_does_not_yield_is_refused(
     scene = with_objects(
         door_scene(), {"cabinet": with_attachment(full_scene().objects["cabinet"], face)}
     )
-    with pytest.raises(InputError, match=f"does not move '{joint}' one way") as caught:
+    with pytest.raises(
+        InputError, match=f"does not move '{joint}' in a single direction"
+    ) as caught:
         compiled(scene, {joint: 0.2}, "face", "cabinet")
     assert "one side of the joint's axis" in str(caught.value)
     assert cabinet().attachments["grip"].contact == "grasp"
@@ -232,7 +234,7 @@ def test_a_face_on_both_sides_of_the_hinge_is_refused() -> None:
         *placed.object.attachments["push"].freedoms[1:],
     )
     both = dataclasses.replace(placed.object.attachments["push"], name="both", freedoms=wide)
-    with pytest.raises(InputError, match="does not move 'hinge' one way"):
+    with pytest.raises(InputError, match="does not move 'hinge' in a single direction"):
         compiled(
             with_objects(at(-1.0), {"door": with_attachment(placed, both)}), {"hinge": 0.0}, "both"
         )

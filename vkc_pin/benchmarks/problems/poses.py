@@ -115,7 +115,7 @@ def random_start(scene: Scene, rng: np.random.Generator) -> Scene:
             field="start_region",
             expected="x and y intervals",
         )
-    for x, y, yaw in itertools.islice(scene.start_region.draws(rng), _TRIES):
+    for x, y, yaw in itertools.islice(scene.start_region.sample_poses(rng), _TRIES):
         _, z = _drawn(scene, (x, y, yaw), rng)
         if _free(scene, z):
             return scene.with_start(base=z[:3], arm=z[3:])

@@ -1,4 +1,4 @@
-"""What stands where, what is held, and where the robot starts."""
+"""Describes a scene: the robot and its start, obstacles, articulated objects and grasps."""
 
 from vkc_pin.world.scene.scene import Scene, load_scene
 

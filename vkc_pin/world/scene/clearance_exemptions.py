@@ -1,11 +1,11 @@
-"""Finds pairs of shapes that violate the clearance margin in the initial scene, and where they are exempt from it.
+"""Finds pairs of shapes that are exempt from the clearance margin, and the joint ranges for it.
 
-Homes are built tightly: a door's leaf stands in its wall, a refrigerator's door beside the kitchen.
-Such neighbours are found in the scene alone: shapes of articulated objects against all other fixed
-shapes, in the initial state and with all joints at zero, as they were built. A pair of shapes stays
+Homes are built tightly: a door panel stands in its wall, a refrigerator's door beside the kitchen.
+Such neighbours follow from the scene alone: shapes of articulated objects are compared with all
+other fixed shapes, in the initial state and with all joints at zero, as they were built. A pair is
 exempt on the range of joint values around that state on which it is closer than the margin: its
-distance there depends on these joints alone, so that no motion could do better. An exemption never
-extends to other shapes of the same links.
+distance there depends on these joints alone, so that no motion could increase it. An exemption
+never extends to other shapes of the same links.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ __all__ = [
 ]
 
 CONTACT_DEPTH = 1e-4
-"""Overlap that is contact: what stands on a table overlaps it by rounding [m]."""
-_NEARLY = 1e-3  # [m] short of the margin that counts as having it: motions end as close
-_STEPS = 64  # in which the way of a joint to its limit is looked at, and each of them once more
-_TURN = np.pi  # [rad] how far one without a limit is looked at
+"""Largest overlap that counts as contact [m]: resting objects overlap their support by rounding."""
+_MARGIN_TOLERANCE = 1e-3  # [m] below the margin: motions may end that close
+_STEPS = 64  # samples of a joint's path to its limit, and of each refinement
+_TURN = np.pi  # [rad] range examined of joints without limits
 
 
 T = TypeVar("T")
-_TOLD = 6  # pairs that a warning names
-_MOST = 4096  # things that a scene remembers
+_MAX_NAMED = 6  # pairs that a warning names
+_MAX_CACHED = 4096  # results in a scene's cache
 
 
 class SceneLike(Protocol):
-    """What of a scene is asked for here; see `Scene`."""
+    """The attributes of a `Scene` that are used here."""
 
     @property
     def objects(self) -> Mapping[str, PlacedObject]:
@@ -63,31 +63,31 @@ class SceneLike(Protocol):
 
     @property
     def obstacles(self) -> Sequence[pin.GeometryObject]:
-        """What does not move."""
+        """Shapes of the fixed obstacles."""
 
     @property
     def obstacle_labels(self) -> Sequence[str]:
-        """Whose shape each of these is."""
+        """Name of the obstacle of each of these shapes."""
 
     @property
     def held(self) -> Collection[str]:
-        """What the robot holds."""
+        """Names of the objects that the robot holds."""
 
     @property
     def allowed(self) -> Mapping[frozenset[str], float]:
-        """Pairs of links that may be close, with their margins [m]."""
+        """Pairs of links that may be close → margin that they keep [m]."""
 
     @property
     def memory(self) -> dict[Any, Any]:
-        """What is known of it already."""
+        """Cache of derived results."""
 
 
 class ClosePair(NamedTuple):
-    """Two links that stand close to each other.
+    """Two links that are close to each other.
 
     Attributes:
-        first, second: Their labels, the first that of a link that can move.
-        distance: Signed [m].
+        first, second: Their labels; the first link can move.
+        distance: Signed distance [m].
     """
 
     first: str
@@ -108,14 +108,13 @@ class ClearanceExemption:
     """Two links, or one shape of each, that are exempt from the clearance margin.
 
     Attributes:
-        first, second: The links' labels.
-        margin: The clearance they must keep instead [m]; negative: an allowed penetration; -inf:
-            any distance.
-        distance: Their distance in the initial state, or as built [m]; `margin` for what the
+        first, second: Labels of the links.
+        margin: Clearance that they keep instead [m]; negative: an allowed penetration; -inf: none.
+        distance: Their distance in the initial state, or as built [m]; `margin` for pairs that the
             scene's description allows.
-        ranges: Coordinate "<object>.<joint>" → (lower, upper) between which the exemption holds,
-            [rad] or [m]; none: always.
-        shapes: The exempt shape of each link, see `make_shape_keys`; None: all shapes of both links.
+        ranges: Coordinate "<object>.<joint>" → (lower, upper) on which the exemption is active,
+            [rad] or [m]; empty: always.
+        shapes: Exempt shape of each link, see `make_shape_keys`; None: all shapes of both links.
     """
 
     first: str
@@ -126,15 +125,15 @@ class ClearanceExemption:
     shapes: tuple[str, str] | None = None
 
     def is_between(self, one: str, other: str) -> bool:
-        """Return whether it is about two links, by their labels."""
+        """Return whether the exemption is between two links, given by their labels."""
         return {one, other} == {self.first, self.second}
 
     def find_shape_pairs(self, labels: Sequence[str], keys: Sequence[str]) -> list[tuple[int, int]]:
-        """Return the pairs (i, j), i < j, of shapes that it exempts.
+        """Return the exempt pairs (i, j), i < j, of shapes.
 
         Args:
-            labels: The label of each shape.
-            keys: The key of each shape, see `make_shape_keys`.
+            labels: Label of each shape.
+            keys: Key of each shape, see `make_shape_keys`.
         """
         wanted = (None, None) if self.shapes is None else self.shapes
         ones, others = (
@@ -144,7 +143,12 @@ class ClearanceExemption:
         return [(min(i, j), max(i, j)) for i in ones for j in others]
 
     def is_active(self, names: Sequence[str], states: Floats) -> Bools:
-        """Return whether it holds at states, shape (S, n), of coordinates that are called like this: shape (S,)."""
+        """Return at which states the exemption is active, shape (S,).
+
+        Args:
+            names: Names of the n coordinates.
+            states: Values of the coordinates, shape (S, n), [rad] or [m].
+        """
         inside = np.ones(len(states), bool)
         for name, (lower, upper) in self.ranges.items():
             column = states[:, names.index(name)]
@@ -156,14 +160,13 @@ class ClearanceExemption:
 
 
 def make_shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return a key of each shape that is the same in every model of a scene.
+    """Return a key for each shape that is the same in every model of a scene.
 
-    It is the shape's own name, with its object before it: "door.leaf_0", "wall_2".
+    The key is the shape's own name, after that of its object: "door.leaf_0", "wall_2".
 
     Args:
-        labels: Of each shape, "<object>.<link>" or the name of an obstacle or of a link of the
-            robot.
-        names: Of each shape, in the model of its object or in one that has several.
+        labels: Label of each shape: "<object>.<link>", or the name of an obstacle or robot link.
+        names: Name of each shape in the model of its object, or in a model of several objects.
     """
     keys = []
     for label, name in zip(labels, names, strict=True):
@@ -173,35 +176,42 @@ def make_shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def find_clearance_exemptions(scene: SceneLike, dist_safe: float) -> tuple[ClearanceExemption, ...]:
-    """Return all pairs that may be closer than `dist_safe` [m]: links that the scene allows, and neighbouring shapes."""
+    """Return all pairs that may be closer than the clearance margin.
 
-    def found() -> tuple[ClearanceExemption, ...]:
+    These are the links that the scene allows, and neighbouring shapes.
+
+    Args:
+        scene: Scene.
+        dist_safe: Clearance margin [m].
+    """
+
+    def find() -> tuple[ClearanceExemption, ...]:
         listed = [
             ClearanceExemption(min(pair), max(pair), margin, margin)
             for pair, margin in scene.allowed.items()
             if len(pair) == 2
         ]
-        return *listed, *_neighbours(scene, dist_safe)
+        return *listed, *_find_neighbours(scene, dist_safe)
 
-    return _kept(
+    return _get_cached(
         scene,
         (
             "clearance_exemptions",
             dist_safe,
-            *(_key(placed) for placed in scene.objects.values()),
+            *(_make_state_key(placed) for placed in scene.objects.values()),
         ),
-        found,
+        find,
     )
 
 
 def find_close_pairs(scene: SceneLike, reach: float) -> list[ClosePair]:
-    """Return what can move and stands closer than `reach` [m] to something, but for what the hand holds.
+    """Return the pairs of links closer than `reach` [m] of which one can move.
 
-    Links of one object, what a scene allows, and the floor below what is not free do not count; nor
-    does what a free object stands on, unless it stands in it.
+    Held objects, pairs of links of one object, pairs that the scene allows, and fixed objects on
+    the floor are left out; so are free objects on their support, unless they overlap it.
     """
-    standing, found = PlacedShapes(scene, scene.objects), []
-    for (first, second), distance in standing.find_near_links(reach).items():
+    shapes, found = PlacedShapes(scene, scene.objects), []
+    for (first, second), distance in shapes.find_near_links(reach).items():
         free = any(
             scene.objects[label.partition(".")[0]].object.free
             for label in (first, second)
@@ -215,18 +225,22 @@ def find_close_pairs(scene: SceneLike, reach: float) -> list[ClosePair]:
 
 
 def warn_of_overlaps(scene: SceneLike, name: str) -> None:
-    """Warn of what stands inside something else and can move, if there is any, in a scene that is called so."""
+    """Warn of movable links that overlap other shapes in the scene called `name`."""
     found = [pair for pair in find_close_pairs(scene, 0.0) if pair.distance < -CONTACT_DEPTH]
     if found:
-        told = "; ".join(map(str, found[:_TOLD])) + (
-            f"; and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
+        pairs = "; ".join(map(str, found[:_MAX_NAMED])) + (
+            f"; and {len(found) - _MAX_NAMED} more" if len(found) > _MAX_NAMED else ""
         )
-        hint = "They may, until they have been apart; `allow:` in the scene says that they may touch, `vkc-pin check` names all."
-        warnings.warn(f"{name}: things that can move stand in others: {told}. {hint}", stacklevel=4)
+        hint = "They may overlap until they have separated once. `allow:` in the scene permits "
+        hint += "contact; `vkc-pin check` lists all pairs."
+        warnings.warn(f"{name}: movable links overlap other shapes: {pairs}. {hint}", stacklevel=4)
 
 
-def _neighbours(scene: SceneLike, dist_safe: float) -> Iterator[ClearanceExemption]:
-    """Yield shapes of fixed objects that are closer than `dist_safe` to another, there or with all joints at zero."""
+def _find_neighbours(scene: SceneLike, dist_safe: float) -> Iterator[ClearanceExemption]:
+    """Yield exemptions of shapes of fixed objects closer than `dist_safe` to others.
+
+    Two states are examined: the initial one, and that with all joints at zero.
+    """
     jointed = {name: placed for name, placed in scene.objects.items() if not placed.object.free}
     neutral = {
         name: np.clip(0.0, placed.object.lower, placed.object.upper)
@@ -242,10 +256,10 @@ def _neighbours(scene: SceneLike, dist_safe: float) -> Iterator[ClearanceExempti
     known = set[tuple[tuple[str, str], float, tuple[tuple[str, tuple[float, float]], ...]]]()
     for objects in states:
         standing = PlacedShapes(scene, objects)
-        for (i, j), distance in standing.find_near_shapes(dist_safe - _NEARLY).items():
+        for (i, j), distance in standing.find_near_shapes(dist_safe - _MARGIN_TOLERANCE).items():
             ranges, least = standing.find_exempt_ranges(i, j, dist_safe)
-            # The distance is a function of one joint; with several, each alone shows how deep they
-            # may be.
+            # With one joint the exemption's range bounds the overlap. With several joints it is
+            # bounded by what each joint does alone.
             deep = -np.inf if len(ranges) == 1 else min(least, distance)
             margin = 0.0 if distance > -CONTACT_DEPTH else deep
             shapes = (standing.keys[i], standing.keys[j])
@@ -258,15 +272,15 @@ def _neighbours(scene: SceneLike, dist_safe: float) -> Iterator[ClearanceExempti
 
 
 class PlacedShapes:
-    """The shapes of objects and obstacles in the world, S of them.
+    """The S shapes of objects and obstacles in the world.
 
     Args:
-        scene: The scene.
-        objects: Which objects, and in what state.
+        scene: Scene.
+        objects: Objects, in the states to examine.
 
     Attributes:
-        labels: Of each shape, its link or obstacle.
-        keys: Of each shape, see `make_shape_keys`.
+        labels: Link or obstacle of each shape.
+        keys: Key of each shape, see `make_shape_keys`.
     """
 
     def __init__(self, scene: SceneLike, objects: Mapping[str, PlacedObject]) -> None:
@@ -291,7 +305,7 @@ class PlacedShapes:
         self.keys = make_shape_keys(self.labels, [shape.name for shape in self._shapes])
 
     def find_near_shapes(self, reach: float) -> dict[tuple[int, int], float]:
-        """Return pairs of shapes, the first of which can move, that are closer than so much: their distance [m]."""
+        """Return pairs of shapes closer than `reach` [m] → distance [m]; the first can move."""
         if not self._moving:
             return {}
         boxes = [compute_world_box(shape.geometry, shape.placement) for shape in self._shapes]
@@ -305,7 +319,7 @@ class PlacedShapes:
                 axis=0
             ) & (owners != owners[i])
             if not self.objects[str(owners[i])].object.free:
-                close &= ~floor  # it hangs as its makers hung it
+                close &= ~floor  # its height above the floor is given
             for j in np.flatnonzero(close).tolist():
                 if (j, i) in found:
                     continue
@@ -318,7 +332,7 @@ class PlacedShapes:
         return found
 
     def find_near_links(self, reach: float) -> dict[tuple[str, str], float]:
-        """Return pairs of links, by their labels, that are closer than so much: the distance of their closest shapes [m]."""
+        """Return pairs of link labels closer than `reach` [m] → smallest distance [m]."""
         found: dict[tuple[str, str], float] = {}
         for (i, j), distance in self.find_near_shapes(reach).items():
             pair = (self.labels[i], self.labels[j])
@@ -329,10 +343,16 @@ class PlacedShapes:
     def find_exempt_ranges(
         self, i: int, j: int, reach: float
     ) -> tuple[dict[str, tuple[float, float]], float]:
-        """Return coordinate → (lower, upper): how far each joint alone can go until two shapes are `reach` [m] apart.
+        """Return how far each joint alone can move until two shapes are `reach` [m] apart.
 
-        A limit of the joint before that is infinite here. The second result is the least distance
-        on these ranges [m].
+        Args:
+            i: Index of one shape.
+            j: Index of the other shape.
+            reach: Distance at which a range ends [m].
+
+        Returns:
+            Coordinate → (lower, upper), infinite where a joint limit comes first; and the smallest
+            distance on these ranges [m].
         """
         found, least = dict[str, tuple[float, float]](), np.inf
         for own, other in ((i, j), (j, i)):
@@ -347,23 +367,25 @@ class PlacedShapes:
                     self.keys[other],
                     joint,
                     reach,
-                    *map(_key, where),
+                    *map(_make_state_key, where),
                 )
-                lower, upper, deepest = _kept(
-                    self.scene, key, partial(self._range, own, other, joint, reach)
+                lower, upper, deepest = _get_cached(
+                    self.scene, key, partial(self._find_exempt_range, own, other, joint, reach)
                 )
                 found[f"{owner}.{joint}"] = (lower, upper)
                 least = min(least, deepest)
         return found, least
 
-    def _range(self, own: int, other: int, joint: str, reach: float) -> tuple[float, float, float]:
+    def _find_exempt_range(
+        self, own: int, other: int, joint: str, reach: float
+    ) -> tuple[float, float, float]:
         placed = self.objects[self.labels[own].partition(".")[0]]
         index = placed.object.coordinates.index(joint)
         at, ends, least = float(placed.state[index]), list[float](), np.inf
 
         def distance(values: Floats) -> Floats:
             found: Floats = self.compute_distances(self.labels[own], index, values, [other], reach)[
-                :, self._number(own), 0
+                :, self._index_in_link(own), 0
             ]
             return found
 
@@ -392,46 +414,52 @@ class PlacedShapes:
             ends.append((low + high) / 2.0 if left else float(np.copysign(np.inf, beyond)))
         return ends[0], ends[1], least
 
-    def _number(self, shape: int) -> int:
-        """Return which of the shapes of its link a shape is."""
+    def _index_in_link(self, shape: int) -> int:
+        """Return the index of a shape among the shapes of its link."""
         return self.labels[:shape].count(self.labels[shape])
 
     def find_shapes(self, labels: Collection[str]) -> list[int]:
-        """Return the shapes of links or obstacles, by their labels."""
+        """Return the indices of the shapes of links or obstacles, given by their labels."""
         return [k for k, label in enumerate(self.labels) if label in labels]
 
     def compute_distances(
         self, label: str, index: int, values: Floats, others: Sequence[int], reach: float
     ) -> Floats:
-        """Return the distances of a link's shapes from others while one of its coordinates takes values [m].
+        """Return the distances of a link's shapes from others for values of one coordinate [m].
 
         Args:
-            label: The link, with K shapes.
-            index: Of the coordinate of its object.
-            values: Shape (V,) [rad] or [m].
-            others: Which other shapes, O of them.
-            reach: Distances larger than this may be infinite in the result [m].
+            label: Link, with K shapes.
+            index: Index of the coordinate of its object.
+            values: Values of the coordinate, shape (V,), [rad] or [m].
+            others: Indices of the other shapes, O of them.
+            reach: Larger distances may be infinite in the result [m].
 
         Returns:
             Shape (V, K, O).
         """
         own = find_link_shapes(self.objects[label.partition(".")[0]], label.partition(".")[2])
-        standing = [self._shapes[k] for k in others]
+        targets = [self._shapes[k] for k in others]
         shapes = Shapes(
-            [shape.geometry for shape in (*own, *standing)], [shape.placement for shape in standing]
+            [shape.geometry for shape in (*own, *targets)], [shape.placement for shape in targets]
         )
-        where, near = self._moved(label, index, values, standing, reach)
+        where, near = self._sweep_link(label, index, values, targets, reach)
         row, k, j = np.nonzero(near)
         found = np.full(near.shape, np.inf)
         found[row, k, j] = shapes.compute_distances(where, row, np.column_stack([k, len(own) + j]))
         return found
 
     def find_links_near_sweep(self, label: str, index: int, values: Floats) -> set[str]:
-        """Return the labels of what the boxes of a link meet while one of its object's coordinates takes values, shape (V,)."""
-        _, near = self._moved(label, index, values, self._shapes, 0.0)
+        """Return the labels of shapes whose bounding boxes meet those of a moving link.
+
+        Args:
+            label: Link.
+            index: Index of the coordinate of its object.
+            values: Values of the coordinate, shape (V,), [rad] or [m].
+        """
+        _, near = self._sweep_link(label, index, values, self._shapes, 0.0)
         return {self.labels[j] for j in np.flatnonzero(near.any(axis=(0, 1)))}
 
-    def _moved(
+    def _sweep_link(
         self,
         label: str,
         index: int,
@@ -439,7 +467,12 @@ class PlacedShapes:
         others: Sequence[pin.GeometryObject],
         reach: float,
     ) -> tuple[Floats, Bools]:
-        """Return where a link's shapes are at values of a coordinate, (V, K, 12), and which are near `others`, (V, K, others)."""
+        """Return placements of a link's shapes for values of a coordinate, and near pairs.
+
+        Returns:
+            Placements, shape (V, K, 12), and a mask of pairs with close bounding boxes, shape (V,
+            K, O).
+        """
         owner, _, link = label.partition(".")
         where, lower, upper = sweep_link_shapes(self.objects[owner], link, index, values)
         lows, highs = (
@@ -452,24 +485,24 @@ class PlacedShapes:
         return where, np.asarray(near.all(axis=3))
 
     def find_joints(self, label: str) -> list[str]:
-        """Return the joints that move a link of an object that stands fixed; none for any other."""
+        """Return the joints that move a link of a fixed object; for other links, none."""
         owner, _, link = label.partition(".")
         if owner not in self.objects or self.objects[owner].object.free:
             return []
-        thing = self.objects[owner].object
-        support = thing.model.supports[thing.model.frames[thing.link_frame(link)].parentJoint]
-        return [str(thing.model.names[joint]) for joint in support if joint]
+        item = self.objects[owner].object
+        support = item.model.supports[item.model.frames[item.link_frame(link)].parentJoint]
+        return [str(item.model.names[joint]) for joint in support if joint]
 
 
-def _kept(scene: SceneLike, key: Hashable, make: Callable[[], T]) -> T:
-    """Return what a scene remembers under a key, made if it does not."""
+def _get_cached(scene: SceneLike, key: Hashable, make: Callable[[], T]) -> T:
+    """Return the value cached under a key in a scene, computed if there is none."""
     found: T | None = scene.memory.get(key)
     if found is None:
-        if len(scene.memory) >= _MOST:
+        if len(scene.memory) >= _MAX_CACHED:
             scene.memory.clear()
         found = scene.memory[key] = make()
     return found
 
 
-def _key(placed: PlacedObject) -> tuple[bytes, bytes]:
+def _make_state_key(placed: PlacedObject) -> tuple[bytes, bytes]:
     return placed.placement.homogeneous.tobytes(), placed.state.tobytes()

@@ -1,28 +1,29 @@
-"""What may be close to what, and for how long: the rules that the program and its independent check keep, each in its own way.
+"""Defines which shapes may be close to each other, and for how long.
 
-- A hand keeps the attachment's clearance from the whole object that it takes hold of, for
-  `CONTACT_WINDOW` before it is held, as long as it is held, and for `CONTACT_WINDOW` after. Without a
-  clearance of its own that is `Options.grasp_clearance`. What is held through another link, and
-  that link, need none.
-- The hand and the link that it holds move as one, unless the grasp leaves a freedom.
+The planner and the independent validation both implement these rules.
+
+- A hand keeps the attachment's clearance from the whole object that it grasps, during the grasp and
+  for `CONTACT_WINDOW` before and after. Without a clearance of its own that is
+  `Options.grasp_clearance`. An object held through another link needs no clearance from that link.
+- The hand and the grasped link are rigidly connected, unless the grasp has a freedom.
 - A hand that pushes touches the link with its foremost point. It needs no clearance from that link,
-  overlaps it nowhere, and moves it ahead of it only.
-- What is lifted, put down, or begins or ends a ride, and what is next to it there, may be as near
-  as they are there for `CONTACT_WINDOW`. So may a link that touches something, and what is at that
-  place.
-- What rides and what it stands on move as one.
-- Shapes of articulated objects that are closer than `Options.dist_safe` to other fixed shapes, at
-  the start or with all joints at zero, keep no clearance until their joints have taken them so far
-  apart. They overlap only if they did there, and no deeper than one joint alone takes them; see
-  `neighbours`.
-- What a free object stands in where it is lifted for the first time, it may leave within
+  never overlaps it, and moves it forward only.
+- Objects that are lifted or put down, and objects that begin or cease to rest on a moving link, may
+  be as close to their surroundings as they are at that moment, for `CONTACT_WINDOW`. The same holds
+  for a link that touches a target, and the shapes at that target.
+- A supported object and its support are rigidly connected.
+- Shapes of articulated objects that are closer than `Options.dist_safe` to other fixed shapes, in
+  the initial state or with all joints at zero, keep no clearance until their joints have moved them
+  that far apart. They may overlap only if they did so in that state, and no deeper than a single
+  joint takes them; see `clearance_exemptions`.
+- A free object that overlaps its surroundings where it is first lifted may leave them within
   `CONTACT_WINDOW`.
-- What is in the hand at the start is lifted there: what it is next to, or in, it may leave within
-  `CONTACT_WINDOW`.
-- What the scene allows keeps the margin that the scene says, or none; see `Scene.allowed`.
+- An object grasped at the start counts as lifted there: it may leave what it touches or overlaps
+  within `CONTACT_WINDOW`.
+- Pairs that the scene allows keep the scene's margin, or none; see `Scene.allowed`.
 
-The gripper is as far open as the attachment says that it holds, or comes to next; it opens and
-closes where something is grasped or let go, and before the motion. Afterwards it stays as it is.
+The gripper opening is that of the attachment it holds or grasps next. It changes where an object is
+grasped or released, and before the motion; after the last grasp it stays.
 """
 
 from __future__ import annotations
@@ -52,27 +53,29 @@ __all__ = [
 ]
 
 CONTACT_WINDOW = 1.0
-"""For how long before and after a contact shapes may be close; at `Options.dt` a waypoint [s]."""
+"""Time before and after a contact in which shapes may be close [s]."""
 
 
 def find_grasped_link(scene: Scene, hold: Hold) -> str:
-    """Return the label of the link that a hold takes hold of, "<object>.<link>"."""
+    """Return the label of the grasped link, "<object>.<link>"."""
     return f"{hold.object}.{scene.objects[hold.object].object.attachments[hold.attachment].link}"
 
 
 def find_touch_links(scene: Scene, hold: Hold) -> Collection[str]:
-    """Return the labels of the links that take hold: the robot's touch links, or the link that something is held through."""
+    """Return the labels of the grasping links: the robot's touch links, or `hold.frame`."""
     return scene.robot.touch_links if hold.frame is None else (hold.frame,)
 
 
 def compute_hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> float:
-    """Return what the links that take hold keep from a link of what they take hold of, near the grasp and while it lasts [m].
+    """Return the clearance that the grasping links keep from a link of the grasped object [m].
+
+    It applies during the grasp and shortly before and after.
 
     Args:
-        scene: Whose objects they are.
-        hold: The hold.
-        link: The link of its object, "<object>.<link>".
-        options: Clearances where the attachment has none of its own.
+        scene: Scene with the objects.
+        hold: Hold.
+        link: Link of the grasped object, "<object>.<link>".
+        options: Clearances for attachments that have none of their own.
     """
     attachment = scene.objects[hold.object].object.attachments[hold.attachment]
     if (hold.by or attachment.contact == "push") and link == find_grasped_link(scene, hold):
@@ -84,7 +87,10 @@ def compute_hand_clearance(scene: Scene, hold: Hold, link: str, options: Options
 
 
 def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
-    """Return what of the hand is brought to an attachment, in the tool frame: that itself, or the foremost point that pushes."""
+    """Return the frame that is brought to an attachment, in the tool frame.
+
+    It is the tool frame itself, or, for a push, the foremost point of the hand.
+    """
     return (
         robot.opened(robot.opening(attachment.opening)).front
         if attachment.contact == "push"
@@ -93,25 +99,25 @@ def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
 
 
 def is_rigid_grasp(scene: Scene, hold: Hold) -> bool:
-    """Return whether what holds does not move relative to what is grasped while it is held."""
+    """Return whether the grasping link does not move relative to the grasped link."""
     attachment = scene.objects[hold.object].object.attachments[hold.attachment]
     return attachment.contact != "push" and (attachment.firm or not attachment.freedoms)
 
 
 def find_gripper_hold(holds: Iterable[Hold]) -> Hold | None:
-    """Return what the gripper itself holds; what is held through that does not matter to it."""
+    """Return the hold of the gripper itself, not one through a grasped object; None: none."""
     return next((hold for hold in holds if hold.by is None), None)
 
 
 def compute_grasp_opening(scene: Scene, hold: Hold) -> float | None:
-    """Return how far the robot's gripper is open when it takes, or has, what it holds [m]; None: as at rest."""
+    """Return the gripper opening of a hold [m]; None: as in the robot's rest configuration."""
     return scene.robot.opening(
         scene.objects[hold.object].object.attachments[hold.attachment].opening
     )
 
 
 def compute_start_opening(scene: Scene) -> float | None:
-    """Return how far the gripper is open at a scene's start [m]; None: as at rest."""
+    """Return the gripper opening at the start of a scene [m]; None: as in the rest state."""
     hold = find_gripper_hold(scene.holds)
     return (
         scene.robot.opening(scene.opening) if hold is None else compute_grasp_opening(scene, hold)

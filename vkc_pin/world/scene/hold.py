@@ -1,4 +1,4 @@
-"""Holds: what is held, where and through what, whether that fits the objects, from which side, and where it puts them."""
+"""Defines holds: which object is grasped, at which attachment and through which frame."""
 
 from __future__ import annotations
 
@@ -31,28 +31,26 @@ __all__ = [
 ]
 
 Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
-"""Shapes, each with where it is."""
+"""Shapes with their placements in the world frame."""
 
-_DEEP = 0.01  # [m] of a hand in an object, or in the floor, that is no matter of how far it is open
-_ROUNDING = 2e-4  # [m] of an opening, which is measured less exactly than it is written
-_WAY = (0.0, 0.04, 0.08)  # [m] before the grasp where a hand is looked at
+_MAX_OVERLAP = 0.01  # [m] of hand and object or floor: larger than opening inaccuracies
+_ROUNDING = 2e-4  # [m] of an opening: measured less accurately than it is written
+_APPROACH = (0.0, 0.04, 0.08)  # [m] distances before the grasp at which overlaps are checked
 MAX_HELD = 50
-"""So many things may be held at once: they are followed one through the other."""
+"""Largest number of objects held at once; each may be held through another."""
 
 
 @dataclass(frozen=True)
 class Hold:
-    """One object held at one of its attachments, by the robot's tool or through another object that is held.
+    """An object held at one of its attachments, by the robot's tool or through another held object.
 
-    Two holds are the same if what is held, where and through what is the same, whatever values `at`
-    has.
+    Holds are equal if object, attachment and grasping frame are equal, whatever the values `at`.
 
     Attributes:
         object: Its name in the scene.
-        attachment: Where it is held.
-        by: The hold of the object that it is held through (a stick); None: the robot's tool holds
-            it.
-        link: The link of that object which takes the place of the tool frame.
+        attachment: Attachment that is grasped.
+        by: Hold of the object that it is held through, such as a stick; None: the robot's tool.
+        link: Link of that object which replaces the tool frame.
         at: Values of the attachment's freedoms at the start of a scene that has this hold, [m] and
             [rad]; empty elsewhere.
     """
@@ -75,7 +73,7 @@ class Hold:
 
     @property
     def frame(self) -> str | None:
-        """The frame that holds it, "<object>.<link>"; None is the tool frame."""
+        """Label of the grasping frame, "<object>.<link>"; None: the tool frame."""
         return f"{self.by.object}.{self.link}" if self.by else None
 
     def __str__(self) -> str:
@@ -87,23 +85,23 @@ def make_holds(
     by: Mapping[str, str] | None = None,
     at: Mapping[str, Sequence[float]] | None = None,
 ) -> tuple[Hold, ...]:
-    """Return the holds that mappings describe, as files do, each after the one it depends on.
+    """Return the holds that mappings describe, as in files, each after the one it depends on.
 
     Args:
         held: Object → attachment.
-        by: Object → "<object>.<link>", for what is not held by the tool itself.
+        by: Object → "<object>.<link>", for objects that the tool itself does not hold.
         at: Object → values of its attachment's freedoms, [m] and [rad].
 
     Raises:
         UnknownNameError: `by` or `at` name an object that is not held.
-        InputError: Objects hold each other in a circle, `by` is not of that form, or more is held
-            than anybody can.
+        InputError: Objects hold each other in a cycle, `by` is not of that form, or too many
+            objects are held.
     """
     held = mapping(held, "held", "object names, each with that of an attachment")
     by, at = mapping({} if by is None else by, "by"), mapping({} if at is None else at, "at")
     if len(held) > MAX_HELD:
         raise InputError(
-            "too many things are held", field="held", expected=f"at most {MAX_HELD}", got=len(held)
+            "too many objects are held", field="held", expected=f"at most {MAX_HELD}", got=len(held)
         )
     for field_name, names in (("by", by), ("at", at)):
         for name in names:
@@ -114,7 +112,7 @@ def make_holds(
     def find(name: str, above: tuple[str, ...]) -> Hold:
         if name in above:
             raise InputError(
-                "objects hold each other in a circle", field="by", got=", ".join(sorted(above))
+                "objects hold each other in a cycle", field="by", got=", ".join(sorted(above))
             )
         if name not in found:
             holder, link = None, None
@@ -142,23 +140,29 @@ def make_holds(
 
 
 def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
-    """Return holds as they are, if each comes after the one it depends on. Raises `InputError` if one does not."""
+    """Return the holds as a tuple if each comes after the one it depends on.
+
+    Raises:
+        InputError: A hold comes before the one it depends on.
+    """
     holds = items(holds, "holds", "a list of Hold", Hold)
     for number, hold in enumerate(holds):
         if hold.by not in (None, *holds[:number]):
             raise InputError(
-                "held through what is not held before it", field="holds", got=str(hold)
+                "it is held through an object that is not held before it",
+                field="holds",
+                got=str(hold),
             )
     return holds
 
 
 def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) -> tuple[Hold, ...]:
-    """Return holds that fit the objects, with the values of all freedoms: zero where nothing is said; see `Scene.with_held`.
+    """Return holds checked against the objects, with values for all freedoms (default 0).
 
     Raises:
         UnknownNameError: There is no such object, attachment or link.
-        InputError: Values that do not fit the attachment's freedoms, or one is held through what
-            cannot hold it.
+        InputError: Values do not fit the attachment's freedoms, or an object is held through one
+            that cannot hold it.
     """
     found: dict[Hold, Hold] = {}
     for hold in check_hold_order(holds):
@@ -173,7 +177,7 @@ def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
             raise InputError(
                 "wrong number of values",
                 field=where,
-                expected=f"{len(freedoms)}, one a freedom",
+                expected=f"{len(freedoms)}, one per freedom",
                 got=len(values),
             )
         for value, freedom in zip(values, freedoms, strict=True):
@@ -194,12 +198,12 @@ def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
 def place_held_objects(
     objects: Mapping[str, PlacedObject], tool: Callable[[], pin.SE3], holds: Iterable[Hold]
 ) -> Mapping[str, PlacedObject]:
-    """Return the objects with every free one that is held placed where it is held.
+    """Return the objects with every free held object at its placement in the hand.
 
     Args:
-        objects: By name.
+        objects: Objects by name.
         tool: Returns the placement of the tool frame in the world.
-        holds: With the values of all freedoms, each after the one it depends on.
+        holds: Holds with the values of all freedoms, each after the one it depends on.
     """
     placed = dict(objects)
     for hold in holds:
@@ -215,20 +219,20 @@ def place_held_objects(
 def find_reversed_approaches(
     objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids
 ) -> list[Hold]:
-    """Return those of some holds whose hand comes out of the object or from below the floor, and would not from the other side.
+    """Return the holds whose approach overlaps the object or the floor, unless reversed.
 
     Args:
-        objects: All, where they stand.
-        holds: What is to be held, where and through what.
-        robot: Whose hand it is, as far open as the attachment says.
-        floor: The floor, if there is one.
+        objects: All objects at their placements.
+        holds: Holds to check.
+        robot: Robot, whose gripper opens as far as each attachment states.
+        floor: Floor, if there is one.
     """
     found, hands = list[Hold](), dict[float | None, Solids]()
     for hold in holds:
         placed = objects[hold.object]
         opening = robot.opening(placed.object.attachment(hold.attachment).opening)
         if opening not in hands:
-            hands[opening] = _hand(robot.opened(opening))
+            hands[opening] = _find_hand_shapes(robot.opened(opening))
         hand = hands[opening]
         if hold.by is not None and hold.link is not None:
             holder = objects[hold.by.object]
@@ -238,9 +242,11 @@ def find_reversed_approaches(
                 for shape, where in list_placed_shapes(make_world_shapes(holder))
             ]
         solids = [*list_placed_shapes(make_world_shapes(placed)), *floor]
-        if hold.attachment in placed.reversed or _free(placed, hold.attachment, hand, solids):
+        if hold.attachment in placed.reversed or _is_approach_free(
+            placed, hold.attachment, hand, solids
+        ):
             continue
-        if _free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):
+        if _is_approach_free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):
             found.append(hold)
     return found
 
@@ -248,30 +254,30 @@ def find_reversed_approaches(
 def warn_of_openings(
     objects: Mapping[str, PlacedObject], robot: Robot, start: float | None, where: str
 ) -> None:
-    """Warn of openings that a robot's gripper cannot stand at: it stands as near to them as it can.
+    """Warn of openings out of the gripper's range, which are replaced by the nearest possible one.
 
     Args:
-        objects: Whose attachments say how far the hand is open.
-        robot: Whose gripper it is.
-        start: How far it is open at the start [m]; None: nobody says so.
-        where: What the warning begins with.
+        objects: Objects whose attachments state an opening.
+        robot: Robot.
+        start: Opening at the start [m]; None: unspecified.
+        where: Beginning of the warning, which names the scene.
     """
-    asked = {} if start is None else {"the start": start}
+    requested = {} if start is None else {"the start": start}
     for name, placed in objects.items():
         own = placed.object.attachments.values()
-        asked |= {f"{name}.{one.name}": one.opening for one in own if one.opening is not None}
-    said = ", ".join(f"{what} {1e3 * opening:g} mm" for what, opening in asked.items())
-    if robot.gripper is None and asked:
-        hint = "it stays as it rests; `gripper` in its robot.yaml says how it opens"
+        requested |= {f"{name}.{one.name}": one.opening for one in own if one.opening is not None}
+    openings = ", ".join(f"{what} {1e3 * opening:g} mm" for what, opening in requested.items())
+    if robot.gripper is None and requested:
+        hint = "it keeps its rest configuration; describe `gripper` in its robot.yaml"
         warnings.warn(
-            f"{where}: the gripper of '{robot.name}' does not open as asked for ({said}): {hint}",
+            f"{where}: the gripper of '{robot.name}' cannot open as requested ({openings}): {hint}",
             stacklevel=4,
         )
     elif robot.gripper is not None:
         least, most = robot.gripper.min_opening, robot.gripper.max_opening
         beyond = {
             what: opening
-            for what, opening in asked.items()
+            for what, opening in requested.items()
             if abs(robot.gripper.clamp_opening(opening) - opening) > _ROUNDING
         }
         for what, opening in beyond.items():
@@ -279,28 +285,34 @@ def warn_of_openings(
                 f"{1e3 * least:.1f} to {1e3 * most:.1f} mm",
                 1e3 * robot.gripper.clamp_opening(opening),
             )
-            text = f"the gripper of '{robot.name}' opens from {can}, not {1e3 * opening:g} mm as asked for {what}"
+            text = f"the gripper of '{robot.name}' opens from {can}"
+            text += f", not {1e3 * opening:g} mm as requested for {what}"
             warnings.warn(f"{where}: {text}: it opens to {nearest:.1f} mm", stacklevel=4)
 
 
-def _free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -> bool:
-    """Return whether a hand, given in its tool frame, is nowhere deep in solids when it comes to an attachment."""
+def _is_approach_free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -> bool:
+    """Return whether the hand approaches an attachment without overlapping solids.
+
+    `hand` is given in the tool frame.
+    """
     grasp = placed.object.attachment(attachment)
     where = placed.link_placement(grasp.link)
     for values in product(*({freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms)):
         tool = where * grasp.tool(values)
-        way = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _WAY]
+        approach = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _APPROACH]
         if (
             compute_clearance(
-                [(shape, at * local) for at in way for shape, local in hand], solids, reach=-_DEEP
+                [(shape, at * local) for at in approach for shape, local in hand],
+                solids,
+                reach=-_MAX_OVERLAP,
             )
-            >= -_DEEP
+            >= -_MAX_OVERLAP
         ):
             return True
     return False
 
 
-def _hand(robot: Robot) -> Solids:
+def _find_hand_shapes(robot: Robot) -> Solids:
     """Return the shapes of a robot's touch links in its tool frame, with all joints at home."""
     data, shapes = robot.model.createData(), robot.collision.createData()
     q = robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))

@@ -1,4 +1,4 @@
-"""Obstacles: what does not move, as shapes in the world frame, and the floor among them."""
+"""Builds the collision and visual shapes of fixed obstacles, including the floor."""
 
 from __future__ import annotations
 
@@ -19,20 +19,18 @@ __all__ = ["FLOOR", "make_floor_shape", "make_obstacle_shapes"]
 FLOOR = "floor"
 """Name of the floor among a scene's obstacles."""
 _FLOOR_THICKNESS = 0.1
-_FLOOR_BORDER = (
-    2.0  # the floor reaches this far beyond the arena [m]: an arm may hang over its edge
-)
+_FLOOR_BORDER = 2.0  # [m] beyond the arena: an arm may reach over its edge
 
 
 def make_obstacle_shapes(
     item: schema.ObstacleSchema, pose: pin.SE3, folder: Path
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
-    """Return what to draw of an obstacle and what collides, in the world frame.
+    """Return the visual and the collision shapes of an obstacle, in the world frame.
 
     Args:
-        item: Its description.
-        pose: Where it stands in the world frame.
-        folder: Where the path of its mesh or URDF starts from.
+        item: Description of the obstacle.
+        pose: Its placement in the world frame.
+        folder: Folder that the path of its mesh or URDF is relative to.
 
     Raises:
         InputError: The file cannot be read.
@@ -40,7 +38,7 @@ def make_obstacle_shapes(
     from vkc_pin.world.scene import scene_schema as schema
 
     if isinstance(item, schema.UrdfSchema):
-        return _from_urdf(item, pose, folder / item.file)
+        return _make_urdf_shapes(item, pose, folder / item.file)
     drawn_as, scale = "", np.ones(3)
     solid: coal.CollisionGeometry
     match item:
@@ -57,23 +55,27 @@ def make_obstacle_shapes(
 
             drawn_as, scale = str(folder / item.file), np.array(item.scale)
             solid = load_convex(drawn_as, scale, about=item.name)
-    drawn = _shape(item.name, pose, solid, item.colour)
+    drawn = _make_shape(item.name, pose, solid, item.colour)
     drawn.meshPath, drawn.meshScale = drawn_as, scale
-    return [drawn], [_shape(item.name, pose, solid, item.colour)]
+    return [drawn], [_make_shape(item.name, pose, solid, item.colour)]
 
 
 def make_floor_shape(arena: tuple[float, float, float, float]) -> pin.GeometryObject:
-    """Return the floor of an arena, (x_min, x_max, y_min, y_max) [m]: a box, as a half space has no size to draw or to bound."""
+    """Return the floor of an arena as a box, which, unlike a half space, can be drawn and bounded.
+
+    Args:
+        arena: (x_min, x_max, y_min, y_max) [m].
+    """
     x_min, x_max, y_min, y_max = arena
     size = (x_max - x_min + 2 * _FLOOR_BORDER, y_max - y_min + 2 * _FLOOR_BORDER, _FLOOR_THICKNESS)
     centre = np.array([(x_min + x_max) / 2, (y_min + y_max) / 2, -_FLOOR_THICKNESS / 2])
-    return _shape(FLOOR, pin.SE3(np.eye(3), centre), coal.Box(*size), (0.80, 0.78, 0.74, 1.0))
+    return _make_shape(FLOOR, pin.SE3(np.eye(3), centre), coal.Box(*size), (0.80, 0.78, 0.74, 1.0))
 
 
-def _from_urdf(
+def _make_urdf_shapes(
     item: schema.UrdfSchema, pose: pin.SE3, file: Path
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
-    """Return what to draw and what collides of a URDF, with all of its joints at zero."""
+    """Return the visual and the collision shapes of a URDF with all joints at zero."""
     from vkc_pin.world.files.urdf import load_urdf
 
     model, collision, visual = load_urdf(file)
@@ -96,12 +98,12 @@ def _from_urdf(
     return both[0], both[1]
 
 
-def _shape(
+def _make_shape(
     name: str,
     pose: pin.SE3,
     shape: coal.CollisionGeometry,
     colour: tuple[float, float, float, float],
 ) -> pin.GeometryObject:
-    made = pin.GeometryObject(name, 0, 0, pose, shape)
-    made.meshColor, made.overrideMaterial = np.array(colour), True
-    return made
+    created = pin.GeometryObject(name, 0, 0, pose, shape)
+    created.meshColor, created.overrideMaterial = np.array(colour), True
+    return created

@@ -1,4 +1,4 @@
-"""Placed objects: articulated objects, each with where it stands in the world and the values of its joints."""
+"""Defines placed objects: articulated objects with a placement and joint values."""
 
 from __future__ import annotations
 
@@ -24,22 +24,21 @@ from vkc_pin.world.models.shapes import (
 
 __all__ = ["PlacedObject", "find_link_shapes", "make_world_shapes", "sweep_link_shapes"]
 
-_OTHER_SIDE = pin.SE3(
-    np.diag([1.0, -1.0, -1.0]), np.zeros(3)
-)  # half a turn about the line on which fingers close
+# Half a turn about the line along which the fingers close.
+_OTHER_SIDE = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedObject:
-    """An articulated object that stands in the world (or is held).
+    """An articulated object with a placement in the world and joint values.
 
     Attributes:
         name: Its name in the scene.
-        object: What it is.
-        placement: Its base link in the world frame.
+        object: Articulated object.
+        placement: Placement of its base link in the world frame.
         state: Its joint values, shape (n,), [rad] or [m], in the order of
             `object.coordinates.names`.
-        reversed: The attachments that are approached from the other side than its description says.
+        reversed: Attachments that are approached from the side opposite to their description.
     """
 
     name: str
@@ -55,7 +54,10 @@ class PlacedObject:
         return f"<PlacedObject {self.name}: {self.object.name}{f', {state}' if state else ''}>"
 
     def with_state(self, values: Mapping[str, float]) -> PlacedObject:
-        """Return the object with joints at `values`, by joint name, [rad] or [m]; the other joints stay.
+        """Return a copy with joints at `values`; the other joints keep theirs.
+
+        Args:
+            values: Joint name → value, [rad] or [m].
 
         Raises:
             UnknownNameError: It has no such joint.
@@ -74,7 +76,9 @@ class PlacedObject:
         return dataclasses.replace(self, state=state)
 
     def with_reversed(self, attachment: str) -> PlacedObject:
-        """Return the object with an attachment approached from the other side, the fingers closing along the same line.
+        """Return a copy with an attachment approached from the other side.
+
+        The fingers close along the same line.
 
         Raises:
             UnknownNameError: It has no such attachment.
@@ -94,19 +98,23 @@ class PlacedObject:
         )
 
     def link_placement(self, link: str) -> pin.SE3:
-        """Return the placement of `link` in the world frame. Raises `UnknownNameError` if there is none."""
+        """Return the placement of `link` in the world frame.
+
+        Raises:
+            UnknownNameError: It has no such link.
+        """
         return self.placement * self.object.link_placement(link, self.state)
 
 
 def make_world_shapes(placed: PlacedObject, *, visual: bool = False) -> list[pin.GeometryObject]:
-    """Return copies of an object's shapes where they stand: parent joint 0, placements in the world frame.
+    """Return copies of an object's shapes with parent joint 0 and placements in the world frame.
 
     Args:
-        placed: The object.
-        visual: Return what to draw instead of what collides.
+        placed: Object.
+        visual: Return visual instead of collision shapes.
 
     Returns:
-        The shapes in the object's own order, with their names in the object (`<link>_<number>`).
+        Shapes in the object's own order, with their names in the object (`<link>_<number>`).
     """
     model, geometry = (
         placed.object.model,
@@ -123,7 +131,7 @@ def make_world_shapes(placed: PlacedObject, *, visual: bool = False) -> list[pin
 
 
 def find_link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
-    """Return the convex shapes of a link of an object, in the frames of their joints."""
+    """Return the convex collision shapes of a link, in the frames of their joints."""
     return [
         shape
         for shape in placed.object.collision.geometryObjects
@@ -134,17 +142,17 @@ def find_link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject
 def sweep_link_shapes(
     placed: PlacedObject, link: str, index: int, values: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return where a link's shapes are in the world while one coordinate of the object takes values, shape (V,).
+    """Return a link's shapes in the world while one coordinate of its object takes several values.
 
     Args:
-        placed: The object; its other coordinates stay.
-        link: The link, with K shapes.
-        index: Of the coordinate.
-        values: [rad] or [m].
+        placed: Object; its other coordinates are fixed.
+        link: Link, with K shapes.
+        index: Index of the coordinate.
+        values: Values of the coordinate, shape (V,), [rad] or [m].
 
     Returns:
-        Placements, shape (V, K, 12), see `placements.flatten_placements`, and the corners of boxes around
-        the shapes, both (V, K, 3) [m].
+        Placements, shape (V, K, 12), see `placements.columns_of`, and lower and upper corners of
+            the axis-aligned bounding boxes, both (V, K, 3) [m].
     """
     model, data, own, state = (
         placed.object.model,

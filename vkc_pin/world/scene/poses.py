@@ -1,4 +1,4 @@
-"""Poses and points as users give them."""
+"""Converts poses and points given by users to Pinocchio placements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vkc_pin.utils.arrays import LARGEST
 __all__ = ["as_placement", "as_target"]
 
 _POSE = "a pinocchio.SE3, a 4 x 4 matrix, (x, y, z, roll, pitch, yaw) or (x, y, z, qx, qy, qz, qw)"
-_UNIT = 1e-3  # by which a quaternion may miss length 1
+_NORM_TOLERANCE = 1e-3  # of a unit quaternion
 
 
 def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
@@ -22,12 +22,12 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
 
     Args:
         pose: An SE3, a 4 × 4 homogeneous matrix, (x, y, z, roll, pitch, yaw) in [m] and [rad], or
-            (x, y, z, qx, qy, qz, qw) with a unit quaternion, the scalar last.
-        name: The argument's name, for the message.
+            (x, y, z, qx, qy, qz, qw) with a unit quaternion, scalar last.
+        name: Name of the argument in error messages.
 
     Raises:
-        InputError: It is none of these, not finite, further away than `LARGEST`, or its rotation is
-            no rotation.
+        InputError: `pose` has none of these forms, is not finite, exceeds `LARGEST`, or its
+            rotation is not a proper rotation.
     """
     array = numbers(
         pose.homogeneous if isinstance(pose, pin.SE3) else pose, name, _POSE, problem="not a pose"
@@ -44,7 +44,7 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
         return pin.SE3(pin.rpy.rpyToMatrix(*array[3:]), array[:3])
     if array.shape == (7,):
         norm = float(np.linalg.norm(array[3:]))
-        if abs(norm - 1.0) > _UNIT:
+        if abs(norm - 1.0) > _NORM_TOLERANCE:
             raise InputError(
                 "not a rotation",
                 field=name,
@@ -65,10 +65,14 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
 
 
 def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]:
-    """Return `target` as a point [m] if it is three numbers, otherwise as a placement; see `as_placement`.
+    """Return a point [m] for three numbers, and a placement otherwise; see `as_placement`.
+
+    Args:
+        target: Point (x, y, z) [m], or a pose.
+        name: Name of the argument in error messages.
 
     Raises:
-        InputError: It is neither.
+        InputError: `target` is neither.
     """
     if isinstance(target, pin.SE3):
         return as_placement(target, name=name)

@@ -1,4 +1,4 @@
-"""Scenes: a robot, where it starts, and the obstacles and articulated objects around it."""
+"""Defines scenes: a robot, its start, and the obstacles and articulated objects around it."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 __all__ = ["START_CLEARANCE", "Scene", "load_scene"]
 
 START_CLEARANCE = 0.03
-"""Random starts keep the robot at least this far from everything but the floor [m]."""
-_TRIES = 2000  # random starts that may be in the way of something
+"""Minimum distance of a random start from all shapes but the floor [m]."""
+_MAX_TRIES = 2000  # random starts
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,30 +51,30 @@ class Scene:
 
     Attributes:
         name: Its name.
-        file: The file it came from, if any.
-        folder: The folder that relative paths in `document` start from.
-        robot: The robot.
-        start: Where it starts: base x, y [m], yaw [rad], then the arm joints [rad], shape (n,).
-        objects: Name → articulated object. One that is free and held stands where the robot's hand
-            holds it.
-        obstacles: What does not move, as convex shapes: parent joint 0, placement in the world
-            frame, colour set. An obstacle of one shape has its name, one of several shapes
+        file: File it was loaded from, if any.
+        folder: Folder that relative paths in `document` refer to.
+        robot: Robot.
+        start: Initial configuration: base x, y [m], yaw [rad], then the arm joints [rad], shape
+            (n,).
+        objects: Name → articulated object. A free object that is held is placed in the robot's
+            hand.
+        obstacles: Fixed obstacles as convex shapes: parent joint 0, placement in the world frame,
+            colour set. An obstacle of one shape has its name, one of several shapes
             `<name>_<number>`. The floor is among them.
-        obstacle_labels: For each of these shapes, the name of its obstacle (`FLOOR` for the floor).
-        obstacle_names: The obstacles' names in the order of the file, without the floor.
-        obstacle_visual: What to draw of the obstacles, without the floor.
+        obstacle_labels: Name of the obstacle of each of these shapes (`FLOOR` for the floor).
+        obstacle_names: Names of the obstacles in the order of the file, without the floor.
+        obstacle_visual: Visual shapes of the obstacles, without the floor.
         floor: Whether there is a floor at z = 0.
-        arena: The floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
-        start_region: Where `sample_start` draws from, if the scene says so.
-        holds: What the robot holds at the start, each hold after the one it depends on.
-        allowed: Pairs of links, by label, that may be close, and what they must keep: a margin [m],
-            or -inf if nothing.
-        opening: How far the gripper is open at the start, unless it holds something [m]; None: as
-            the robot rests.
-        described: What it was made of; `document` takes from it what cannot be told from the rest:
-            robot, obstacles, files.
-        memory: What was found out about it and serves what the `with_` methods return; makes no
-            difference to anything but time.
+        arena: Part of the floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
+        start_region: Region from which `sample_start` draws, if the scene has one.
+        holds: Holds at the start, each after the one it depends on.
+        allowed: Pairs of link labels that may be close → margin that they keep [m]; -inf: none.
+        opening: Gripper opening at the start if the gripper holds nothing [m]; None: as in the
+            robot's rest configuration.
+        described: Description it was built from; source of the robot, obstacles and files in
+            `document`.
+        memory: Cache of derived results, shared with the copies that the `with_` methods return;
+            affects computation times only.
     """
 
     name: str
@@ -107,12 +107,12 @@ class Scene:
 
     @property
     def held(self) -> dict[str, str]:
-        """Object → attachment of what the robot holds at the start."""
+        """Object → attachment of the objects held at the start."""
         return {hold.object: hold.attachment for hold in self.holds}
 
     @property
     def document(self) -> dict[str, Any]:
-        """The scene as plain data, from which `from_document` builds it again; made when asked for."""
+        """The scene as plain data, from which `from_document` builds it again."""
         from vkc_pin.world.scene.scene_file import make_document
 
         return make_document(vars(self))
@@ -122,11 +122,11 @@ class Scene:
         """Build a scene from plain data (see `Scene.document` and the scene files).
 
         Args:
-            document: Dictionaries, lists, text and numbers.
-            folder: The folder that relative paths in it start from.
+            document: Dictionaries, lists, strings and numbers.
+            folder: Folder that relative paths in it refer to.
 
         Raises:
-            InputError: It does not fit; `UnknownNameError` where a name does not exist.
+            InputError: The data are invalid; `UnknownNameError` where a name does not exist.
         """
         from vkc_pin.world.files.documents import Document
         from vkc_pin.world.scene.scene_file import make_scene_fields
@@ -134,7 +134,7 @@ class Scene:
         fields = make_scene_fields(
             Document(mapping(document, "document")), file_path(folder, "folder")
         )
-        return _checked(Scene(**fields)._with())
+        return _check_new_scene(Scene(**fields)._with())
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
         """Return the scene with another start.
@@ -177,25 +177,35 @@ class Scene:
         return self._with(start=start)
 
     def with_state(self, name: str, values: Mapping[str, float]) -> Scene:
-        """Return the scene with joints of object `name` at `values`, by joint name, [rad] or [m].
+        """Return the scene with joints of object `name` at `values`.
+
+        Args:
+            name: Object.
+            values: Joint name → value, [rad] or [m].
 
         Raises:
             UnknownNameError: There is no such object, or it has no such joint.
             InputError: A value is not finite or outside the joint's limits.
         """
         return self._with(
-            objects=MappingProxyType({**self.objects, name: self._placed(name).with_state(values)})
+            objects=MappingProxyType(
+                {**self.objects, name: self._find_object(name).with_state(values)}
+            )
         )
 
     def with_placement(self, name: str, placement: pin.SE3) -> Scene:
-        """Return the scene with object `name` at `placement` (of its base link, in the world frame); see `as_placement`.
+        """Return the scene with object `name` at another placement.
+
+        Args:
+            name: Object.
+            placement: Placement of its base link in the world frame; see `as_placement`.
 
         Raises:
             UnknownNameError: There is no such object.
-            InputError: `placement` is no pose.
+            InputError: `placement` is not a pose.
         """
         placed = dataclasses.replace(
-            self._placed(name), placement=as_placement(placement, name="placement")
+            self._find_object(name), placement=as_placement(placement, name="placement")
         )
         return self._with(objects=MappingProxyType({**self.objects, name: placed}))
 
@@ -209,29 +219,26 @@ class Scene:
         """Return the scene with the robot holding objects at the start.
 
         Args:
-            held: Object → attachment; or holds, each after the one it depends on, which say all of
-                it.
-            by: Object → "<object>.<link>", for what is held through another object of `held`.
-            at: Object → values of its attachment's freedoms, [m] and [rad]; zero where nothing is
-                said.
+            held: Object → attachment; or complete holds, each after the one it depends on.
+            by: Object → "<object>.<link>", for objects held through another object of `held`.
+            at: Object → values of its attachment's freedoms, [m] and [rad]; default 0.
 
         Raises:
             UnknownNameError: There is no such object, attachment or link.
-            InputError: Values that do not fit the attachment's freedoms, or objects that hold each
-                other.
+            InputError: Values do not fit the attachment's freedoms, or objects hold each other.
         """
         holds = make_holds(held, by, at) if isinstance(held, Mapping) else held
         return self._with(holds=resolve_holds(self.objects, holds))
 
     def with_approaches(self, holds: Iterable[Hold], *, stacklevel: int = 2) -> Scene:
-        """Return the scene with attachments reversed to which the hand would come out of the object or from below the floor.
+        """Return the scene with those attachments reversed that cannot be approached otherwise.
 
-        Each of them gives a warning. Those from whose other side it would be no better stay as they
-        are.
+        These are attachments whose approach would take the hand through the object or the floor.
+        Each reversal raises a warning. Attachments whose other side is no better are unchanged.
 
         Args:
-            holds: What is to be held, where and through what.
-            stacklevel: Whose line the warnings name, as for `warnings.warn`.
+            holds: Holds whose approaches are checked.
+            stacklevel: Stack level of the warnings, as for `warnings.warn`.
         """
         floor = [
             shape
@@ -243,30 +250,29 @@ class Scene:
             self.objects, holds, self.robot, list_placed_shapes(floor)
         ):
             objects[hold.object] = objects[hold.object].with_reversed(hold.attachment)
-            what = f"{hold.frame or 'the hand'} would come to {hold.object}.{hold.attachment}"
-            text = f"{what} out of the object or from below the floor"
-            hint = f"turn its approach, the frame, or say `reversed: [{hold.attachment}]` of the object"
+            what = f"{hold.frame or 'the hand'} would approach {hold.object}.{hold.attachment}"
+            text = f"{what} through the object or the floor, so its approach is reversed"
+            hint = f"turn its approach, or set `reversed: [{hold.attachment}]` for the object"
             warnings.warn(
-                f"{self.file or self.name}: {text}: it comes from the other side; {hint}",
+                f"{self.file or self.name}: {text}; {hint}",
                 stacklevel=stacklevel,
             )
         return (
             self._with(objects=MappingProxyType(objects)) if objects != dict(self.objects) else self
         )
 
-    def _placed(self, name: str) -> PlacedObject:
+    def _find_object(self, name: str) -> PlacedObject:
         return self.objects[known(name, self.objects, "object")]
 
     def _with(self, **fields: Any) -> Scene:
-        """Return the scene with other attributes, and every free object that is held where the robot then holds it."""
+        """Return the scene with other attributes, and with free held objects placed in the hand."""
         changed = dataclasses.replace(self, **fields)
         changed = dataclasses.replace(
             changed,
             objects=place_held_objects(changed.objects, changed.tool_placement, changed.holds),
         )
-        object.__setattr__(
-            changed, "memory", self.memory
-        )  # other copies begin anew: their obstacles may be others
+        # Only copies made here share the cache: `dataclasses.replace` may change obstacles.
+        object.__setattr__(changed, "memory", self.memory)
         return changed
 
     def tool_placement(self) -> pin.SE3:
@@ -277,12 +283,13 @@ class Scene:
         return data.oMf[model.getFrameId(self.robot.tool_frame)].copy()
 
     def start_clearance(self, *, reach: float = np.inf) -> float:
-        """Return the smallest distance [m] at the start between the robot, with what it carries, and the world.
+        """Return the smallest distance between robot and world at the start [m].
 
-        The floor does not count, nor do the robot's distances to itself and to what it holds.
+        Objects in the hand count as part of the robot. Distances to the floor, of the robot to
+        itself and to the objects it holds do not count.
 
         Args:
-            reach: Distances above this do not matter [m]: the result is then some number ≥ `reach`.
+            reach: Largest distance of interest [m]: beyond it the result is some number ≥ `reach`.
         """
         if not is_number(reach) or reach != reach:
             raise InputError(
@@ -314,17 +321,17 @@ class Scene:
         return compute_clearance(moving, list_placed_shapes(standing), reach=reach)
 
     def sample_start(self, rng: np.random.Generator) -> Scene:
-        """Return the scene with the base at a random place of its start region, clear of everything.
+        """Return the scene with the base at a random collision-free pose in its start region.
 
-        The base's x, y and heading are uniform in the region; places where `start_clearance` is
-        below `START_CLEARANCE` are drawn again.
+        The base's x, y and heading are uniform in the region; poses with a `start_clearance` below
+        `START_CLEARANCE` are rejected.
 
         Args:
-            rng: Where the random numbers come from; the same state gives the same start.
+            rng: Random number generator; the same state gives the same start.
 
         Raises:
-            InputError: The scene has no start region, the robot holds something that stands fixed
-                in the world, or no free place was found.
+            InputError: The scene has no start region, the robot holds a fixed object, or no free
+                pose was found.
         """
         instance(rng, np.random.Generator, "rng")
         region, file = self.start_region, self.file
@@ -338,15 +345,15 @@ class Scene:
         for name in self.held:
             if not self.objects[name].object.free:
                 raise InputError(
-                    "the robot cannot start elsewhere while it holds this",
+                    "the start cannot be sampled while the robot holds a fixed object",
                     file=file,
                     field=f"start.held.{name}",
                 )
-        for base in itertools.islice(region.draws(rng), _TRIES):
-            there = self.with_start(base=base)
-            if there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
-                return there
-        problem = f"no free place for the robot in {_TRIES} tries"
+        for base in itertools.islice(region.sample_poses(rng), _MAX_TRIES):
+            candidate = self.with_start(base=base)
+            if candidate.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
+                return candidate
+        problem = f"no collision-free start of the robot in {_MAX_TRIES} attempts"
         raise InputError(
             problem,
             file=file,
@@ -356,34 +363,33 @@ class Scene:
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
-    """Load a scene: by the name of a file in `scenes`, or by the path of a scene file (.yaml).
+    """Load a scene by the name of a file in `scenes`, or by the path of a scene file (.yaml).
 
-    What can move and stands in something else gives a warning.
+    Movable links that overlap other shapes raise a warning.
 
     Raises:
         UnknownNameError: There is no such scene, or it names something that does not exist.
-        InputError: Something in the file is wrong; the error says what, in which file, line and
-            field.
+        InputError: The file is invalid; the error names the file, line and field.
     """
     from vkc_pin.world.files.documents import read_yaml
     from vkc_pin.world.scene.scene_file import make_scene_fields
 
     file = located(name_or_path, "scenes", "*.yaml", what="scene")
-    return _checked(Scene(**make_scene_fields(read_yaml(file), file.parent))._with())
+    return _check_new_scene(Scene(**make_scene_fields(read_yaml(file), file.parent))._with())
 
 
-def _checked(scene: Scene) -> Scene:
-    """Return a scene that was made of a description; warn of what that may not have meant."""
+def _check_new_scene(scene: Scene) -> Scene:
+    """Return a new scene with corrected approaches; warn of probable mistakes."""
     warn_of_overlaps(scene, str(scene.file or scene.name))
     warn_of_openings(scene.objects, scene.robot, scene.opening, str(scene.file or scene.name))
-    unsaid = [
+    undecided = [
         item.name
         for item in scene.described.objects
         if item.reversed is None and item.name not in scene.held
     ]
     holds = (
         Hold(name, attachment)
-        for name in unsaid
+        for name in undecided
         for attachment in scene.objects[name].object.attachments
     )
     return scene.with_approaches(holds, stacklevel=4)

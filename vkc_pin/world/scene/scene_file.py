@@ -1,4 +1,4 @@
-"""Makes the parts of a scene of its description, says where the description is wrong, and describes the parts again."""
+"""Builds the attributes of a scene from its description, and the description from a scene."""
 
 from __future__ import annotations
 
@@ -32,40 +32,40 @@ __all__ = ["make_document", "make_scene_fields"]
 
 
 def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
-    """Return what the scene that `document` describes consists of: the attributes of a `Scene`, by name.
+    """Return the attributes of the `Scene` that `document` describes, by name.
 
     Args:
-        document: The description.
-        folder: Where relative paths in it start from.
+        document: Description.
+        folder: Folder that relative paths in it refer to.
 
     Raises:
-        InputError: The description is wrong; `UnknownNameError` where it names something that does
-            not exist.
+        InputError: The description is invalid; `UnknownNameError` where it names something that
+            does not exist.
     """
     description = check(document, schema.SceneSchema)
-    robot = _robot(document, description, folder)
-    _unique_names(document, description)
+    robot = _load_robot(document, description, folder)
+    _check_unique_names(document, description)
     objects = {
-        item.name: _object(document, ("objects", index), item, folder)
+        item.name: _load_object(document, ("objects", index), item, folder)
         for index, item in enumerate(description.objects)
     }
     arena = (*description.arena.x, *description.arena.y)
     obstacles, visual, labels = list[pin.GeometryObject](), list[pin.GeometryObject](), list[str]()
     for index, item in enumerate(description.obstacles):
-        drawn, shapes = _obstacle(document, ("obstacles", index), item, folder)
+        drawn, shapes = _load_obstacle(document, ("obstacles", index), item, folder)
         visual += drawn
         obstacles += shapes
         labels += [item.name] * len(shapes)
     if description.floor:
         obstacles.append(make_floor_shape(arena))
         labels.append(FLOOR)
-    _check_places(document, description, arena)
+    _check_within_arena(document, description, arena)
     return {
         "name": description.name or (document.file.stem if document.file else "scene"),
         "file": document.file,
         "folder": folder,
         "robot": robot,
-        "start": _start(document, description.start, robot),
+        "start": _make_start(document, description.start, robot),
         "objects": MappingProxyType(objects),
         "obstacles": tuple(obstacles),
         "obstacle_labels": tuple(labels),
@@ -74,21 +74,23 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "floor": description.floor,
         "arena": arena,
         "start_region": description.start_region,
-        "holds": _holds(document, description.start.held, objects),
-        "allowed": MappingProxyType(_allowed(document, description, folder, robot, objects)),
+        "holds": _make_holds(document, description.start.held, objects),
+        "allowed": MappingProxyType(
+            _find_allowed_pairs(document, description, folder, robot, objects)
+        ),
         "described": description,
         "opening": description.start.opening,
     }
 
 
 def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return plain data from which `make_scene_fields` makes these parts of a scene again.
+    """Return plain data from which `make_scene_fields` builds the same attributes again.
 
-    What stands where it was described keeps the words of the description; what does not is
-    described by position and rpy.
+    Objects that still are where the description put them keep its fields; the others are described
+    by position and rpy.
 
     Args:
-        fields: The attributes of a `Scene`, by name.
+        fields: Attributes of a `Scene`, by name.
     """
     described, start, objects, region = (
         fields[key] for key in ("described", "start", "objects", "start_region")
@@ -98,12 +100,12 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
     )
     held = {}
     for hold in fields["holds"]:
-        said = {
+        entries = {
             "attachment": hold.attachment,
             "by": hold.frame,
             "at": list(hold.at) if any(hold.at) else None,
         }
-        held[hold.object] = {key: value for key, value in said.items() if value is not None}
+        held[hold.object] = {key: value for key, value in entries.items() if value is not None}
     for item, entry in zip(described.objects, plain["objects"], strict=True):
         placed = objects[item.name]
         names, neutral = (
@@ -113,16 +115,15 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
         entry["state"] = dict(zip(names, placed.state.tolist(), strict=True))
         in_hand = placed.object.free and item.name in held
         moved = not in_hand and not np.array_equal(
-            placed.placement.homogeneous, _pose(item).homogeneous
+            placed.placement.homogeneous, _make_pose(item).homogeneous
         )
         entry.pop("reversed", None)
         as_described = not moved and entry["state"] == {
             **dict(zip(names, neutral.tolist(), strict=True)),
             **item.state,
         }
-        if (
-            placed.reversed or item.reversed is not None or not as_described
-        ):  # else whoever reads this finds the same
+        # Otherwise loading the document finds the same approaches again.
+        if placed.reversed or item.reversed is not None or not as_described:
             entry["reversed"] = list(placed.reversed)
         if moved:
             for orientation in ("yaw", "quaternion"):
@@ -153,35 +154,35 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _robot(document: Document, description: schema.SceneSchema, folder: Path) -> Robot:
+def _load_robot(document: Document, description: schema.SceneSchema, folder: Path) -> Robot:
     item, height = description.robot, description.start.z
-    by_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
-    short = isinstance(document.data["robot"], str)  # robot: husky_ur5e
-    with document.at(("robot",) if short else ("robot", "name")):
-        name = folder / item.name if by_path else item.name
+    is_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
+    is_short = isinstance(document.data["robot"], str)  # robot: husky_ur5e
+    with document.at(("robot",) if is_short else ("robot", "name")):
+        name = folder / item.name if is_path else item.name
         turning = item.turning_radius
         return load_robot(
             name, base=item.base, tool_frame=item.tool_frame, height=height, turning_radius=turning
         )
 
 
-def _unique_names(document: Document, description: schema.SceneSchema) -> None:
-    taken = {FLOOR: "the floor"}
+def _check_unique_names(document: Document, description: schema.SceneSchema) -> None:
+    used = {FLOOR: "the floor"}
     for group, items in (("obstacles", description.obstacles), ("objects", description.objects)):
         for index, item in enumerate(items):
             path = (group, index, "name")
-            if item.name in taken:
+            if item.name in used:
                 raise document.error(
                     path,
-                    "this name is taken",
+                    "this name is already used",
                     expected="a new name",
-                    got=f"{item.name}, as {taken[item.name]}",
+                    got=f"{item.name}, as {used[item.name]}",
                 )
             line = document.line(path)
-            taken[item.name] = f"{group}[{index}]" + (f" in line {line}" if line else "")
+            used[item.name] = f"{group}[{index}]" + (f" in line {line}" if line else "")
 
 
-def _check_places(
+def _check_within_arena(
     document: Document, description: schema.SceneSchema, arena: tuple[float, float, float, float]
 ) -> None:
     for axis, low, high, value in (
@@ -204,7 +205,7 @@ def _check_places(
             )
 
 
-def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats:
+def _make_start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats:
     arm = robot.home if item.arm is None else np.array(item.arm)
     names = robot.coordinates.names[3:]
     if len(arm) != len(names):
@@ -221,7 +222,7 @@ def _start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats
     return start
 
 
-def _holds(
+def _make_holds(
     document: Document, held: Mapping[str, schema.HeldSchema], objects: Mapping[str, PlacedObject]
 ) -> tuple[Hold, ...]:
     attachments = {name: item.attachment for name, item in held.items()}
@@ -243,14 +244,14 @@ def _holds(
         return resolve_holds(objects, make_holds(attachments, by, at))
 
 
-def _allowed(
+def _find_allowed_pairs(
     document: Document,
     description: schema.SceneSchema,
     folder: Path,
     robot: Robot,
     objects: Mapping[str, PlacedObject],
 ) -> dict[frozenset[str], float]:
-    """Return pairs of labels of links that may be close, and their margin [m]; of those named twice the least."""
+    """Return pairs of link labels that may be close → margin [m]; the smallest of several."""
     labels = {link: [link] for link in robot.links}
     for name, placed in objects.items():
         own = [f"{name}.{link}" for link in placed.object.links]
@@ -262,17 +263,17 @@ def _allowed(
     for number, item in enumerate(description.allow):
         pairs: Iterable[tuple[str, ...]] = [item.pair] if item.pair is not None else []
         if item.srdf is not None:
-            short = isinstance(document.data["allow"][number], str)
-            file = _file(
-                document, ("allow", number, *(() if short else ("srdf",))), folder, item.srdf
+            is_short = isinstance(document.data["allow"][number], str)
+            file = _find_file(
+                document, ("allow", number, *(() if is_short else ("srdf",))), folder, item.srdf
             )
             pairs = read_srdf(file, links=labels).allowed
         for pair in pairs:
             for place, name in enumerate(pair):
                 if name not in labels:
-                    short = isinstance(document.data["allow"][number], list | tuple)
+                    is_short = isinstance(document.data["allow"][number], list | tuple)
                     raise document.unknown(
-                        ("allow", number, *(() if short else ("pair",)), place),
+                        ("allow", number, *(() if is_short else ("pair",)), place),
                         "link, object or obstacle",
                         name,
                         labels,
@@ -283,7 +284,7 @@ def _allowed(
     return found
 
 
-def _pose(item: schema.PoseSchema) -> pin.SE3:
+def _make_pose(item: schema.PoseSchema) -> pin.SE3:
     roll, pitch, yaw = item.rpy or (0.0, 0.0, item.yaw or 0.0)
     rotation = pin.rpy.rpyToMatrix(roll, pitch, yaw)
     if item.quaternion is not None:
@@ -291,20 +292,20 @@ def _pose(item: schema.PoseSchema) -> pin.SE3:
     return round_placement(pin.SE3(rotation, np.array(item.position)))
 
 
-def _file(document: Document, path: tuple[str | int, ...], folder: Path, name: str) -> Path:
+def _find_file(document: Document, path: tuple[str | int, ...], folder: Path, name: str) -> Path:
     with document.at(path):
         file = file_path(folder / name, "file", "the name of a file")
     if not file.is_file():
-        near = _nearest(file)
+        similar = _find_similar_name(file)
         expected = f"a file in {folder}" + (
-            f", perhaps {Path(name).with_name(near)}" if near else ""
+            f", perhaps {Path(name).with_name(similar)}" if similar else ""
         )
         raise document.error(path, "there is no such file", expected=expected, got=name)
     return file
 
 
-def _nearest(file: Path) -> str | None:
-    """Return the name in a missing file's folder that resembles its own most, of files of its kind."""
+def _find_similar_name(file: Path) -> str | None:
+    """Return the most similar name in the folder of a missing file, among files of its type."""
     with contextlib.suppress(OSError):
         return nearest_name(
             file.name,
@@ -313,18 +314,18 @@ def _nearest(file: Path) -> str | None:
     return None
 
 
-def _object(
+def _load_object(
     document: Document, path: tuple[str | int, ...], item: schema.PlacedObjectSchema, folder: Path
 ) -> PlacedObject:
     at, kind = (*path, "type"), item.type
     with document.at(at):
         if isinstance(kind, dict):
-            loaded = build_object(_part(document, at), folder)
+            loaded = build_object(_extract_part(document, at), folder)
         else:
-            by_path = kind.endswith((".yaml", ".yml")) or "/" in kind
-            loaded = load_object(_file(document, at, folder, kind) if by_path else kind)
+            is_path = kind.endswith((".yaml", ".yml")) or "/" in kind
+            loaded = load_object(_find_file(document, at, folder, kind) if is_path else kind)
     neutral = np.clip(0.0, loaded.lower, loaded.upper)
-    placed = PlacedObject(item.name, loaded, _pose(item), neutral)
+    placed = PlacedObject(item.name, loaded, _make_pose(item), neutral)
     for joint, value in item.state.items():
         with document.at((*path, "state", joint)):
             placed = placed.with_state({joint: value})
@@ -334,8 +335,8 @@ def _object(
     return placed
 
 
-def _part(document: Document, path: tuple[str | int, ...]) -> Document:
-    """Return the data at `path` as a document of its own, which knows file and lines; its fields are named from there."""
+def _extract_part(document: Document, path: tuple[str | int, ...]) -> Document:
+    """Return the data at `path` as a document of its own, with the same file and lines."""
     inside, data = len(path), functools.reduce(lambda data, key: data[key], path, document.data)
     lines = {
         place[inside:]: line for place, line in document.lines.items() if place[:inside] == path
@@ -343,10 +344,10 @@ def _part(document: Document, path: tuple[str | int, ...]) -> Document:
     return Document(data, document.file, lines)
 
 
-def _obstacle(
+def _load_obstacle(
     document: Document, path: tuple[str | int, ...], item: schema.ObstacleSchema, folder: Path
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
     if isinstance(item, schema.UrdfSchema | schema.MeshSchema):
-        _file(document, (*path, "file"), folder, item.file)
+        _find_file(document, (*path, "file"), folder, item.file)
     with document.at((*path, "file")):
-        return make_obstacle_shapes(item, _pose(item), folder)
+        return make_obstacle_shapes(item, _make_pose(item), folder)

@@ -1,4 +1,4 @@
-"""What a scene file may contain. Lengths in metres, angles in radians, world frame with z up and the floor at z = 0."""
+"""Defines the fields of scene files: lengths [m], angles [rad], z up, the floor at z = 0."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ __all__ = [
     "UrdfSchema",
 ]
 
-_MOST = 10_000  # obstacles; so many are loaded in some seconds
+_MAX_OBSTACLES = 10_000  # which take some seconds to load
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "black": (0.13, 0.13, 0.14),
@@ -65,7 +65,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 
 
-def _colour(value: Any) -> Any:
+def _parse_colour(value: Any) -> Any:
     if isinstance(value, str):
         if value not in COLOURS:
             raise fail(
@@ -78,7 +78,7 @@ def _colour(value: Any) -> Any:
     return value
 
 
-def _triple(value: Any) -> Any:
+def _parse_scale(value: Any) -> Any:
     return (
         (value, value, value)
         if isinstance(value, int | float) and not isinstance(value, bool)
@@ -86,7 +86,7 @@ def _triple(value: Any) -> Any:
     )
 
 
-def _arm(value: Any) -> Any:
+def _parse_arm(value: Any) -> Any:
     if isinstance(value, str) and value != "home":
         raise fail(f"unknown arm configuration '{value}'", "home, or a list of joint values [rad]")
     if not isinstance(value, str | list | tuple):
@@ -94,7 +94,7 @@ def _arm(value: Any) -> Any:
     return None if value == "home" else value
 
 
-def _heading(value: Any) -> Any:
+def _parse_heading(value: Any) -> Any:
     if isinstance(value, str) and value != "any":
         raise fail(f"unknown heading '{value}'", "any, or [lowest, highest]")
     return None if value == "any" else value
@@ -103,7 +103,7 @@ def _heading(value: Any) -> Any:
 Fraction = Annotated[Number, Field(ge=0.0, le=1.0)]
 Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
 Colour = Annotated[
-    tuple[Fraction, Fraction, Fraction, Fraction], count(4), BeforeValidator(_colour)
+    tuple[Fraction, Fraction, Fraction, Fraction], count(4), BeforeValidator(_parse_colour)
 ]
 Interval = Annotated[
     tuple[Number, Number],
@@ -118,11 +118,14 @@ Description = Annotated[
         "the name or file of an object, or its description",
     ),
 ]
-Scale = Annotated[Size, BeforeValidator(_triple)]
+Scale = Annotated[Size, BeforeValidator(_parse_scale)]
 
 
 class PoseSchema(Schema):
-    """Where something stands: position [m], and orientation as roll, pitch, yaw [rad], yaw alone, or quaternion [x, y, z, w]."""
+    """A pose: position [m] and at most one orientation.
+
+    The orientation is given as roll, pitch, yaw [rad], as yaw alone, or as quaternion [x, y, z, w].
+    """
 
     position: Vector3
     rpy: Vector3 | None = None
@@ -130,14 +133,14 @@ class PoseSchema(Schema):
     quaternion: Quaternion | None = None
 
     @model_validator(mode="after")
-    def _one_orientation(self) -> PoseSchema:
+    def _check_orientation(self) -> PoseSchema:
         if sum(given is not None for given in (self.rpy, self.yaw, self.quaternion)) > 1:
-            raise fail("two orientations", "one of rpy, yaw and quaternion")
+            raise fail("more than one orientation", "one of rpy, yaw and quaternion")
         return self
 
 
 class ShapeSchema(PoseSchema):
-    """What all obstacles have."""
+    """Fields of all obstacles."""
 
     name: Name
     colour: Colour = (*COLOURS["grey"], 1.0)
@@ -166,7 +169,7 @@ class CylinderSchema(ShapeSchema):
 
 
 class CapsuleSchema(ShapeSchema):
-    """A cylinder of `length` along its z axis with a half sphere at either end; `position` is its centre."""
+    """A capsule; `position` is its centre, `length` that of its cylindrical part, along z."""
 
     type: Literal["capsule"]
     radius: Positive
@@ -174,7 +177,7 @@ class CapsuleSchema(ShapeSchema):
 
 
 class MeshSchema(ShapeSchema):
-    """A mesh file, which collides as its convex hull; `position` is the origin of its coordinates."""
+    """A mesh file, whose convex hull is used for collisions; `position` is the mesh's origin."""
 
     type: Literal["mesh"]
     file: str
@@ -182,7 +185,7 @@ class MeshSchema(ShapeSchema):
 
 
 class UrdfSchema(PoseSchema):
-    """A URDF whose joints stay at their neutral position; its own colours, unless `colour` replaces them."""
+    """A URDF with all joints at their neutral position; `colour`, if given, overrides its own."""
 
     name: Name
     colour: Colour | None = None
@@ -197,10 +200,11 @@ ObstacleSchema = Annotated[
 
 
 class PlacedObjectSchema(PoseSchema):
-    """An articulated object: `type` names its description or its file, or is one; `state` its joint values (others are 0).
+    """An articulated object: `type` is its name, file or description, `state` its joint values.
 
-    Attachments that are `reversed` are approached from the other side than the object's description
-    says; None: those whose hand would come out of the object or from below the floor.
+    Joints that `state` leaves out are at 0. Attachments that are `reversed` are approached from the
+    side opposite to their description; None: those whose approach would take the hand through the
+    object or the floor.
     """
 
     name: Name
@@ -219,7 +223,7 @@ class SceneRobotSchema(Schema):
 
 
 class HeldSchema(Schema):
-    """How an object is held: at which attachment, through what, and at what values of the attachment's freedoms."""
+    """A hold: attachment, frame that grasps, and values of the attachment's freedoms."""
 
     attachment: str
     by: str | None = None
@@ -227,60 +231,63 @@ class HeldSchema(Schema):
 
 
 class StartSchema(Schema):
-    """Where the robot starts: base [x, y, yaw], arm joints [rad], and object → attachment (or more) of what it holds.
+    """The start: base [x, y, yaw], arm joints [rad], and object → attachment or hold.
 
-    `z` is the height of the robot's root link [m], all the time; the robot's own if it is left out.
-    `opening` is how far its gripper is open [m]; as the robot rests if it is left out.
+    `z` is the constant height of the robot's root link [m]; default: the robot's own. `opening` is
+    the gripper opening [m]; default: that of the robot's rest configuration.
     """
 
     base: Vector3
     z: Number | None = None
     opening: NotNegative | None = None
-    arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_arm)] = None
+    arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_parse_arm)] = None
     held: Mapping[str, Annotated[HeldSchema, text_for("attachment")]] = Field(default_factory=dict)
 
 
 class ArenaSchema(Schema):
-    """The floor that belongs to the scene, an interval in x and one in y."""
+    """The part of the floor that belongs to the scene: intervals of x and y."""
 
     x: Interval = (-5.0, 5.0)
     y: Interval = (-5.0, 5.0)
 
 
 class RegionSchema(Schema):
-    """Where random starts of the base are drawn from: intervals of x and y [m] and of the heading [rad] (None: any)."""
+    """The region of random starts: intervals of x, y [m] and heading [rad] (None: any)."""
 
     x: Interval
     y: Interval
-    yaw: Annotated[Interval | None, BeforeValidator(_heading)] = None
+    yaw: Annotated[Interval | None, BeforeValidator(_parse_heading)] = None
 
-    def draws(self, rng: np.random.Generator) -> Iterator[Floats]:
-        """Yield poses of the base, shape (3,): x, y [m] and yaw [rad], uniform in the region, without end."""
+    def sample_poses(self, rng: np.random.Generator) -> Iterator[Floats]:
+        """Yield base poses x, y [m] and yaw [rad], shape (3,), uniform in the region, endlessly."""
         low, high = zip(self.x, self.y, self.yaw or (-np.pi, np.pi), strict=True)
         while True:
             yield rng.uniform(low, high)
 
 
-def _allow(value: Any) -> Any:
+def _parse_allow(value: Any) -> Any:
     if isinstance(value, str):
         return {"srdf": value}
     return {"pair": value} if isinstance(value, list | tuple) else value
 
 
 class AllowSchema(Schema):
-    """A pair of links, objects or obstacles that may be close, and the margin that it keeps (None: none), or an SRDF."""
+    """A pair of links, objects or obstacles that may be close, or an SRDF file with such pairs.
+
+    `margin` is the clearance that the pair keeps [m]; None: none.
+    """
 
     pair: Annotated[tuple[str, str], count(2)] | None = None
     srdf: str | None = None
     margin: Number | None = None
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> AllowSchema:
+    def _check_pair_or_srdf(self) -> AllowSchema:
         if (self.pair is None) == (self.srdf is None) or (
             self.srdf is not None and self.margin is not None
         ):
             raise fail(
-                "not what may be close",
+                "neither a pair nor an SRDF file",
                 "[one, other], {pair: [one, other], margin: 0.005}, or the name of an SRDF file",
             )
         return self
@@ -295,6 +302,6 @@ class SceneSchema(Schema):
     arena: ArenaSchema = ArenaSchema()
     start_region: RegionSchema | None = None
     floor: bool = True
-    obstacles: Annotated[tuple[ObstacleSchema, ...], Field(max_length=_MOST)] = ()
+    obstacles: Annotated[tuple[ObstacleSchema, ...], Field(max_length=_MAX_OBSTACLES)] = ()
     objects: tuple[PlacedObjectSchema, ...] = ()
-    allow: tuple[Annotated[AllowSchema, BeforeValidator(_allow)], ...] = ()
+    allow: tuple[Annotated[AllowSchema, BeforeValidator(_parse_allow)], ...] = ()

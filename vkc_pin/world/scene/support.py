@@ -1,4 +1,4 @@
-"""What stands on what, found from the shapes: whatever carries a link carries what stands on it, too."""
+"""Finds out from the shapes which objects rest on which links."""
 
 from __future__ import annotations
 
@@ -15,22 +15,26 @@ from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 __all__ = ["MAX_TILT", "SupportedObject", "compute_tilt", "find_supported_objects", "find_supports"]
 
 RESTING_DISTANCE = 5e-3
-"""An object stands on what it would overlap by more than half of this if it were lowered by this, but not if lifted [m]."""
+"""Displacement of the support test [m].
+
+An object rests on a shape if lowering it by this makes the two overlap by more than half of it, and
+lifting it by this separates them.
+"""
 MAX_TILT = 0.1
-"""A link may tilt by this while something stands on it [rad]: less than friction of dry things holds."""
+"""Largest tilt of a link while an object rests on it [rad]; dry friction holds beyond that."""
 _DOWN = np.array([0.0, 0.0, -RESTING_DISTANCE])
 
 
 @dataclass(frozen=True, eq=False)
 class SupportedObject:
-    """A free object that stands on a link and moves with it.
+    """A free object that rests on a link and moves with it.
 
     Attributes:
         object: Its name.
-        hold: What holds the object that the link belongs to.
-        link: The link.
-        local: The placement of its base link in the link's frame.
-        carrier: Where the object that the link belongs to is when the ride begins.
+        hold: Hold of the object that the supporting link belongs to.
+        link: Supporting link.
+        placement_in_link: Placement of its base link in the frame of the supporting link.
+        carrier_placement: Placement of the supporting object when the motion begins, world frame.
     """
 
     object: str
@@ -41,18 +45,18 @@ class SupportedObject:
 
     @property
     def support(self) -> str:
-        """What it stands on, "<object>.<link>"."""
+        """Label of the supporting link, "<object>.<link>"."""
         return f"{self.hold.object}.{self.link}"
 
 
 def find_supports(
     placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]
 ) -> set[str]:
-    """Return the labels of what an object stands on.
+    """Return the labels of the shapes that an object rests on.
 
     Args:
-        placed: The object.
-        shapes: Label and shape of all that stands there, placed in the world.
+        placed: Object.
+        shapes: Label and shape of every possible support, in the world frame.
     """
     own = make_world_shapes(placed)
     boxes = [compute_world_box(shape.geometry, shape.placement) for shape in own]
@@ -65,7 +69,7 @@ def find_supports(
             (low < upper + RESTING_DISTANCE).all() and (high > lower - RESTING_DISTANCE).all()
             for low, high in boxes
         )
-        if any(_bears(shape, one) for one, close in zip(own, near, strict=True) if close):
+        if any(_is_supporting(shape, one) for one, close in zip(own, near, strict=True) if close):
             found.add(label)
     return found
 
@@ -73,12 +77,15 @@ def find_supports(
 def find_supported_objects(
     objects: Mapping[str, PlacedObject], moving: Mapping[str, Collection[str]], free: Iterable[str]
 ) -> dict[str, str]:
-    """Return what rides on links that move: free object → "<object>.<link>" of these, also where others are between.
+    """Return the free objects that rest on moving links, directly or on top of others.
 
     Args:
-        objects: All, where they stand.
+        objects: All objects at their placements.
         moving: Object → its links that move.
-        free: Those that nobody holds and that may ride.
+        free: Names of the free objects that are not grasped.
+
+    Returns:
+        Free object → "<object>.<link>" of the moving link at the bottom of the stack.
     """
     shapes = [
         (f"{name}.{link}", shape)
@@ -86,25 +93,27 @@ def find_supported_objects(
         for shape in make_world_shapes(objects[name])
         if (link := get_link_name(shape.name)) in links
     ]
-    left, found = [name for name in free if name not in moving], dict[str, str]()
-    while left and shapes:
+    remaining, found = [name for name in free if name not in moving], dict[str, str]()
+    while remaining and shapes:
         on = {
-            name: min(labels) for name in left if (labels := find_supports(objects[name], shapes))
+            name: min(labels)
+            for name in remaining
+            if (labels := find_supports(objects[name], shapes))
         }
         found |= {name: found.get(label, label) for name, label in on.items()}
-        left = [name for name in left if name not in on]
+        remaining = [name for name in remaining if name not in on]
         shapes = [(name, shape) for name in on for shape in make_world_shapes(objects[name])]
     return found
 
 
 def compute_tilt(before: pin.SE3, after: pin.SE3) -> float:
-    """Return by how much a link that was level at `before` tilts at `after` [rad]."""
+    """Return the angle between a link's verticals at two placements [rad]."""
     vertical = (after.rotation @ before.rotation.T)[2]
     return float(np.arctan2(np.hypot(vertical[0], vertical[1]), vertical[2]))
 
 
-def _bears(shape: pin.GeometryObject, one: pin.GeometryObject) -> bool:
-    """Return whether a shape of an object stands on `shape`."""
+def _is_supporting(shape: pin.GeometryObject, one: pin.GeometryObject) -> bool:
+    """Return whether `shape` supports `one`, a shape of an object."""
 
     def distance(shift: float) -> float:
         moved = pin.SE3(one.placement.rotation, one.placement.translation + shift * _DOWN)

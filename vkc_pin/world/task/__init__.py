@@ -1,1 +1,1 @@
-"""What is asked for: steps, own terms, and the phases they come to."""
+"""Compiles steps and user terms to the phases of a task."""

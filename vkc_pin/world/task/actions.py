@@ -1,4 +1,4 @@
-"""What steps come to before anything is planned: actions, what they leave open, and what cannot be done at its place."""
+"""Groups steps into actions, proposes alternative attachments, and checks steps before planning."""
 
 from __future__ import annotations
 
@@ -26,15 +26,19 @@ __all__ = [
 
 
 def group_into_actions(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
-    """Return steps by what is done together: a grasp with what comes of it, and letting go with what came before."""
+    """Return steps grouped into actions that belong together.
+
+    A grasp is grouped with the step that moves the grasped object, and a release with the step
+    before.
+    """
     actions: list[tuple[Step, ...]] = []
     for step in steps:
         last = actions[-1] if actions else ()
         grasp = last[-1] if last and isinstance(last[-1], Grasp) else None
-        taken = (
+        moves_grasped = (
             grasp is not None and isinstance(step, Actuate | Place) and step.object == grasp.object
         )
-        if last and (taken or isinstance(step, Release)):
+        if last and (moves_grasped or isinstance(step, Release)):
             actions[-1] = (*last, step)
         else:
             actions.append((step,))
@@ -42,7 +46,10 @@ def group_into_actions(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
 
 
 def has_open_attachment(scene: Scene, step: Step) -> bool:
-    """Return whether a step moves joints of what is not held yet, and leaves open by which of several attachments."""
+    """Return whether a step moves joints of an object by one of several attachments left open.
+
+    That is not so if the object is held already.
+    """
     if not isinstance(step, Actuate) or step.attachment is not None or step.object in scene.held:
         return False
     return len(scene.objects[step.object].object.attachments) > 1
@@ -51,20 +58,20 @@ def has_open_attachment(scene: Scene, step: Step) -> bool:
 def generate_alternatives(
     scene: Scene, task: Task, *, anew: bool = False
 ) -> Iterator[tuple[str, tuple[Step, ...]]]:
-    """Yield the steps of a task by attachments that it does not use, each with "<object>.<attachment>".
+    """Yield the steps of a task with attachments that it does not use, and "<object>.<attachment>".
 
-    There are some only where a single one of its steps leaves that open: of several, each is
-    planned alone before. What is held already may have been grasped where it cannot be moved from,
-    or put down: then it is let go of, and taken anew.
+    Alternatives exist only if a single step leaves its attachment open; of several such steps, each
+    has been planned alone before. An object that is held already may have been grasped where it
+    cannot be moved from, or put down; then it is released and grasped again.
 
     Args:
-        scene: Where the task begins.
-        task: What its steps come to if nobody says otherwise.
-        anew: Whether something may be taken anew, which makes more phases.
+        scene: Scene in which the task begins.
+        task: Task with the default attachments.
+        anew: Whether objects may be released and grasped again, which adds phases.
     """
-    if anew and (again := _taken_anew(scene, task.steps[0])):
+    if anew and (again := _regrasp(scene, task.steps[0])):
         named = again[-1]
-        yield f"{named.object}.{named.attachment}, taken anew", (*again, *task.steps[1:])
+        yield f"{named.object}.{named.attachment}, grasped again", (*again, *task.steps[1:])
     own = [
         (number, step)
         for number, step in enumerate(task.steps)
@@ -84,10 +91,10 @@ def generate_alternatives(
                 )
 
 
-def _taken_anew(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None:
-    """Return the steps by which what is held is let go of, taken again and moved; None if that cannot be.
+def _regrasp(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None:
+    """Return steps that release the held object, grasp it again and move it; None if impossible.
 
-    A free object is let go of only where it stands on something.
+    A free object is released only if it rests on a support.
     """
     if not isinstance(step, Actuate | Place):
         return None
@@ -95,43 +102,51 @@ def _taken_anew(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | N
     if held is None or step.attachment not in (None, held):
         return None
     placed = scene.objects[step.object]
-    if placed.object.free and not find_supports(placed, _standing(scene)):
+    if placed.object.free and not find_supports(placed, _list_resting_shapes(scene)):
         return None
     return Release(step.object), dataclasses.replace(step, attachment=held)
 
 
-def _standing(scene: Scene) -> list[tuple[str, pin.GeometryObject]]:
-    """Return label and shape of all that stands somewhere in a scene."""
+def _list_resting_shapes(scene: Scene) -> list[tuple[str, pin.GeometryObject]]:
+    """Return label and shape of all objects and obstacles in the scene that are not held."""
     others = [(name, other) for name, other in scene.objects.items() if name not in scene.held]
     shapes = [(name, shape) for name, other in others for shape in make_world_shapes(other)]
     return [*shapes, *zip(scene.obstacle_labels, scene.obstacles, strict=True)]
 
 
 def compile_each_step(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:
-    """Check that every step can be done at its place, as far as that does not depend on motions; return what each asks for.
+    """Compile each step alone, in the scene that the steps before should lead to.
+
+    This checks that every step is feasible in its place, as far as that does not depend on motions.
+
+    Returns:
+        Task of each step.
 
     Raises:
-        InputError: It cannot; the error names the first such step.
+        InputError: A step is infeasible; the error names the first such step.
     """
     tasks: list[Task] = []
     for number, step in enumerate(as_steps(steps)):
         tasks.append(compile_task(scene, [step], options, nothing=True, first=number))
-        scene = _ideally_after(scene, tasks[-1])
+        scene = _predict_scene_after(scene, tasks[-1])
     if not any(task.phases for task in tasks):
         raise make_nothing_to_do_error()
     return tasks
 
 
-def _ideally_after(scene: Scene, task: Task) -> Scene:
-    """Return the scene in which a task ends if all goes as it says; what it leaves somewhere stands where it stood."""
+def _predict_scene_after(scene: Scene, task: Task) -> Scene:
+    """Return the scene in which a task should end.
+
+    Released objects without a goal are at the placement that they had before.
+    """
     scene = scene.with_held({})
     for phase in task.phases:
         for coordinate, value in phase.values.items():
             name, _, joint = coordinate.partition(".")
-            thing = scene.objects[name].object
-            index = thing.coordinates.index(joint)
+            item = scene.objects[name].object
+            index = item.coordinates.index(joint)
             scene = scene.with_state(
-                name, {joint: float(np.clip(value, thing.lower[index], thing.upper[index]))}
+                name, {joint: float(np.clip(value, item.lower[index], item.upper[index]))}
             )
         for hold, placement in phase.lowered.items():
             scene = scene.with_placement(hold.object, placement)

@@ -1,6 +1,6 @@
-"""What a hand can do with an object's joints from where it has it: which it moves and unlatches, and which way it pushes.
+"""Determines which joints of an object a hand can move from an attachment, and in which direction.
 
-A hand that pushes moves what it touches ahead of it, and pulls nothing.
+A hand that pushes moves the touched link forward only; it cannot pull.
 """
 
 from __future__ import annotations
@@ -30,44 +30,46 @@ __all__ = [
     "find_shared_coordinate",
 ]
 
-# values of a freedom that turns, about points elsewhere, at which the contact is looked at; a
-# slide's ends are enough
-_PARTS = 9
-_LEAST = 1e-3  # [m] a radian, or of a metre: what moves the contact less is not pushed
+# Samples of a revolute freedom about a distant axis; of a slide, the ends suffice.
+_SAMPLES = 9
+_MIN_ADVANCE = 1e-3  # [m/rad] or 1: below this, a push does not move the joint
 
 
 def compute_advance(
     placed: PlacedObject, attachment: Attachment, joint: str
 ) -> tuple[float, float]:
-    """Return how far the contact moves into its face when a joint does, [m/rad] or 1: the least and the most over the region.
+    """Return the smallest and largest advance of the contact into its face per unit of a joint.
 
-    The velocity of the link at the contact is linear in where that is, so a region of slides has
-    its extremes at corners.
+    The unit is [m/rad], or 1 for a prismatic joint. The velocity of the link is linear in the
+    position of the contact, so a region of slides has its extremes at the corners.
 
     Args:
-        placed: The object, at the state at which that is asked.
-        attachment: Where it is pushed.
-        joint: Of the object.
+        placed: Object, in the state of interest.
+        attachment: Attachment that is pushed.
+        joint: Joint of the object.
     """
     model, data = placed.object.model, placed.object.model.createData()
     frame, index = placed.object.link_frame(attachment.link), model.getJointId(joint)
     q = placed.object.coordinates.q(placed.state)
     jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL).reshape(
         6, -1
-    )  # of one joint it has one dimension
+    )  # Pinocchio returns a vector for a single joint.
     column = jacobian[:, model.joints[index].idx_v]
     into = attachment.placement.rotation[:, 2]
-    found = [into @ (column[:3] + np.cross(column[3:], point)) for point in _region(attachment)]
+    found = [
+        into @ (column[:3] + np.cross(column[3:], point))
+        for point in _sample_contact_region(attachment)
+    ]
     return float(min(found)), float(max(found))
 
 
-def _region(attachment: Attachment) -> list[Floats]:
-    """Return points of the region that may be touched, in the link's frame, among them its corners."""
+def _sample_contact_region(attachment: Attachment) -> list[Floats]:
+    """Return points of the contact region, including its corners, in the link's frame."""
     ranges = [
         np.linspace(
             own.lower,
             own.upper,
-            2 if own.kind == "prismatic" else _PARTS if own.through.any() else 1,
+            2 if own.kind == "prismatic" else _SAMPLES if own.through.any() else 1,
         )
         for own in attachment.freedoms
     ]
@@ -87,18 +89,18 @@ def find_push_directions(
     values: Mapping[str, float],
     where: str,
 ) -> dict[str, int]:
-    """Return which way a push moves each of some coordinates, 1 up or -1 down; nothing where the hand takes hold.
+    """Return the direction in which a push moves each coordinate: 1 up, -1 down; empty for a grasp.
 
     Args:
-        placed: The object.
-        attachment: Where the hand has it.
-        state: Coordinate "<object>.<joint>" → value at the begin [rad] or [m].
-        values: The same at the end.
-        where: The field that asks for it, for errors.
+        placed: Object.
+        attachment: Attachment of the hand.
+        state: Coordinate "<object>.<joint>" → initial value [rad] or [m].
+        values: Coordinate → final value [rad] or [m].
+        where: Field of the request, for errors.
 
     Raises:
-        InputError: Pushing there does not move a joint, or not all of the region moves it the same
-            way, or not that way.
+        InputError: Pushing there does not move a joint, does not move it in the same direction all
+            over the region, or moves it in the other direction.
     """
     if attachment.contact != "push":
         return {}
@@ -107,44 +109,48 @@ def find_push_directions(
         for name, value in state.items()
         if name.partition(".")[0] == placed.name
     }
-    placed, ways = placed.with_state(own), dict[str, int]()
+    placed, directions = placed.with_state(own), dict[str, int]()
     at = f"'{placed.name}' at '{attachment.name}'"
     for coordinate, value in values.items():
         joint = coordinate.partition(".")[2]
         least, most = compute_advance(placed, attachment, joint)
-        if least * most <= 0.0 or min(abs(least), abs(most)) < _LEAST:
-            problem = f"pushing {at} does not move '{joint}' one way"
+        if least * most <= 0.0 or min(abs(least), abs(most)) < _MIN_ADVANCE:
+            problem = f"pushing {at} does not move '{joint}' in a single direction"
             raise InputError(
                 problem,
                 field=where,
-                expected="a face all of which lies on one side of the joint's axis",
+                expected="a face that lies entirely on one side of the joint's axis",
             )
-        ways[coordinate] = way = 1 if least > 0.0 else -1
+        directions[coordinate] = direction = 1 if least > 0.0 else -1
         begin = state[coordinate]
         lower, upper = find_joint_limits(placed, coordinate)
-        if (min(max(value, lower), upper) - begin) * way < 0.0:
-            problem = f"pushing {at} moves '{joint}' {'up' if way > 0 else 'down'} only: a hand that pushes cannot pull"
+        if (min(max(value, lower), upper) - begin) * direction < 0.0:
+            only = "up" if direction > 0 else "down"
+            problem = f"pushing {at} moves '{joint}' {only} only: a hand that pushes cannot pull"
             other = [
                 name for name, one in placed.object.attachments.items() if one.contact != "push"
             ]
-            expected = f"{'≥' if way > 0 else '≤'} {begin:g}"
-            expected += f", or an attachment to hold it by: {', '.join(other)}" if other else ""
+            expected = f"{'≥' if direction > 0 else '≤'} {begin:g}"
+            expected += (
+                f", or an attachment that can be grasped: {', '.join(other)}" if other else ""
+            )
             raise InputError(problem, field=where, expected=expected, got=value)
-    return ways
+    return directions
 
 
 def find_engaged_latches(
     placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float]
 ) -> Iterator[Latch]:
-    """Yield the latches of an object that hold joints which are to move from where they are.
+    """Yield the engaged latches of an object that block joints which are to move.
 
-    What is added to `values` meanwhile counts: what releases a latch may be latched itself.
+    Entries that the caller adds to `values` meanwhile count, since what releases a latch may itself
+    be latched.
 
     Args:
-        placed: The object.
-        state: Coordinate "<object>.<joint>" → value at the begin [rad] or [m]; those it lacks are
-            as the scene has them.
-        values: The same at the end, for the joints that are to move.
+        placed: Object.
+        state: Coordinate "<object>.<joint>" → initial value [rad] or [m]; default: that in the
+            scene.
+        values: Coordinate → final value, for the joints that are to move.
     """
     for latch in placed.object.latches:
         coordinate = f"{placed.name}.{latch.joint}"
@@ -162,19 +168,19 @@ def check_actuation(
     values: Mapping[str, float],
     where: str,
 ) -> None:
-    """Check that a hand which has an object at an attachment can bring joints to values.
+    """Check that a hand at an attachment can bring joints to values.
 
     Args:
-        placed: The object.
-        attachment: Where the hand has it.
-        state: Coordinate "<object>.<joint>" → value at the begin [rad] or [m]; those it lacks are
-            as the scene has them.
-        values: The same at the end, for the joints that are to move.
-        where: The step that asks for it, for errors.
+        placed: Object.
+        attachment: Attachment of the hand.
+        state: Coordinate "<object>.<joint>" → initial value [rad] or [m]; default: that in the
+            scene.
+        values: Coordinate → final value, for the joints that are to move.
+        where: Step of the request, for errors.
 
     Raises:
-        InputError: A joint, or what releases its latch, does not move with the attachment, or a
-            push cannot move it that way.
+        InputError: A joint, or the joint that releases its latch, does not move with the
+            attachment, or a push cannot move it in that direction.
     """
     name, path = placed.name, find_path_joints(placed, attachment)
     for joint in (coordinate.partition(".")[2] for coordinate in values):
@@ -205,16 +211,17 @@ def check_actuation(
 def find_driving_attachments(
     placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float], where: str
 ) -> list[str]:
-    """Return the attachments at which a hand can bring joints of an object to values, in the object's order.
+    """Return the attachments at which a hand can bring joints to values, in the object's order.
 
     Args:
-        placed: The object.
+        placed: Object.
         state: As for `check_actuation`.
         values: As for `check_actuation`.
-        where: The step that asks for it, for errors.
+        where: Step of the request, for errors.
 
     Raises:
-        InputError: There is none; the error says what each of them moves, or why not the only one.
+        InputError: There is none; the error says which joints each attachment moves, or why the
+            only one cannot.
     """
     found, errors = list[str](), list[InputError]()
     for name, attachment in placed.object.attachments.items():
@@ -227,14 +234,15 @@ def find_driving_attachments(
     if not found and len(errors) == 1:
         raise errors[0]
     if not found:
-        asked = " and ".join(f"'{coordinate.partition('.')[2]}'" for coordinate in values)
+        requested = " and ".join(f"'{coordinate.partition('.')[2]}'" for coordinate in values)
         moved = {
             name: ", ".join(find_path_joints(placed, one)) or "nothing"
             for name, one in placed.object.attachments.items()
         }
-        problem = f"no attachment of '{placed.name}' can bring {asked} there"
+        problem = f"no attachment of '{placed.name}' can bring {requested} there"
         if all(error.problem.startswith("joint ") for error in errors):
-            expected = f"joints that one attachment moves: {'; '.join(f'{name} moves {path}' for name, path in moved.items())}"
+            expected = "joints that one attachment moves: "
+            expected += "; ".join(f"{name} moves {path}" for name, path in moved.items())
         else:
             expected = "one that can; " + "; ".join(
                 f"{name}: {error.problem}" for name, error in zip(moved, errors, strict=True)
@@ -256,20 +264,21 @@ def choose_attachment(
     values: Mapping[str, float],
     where: str,
 ) -> str:
-    """Return the attachment at which a hand brings joints to values: the one that is named, or else the first that can.
+    """Return the attachment at which a hand brings joints to values.
+
+    It is the named one, or else the first that can.
 
     Args:
-        placed: The object.
-        named: By the step; None leaves it open.
-        used: Attachments that come before the others then: the one in the hand, and the one that
-            was.
+        placed: Object.
+        named: Attachment named by the step; None leaves it open.
+        used: Attachments preferred in that case: the present and the previous one.
         state: As for `check_actuation`.
         values: As for `check_actuation`.
-        where: The step that asks for it, for errors.
+        where: Step of the request, for errors.
 
     Raises:
-        UnknownNameError: There is none of that name.
-        InputError: It cannot, or none can.
+        UnknownNameError: There is no attachment of that name.
+        InputError: The named attachment cannot, or none can.
     """
     attachment = find_attachment(placed, named, f"{where}.attachment")
     if named is not None:
@@ -289,11 +298,14 @@ def find_driven_coordinates(scene: Scene, hold: Hold) -> list[str]:
 
 
 def find_shared_coordinate(scene: Scene, holds: Iterable[Hold]) -> str | None:
-    """Return a coordinate that two of some holds move, which has no place in one chain then; None if there is none."""
-    seen = set[str]()
+    """Return a coordinate that two of the holds move, or None.
+
+    Such holds cannot be part of the same kinematic chain.
+    """
+    driven = set[str]()
     for hold in holds:
         own = find_driven_coordinates(scene, hold)
-        if not seen.isdisjoint(own):
-            return next(name for name in own if name in seen)
-        seen.update(own)
+        if not driven.isdisjoint(own):
+            return next(name for name in own if name in driven)
+        driven.update(own)
     return None

@@ -1,4 +1,4 @@
-"""Expressions of coordinates and frames: asked for by symbols, kept as plain data."""
+"""Defines expressions of coordinates and frames, built from CasADi symbols and stored as data."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from vkc_pin.utils.arrays import Floats
 
 __all__ = ["Formula", "State"]
 
-# added under every root: a root has no slope at zero, where the norm of a velocity is at rest
+# Added under every square root, whose derivative is infinite at zero (as for a zero velocity).
 ROUNDING = 1e-8
 _COMPARISONS = ("lt", "le", "eq", "ne", "and", "or", "not")
 
 
 class State:
-    """What a term may ask for at a waypoint, as CasADi symbols.
+    """The quantities that a term may use at a waypoint, as CasADi symbols.
 
     Coordinates are those of the robot (`base_x`, `elbow_joint`) and of objects (`door.hinge`);
-    frames are those of the robot, links among them, and links of objects (`cup.cup`, `door.panel`),
-    whoever holds them. Everything is in the world frame. All methods raise `UnknownNameError` for a
-    name that does not exist. Where it is not known yet what there will be (None), any name does.
+    frames are those of the robot, including its links, and links of objects (`cup.cup`,
+    `door.panel`), held or not. Everything is in the world frame. All methods raise
+    `UnknownNameError` for a name that does not exist. If `frames` or `coordinates` are None, any
+    name is accepted.
     """
 
     def __init__(
@@ -42,34 +43,37 @@ class State:
 
     def coordinate(self, name: str) -> Any:
         """Return the value of a coordinate, [m] or [rad]."""
-        return self._of("coordinate", name)[0]
+        return self._find_symbols("coordinate", name)[0]
 
     def rate(self, name: str) -> Any:
-        """Return how fast a coordinate has changed since the waypoint before, [m/s] or [rad/s]."""
-        now, before = self._of("coordinate", name)
+        """Return the mean rate of a coordinate since the previous waypoint, [m/s] or [rad/s]."""
+        now, before = self._find_symbols("coordinate", name)
         return (now - before) / self._dt
 
     def rotation(self, frame: str) -> Any:
-        """Return the rotation of a frame, shape (3, 3): its columns are the frame's axes."""
-        return ca.reshape(self._of("frame", frame)[0][:9], 3, 3)
+        """Return the rotation of a frame, shape (3, 3); its columns are the frame's axes."""
+        return ca.reshape(self._find_symbols("frame", frame)[0][:9], 3, 3)
 
     def position(self, frame: str) -> Any:
         """Return the position of a frame, shape (3, 1) [m]."""
-        return self._of("frame", frame)[0][9:]
+        return self._find_symbols("frame", frame)[0][9:]
 
     def velocity(self, frame: str) -> Any:
-        """Return how fast a frame's position has changed since the waypoint before, shape (3, 1) [m/s]."""
-        now, before = self._of("frame", frame)
+        """Return the mean velocity of a frame since the previous waypoint, shape (3, 1) [m/s]."""
+        now, before = self._find_symbols("frame", frame)
         return (now[9:] - before[9:]) / self._dt
 
     def check_names(self, formula: Formula) -> None:
-        """Check that everything exists that a formula depends on."""
+        """Check that all frames and coordinates of a formula exist."""
         for kind, names in (("frame", formula.frames), ("coordinate", formula.coordinates)):
             for name in names:
-                self._of(kind, name)
+                self._find_symbols(kind, name)
 
-    def _of(self, kind: str, name: str) -> tuple[Any, Any]:
-        """Return symbols of a coordinate, or of a frame's rotation (by columns) and position: now and before."""
+    def _find_symbols(self, kind: str, name: str) -> tuple[Any, Any]:
+        """Return the present and previous symbols of a coordinate or frame.
+
+        The symbol of a frame has its rotation (by columns) and position.
+        """
         choices = self._known[kind]
         if choices is None:
             text(name, self._field or kind, f"the name of a {kind}")
@@ -81,7 +85,7 @@ class State:
         )
 
     def make_formula(self, value: Any) -> Formula:
-        """Return an expression of this state's symbols, shape (rows, 1), as data."""
+        """Return an expression of this state's symbols, shape (rows, 1), as plain data."""
         columns = [
             [
                 pair[when]
@@ -94,7 +98,7 @@ class State:
         function = ca.Function("term", [inputs], [ca.densify(value)])
         code = []
         for k in range(function.n_instructions()):
-            name, constant = _operations()[function.instruction_id(k)], 0.0
+            name, constant = _list_operations()[function.instruction_id(k)], 0.0
             read, written = function.instruction_input(k), function.instruction_output(k)
             if name == "const":
                 constant = float(function.instruction_constant(k))
@@ -111,15 +115,15 @@ class State:
 
 @dataclass(frozen=True)
 class Formula:
-    """An expression as plain data: equal ones are equal, files can hold it, and reading it runs nothing.
+    """An expression as plain data: comparable, storable in files, and safe to read.
 
-    Its inputs, in one column: of every frame rotation (by columns) and position, the coordinates,
-    both again one step before, and the time of that step.
+    Its inputs form one column: rotation (by columns) and position of every frame, the coordinates,
+    the same at the previous waypoint, and the time step.
 
     Attributes:
-        frames, coordinates: Names of what it depends on.
-        rows: How many numbers it returns.
-        code: Operations in order: name, where the operands are, where the result goes, constant.
+        frames, coordinates: Names of the frames and coordinates that it uses.
+        rows: Number of results.
+        code: Operations in order: name, indices of the operands, index of the result, constant.
     """
 
     frames: tuple[str, ...]
@@ -129,7 +133,7 @@ class Formula:
 
     @property
     def has_comparison(self) -> bool:
-        """Whether a result is that of a comparison, which has no slope."""
+        """Whether a result is that of a comparison, which has no derivative."""
         results: dict[int, str] = {}
         for name, read, written, _ in self.code:
             if name == "output" and results.get(read[0]) in _COMPARISONS:
@@ -139,28 +143,31 @@ class Formula:
 
     @property
     def state_size(self) -> int:
-        """How many of the inputs are about the present."""
+        """Number of inputs that describe the present waypoint."""
         return 12 * len(self.frames) + len(self.coordinates)
 
     @cached_property
     def input_indices(self) -> frozenset[int]:
-        """Which of the inputs it depends on."""
+        """Indices of the inputs that it depends on."""
         return frozenset(read[0] for name, read, _, _ in self.code if name == "input")
 
     @property
     def uses_previous(self) -> bool:
-        """Whether it depends on the waypoint before."""
+        """Whether it depends on the previous waypoint."""
         return any(self.state_size <= index < 2 * self.state_size for index in self.input_indices)
 
     @property
     def uses_time_step(self) -> bool:
-        """Whether it depends on the time of a step."""
+        """Whether it depends on the time step."""
         return 2 * self.state_size in self.input_indices
 
     @cached_property
     def function(self) -> ca.Function:
-        """The CasADi function, inputs of shape (2·half + 1, 1) to shape (rows, 1); roots are rounded off at zero."""
-        numbers = {name: number for number, name in _operations().items()}
+        """CasADi function, inputs of shape (2·state_size + 1, 1) to results of shape (rows, 1).
+
+        Square roots are smoothed at zero by `ROUNDING`.
+        """
+        numbers = {name: number for number, name in _list_operations().items()}
         inputs = ca.SX.sym("inputs", 2 * self.state_size + 1)
         work: dict[int, Any] = {}
         results: list[Any] = [ca.SX(0)] * self.rows
@@ -181,7 +188,7 @@ class Formula:
         return ca.Function("term", [inputs], [ca.vertcat(*results)])
 
     def evaluate(self, inputs: Floats) -> Floats:
-        """Return its values, shape (S, rows), at inputs of shape (S, 2·half + 1)."""
+        """Return its results, shape (S, rows), at inputs of shape (S, 2·state_size + 1)."""
         return (
             np.asarray(self.function(np.ascontiguousarray(inputs.T)), float)
             .reshape(self.rows, len(inputs))
@@ -190,8 +197,8 @@ class Formula:
 
 
 @cache
-def _operations() -> dict[int, str]:
-    """Return CasADi's operations by number; files name them."""
+def _list_operations() -> dict[int, str]:
+    """Return CasADi's operations by number, with the names used in files."""
     return {
         getattr(ca, name): name.removeprefix("OP_").lower()
         for name in dir(ca)

@@ -1,4 +1,4 @@
-"""What steps name, found in a scene: objects, attachments, links, joints, frames, and how far the gripper is open."""
+"""Finds what steps name in a scene: objects, attachments, links, joints, frames and openings."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def find_object(scene: Scene, name: str, where: str) -> PlacedObject:
     """Return an object of a scene.
 
     Args:
-        scene: The scene.
-        name: The object's name.
-        where: The field that names it, for the error.
+        scene: Scene.
+        name: Name of the object.
+        where: Field that names it, for the error.
 
     Raises:
         UnknownNameError: There is none.
@@ -44,11 +44,16 @@ def find_object(scene: Scene, name: str, where: str) -> PlacedObject:
 
 
 def find_attachment(placed: PlacedObject, name: str | None, where: str) -> Attachment:
-    """Return an object's attachment `name`, or the default one, for the field `where`.
+    """Return an object's attachment `name`, or its first one.
+
+    Args:
+        placed: Object.
+        name: Name of the attachment; None: the first.
+        where: Field that names it, for errors.
 
     Raises:
         UnknownNameError: There is none of that name.
-        InputError: There is none at all.
+        InputError: The object has no attachment.
     """
     attachments = placed.object.attachments
     if name is None:
@@ -63,13 +68,31 @@ def find_attachment(placed: PlacedObject, name: str | None, where: str) -> Attac
 
 
 def check_link(placed: PlacedObject, link: str, where: str) -> None:
-    """Check that an object has a link, which the field `where` names. Raises `UnknownNameError` if it has not."""
+    """Check that an object has a link.
+
+    Args:
+        placed: Object.
+        link: Name of the link.
+        where: Field that names it, for the error.
+
+    Raises:
+        UnknownNameError: It has no such link.
+    """
     if link not in placed.object.links:
         raise UnknownNameError(f"link of '{placed.name}'", link, placed.object.links, field=where)
 
 
 def find_robot_frame(scene: Scene, name: str | None, where: str) -> str:
-    """Return the robot's frame that the field `where` names, or its tool frame. Raises `UnknownNameError` if there is none."""
+    """Return the name of a robot frame, by default the tool frame.
+
+    Args:
+        scene: Scene.
+        name: Name of the frame; None: the tool frame.
+        where: Field that names it, for the error.
+
+    Raises:
+        UnknownNameError: There is none.
+    """
     frame = name or scene.robot.tool_frame
     frames = [f.name for f in scene.robot.model.frames]
     if frame not in frames:
@@ -78,7 +101,7 @@ def find_robot_frame(scene: Scene, name: str | None, where: str) -> str:
 
 
 def find_path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
-    """Return the names of the object's joints between its base and the attachment's link, base first."""
+    """Return the names of the joints from an object's base to an attachment's link."""
     model = placed.object.model
     joint = model.frames[model.getFrameId(attachment.link, pin.FrameType.BODY)].parentJoint
     names: list[str] = []
@@ -95,17 +118,17 @@ def find_joint_limits(placed: PlacedObject, coordinate: str) -> tuple[float, flo
 
 
 def compute_openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None]:
-    """Return how far the gripper is open in each phase [m]; None: as the robot rests.
+    """Return the gripper opening in each phase [m]; None: as in the robot's rest configuration.
 
-    That is what the attachment says which it holds or comes to next. After the last one it stays as
-    it is.
+    It is the opening of the attachment that the gripper holds or grasps next; after the last grasp
+    it does not change.
     """
-    taken, found = (
+    gripper_holds, found = (
         [find_gripper_hold((*phase.held, *phase.grasps)) for phase in phases],
         list[float | None](),
     )
     for number in range(len(phases)):
-        hold = next((one for one in taken[number:] if one is not None), None)
+        hold = next((one for one in gripper_holds[number:] if one is not None), None)
         before = found[-1] if found else compute_start_opening(scene)
         found.append(before if hold is None else compute_grasp_opening(scene, hold))
     return found

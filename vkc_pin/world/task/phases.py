@@ -1,4 +1,4 @@
-"""Task: what steps ask for, in phases. What is held when, which joints move, and what must hold at the end (f_task of eq. 3)."""
+"""Defines tasks as sequences of phases: holds, moving joints and goals (f_task of eq. 3)."""
 
 from __future__ import annotations
 
@@ -39,15 +39,14 @@ _VERBS: Mapping[PhaseKind, str] = {
 
 @dataclass(frozen=True)
 class FrameGoal:
-    """A frame that must be somewhere in the world.
+    """A goal placement of a frame in the world.
 
     Attributes:
-        frame: Of the robot, or a link of the object that `hold` holds.
-        placement: Where; of a point only the translation counts.
-        kind: "pose", "point", or "upright": the point, and the vertical as `placement` has it, at
-            any heading.
-        hold: What holds the object that the frame belongs to; None for a frame of the robot.
-        touches: Whether the frame's link may come as close to what is there as it likes.
+        frame: Frame of the robot, or link of the object that `hold` holds.
+        placement: Goal placement; of a point only the translation counts.
+        kind: "pose", "point", or "upright": position and vertical of `placement`, any heading.
+        hold: Hold of the object that the frame belongs to; None for a frame of the robot.
+        touches: Whether the frame's link is exempt from the clearance to what is at the goal.
     """
 
     frame: str
@@ -62,36 +61,34 @@ class FrameGoal:
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of the motion in which the same things are held.
+    """A part of the motion with constant holds.
 
     Attributes:
-        kind: What happens in it: "grasp", "reach" of a frame, "touch", "place", "turn" what
-            releases a latch, "move" joints of an object, "go" of the base, or "stand" still.
-        about: What that happens to: object and attachment (and the link that holds it, or ""),
+        kind: Kind of phase: "grasp", "reach" of a frame, "touch", "place", "turn" (a joint that
+            releases a latch), "move" (joints of an object), "go" (of the base), or "stand" (still).
+        about: Subject of the phase: object and attachment (and the link that holds it, or ""),
             frame, object or coordinates.
-        segments: Steps of time; the phase has `segments + 1` waypoints, the first shared with the
-            phase before.
-        held: What is held, each after the hold it depends on.
-        ranges: Object coordinate → (lower, upper) for every waypoint after the first; all others
-            stand still.
+        segments: Number of time steps; the phase has `segments + 1` waypoints, the first of which
+            is the last of the previous phase.
+        held: Holds during the phase, each after the one it depends on.
+        ranges: Object coordinate → (lower, upper) at all waypoints after the first; all other
+            coordinates are constant.
         values: Object coordinate → value at the last waypoint.
-        pushed: Object coordinate → 1 or -1, for those that may only go up or down, because the hand
-            pushes.
+        pushed: Object coordinate → 1 or -1, for coordinates that are pushed and can only increase
+            or decrease.
         frames: Frame goals at the last waypoint.
-        base: (x, y, yaw or None) at the last waypoint, in the world.
-        grasps: What is grasped at the last waypoint.
-        leaves: What was let go of just before.
-        before: Object coordinate → value at the first waypoint, for the joints that this task's
-            grasps can move.
-        standing: Free object → its placement, for those that nobody holds and this task has to do
-            with.
-        left: Free object → the hold that left it where it stands, and the number of the phase at
-            whose end it did, for those of `standing` that stand there only nearly: where exactly,
-            the motion decides.
-        lifted: Hold → placement in which its free object stood when it was grasped just before.
-        lowered: Hold → placement in which its free object stands when it is let go of at the end.
-        rides: What stands on something that moves, and moves along.
-        opening: How far the gripper is open [m]; None: as the robot rests.
+        base: Goal (x, y, yaw or None) of the base at the last waypoint, world frame.
+        grasps: Holds that begin at the last waypoint.
+        released: Holds that ended just before the phase.
+        initial_values: Object coordinate → value at the first waypoint, for the joints that the
+            task's grasps can move.
+        resting: Free object → its placement, for free objects of the task that are not held.
+        released_by: Free object → the hold that released it, and the number of the phase at whose
+            end it did, for objects of `resting` whose exact placement the motion decides.
+        lifted: Hold → placement of its free object when it was grasped just before the phase.
+        lowered: Hold → placement of its free object when it is released at the end of the phase.
+        supported: Free objects that rest on moving links and move with them.
+        opening: Gripper opening [m]; None: as in the robot's rest configuration.
     """
 
     kind: PhaseKind
@@ -115,23 +112,23 @@ class Phase:
 
     @property
     def name(self) -> str:
-        """What people call it, e.g. "reach door.handle", "turn door.knob" or "go to"."""
+        """Name for users, e.g. "reach door.handle", "turn door.knob" or "go to"."""
         about = ", ".join(map(str, self.grasps) if self.kind == "grasp" else self.about)
         return f"{_VERBS[self.kind]} {about}".rstrip()
 
     @property
     def key(self) -> PhaseKey:
-        """What is equal for phases in which the same happens."""
+        """Kind and subject, which are equal for phases that do the same."""
         return self.kind, self.about
 
 
 @dataclass(frozen=True)
 class StepBoundary:
-    """How much of a task there is when a step is done.
+    """Extent of a task at the end of a step.
 
     Attributes:
-        phases, holds, state: Number of the task's phases, holds and coordinates up to there.
-        after: What is held then.
+        phases, holds, state: Number of the task's phases, holds and coordinates so far.
+        after: Holds at the end of the step.
     """
 
     phases: int
@@ -142,16 +139,16 @@ class StepBoundary:
 
 @dataclass(frozen=True)
 class Task:
-    """What the steps ask for, in phases.
+    """The phases that bring about a list of steps.
 
     Attributes:
-        steps: The user's steps.
-        phases: In order; at least one.
-        holds: Everything that is held at any time, each after the hold it depends on.
+        steps: Steps.
+        phases: Phases in order; at least one.
+        holds: All holds of the task, each after the one it depends on.
         state: Object coordinate (`<object>.<joint>`) → value at the start, for the joints that
             `holds` can move.
-        after: What is held when all is done.
-        marks: For every step, how much of the task there is when it is done.
+        after: Holds at the end.
+        boundaries: Extent of the task at the end of each step.
     """
 
     steps: tuple[Step, ...]
@@ -163,18 +160,18 @@ class Task:
 
     @property
     def segments(self) -> int:
-        """Steps of time of the whole task; it has one waypoint more."""
+        """Number of time steps of the task; it has one waypoint more."""
         return sum(phase.segments for phase in self.phases)
 
     @property
     def supported(self) -> tuple[SupportedObject, ...]:
-        """All rides of its phases."""
-        return tuple(dict.fromkeys(ride for phase in self.phases for ride in phase.supported))
+        """Objects that rest on moving links in any phase."""
+        return tuple(dict.fromkeys(one for phase in self.phases for one in phase.supported))
 
     def truncate(self, count: int) -> Task:
-        """Return the task of the first `count` steps, at least 1, as if there were no others."""
-        mark = self.boundaries[count - 1]
-        state = dict(islice(self.state.items(), mark.state))
+        """Return the task of the first `count` steps (at least 1) alone."""
+        boundary = self.boundaries[count - 1]
+        state = dict(islice(self.state.items(), boundary.state))
         phases = (
             replace(
                 phase,
@@ -182,18 +179,18 @@ class Task:
                     name: value for name, value in phase.initial_values.items() if name in state
                 },
             )
-            for phase in self.phases[: mark.phases]
+            for phase in self.phases[: boundary.phases]
         )
         return Task(
             self.steps[:count],
             tuple(phases),
-            self.holds[: mark.holds],
+            self.holds[: boundary.holds],
             state,
-            mark.after,
+            boundary.after,
             self.boundaries[:count],
         )
 
 
 def summarize_phases(task: Task) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the phases' names and the objects that are held in them."""
+    """Return the names of the phases and of the objects held in them."""
     return [(phase.name, tuple(hold.object for hold in phase.held)) for phase in task.phases]

@@ -1,4 +1,4 @@
-"""What a user asks for: steps, each a change in the world."""
+"""Defines the steps of a task: desired changes in the world."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ __all__ = [
 ]
 
 
-def _names(step: Any, **optional: bool) -> None:
-    """Check that fields of a step are text, or None where that is optional."""
+def _check_names(step: Any, **optional: bool) -> None:
+    """Check that fields of a step are strings, or None where that is allowed."""
     for name, may_be_none in optional.items():
         value = getattr(step, name)
         if value is not None or not may_be_none:
@@ -41,8 +41,8 @@ class Reach:
     """Bring a frame of the robot to a pose.
 
     Attributes:
-        pose: Where, expressed in the world frame; see `as_placement` for what is taken.
-        frame: Which frame of the robot; None is its tool frame.
+        pose: Goal pose in the world frame; see `as_placement` for its forms.
+        frame: Frame of the robot; None: the tool frame.
     """
 
     pose: Any
@@ -50,18 +50,18 @@ class Reach:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", as_placement(self.pose, name="Reach.pose"))
-        _names(self, frame=True)
+        _check_names(self, frame=True)
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """Take hold of an object.
+    """Grasp an object.
 
     Attributes:
         object: Its name in the scene.
-        attachment: Where to grasp it; None is the object's first attachment.
-        by: Through what: "<object>.<link>", a link of an object in the hand (a stick's tip), which
-            takes the place of the tool frame; None is the hand itself.
+        attachment: Attachment to grasp; None: the object's first one.
+        by: Link of a held object that grasps instead of the tool frame (a stick's tip),
+            "<object>.<link>"; None: the hand.
     """
 
     object: str
@@ -69,19 +69,19 @@ class Grasp:
     by: str | None = None
 
     def __post_init__(self) -> None:
-        _names(self, object=False, attachment=True, by=True)
+        _check_names(self, object=False, attachment=True, by=True)
 
 
 @dataclass(frozen=True)
 class Actuate:
-    """Bring joints of an object to values; grasping it and releasing its latches is implied.
+    """Bring joints of an object to values; the object is grasped and unlatched first if necessary.
 
     Attributes:
-        object: The object's name in the scene.
-        joints: Joint name → value at the end, [rad] or [m].
-        attachment: Where to grasp it if it is not held there; None leaves that open: it is held on
-            to if the joints move so, else taken by the object's first attachment that moves them,
-            and where planning with that one fails, by the others that do.
+        object: Name of the object in the scene.
+        joints: Joint name → final value, [rad] or [m].
+        attachment: Attachment to grasp if the object is not held there; None leaves it open: the
+            present grasp is kept if it can move the joints, else the first attachment that moves
+            them is used, and if planning fails, the others that do.
     """
 
     object: str
@@ -89,7 +89,7 @@ class Actuate:
     attachment: str | None = None
 
     def __post_init__(self) -> None:
-        _names(self, object=False, attachment=True)
+        _check_names(self, object=False, attachment=True)
         expected = "a mapping such as {'hinge': 1.2}"
         if not isinstance(self.joints, Mapping) or not self.joints:
             raise InputError(
@@ -107,12 +107,12 @@ class Actuate:
 
 @dataclass(frozen=True)
 class Touch:
-    """Bring a frame of what is held, or of the robot, to a point or a pose.
+    """Bring a frame of a held object, or of the robot, to a point or a pose.
 
     Attributes:
         frame: "<object>.<link>", a link of a free object, which is grasped first unless it is held;
             or a frame of the robot.
-        target: In the world frame: a point (x, y, z) [m], at any orientation, or a pose; see
+        target: In the world frame: a point (x, y, z) [m] with any orientation, or a pose; see
             `as_placement`.
     """
 
@@ -126,14 +126,14 @@ class Touch:
 
 @dataclass(frozen=True)
 class Place:
-    """Put a free object somewhere and let go of it; grasping it first is implied.
+    """Put a free object down and release it; it is grasped first if necessary.
 
     Attributes:
         object: Its name in the scene.
-        pose: Of its base link in the world frame: a pose (see `as_placement`), or a point (x, y, z)
-            [m], where it then stands as upright as it does before the plan, at any heading; with
-            its z axis up if it is in the hand then.
-        attachment: Where to grasp it if it is not held yet; None is the object's first attachment.
+        pose: Goal of its base link in the world frame: a pose (see `as_placement`), or a point (x,
+            y, z) [m], where it is as upright as before the plan, at any heading; if it is held at
+            the start, with its z axis up.
+        attachment: Attachment to grasp if it is not held yet; None: the object's first one.
     """
 
     object: str
@@ -141,31 +141,31 @@ class Place:
     attachment: str | None = None
 
     def __post_init__(self) -> None:
-        _names(self, object=False, attachment=True)
+        _check_names(self, object=False, attachment=True)
         object.__setattr__(self, "pose", as_target(self.pose, name="Place.pose"))
 
 
 @dataclass(frozen=True)
 class Release:
-    """Let go.
+    """Release an object.
 
     Attributes:
-        object: Of what; None is everything in the hand.
+        object: Its name; None: all held objects.
     """
 
     object: str | None = None
 
     def __post_init__(self) -> None:
-        _names(self, object=True)
+        _check_names(self, object=True)
 
 
 @dataclass(frozen=True)
 class GoTo:
-    """Bring the base to a place on the floor, carrying along what can be carried and letting go of the rest.
+    """Bring the base to a position; free held objects are carried along, fixed ones are released.
 
     Attributes:
-        x, y: Position of the base frame in the world, [m].
-        yaw: Heading [rad]; None leaves it open.
+        x, y: Position of the base frame in the world [m].
+        yaw: Heading [rad]; None: any.
     """
 
     x: float
@@ -180,7 +180,7 @@ class GoTo:
 
 Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release
 STEPS = (Reach, Grasp, Actuate, GoTo, Touch, Place, Release)
-"""All kinds of steps."""
+"""All step classes."""
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in STEPS}
 
 
@@ -188,11 +188,11 @@ def as_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
     """Return steps as a tuple.
 
     Raises:
-        InputError: They are no list, or an empty one.
+        InputError: They are not a list of steps, or there are none.
     """
     if isinstance(steps, STEPS):
         raise InputError(
-            "one step alone", field="steps", expected="a list of steps", got=shown(steps)
+            "a single step", field="steps", expected="a list of steps", got=shown(steps)
         )
     found: tuple[Step, ...] = items(steps, "steps", "a list of steps")
     if not found:
@@ -221,19 +221,19 @@ def step_to_dict(step: Step) -> dict[str, Any]:
 
 
 def step_from_dict(data: Mapping[str, Any]) -> Step:
-    """Return the step that `step_to_dict` made `data` of.
+    """Return the step that `step_to_dict` converted to `data`.
 
     Raises:
         UnknownNameError: There is no such step, or it has no such field.
-        InputError: A field is missing or wrong.
+        InputError: A field is missing or invalid.
     """
     given = mapping(data, "step", "a step as data")
     kind = known(given.pop("step", ""), _KINDS, "step", "step")
-    has = {item.name: item for item in fields(_KINDS[kind])}
+    known_fields = {item.name: item for item in fields(_KINDS[kind])}
     for name in given:
-        if name not in has:
-            raise UnknownNameError(f"field of {kind}", name, has, field=f"{kind}.{name}")
-    for name, item in has.items():
+        if name not in known_fields:
+            raise UnknownNameError(f"field of {kind}", name, known_fields, field=f"{kind}.{name}")
+    for name, item in known_fields.items():
         if name not in given and item.default is MISSING and item.default_factory is MISSING:
             raise InputError("this is missing", field=f"{kind}.{name}")
     step: Step = _KINDS[kind](**given)

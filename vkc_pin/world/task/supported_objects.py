@@ -1,4 +1,4 @@
-"""What rides along while something is moved or carried: as `world.scene.support` finds it, in the state of a task."""
+"""Tracks which objects rest on carried or moving links in the course of a task."""
 
 from __future__ import annotations
 
@@ -29,83 +29,85 @@ __all__ = [
 
 
 class SupportTracker:
-    """What stands on what a robot carries or moves, along a task.
+    """Free objects that rest on links which a robot carries or moves.
 
     Attributes:
-        carried: What rides on what is in the hand.
-        moved: What is or has been moved with what it stands on.
+        carried: Objects that rest on held free objects.
+        moved: Names of the objects that have moved with their support.
 
     Args:
-        scene: The scene at the start.
-        standing: Free object → its placement, for those that nobody holds; kept up to date here.
+        scene: Scene at the start.
+        resting: Free object → its placement, for free objects that are not held; updated here.
     """
 
-    def __init__(self, scene: Scene, standing: dict[str, pin.SE3]) -> None:
-        self.scene, self.standing = scene, standing
+    def __init__(self, scene: Scene, resting: dict[str, pin.SE3]) -> None:
+        self.scene, self.resting = scene, resting
         self.carried: tuple[SupportedObject, ...] = ()
         self.moved: set[str] = set()
-        self._rides: tuple[SupportedObject, ...] = ()
+        self._on_moving: tuple[SupportedObject, ...] = ()
         self._before: dict[str, PlacedObject] = {}
 
-    def load(self, hold: Hold, state: Mapping[str, float], where: str) -> None:
-        """Let ride what stands on something that is taken hold of, if that is free."""
+    def add_carried(self, hold: Hold, state: Mapping[str, float], where: str) -> None:
+        """Add the objects that rest on an object that is grasped, if that is free."""
         placed = self.scene.objects[hold.object]
         if placed.object.free:
-            now = {hold.object: placed, **place_objects(self.scene, state, self.standing)}
-            riding = find_objects_supported_by(self.scene, now, hold, set(), where)
-            self.carried += riding
-            for ride in riding:
-                self.standing.pop(ride.object)
-                self.moved.add(ride.object)
+            now = {hold.object: placed, **place_objects(self.scene, state, self.resting)}
+            supported = find_objects_supported_by(self.scene, now, hold, set(), where)
+            self.carried += supported
+            for one in supported:
+                self.resting.pop(one.object)
+                self.moved.add(one.object)
 
-    def unload(self, hold: Hold, placement: pin.SE3) -> list[str]:
-        """Let stand what rode on something free that is let go of at `placement`; return it."""
+    def release_carried(self, hold: Hold, placement: pin.SE3) -> list[str]:
+        """Release the objects on a free object released at `placement`; return their names."""
         placed = replace(self.scene.objects[hold.object], placement=placement)
-        ended = [ride for ride in self.carried if ride.hold == hold]
-        for ride in ended:
-            self.standing[ride.object] = placed.link_placement(ride.link) * ride.placement_in_link
-        self.carried = tuple(ride for ride in self.carried if ride.hold != hold)
-        return [ride.object for ride in ended]
+        ended = [one for one in self.carried if one.hold == hold]
+        for one in ended:
+            self.resting[one.object] = placed.link_placement(one.link) * one.placement_in_link
+        self.carried = tuple(one for one in self.carried if one.hold != hold)
+        return [one.object for one in ended]
 
-    def begin(self, hold: Hold, joints: Set[str], state: Mapping[str, float], where: str) -> None:
-        """Let ride what stands on something fixed, joints of which begin to move; see `find_objects_supported_by`."""
-        self._before = place_objects(self.scene, state, self.standing)
-        self._rides = find_objects_supported_by(self.scene, self._before, hold, joints, where)
-        self.moved |= {ride.object for ride in self._rides}
+    def begin_motion(
+        self, hold: Hold, joints: Set[str], state: Mapping[str, float], where: str
+    ) -> None:
+        """Add the objects that rest on a fixed object of which joints begin to move."""
+        self._before = place_objects(self.scene, state, self.resting)
+        self._on_moving = find_objects_supported_by(self.scene, self._before, hold, joints, where)
+        self.moved |= {one.object for one in self._on_moving}
 
-    def end(self, state: Mapping[str, float], where: str) -> None:
-        """Let stand what rode since `begin`; see `compute_placement_after_motion`."""
-        for ride in self._rides:
-            name, after = ride.hold.object, place_objects(self.scene, state, self.standing)
-            self.standing[ride.object] = compute_placement_after_motion(
-                ride, self._before[name], after[name], where
+    def end_motion(self, state: Mapping[str, float], where: str) -> None:
+        """Release the objects added by `begin_motion` at their new placements."""
+        for one in self._on_moving:
+            name, after = one.hold.object, place_objects(self.scene, state, self.resting)
+            self.resting[one.object] = compute_placement_after_motion(
+                one, self._before[name], after[name], where
             )
-        self._rides = ()
+        self._on_moving = ()
 
     @property
-    def rides(self) -> tuple[SupportedObject, ...]:
-        """What rides now."""
-        return (*self.carried, *self._rides)
+    def supported(self) -> tuple[SupportedObject, ...]:
+        """Objects that rest on moving links at present."""
+        return (*self.carried, *self._on_moving)
 
 
 def place_objects(
-    scene: Scene, state: Mapping[str, float], standing: Mapping[str, pin.SE3]
+    scene: Scene, state: Mapping[str, float], resting: Mapping[str, pin.SE3]
 ) -> dict[str, PlacedObject]:
-    """Return the objects that stand somewhere at some time of a task, free or not.
+    """Return the objects that are not held at some time of a task, in their states.
 
     Args:
-        scene: The scene at the start.
-        state: Object coordinate → value, for those that differ from the scene's.
-        standing: Free object → its placement, for those that stand.
+        scene: Scene at the start.
+        state: Object coordinate → value, where it differs from the scene's.
+        resting: Free object → its placement, for free objects that are not held.
     """
     found = {}
     for name, placed in scene.objects.items():
-        if placed.object.free and name not in standing:
+        if placed.object.free and name not in resting:
             continue
         values = {
             c.removeprefix(f"{name}."): v for c, v in state.items() if c.startswith(f"{name}.")
         }
-        found[name] = replace(placed, placement=standing.get(name, placed.placement)).with_state(
+        found[name] = replace(placed, placement=resting.get(name, placed.placement)).with_state(
             values
         )
     return found
@@ -114,42 +116,43 @@ def place_objects(
 def find_objects_supported_by(
     scene: Scene, now: Mapping[str, PlacedObject], hold: Hold, joints: Set[str], where: str
 ) -> tuple[SupportedObject, ...]:
-    """Return what will ride on an object that is held.
+    """Return the objects that will rest on a held object while it moves.
 
     Args:
-        scene: The scene.
-        now: The objects that stand somewhere when that begins, and the one that is held.
-        hold: What is held.
-        joints: Its joints that will move, of an object that stands fixed; a free one moves with all
-            of its links.
-        where: The step, for messages.
+        scene: Scene.
+        now: Objects that are not held when the motion begins, and the held one.
+        hold: Hold.
+        joints: Joints of a fixed object that will move; a free object moves with all its links.
+        where: Step, for messages.
 
     Raises:
-        InputError: Something stands on what moves and on what does not.
+        InputError: An object rests both on a moving and on a fixed link.
     """
-    thing = now[hold.object].object
-    links = set(thing.links) if thing.free else thing.links_moved_by(joints)
+    item = now[hold.object].object
+    links = set(item.links) if item.free else item.links_moved_by(joints)
     free = [name for name, placed in now.items() if placed.object.free and name != hold.object]
-    riding = find_supported_objects(now, {hold.object: links}, free)
-    if not riding:
+    supported = find_supported_objects(now, {hold.object: links}, free)
+    if not supported:
         return ()
-    still = [
+    static_shapes = [
         (f"{name}.{get_link_name(shape.name)}", shape)
         for name, placed in now.items()
-        if name not in riding
+        if name not in supported
         for shape in make_world_shapes(placed)
         if name != hold.object or get_link_name(shape.name) not in links
     ]
-    still += zip(scene.obstacle_labels, scene.obstacles, strict=True)
+    static_shapes += zip(scene.obstacle_labels, scene.obstacles, strict=True)
     found = []
-    for name, label in riding.items():
-        other = min(find_supports(now[name], still), default=None)
-        if other is not None and not thing.free:
-            problem = f"'{name}' stands on what moves and on what does not: '{label}' and '{other}'"
+    for name, label in supported.items():
+        other = min(find_supports(now[name], static_shapes), default=None)
+        if other is not None and not item.free:
+            problem = (
+                f"'{name}' rests both on a moving and on a fixed link: '{label}' and '{other}'"
+            )
             raise InputError(
                 problem,
                 field=where,
-                expected="that it is taken off, or stands on one of them alone",
+                expected="that it is removed, or rests on one of them only",
             )
         link = label.partition(".")[2]
         carrier = now[hold.object]
@@ -166,23 +169,29 @@ def find_objects_supported_by(
 
 
 def compute_placement_after_motion(
-    ride: SupportedObject, before: PlacedObject, after: PlacedObject, where: str
+    one: SupportedObject, before: PlacedObject, after: PlacedObject, where: str
 ) -> pin.SE3:
-    """Return where an object stands after a ride on a joint of what stands fixed, which moves from `before` to `after`.
+    """Return the placement of a supported object after a joint of its support has moved.
+
+    Args:
+        one: Supported object.
+        before: Supporting object before the motion.
+        after: Supporting object after the motion.
+        where: Step, for messages.
 
     Raises:
-        InputError: The link that it stands on tips.
+        InputError: The supporting link tilts too much.
     """
-    link = after.link_placement(ride.link)
-    if (angle := compute_tilt(before.link_placement(ride.link), link)) > MAX_TILT:
+    link = after.link_placement(one.link)
+    if (angle := compute_tilt(before.link_placement(one.link), link)) > MAX_TILT:
         problem, got = (
-            f"'{ride.object}' stands on '{ride.support}', which would tip",
+            f"'{one.object}' rests on '{one.support}', which would tilt too much",
             f"{angle:.2f} rad",
         )
         raise InputError(
             problem,
             field=where,
-            expected=f"that it is taken off before, or at most {MAX_TILT:g} rad",
+            expected=f"that it is removed before, or at most {MAX_TILT:g} rad",
             got=got,
         )
-    return link * ride.placement_in_link
+    return link * one.placement_in_link

@@ -1,8 +1,8 @@
-"""A user's own constraints and costs: CasADi expressions of coordinates and frames.
+"""Defines constraints and costs of users: CasADi expressions of coordinates and frames.
 
-The user's function is called once, with symbols, and what it returns is kept as plain data
-(`formula`). The program composes that with its kinematics; validation evaluates the same on
-placements of its own.
+The user's function is called once, with symbols, and its result is stored as plain data
+(`formula`). The nonlinear program composes that with its kinematics; validation evaluates it at
+placements that it computes itself.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class _Term:
     def make_error(
         self, problem: str, field: str, expected: object = None, got: object = None
     ) -> InputError:
-        """Return (not raise) the error that says that one of its fields is wrong."""
+        """Return (without raising) the error for an invalid field."""
         return InputError(
             problem, field=f"terms[{self.name!r}].{field}", expected=expected, got=got
         )
@@ -94,14 +94,14 @@ class _Term:
         )
 
     def is_active(self, phase: str, held: Iterable[str]) -> bool:
-        """Return whether it holds in a phase of this name, in which these objects are held."""
+        """Return whether the term applies in a phase called `phase`, in which `held` are held."""
         return (self.during is None or phase in self.during) and (
             self.holding is None or self.holding in held
         )
 
     @property
     def formula(self) -> Formula:
-        """Its expression, once it is data."""
+        """The expression as plain data."""
         if not isinstance(self.expression, Formula):
             raise self.make_error("not traced yet", "expression")
         return self.expression
@@ -109,17 +109,18 @@ class _Term:
 
 @dataclass(frozen=True)
 class Constraint(_Term):
-    """An expression that must stay between bounds, at every waypoint of the chosen phases after their first.
+    """An expression that is bounded at every waypoint of the chosen phases but their first.
 
     Attributes:
-        name: What reports call it.
-        expression: Given a `State`, returns a CasADi number or column. Roots are taken of x + 1e-8
-            instead of x, so that norms have a slope at zero; comparisons are said by the bounds.
-        lower, upper: Bounds, numbers or one per entry; None is no bound.
-        during: Names of phases, e.g. "place cup" (`plan.trajectory.phases` has them); None is all.
-        holding: The object that must be held for it; None is none.
-        tolerance: By how much validation lets it be off at a waypoint, in the expression's own
-            unit; ten times as much between two waypoints, where the program asks for nothing.
+        name: Name in reports.
+        expression: Maps a `State` to a CasADi number or column. Square roots are evaluated at x +
+            1e-8 instead of x, so that norms are differentiable at zero; comparisons are expressed
+            by the bounds.
+        lower, upper: Bounds, one number or one per entry; None: no bound.
+        during: Names of phases, e.g. "place cup" (listed in `plan.trajectory.phases`); None: all.
+        holding: Object that must be held for the constraint to apply; None: none.
+        tolerance: Violation that validation accepts at a waypoint, in the unit of the expression;
+            ten times as much between waypoints, where the program has no constraint.
     """
 
     _: KW_ONLY
@@ -133,10 +134,10 @@ class Constraint(_Term):
         for field in ("lower", "upper"):
             value = getattr(self, field)
             if value is not None:
-                object.__setattr__(self, field, self._bound(field, value))
+                object.__setattr__(self, field, self._check_bound(field, value))
         self.compute_bounds(self.expression.rows if isinstance(self.expression, Formula) else None)
 
-    def _bound(self, field: str, value: Any) -> float | tuple[float, ...]:
+    def _check_bound(self, field: str, value: Any) -> float | tuple[float, ...]:
         given = numbers(
             value,
             f"terms[{self.name!r}].{field}",
@@ -151,7 +152,10 @@ class Constraint(_Term):
         return float(given) if given.ndim == 0 else tuple(given.tolist())
 
     def compute_bounds(self, rows: int | None) -> tuple[Floats, Floats]:
-        """Return both bounds, shape (rows,); None: as many as there are bounds.
+        """Return both bounds, shape (rows,).
+
+        Args:
+            rows: Number of rows of the expression; None: as many as there are bounds.
 
         Raises:
             InputError: They do not fit the expression, or each other.
@@ -193,13 +197,15 @@ class Constraint(_Term):
 
 @dataclass(frozen=True)
 class Cost(_Term):
-    """An expression that should be small: `weight` times its sum over all waypoints of the chosen phases after their first.
+    """An expression to minimise: `weight` times its sum over the waypoints of the chosen phases.
+
+    The first waypoint of each phase does not count.
 
     Attributes:
-        name: What errors call it.
-        expression: Given a `State`, returns a CasADi number; see `Constraint`.
-        weight: How much it counts, beside `Options.velocity_weight_*` and the others.
-        during, holding: When, as for a `Constraint`.
+        name: Name in error messages.
+        expression: Maps a `State` to a CasADi number; see `Constraint`.
+        weight: Weight beside `Options.velocity_weight_*` and the others.
+        during, holding: When the cost applies, as for a `Constraint`.
     """
 
     _: KW_ONLY
@@ -214,52 +220,52 @@ Term = Constraint | Cost
 
 
 def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
-    """Return terms with their expressions as data, checked against what a scene has.
+    """Return terms with their expressions as plain data, checked against a scene.
 
     Raises:
-        UnknownNameError: One asks for a frame, coordinate or object that does not exist.
-        InputError: They are no terms, two share a name, or an expression is none.
+        UnknownNameError: A frame, coordinate or object does not exist.
+        InputError: They are not terms, two share a name, or an expression is invalid.
     """
     terms = items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
     if not terms:
         return ()
     robot = [str(frame.name) for frame in scene.robot.model.frames if frame.name != "universe"]
-    things = [(name, placed.object) for name, placed in scene.objects.items()]
-    frames = [*robot, *(f"{name}.{link}" for name, thing in things for link in thing.links)]
-    joints = [f"{name}.{joint}" for name, thing in things for joint in thing.coordinates.names]
+    items_by_name = [(name, placed.object) for name, placed in scene.objects.items()]
+    frames = [*robot, *(f"{name}.{link}" for name, item in items_by_name for link in item.links)]
+    joints = [f"{name}.{joint}" for name, item in items_by_name for joint in item.coordinates.names]
     for term in terms:
         if term.holding is not None and term.holding not in scene.objects:
             raise UnknownNameError(
                 "object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding"
             )
-    return _all_traced(terms, frames, [*scene.robot.coordinates.names, *joints])
+    return _trace_all(terms, frames, [*scene.robot.coordinates.names, *joints])
 
 
 def trace_terms_without_scene(terms: Sequence[Term]) -> tuple[Term, ...]:
-    """Return terms with their expressions as data, for scenes that are not there yet: frames and coordinates may have any name.
+    """Return terms with their expressions as plain data, with any names of frames and coordinates.
 
     Raises:
-        InputError: They are no terms, two share a name, or an expression is none.
+        InputError: They are not terms, two share a name, or an expression is invalid.
     """
-    return _all_traced(
+    return _trace_all(
         items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None
     )
 
 
 def rename_term(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -> Term:
-    """Return a traced term about other frames, and another object that must be held for it.
+    """Return a traced term with other frames, and another object that must be held.
 
     Args:
-        term: The term.
-        frames: Name of a frame in its expression → the one that is meant; others stay.
-        objects: The same of `holding`.
+        term: Term.
+        frames: Name of a frame in its expression → its new name; others keep theirs.
+        objects: Name of an object in `holding` → its new name.
     """
     formula = term.formula
     formula = replace(formula, frames=tuple(frames.get(name, name) for name in formula.frames))
     return replace(term, expression=formula, holding=objects.get(term.holding or "", term.holding))
 
 
-def _all_traced(
+def _trace_all(
     terms: Sequence[Term], frames: Sequence[str] | None, coordinates: Sequence[str] | None
 ) -> tuple[Term, ...]:
     found: list[Term] = []
@@ -271,11 +277,11 @@ def _all_traced(
                 expected="different names",
                 got=shown(term.name),
             )
-        found.append(_traced(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
+        found.append(_trace(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
     return tuple(found)
 
 
-def _traced(term: Term, state: State) -> Term:
+def _trace(term: Term, state: State) -> Term:
     if isinstance(term.expression, Formula):
         state.check_names(term.expression)
         return term
@@ -329,15 +335,15 @@ def _traced(term: Term, state: State) -> Term:
 
 
 def check_terms_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str]]]) -> None:
-    """Check that every term is about some phase of a task.
+    """Check that every term applies in some phase of a task.
 
     Args:
-        terms: The terms.
+        terms: Terms.
         phases: Name of every phase of the task, and the objects held in it.
 
     Raises:
-        UnknownNameError: `during` names a phase that there is not.
-        InputError: A term is about no phase.
+        UnknownNameError: `during` names a phase that does not exist.
+        InputError: A term applies in no phase.
     """
     names = list(dict.fromkeys(name for name, _ in phases))
     for term in terms:
@@ -359,10 +365,10 @@ def term_to_dict(term: Term) -> dict[str, Any]:
 
 
 def term_from_dict(data: Mapping[str, Any]) -> Term:
-    """Return the term that `term_to_dict` made `data` of.
+    """Return the term that `term_to_dict` converted to `data`.
 
     Raises:
-        InputError: Something does not fit.
+        InputError: The data are invalid.
     """
     fields = mapping(data, "terms", "a term as data")
     kinds: dict[str, type[Constraint] | type[Cost]] = {"Constraint": Constraint, "Cost": Cost}

@@ -1,4 +1,4 @@
-"""What can be asked for in a scene, and tasks made at random: a room, and something to do in it."""
+"""Lists possible steps in a scene, and generates random tasks: a room, and a step in it."""
 
 from __future__ import annotations
 
@@ -19,22 +19,21 @@ from vkc_pin.world.task.steps import Actuate, Grasp, Step
 
 __all__ = ["goals", "random_task"]
 
-_SHARES = (0.35, 0.65)  # of a joint's range by which random tasks move it
+_SHARES = (0.35, 0.65)  # fraction of a joint's range by which random tasks move it
 _TURN = np.pi  # [rad] range of joints without limits
-_OBJECTS = 2  # at most, of one room
+_MAX_OBJECTS = 2  # in one room
 
 
 def goals(scene: Scene, *, share: float = 0.5) -> tuple[Step, ...]:
-    """Return what a hand can do with the objects of a scene, each as a step of its own.
+    """Return steps that a hand could do with the objects of a scene, each on its own.
 
-    Of every object that stands fixed, each joint on the base that some attachment moves is moved up
-    if it is in the lower half of its range, else down, by the attachment that leaves the hand most
-    freedom. What is free is grasped. Nobody asks a planner whether any of it can be done from where
-    the robot starts.
+    For each fixed object, every joint next to its base that some attachment moves is moved up if it
+    is in the lower half of its range, else down, by the attachment with the most freedoms. Free
+    objects are grasped. Whether a step is feasible from the robot's start is not checked.
 
     Args:
-        scene: The scene.
-        share: By how much of its range a joint is moved, above 0 and at most 1.
+        scene: Scene.
+        share: Fraction of its range by which a joint is moved, above 0 and at most 1.
 
     Raises:
         InputError: `share` is out of range.
@@ -45,83 +44,83 @@ def goals(scene: Scene, *, share: float = 0.5) -> tuple[Step, ...]:
     found: list[Step] = []
     for name, placed in scene.objects.items():
         if placed.object.free and not placed.object.attachments:
-            continue  # too thick for any hand
+            continue  # it cannot be grasped
         if placed.object.free:
-            found.append(Grasp(name, _freest(list(placed.object.attachments.values())).name))
+            found.append(Grasp(name, _find_freest(list(placed.object.attachments.values())).name))
         else:
-            found += _openings(name, placed, share)
+            found += _list_joint_steps(name, placed, share)
     return tuple(found)
 
 
 def random_task(
     seed: int, settings: RoomSettings | None = None, **changes: Any
 ) -> tuple[Scene, tuple[Step, ...]]:
-    """Return a random room, and something to open, to close or to grasp in it; the same in every run.
+    """Return a random room and a reproducible random step in it: to open, close or grasp an object.
 
     Args:
-        seed: Which task, from 0; the room is `random_room(seed, ...)`.
-        settings: What the room is like; None: `RoomSettings()`.
-        changes: Fields of `RoomSettings` that are to be otherwise. Without `objects`, one or two of
-            `random_object` are drawn.
+        seed: Random seed, from 0; the room is `random_room(seed, ...)`.
+        settings: Settings of the room; None: `RoomSettings()`.
+        changes: Fields of `RoomSettings` that differ. Without `objects`, one or two random objects
+            are drawn.
 
     Returns:
-        Scene and steps, as `plan` takes them.
+        Scene and steps, the inputs of `plan`.
 
     Raises:
-        InputError: A number or a field is out of range, or the things find no place in a room of
+        InputError: A number or a field is out of range, or the objects do not fit into a room of
             this size.
         UnknownNameError: There is no such field, or no such type of object.
     """
     rng = np.random.default_rng([6, whole(seed, "seed", low=0)])
-    count = 1 + int(rng.integers(_OBJECTS))
+    count = 1 + int(rng.integers(_MAX_OBJECTS))
     kinds = tuple(RANDOM + str(kind) for kind in rng.choice(sorted(KINDS), count, replace=False))
     share = round(float(rng.uniform(*_SHARES)), 3)
     if "objects" not in changes and (settings is None or settings.objects is None):
         changes["objects"] = kinds
     scene = random_room(seed, settings, **changes)
-    offered = goals(scene, share=share)
-    if not offered:
+    candidates = goals(scene, share=share)
+    if not candidates:
         raise InputError(
-            "nothing can be done here",
+            "no step is possible in this room",
             field="objects",
-            expected="something to open or to carry",
+            expected="an object to open or to grasp",
             got="nothing",
         )
-    return scene, (offered[int(rng.integers(len(offered)))],)
+    return scene, (candidates[int(rng.integers(len(candidates)))],)
 
 
-def _openings(name: str, placed: PlacedObject, share: float) -> list[Step]:
+def _list_joint_steps(name: str, placed: PlacedObject, share: float) -> list[Step]:
     """Return the steps that open or close the joints of an object."""
-    item, reached = placed.object, dict[str, list[Attachment]]()
+    item, attachments_of = placed.object, dict[str, list[Attachment]]()
     for attachment in item.attachments.values():
-        joint = _first_joint(item, attachment)
-        if joint is not None and attachment.contact == "grasp":  # what is pushed goes one way only
-            reached.setdefault(joint, []).append(attachment)
+        joint = _find_first_joint(item, attachment)
+        if (
+            joint is not None and attachment.contact == "grasp"
+        ):  # pushes move a joint in one direction only
+            attachments_of.setdefault(joint, []).append(attachment)
     steps: list[Step] = []
-    for joint, attachments in reached.items():
+    for joint, attachments in attachments_of.items():
         k = item.coordinates.index(joint)
         now = float(placed.state[k])
         lower, upper = (
-            limit if np.isfinite(limit) else now + away
-            for limit, away in zip((item.lower[k], item.upper[k]), (-_TURN, _TURN), strict=True)
+            limit if np.isfinite(limit) else now + offset
+            for limit, offset in zip((item.lower[k], item.upper[k]), (-_TURN, _TURN), strict=True)
         )
         by = share * (upper - lower)
         goal = now + by if now <= (lower + upper) / 2.0 else now - by
-        within = float(
-            np.clip(round(goal, 3), lower, upper)
-        )  # in this order: rounded, a limit may be beyond itself
-        steps.append(Actuate(name, {joint: within}, _freest(attachments).name))
+        value = float(np.clip(round(goal, 3), lower, upper))  # a rounded limit may exceed itself
+        steps.append(Actuate(name, {joint: value}, _find_freest(attachments).name))
     return steps
 
 
-def _first_joint(item: ArticulatedObject, attachment: Attachment) -> str | None:
-    """Return the joint that moves an attachment's link most directly from the base, if any does."""
+def _find_first_joint(item: ArticulatedObject, attachment: Attachment) -> str | None:
+    """Return the joint next to the base that moves an attachment's link, or None."""
     joint = item.model.frames[item.link_frame(attachment.link)].parentJoint
     while item.model.parents[joint]:
         joint = item.model.parents[joint]
     return str(item.model.names[joint]) if joint else None
 
 
-def _freest(attachments: list[Attachment]) -> Attachment:
-    """Return the attachment of most freedoms, the first of several."""
+def _find_freest(attachments: list[Attachment]) -> Attachment:
+    """Return the attachment with the most freedoms, the first of several."""
     return max(attachments, key=lambda attachment: len(attachment.freedoms))

@@ -1,4 +1,4 @@
-"""Builds objects of boxes, cylinders and balls, link by link, and describes them as URDF and attachments."""
+"""Builds articulated objects from boxes, cylinders and spheres, as URDF and attachments."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ COLOURS: dict[str, tuple[float, float, float]] = {
     "walnut": (0.45, 0.31, 0.20),
     "white": (0.93, 0.92, 0.89),
 }
-_DENSITY = 500.0  # [kg/m³] of wood; what is hollow is built of its walls
-_UPRIGHT = (0.0, 0.0, 0.0)
-_TURNED = {
+_DENSITY = 500.0  # [kg/m³], wood; hollow bodies are built of their walls
+_NO_ROTATION = (0.0, 0.0, 0.0)
+_CYLINDER_RPY = {
     "x": (0.0, math.pi / 2.0, 0.0),
     "y": (math.pi / 2.0, 0.0, 0.0),
-    "z": _UPRIGHT,
+    "z": _NO_ROTATION,
 }  # roll, pitch, yaw of a cylinder
 _VELOCITY = {"revolute": 1.0, "prismatic": 0.5}  # [rad/s], [m/s]
 _EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
@@ -42,7 +42,15 @@ _EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
 
 @dataclass(frozen=True)
 class _Shape:
-    """A shape of a link: "box" with its edges, "cylinder" with radius and length, or "sphere" with its radius [m]."""
+    """A shape of a link; lengths [m].
+
+    Attributes:
+        kind: "box", "cylinder" or "sphere".
+        size: Edges of a box, radius and length of a cylinder, or radius of a sphere.
+        centre: Its centre in the link's frame.
+        rpy: Its orientation as roll, pitch, yaw [rad].
+        colour: Name of its colour, see `COLOURS`.
+    """
 
     kind: str
     size: tuple[float, ...]
@@ -50,22 +58,23 @@ class _Shape:
     rpy: tuple[float, float, float]
     colour: str
 
-    def xml(self, element: str) -> str:
-        """Return the element <visual> or <collision>."""
+    def make_xml(self, element: str) -> str:
+        """Return the URDF element `<visual>` or `<collision>`."""
         if self.kind == "box":
-            size = f'size="{_numbers(self.size)}"'
+            size = f'size="{_format_numbers(self.size)}"'
         else:
-            size = f'radius="{_numbers(self.size[:1])}"' + (
-                f' length="{_numbers(self.size[1:])}"' if self.size[1:] else ""
+            size = f'radius="{_format_numbers(self.size[:1])}"' + (
+                f' length="{_format_numbers(self.size[1:])}"' if self.size[1:] else ""
             )
-        turned = f' rpy="{_numbers(self.rpy, 6)}"' if any(self.rpy) else ""
+        rpy = f' rpy="{_format_numbers(self.rpy, 6)}"' if any(self.rpy) else ""
         material = f"<material name={quoteattr(self.colour)}/>" if element == "visual" else ""
         geometry = f"<geometry><{self.kind} {size}/></geometry>"
-        return f'    <{element}><origin xyz="{_numbers(self.centre)}"{turned}/>{geometry}{material}</{element}>'
+        origin = f'<origin xyz="{_format_numbers(self.centre)}"{rpy}/>'
+        return f"    <{element}>{origin}{geometry}{material}</{element}>"
 
     @property
     def mass(self) -> float:
-        """Its mass [kg]."""
+        """Mass [kg]."""
         if self.kind == "box":
             return _DENSITY * math.prod(self.size)
         radius = self.size[0]
@@ -78,7 +87,7 @@ class _Shape:
 
     @property
     def inertia(self) -> Floats:
-        """Its inertia about its centre, along the link's axes, shape (3, 3) [kg·m²]."""
+        """Inertia about its centre along the link's axes, shape (3, 3) [kg·m²]."""
         if self.kind == "sphere":
             return np.eye(3) * 0.4 * self.mass * self.size[0] ** 2
         if self.kind == "box":
@@ -89,13 +98,13 @@ class _Shape:
             0.5 * self.mass * radius**2,
             self.mass * (3.0 * radius**2 + length**2) / 12.0,
         )
-        turned = pin.rpy.rpyToMatrix(*self.rpy)
-        return np.asarray(turned @ np.diag([across, across, along]) @ turned.T)
+        rotation = pin.rpy.rpyToMatrix(*self.rpy)
+        return np.asarray(rotation @ np.diag([across, across, along]) @ rotation.T)
 
 
 @dataclass
 class LinkBuilder:
-    """A link that is being built; lengths in metres, in its own frame."""
+    """A link under construction; lengths in metres, in its own frame."""
 
     name: str
     shapes: list[_Shape] = field(default_factory=list)
@@ -108,7 +117,7 @@ class LinkBuilder:
                 "box",
                 size,
                 tuple((a + b) / 2.0 for a, b in zip(low, high, strict=True)),
-                _UPRIGHT,
+                _NO_ROTATION,
                 colour,
             )
         )
@@ -118,24 +127,24 @@ class LinkBuilder:
     ) -> None:
         """Add a cylinder along an axis of the link: "x", "y" or "z"."""
         self.shapes.append(
-            _Shape("cylinder", (radius, length), tuple(centre), _TURNED[axis], colour)
+            _Shape("cylinder", (radius, length), tuple(centre), _CYLINDER_RPY[axis], colour)
         )
 
     def add_rod(self, one: Point, other: Point, radius: float, colour: str) -> None:
         """Add a cylinder between two points."""
-        way = np.subtract(other, one)
-        length = float(np.linalg.norm(way))
-        turned = (0.0, float(np.arccos(way[2] / length)), float(np.arctan2(way[1], way[0])))
+        axis = np.subtract(other, one)
+        length = float(np.linalg.norm(axis))
+        rpy = (0.0, float(np.arccos(axis[2] / length)), float(np.arctan2(axis[1], axis[0])))
         self.shapes.append(
-            _Shape("cylinder", (radius, length), tuple(np.add(one, other) / 2.0), turned, colour)
+            _Shape("cylinder", (radius, length), tuple(np.add(one, other) / 2.0), rpy, colour)
         )
 
     def add_sphere(self, centre: Point, radius: float, colour: str) -> None:
-        """Add a ball."""
-        self.shapes.append(_Shape("sphere", (radius,), tuple(centre), _UPRIGHT, colour))
+        """Add a sphere."""
+        self.shapes.append(_Shape("sphere", (radius,), tuple(centre), _NO_ROTATION, colour))
 
     def add_case(self, low: Point, high: Point, wall: float, colour: str, inside: str) -> None:
-        """Add a box that is open towards -x: two sides, top, bottom and back."""
+        """Add a case that is open towards -x: two sides, top, bottom and back."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         self.add_box((x0, y0, z0), (x1, y0 + wall, z1), colour)
         self.add_box((x0, y1 - wall, z0), (x1, y1, z1), colour)
@@ -143,8 +152,8 @@ class LinkBuilder:
         self.add_box((x0, y0 + wall, z0), (x1, y1 - wall, z0 + wall), colour)
         self.add_box((x1 - wall, y0 + wall, z0 + wall), (x1, y1 - wall, z1 - wall), inside)
 
-    def xml(self) -> str:
-        """Return the element <link>, with mass and inertia of the shapes."""
+    def make_xml(self) -> str:
+        """Return the URDF element `<link>`, with mass and inertia of the shapes."""
         masses = np.array([shape.mass for shape in self.shapes])
         centres = np.array([shape.centre for shape in self.shapes], float)
         middle = masses @ centres / masses.sum()
@@ -154,36 +163,36 @@ class LinkBuilder:
                 offset @ offset * np.eye(3) - np.outer(offset, offset)
             )
         entries = " ".join(
-            f'i{"xyz"[i]}{"xyz"[j]}="{_numbers([inertia[i, j]], 6)}"'
+            f'i{"xyz"[i]}{"xyz"[j]}="{_format_numbers([inertia[i, j]], 6)}"'
             for i in range(3)
             for j in range(i, 3)
         )
         mass, origin = (
-            f'<mass value="{_numbers([masses.sum()])}"/>',
-            f'<origin xyz="{_numbers(middle)}"/>',
+            f'<mass value="{_format_numbers([masses.sum()])}"/>',
+            f'<origin xyz="{_format_numbers(middle)}"/>',
         )
         lines = [
             f"  <link name={quoteattr(self.name)}>",
             f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>",
         ]
         lines += [
-            shape.xml(element) for element in ("visual", "collision") for shape in self.shapes
+            shape.make_xml(element) for element in ("visual", "collision") for shape in self.shapes
         ]
         return "\n".join([*lines, "  </link>"])
 
 
 @dataclass
 class ObjectBuilder:
-    """An object that is being built.
+    """An articulated object under construction.
 
-    Its base link's frame lies on the floor (or on what it stands on) in the middle below its face:
-    x points into it, away from whoever stands before it, z up. `description` is what
-    `vkc_pin.load_object` takes.
+    The frame of its base link lies on the floor (or on its support), below the middle of its front:
+    x points into the object, away from the user, z up. `description` is the input of
+    `vkc_pin.load_object`.
 
     Attributes:
         name: Its name.
-        base: Its base link.
-        links: The other links, each with the element <joint> that it hangs on.
+        base: Base link.
+        links: Other links, each with the URDF element `<joint>` that moves it.
     """
 
     name: str
@@ -209,29 +218,31 @@ class ObjectBuilder:
         """Add a joint, and return the link that it moves.
 
         Args:
-            name: Of the joint.
+            name: Name of the joint.
             kind: "revolute" or "prismatic".
-            origin: Of joint and link in the parent's frame [m].
-            axis: Of the joint.
-            upper: The upper limit [rad] or [m].
-            lower: The lower limit.
-            link: The link's name.
-            parent: The link it hangs on; None: the base.
-            acceleration: Its limit [rad/s²] or [m/s²].
+            origin: Origin of joint and link in the parent's frame [m].
+            axis: Joint axis.
+            upper: Upper limit [rad] or [m].
+            lower: Lower limit [rad] or [m].
+            link: Name of the link.
+            parent: Name of the parent link; None: the base.
+            acceleration: Acceleration limit [rad/s²] or [m/s²].
         """
-        moved = LinkBuilder(link)
-        limits = f'lower="{_numbers([lower])}" upper="{_numbers([upper])}"'
-        rates = f'velocity="{_numbers([_VELOCITY[kind]])}" effort="{_numbers([_EFFORT[kind]])}"'
+        child = LinkBuilder(link)
+        limits = f'lower="{_format_numbers([lower])}" upper="{_format_numbers([upper])}"'
+        velocity, effort = (_format_numbers([limit[kind]]) for limit in (_VELOCITY, _EFFORT))
+        rates = f'velocity="{velocity}" effort="{effort}"'
+        parent_name = quoteattr(parent or self.base.name)
         lines = [
             f'  <joint name={quoteattr(name)} type="{kind}">',
-            f"    <parent link={quoteattr(parent or self.base.name)}/><child link={quoteattr(link)}/>",
-            f'    <origin xyz="{_numbers(origin)}"/><axis xyz="{_numbers(axis)}"/>',
+            f"    <parent link={parent_name}/><child link={quoteattr(link)}/>",
+            f'    <origin xyz="{_format_numbers(origin)}"/><axis xyz="{_format_numbers(axis)}"/>',
             f"    <limit {limits} {rates}/>",
             "  </joint>",
         ]
-        self.links.append((moved, "\n".join(lines)))
+        self.links.append((child, "\n".join(lines)))
         self.accelerations[name] = acceleration
-        return moved
+        return child
 
     def add_attachment(
         self,
@@ -242,11 +253,11 @@ class ObjectBuilder:
         closing: Point,
         **freedom: Any,
     ) -> None:
-        """Add an attachment: where and how a hand takes hold of a link, in the link's frame; see `Attachment`."""
+        """Add an attachment of a link, given in the link's frame; see `Attachment`."""
         where = {
-            "position": _rounded(position),
-            "approach": _rounded(approach),
-            "closing": _rounded(closing),
+            "position": _round_all(position),
+            "approach": _round_all(approach),
+            "closing": _round_all(closing),
         }
         self.attachments.append({"name": name, "link": link.name, **where, **freedom})
 
@@ -256,34 +267,36 @@ class ObjectBuilder:
         links = [self.base, *(link for link, _ in self.links)]
         used = sorted({shape.colour for link in links for shape in link.shapes})
         materials = [
-            f'  <material name="{name}"><color rgba="{_numbers(COLOURS[name])} 1"/></material>'
-            for name in used
+            f'  <material name="{name}"><color rgba="{colour} 1"/></material>'
+            for name, colour in ((name, _format_numbers(COLOURS[name])) for name in used)
         ]
-        parts = [part for link, joint in self.links for part in (joint, link.xml())]
+        parts = [part for link, joint in self.links for part in (joint, link.make_xml())]
         head = ['<?xml version="1.0"?>', f"<robot name={quoteattr(self.name)}>", *materials]
-        return "\n".join([*head, self.base.xml(), *parts, "</robot>"]) + "\n"
+        return "\n".join([*head, self.base.make_xml(), *parts, "</robot>"]) + "\n"
 
     @property
     def description(self) -> dict[str, Any]:
-        """The object's description as plain data, the URDF inside it."""
+        """The object's description as plain data, including its URDF."""
         plain: dict[str, Any] = {"urdf": self.urdf}
         plain["joints"] = {
             name: {"acceleration": value} for name, value in self.accelerations.items()
         }
-        plain["attachments"] = [_plain(item) for item in self.attachments]
+        plain["attachments"] = [_to_plain_data(item) for item in self.attachments]
         return {
             **plain,
-            **({"latches": [_plain(item) for item in self.latches]} if self.latches else {}),
+            **(
+                {"latches": [_to_plain_data(item) for item in self.latches]} if self.latches else {}
+            ),
         }
 
 
-def _numbers(values: Sequence[float] | Floats, digits: int = 4) -> str:
+def _format_numbers(values: Sequence[float] | Floats, digits: int = 4) -> str:
     return " ".join(f"{round(float(value), digits) + 0.0:.10g}" for value in values)
 
 
-def _rounded(values: Point) -> list[float]:
+def _round_all(values: Point) -> list[float]:
     return [round(float(value), 6) + 0.0 for value in values]
 
 
-def _plain(item: Mapping[str, Any]) -> dict[str, Any]:
+def _to_plain_data(item: Mapping[str, Any]) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in item.items()}

@@ -1,4 +1,4 @@
-"""The kinds of furniture and appliances that are builder at random, and where each kind stands."""
+"""Lists the kinds of furniture and appliances that are generated at random."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Kind:
     """A kind of furniture.
 
     Attributes:
-        make: Makes one of random sizes.
-        place: "wall" for what stands in an opening of a wall, "floor", or "counter" for what stands
-            on something.
-        beside: How far to either side of it the floor before it is needed, by robot and leaves [m].
+        make: Generates an object of random sizes.
+        place: "wall" for an object in an opening of a wall, "floor", or "counter".
+        beside: Width of the floor in front of it that must stay free on either side, for the robot
+            and for doors [m].
     """
 
     make: Callable[[Sampler], ObjectBuilder]
@@ -58,21 +58,20 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
 
 
 def random_object(kind: str, seed: int = 0) -> dict[str, Any]:
-    """Return a piece of furniture or an appliance of random, sensible sizes that can be opened or turned.
+    """Return a random piece of furniture or an appliance that can be opened or turned.
 
-    Its joints, handles and attachments are in the description, its URDF too. It is what
-    `load_object` takes, and `type` of an object in a scene, and it is the same in every run. Its
-    base link stands on the floor, or on a counter, and looks along -x; a door's is on the hinge
-    line, in the middle of a wall.
+    The description, with URDF, joints, handles and attachments, is an input of `load_object`, and
+    `type` of an object in a scene. It is reproducible. The base link is on the floor, or on a
+    counter, with its front towards -x; a door's is on the hinge line, in the middle of a wall.
 
     Args:
         kind: `cabinet`, `chest` (with a lid), `dishwasher`, `door`, `drawers`, `faucet`,
             `microwave`, `oven`, `refrigerator` or `valve`.
-        seed: Which one, from 0.
+        seed: Random seed, from 0.
 
     Raises:
         UnknownNameError: There is no such kind.
-        InputError: `seed` is no whole number of at least 0.
+        InputError: `seed` is not an integer of at least 0.
     """
     own = KINDS[known(kind, KINDS, "kind of furniture", "kind")]
     rng = np.random.default_rng([4, zlib.crc32(kind.encode()), whole(seed, "seed", low=0)])
@@ -80,27 +79,27 @@ def random_object(kind: str, seed: int = 0) -> dict[str, Any]:
 
 
 def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
-    """Write the description of an object to files: `<name>.yaml`, and its URDF beside it if that is part of it.
+    """Write the description of an object to `<name>.yaml`, and a URDF that it contains beside it.
 
     Args:
-        description: What `random_object` returns, or plain data of that form.
-        path: The file `<name>.yaml`.
+        description: Result of `random_object`, or plain data of that form.
+        path: Path of the file `<name>.yaml`.
 
     Returns:
-        The path of the file, which `load_object` and scenes take.
+        Path of the file, an input of `load_object` and of scenes.
 
     Raises:
-        InputError: The description is wrong, or a file cannot be written.
+        InputError: The description is invalid, or a file cannot be written.
     """
     plain, file = mapping(description, "description"), file_path(path, "path")
     if file.suffix not in (".yaml", ".yml"):
         raise InputError(
-            "not a file of an object",
+            "not an object file",
             field="path",
             expected="a path that ends with .yaml",
             got=file.name,
         )
-    load_object(plain, folder=file.parent)  # says what is wrong with it
+    load_object(plain, folder=file.parent)  # raises an error if it is invalid
     urdf = plain["urdf"]
     if urdf.lstrip().startswith("<"):
         plain = {**plain, "urdf": write_atomically(file.with_suffix(".urdf"), urdf.encode()).name}

@@ -1,4 +1,4 @@
-"""Random sizes and choices, rounded so that they are the same on every machine."""
+"""Draws random sizes and choices, rounded so that they are the same on every machine."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ T = TypeVar("T")
 
 
 class Sampler:
-    """Random sizes and choices from a generator of random numbers."""
+    """Random sizes and choices from a random number generator."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
 
     def sample_length(self, low: float, high: float) -> float:
-        """Return a length or angle between two, to the millimetre or milliradian."""
+        """Return a length [m] or angle [rad] between two, rounded to three decimals."""
         return round(float(self._rng.uniform(low, high)), 3)
 
     def sample_integer(self, low: int, high: int) -> int:
-        """Return a whole number from the lowest to the highest."""
+        """Return an integer from `low` to `high`, both included."""
         return int(self._rng.integers(low, high + 1))
 
-    def sample_bool(self, share: float) -> bool:
-        """Return True in a share of all draws."""
-        return bool(self._rng.random() < share)
+    def sample_bool(self, probability: float) -> bool:
+        """Return True with a probability."""
+        return bool(self._rng.random() < probability)
 
     def choose(self, choices: Sequence[T]) -> T:
-        """Return one of some choices."""
+        """Return one of the choices."""
         return choices[int(self._rng.integers(len(choices)))]

@@ -1,4 +1,4 @@
-"""What has drawers, or leaves on level hinges: chests of drawers, dishwashers, ovens, chests with a lid."""
+"""Generates objects with drawers or with doors on horizontal hinges."""
 
 from __future__ import annotations
 
@@ -8,25 +8,22 @@ from vkc_pin.procedural.furniture.handles import add_knob, add_level_bar
 
 __all__ = ["make_chest", "make_dishwasher", "make_drawers", "make_oven"]
 
-_GAP = 0.006  # [m] of air between a leaf and its case
+_GAP = 0.006  # [m] between a door or drawer and its case
 _FRONTS = ("white", "shade", "sage", "sand", "slate", "oak", "walnut")
-_DOWN, _UP = (
-    (-1.7, 0.5),
-    (-0.5, 1.7),
-)  # [rad] a hand turns about a bar that goes down or up with its leaf, and stays level
+# [rad] turns of a hand about a bar that moves down or up with its door while the hand stays level
+_DOWN, _UP = (-1.7, 0.5), (-0.5, 1.7)
 
 
 def make_drawers(sampler: Sampler) -> ObjectBuilder:
-    """Return a chest of one to four drawers above each other."""
+    """Return a chest of one to four drawers, one above the other."""
     count, width, depth = (
         sampler.sample_integer(1, 4),
         sampler.sample_length(0.4, 0.9),
         sampler.sample_length(0.42, 0.6),
     )
     foot, front = sampler.sample_length(0.06, 0.1), sampler.sample_length(0.17, 0.26)
-    low = (
-        foot if count > 2 else sampler.sample_length(0.35, 0.55)
-    )  # a single drawer is under the top of a higher case
+    # One or two drawers are under the top of a taller case.
+    low = foot if count > 2 else sampler.sample_length(0.35, 0.55)
     height = round(low + count * front + 0.025, 3)
     builder = ObjectBuilder("drawers", LinkBuilder("case"))
     colour = sampler.choose(_FRONTS)
@@ -62,7 +59,7 @@ def make_drawers(sampler: Sampler) -> ObjectBuilder:
             (-_GAP, -side + 0.012, bottom), (back - 0.012, side - 0.012, bottom + 0.008), "oak"
         )
         at = (-_GAP - 0.018, 0.0, 0.0)
-        if bars or middle < 0.55:  # a knob is taken level
+        if bars or middle < 0.55:  # a knob is grasped horizontally
             add_level_bar(builder, tray, at, length, out, height=middle, name=f"handle{name}")
         else:
             add_knob(builder, tray, at, out, f"handle{name}")
@@ -70,7 +67,7 @@ def make_drawers(sampler: Sampler) -> ObjectBuilder:
 
 
 def make_dishwasher(sampler: Sampler) -> ObjectBuilder:
-    """Return a dishwasher, 0.45 or 0.6 wide, whose leaf opens downwards."""
+    """Return a dishwasher, 0.45 or 0.6 m wide, whose door opens downwards."""
     width, height, depth = (
         sampler.choose((0.448, 0.598)),
         sampler.sample_length(0.82, 0.88),
@@ -85,12 +82,12 @@ def make_dishwasher(sampler: Sampler) -> ObjectBuilder:
     builder.base.add_box(
         (0.05, -width / 2 + 0.02, 0), (depth - 0.02, width / 2 - 0.02, foot), "dark"
     )
-    _flap(builder, width, (foot + 0.01, height), 0.03, colour, sampler)
+    _add_flap(builder, width, (foot + 0.01, height), 0.03, colour, sampler)
     return builder
 
 
 def make_oven(sampler: Sampler) -> ObjectBuilder:
-    """Return an oven whose leaf opens downwards: under a hob, or in a high case."""
+    """Return an oven whose door opens downwards: under a hob, or in a tall cabinet."""
     width, depth, high = (
         sampler.sample_length(0.56, 0.62),
         sampler.sample_length(0.54, 0.6),
@@ -109,7 +106,7 @@ def make_oven(sampler: Sampler) -> ObjectBuilder:
     )
     builder.base.add_box((0.0, -width / 2, 0.0), (depth, width / 2, low - 0.02), case)
     builder.base.add_box((0.0, -width / 2, top + 0.02), (depth, width / 2, height), case)
-    _flap(builder, width, (low, top), 0.035, colour, sampler)
+    _add_flap(builder, width, (low, top), 0.035, colour, sampler)
     return builder
 
 
@@ -130,11 +127,8 @@ def make_chest(sampler: Sampler) -> ObjectBuilder:
         ((wall, -width / 2 + wall, 0), (depth - wall, width / 2 - wall, wall)),
     ):
         builder.base.add_box(low, high, colour)
-    hinge = (
-        depth - 0.06,
-        0.0,
-        height + _GAP + thick,
-    )  # so that the lid, open, stays before the chest's back
+    # The open lid does not reach beyond the chest's back.
+    hinge = (depth - 0.06, 0.0, height + _GAP + thick)
     lid = builder.add_joint(
         "lid", "revolute", hinge, (0, 1, 0), sampler.sample_length(1.2, 1.4), link="lid"
     )
@@ -154,7 +148,7 @@ def make_chest(sampler: Sampler) -> ObjectBuilder:
     return builder
 
 
-def _flap(
+def _add_flap(
     builder: ObjectBuilder,
     width: float,
     z: tuple[float, float],
@@ -162,7 +156,7 @@ def _flap(
     colour: str,
     sampler: Sampler,
 ) -> None:
-    """Add a leaf that opens downwards, with a bar near its upper edge."""
+    """Add a door that opens downwards, with a bar near its upper edge."""
     low, high = z
     origin = (-_GAP - thick / 2, 0.0, low)
     leaf = builder.add_joint(

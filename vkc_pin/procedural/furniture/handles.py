@@ -1,7 +1,7 @@
-"""Handles of furniture, and the attachments that a hand takes them by.
+"""Builds handles of furniture, and the attachments for grasping them.
 
-A finger reaches some 0.02 beyond the tool's origin: what stands 0.05 and more before its face is
-taken with air behind it.
+A finger reaches some 0.02 m beyond the tool's origin: a handle 0.05 m or more in front of its face
+leaves room behind it.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder, Po
 __all__ = ["add_knob", "add_level_bar", "add_upright_bar"]
 
 _POST = 0.02  # [m] from a bar's ends to the posts that carry it
-_THUMB = 0.03  # [m] from a post to the middle of the hand
-_TILT = 0.6  # [rad] to which a hand may tilt about a bar
-_SWING = 0.8  # [rad] to which it may swing about an upright bar, or in any direction about a knob
-# [m] height from which on a hand comes level; to lower handles it comes obliquely from above
+_HALF_HAND = 0.03  # [m] from a post to the middle of the hand
+_TILT = 0.6  # [rad] largest tilt of a hand about a bar
+_SWING = 0.8  # [rad] largest rotation about an upright bar, or in any direction about a knob
+# [m] height above which a hand approaches horizontally; lower handles obliquely from above
 _LEVEL = 0.55
-_STEEPEST = 0.65  # [rad] to which it does so
+_STEEPEST = 0.65  # [rad] largest slope of such an approach
 
 
 def add_upright_bar(
@@ -32,20 +32,22 @@ def add_upright_bar(
     out: float,
     name: str = "handle",
 ) -> None:
-    """Add an upright bar before a face that looks along -x, and its attachments `name` and `<name>_free`.
+    """Add a vertical bar in front of a face, with attachments `name` and `<name>_free`.
+
+    The face looks along -x.
 
     Args:
-        builder: What is being built.
-        link: That the bar belongs to.
-        at: Where on the face its middle is, in the link's frame [m].
-        length: Of the bar, at least 0.1 [m].
-        out: From the face to the bar's centre line [m].
-        name: Of the attachment.
+        builder: Object under construction.
+        link: Link of the bar.
+        at: Position of the bar's middle on the face, in the link's frame [m].
+        length: Length of the bar, at least 0.1 [m].
+        out: Distance from the face to the bar's centre line [m].
+        name: Name of the attachment.
     """
-    middle, reach = _bar(link, at, length, out, "z")
+    middle, reach = _add_posts_and_bar(link, at, length, out, "z")
     where: tuple[LinkBuilder, Point, Point, Point] = (link, middle, (1, 0, 0), (0, 1, 0))
     builder.add_attachment(name, *where)
-    limits, turn = _interval(reach), _interval(_SWING)
+    limits, turn = _make_interval(reach), _make_interval(_SWING)
     builder.add_attachment(
         f"{name}_free", *where, joint="cylindrical", axis=[0, 1, 0], limits=limits, turn=turn
     )
@@ -62,19 +64,21 @@ def add_level_bar(
     name: str = "handle",
     turn: Sequence[float] | None = None,
 ) -> None:
-    """Add a level bar before a face that looks along -x, and its attachments `name` and `<name>_free`.
+    """Add a horizontal bar in front of a face, with attachments `name` and `<name>_free`.
+
+    The face looks along -x.
 
     Args:
-        builder: What is being built.
-        link: That the bar belongs to.
-        at: Where on the face its middle is, in the link's frame [m].
-        length: Of the bar, at least 0.1 [m].
-        out: From the face to the bar's centre line [m].
-        height: Of the bar above the floor [m].
-        name: Of the attachment.
-        turn: How far a hand may turn about the bar [rad]; None: as far as it may tilt.
+        builder: Object under construction.
+        link: Link of the bar.
+        at: Position of the bar's middle on the face, in the link's frame [m].
+        length: Length of the bar, at least 0.1 [m].
+        out: Distance from the face to the bar's centre line [m].
+        height: Height of the bar above the floor [m].
+        name: Name of the attachment.
+        turn: Range of the hand's rotation about the bar [rad]; None: that of its tilt.
     """
-    middle, reach = _bar(link, at, length, out, "y")
+    middle, reach = _add_posts_and_bar(link, at, length, out, "y")
     down = _STEEPEST * float(np.clip((_LEVEL - height) / 0.25, 0.0, 1.0))
     approach, closing = (
         (math.cos(down), 0.0, -math.sin(down)),
@@ -82,13 +86,13 @@ def add_level_bar(
     )
     where: tuple[LinkBuilder, Point, Point, Point] = (link, middle, approach, closing)
     builder.add_attachment(name, *where)
-    limits = list(turn) if turn is not None else _interval(_TILT)
+    limits = list(turn) if turn is not None else _make_interval(_TILT)
     builder.add_attachment(
         f"{name}_free",
         *where,
         joint="cylindrical",
         axis=[0, 1, 0],
-        limits=_interval(reach),
+        limits=_make_interval(reach),
         turn=limits,
     )
 
@@ -96,33 +100,41 @@ def add_level_bar(
 def add_knob(
     builder: ObjectBuilder, link: LinkBuilder, at: Point, out: float, name: str = "handle"
 ) -> None:
-    """Add a round knob before a face that looks along -x, and its attachments `name` and `<name>_free`.
+    """Add a round knob in front of a face, with attachments `name` and `<name>_free`.
+
+    The face looks along -x.
 
     Args:
-        builder: What is being built.
-        link: That the knob belongs to.
-        at: Where on the face it is, in the link's frame [m].
-        out: From the face to the knob's centre [m].
-        name: Of the attachment.
+        builder: Object under construction.
+        link: Link of the knob.
+        at: Position of the knob on the face, in the link's frame [m].
+        out: Distance from the face to the knob's centre [m].
+        name: Name of the attachment.
     """
     x, y, z = at
     link.add_sphere((x - out, y, z), 0.016, "steel")
     link.add_cylinder((x - out / 2.0, y, z), 0.007, out, "x", "steel")
     where: tuple[LinkBuilder, Point, Point, Point] = (link, (x - out, y, z), (1, 0, 0), (0, 1, 0))
     builder.add_attachment(name, *where)
-    builder.add_attachment(f"{name}_free", *where, joint="spherical", limits=_interval(_SWING))
+    builder.add_attachment(f"{name}_free", *where, joint="spherical", limits=_make_interval(_SWING))
 
 
-def _bar(link: LinkBuilder, at: Point, length: float, out: float, axis: str) -> tuple[Point, float]:
-    """Add a bar along an axis on two posts; return its middle, and how far a hand may slide from there to either side [m]."""
+def _add_posts_and_bar(
+    link: LinkBuilder, at: Point, length: float, out: float, axis: str
+) -> tuple[Point, float]:
+    """Add a bar along an axis on two posts.
+
+    Returns:
+        Middle of the bar, and the range of a hand along it to either side [m].
+    """
     x, y, z = at
     middle, end = (x - out, y, z), length / 2.0 - _POST
     link.add_cylinder(middle, 0.01, length, axis, "steel")
     for shift in (-end, end):
         post = (x - out / 2.0, y, z + shift) if axis == "z" else (x - out / 2.0, y + shift, z)
         link.add_cylinder(post, 0.006, out, "x", "steel")
-    return middle, max(end - _THUMB, 0.0)
+    return middle, max(end - _HALF_HAND, 0.0)
 
 
-def _interval(reach: float) -> list[float]:
+def _make_interval(reach: float) -> list[float]:
     return [-round(reach, 4), round(reach, 4)]

@@ -1,4 +1,4 @@
-"""What has leaves on upright hinges: doors in walls, cabinets, refrigerators, microwave ovens."""
+"""Generates objects with doors on vertical hinges: doors in walls, cabinets and appliances."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from vkc_pin.procedural.furniture.handles import add_knob, add_upright_bar
 
 __all__ = ["make_cabinet", "make_door", "make_microwave", "make_refrigerator"]
 
-_GAP = 0.006  # [m] of air between a leaf and its case
+_GAP = 0.006  # [m] between a door and its case
 _POST = 0.05  # [m] width of a door's posts
-_AIR = 0.025  # [m] between a door's panel and its frame: more than the clearance of a plan
+_AIR = 0.025  # [m] between a door's panel and its frame: more than a plan's clearance
 _FRONTS = ("white", "shade", "sage", "sand", "slate", "oak", "walnut")
 
 
 def make_door(sampler: Sampler) -> ObjectBuilder:
-    """Return a door in its frame, which is pushed or pulled open: with levers and a latch, or with a bar on either side.
+    """Return a door in its frame, which is pushed or pulled open.
 
-    The base link's frame is on the hinge line, in the middle of a wall about 0.1 thick. Measures
-    are those of DIN 18101, with leaves from 0.735 to 0.985.
+    It has levers and a latch, or a bar. The base link's frame is on the hinge line, in the middle
+    of a wall about 0.1 m thick. Dimensions are those of DIN 18101, with door widths from 0.735 to
+    0.985 m.
     """
     width, height, thick = (
         sampler.sample_length(0.735, 0.985),
         sampler.sample_length(1.95, 2.05),
         0.04,
     )
-    to = sampler.choose((-1.0, 1.0))  # from the hinge to the lock, along y
+    to = sampler.choose((-1.0, 1.0))  # direction from the hinge to the lock, along y
     away = sampler.choose((-1.0, 1.0))  # 1: pushed open; -1: pulled
     builder = ObjectBuilder("door", LinkBuilder("frame"))
     top = 0.01 + height + _AIR
@@ -60,11 +61,8 @@ def make_door(sampler: Sampler) -> ObjectBuilder:
     lever.add_cylinder((0, 0, 0), 0.011, 2 * out, "x", "steel")
     for side in (-1, 1):
         lever.add_cylinder((side * out, -to * (length / 2 - 0.01), 0), 0.012, length, "y", "steel")
-    held = (
-        -out,
-        -to * 0.085,
-        0.0,
-    )  # so far from the spindle the wrist passes the post with room to spare
+    # Far enough from the spindle for the wrist to pass the post.
+    held = (-out, -to * 0.085, 0.0)
     builder.add_attachment("handle", lever, held, (1, 0, 0), (0, 0, 1))
     builder.add_attachment(
         "handle_free",
@@ -89,9 +87,9 @@ def make_door(sampler: Sampler) -> ObjectBuilder:
 
 
 def make_cabinet(sampler: Sampler) -> ObjectBuilder:
-    """Return a cabinet or wardrobe with one or two leaves, bars or knobs, and shelves in it."""
-    two = sampler.sample_bool(0.4)
-    width = sampler.sample_length(0.7, 1.1) if two else sampler.sample_length(0.4, 0.65)
+    """Return a cabinet or wardrobe with one or two doors, bars or knobs, and shelves."""
+    has_two = sampler.sample_bool(0.4)
+    width = sampler.sample_length(0.7, 1.1) if has_two else sampler.sample_length(0.4, 0.65)
     height, depth, foot = (
         sampler.sample_length(0.8, 1.9),
         sampler.sample_length(0.35, 0.6),
@@ -115,20 +113,26 @@ def make_cabinet(sampler: Sampler) -> ObjectBuilder:
         sampler.sample_length(0.055, 0.075),
     )
     grip = sampler.sample_length(0.85, 1.1)
-    names = ("left", "right") if two else (sampler.choose(("left", "right")),)
+    names = ("left", "right") if has_two else (sampler.choose(("left", "right")),)
     upper = sampler.sample_length(1.7, 1.9)
     for name in names:
         y = (
             (0.002, width / 2)
-            if two and name == "left"
+            if has_two and name == "left"
             else (-width / 2, -0.002)
-            if two
+            if has_two
             else (-width / 2, width / 2)
         )
-        leaf = _leaf(
-            builder, (y[0], y[1], foot, height), 0.02, name, f"_{name}" if two else "", front, upper
+        leaf = _add_leaf(
+            builder,
+            (y[0], y[1], foot, height),
+            0.02,
+            name,
+            f"_{name}" if has_two else "",
+            front,
+            upper,
         )
-        _handle(
+        _add_handle(
             builder,
             leaf,
             (y[1] - y[0], foot, height),
@@ -136,13 +140,13 @@ def make_cabinet(sampler: Sampler) -> ObjectBuilder:
             name,
             grip,
             (length if bars else 0.0, out),
-            two,
+            has_two,
         )
     return builder
 
 
 def make_refrigerator(sampler: Sampler) -> ObjectBuilder:
-    """Return a refrigerator: with one leaf, a freezer with its own above or below, or two leaves side by side."""
+    """Return a refrigerator with one door, a separate freezer, or two doors side by side."""
     kind = sampler.choose(("single", "stacked", "stacked", "side_by_side"))
     width = (
         sampler.sample_length(0.8, 0.92)
@@ -193,9 +197,9 @@ def make_refrigerator(sampler: Sampler) -> ObjectBuilder:
         ],
     }[kind]
     for suffix, hinge, (y0, y1, z0, z1) in parts:
-        leaf = _leaf(builder, (y0, y1, z0, z1), 0.05, hinge, suffix, colour, upper)
+        leaf = _add_leaf(builder, (y0, y1, z0, z1), 0.05, hinge, suffix, colour, upper)
         own = min(length, round(0.5 * (z1 - z0), 3))
-        _handle(
+        _add_handle(
             builder,
             leaf,
             (y1 - y0, z0, z1),
@@ -210,7 +214,10 @@ def make_refrigerator(sampler: Sampler) -> ObjectBuilder:
 
 
 def make_microwave(sampler: Sampler) -> ObjectBuilder:
-    """Return a microwave oven, which stands on something: its leaf opens to the left, its panel with buttons is on the right."""
+    """Return a microwave oven for a counter.
+
+    Its door opens to the left, its panel is on the right.
+    """
     width, height, depth = (
         sampler.sample_length(0.45, 0.56),
         sampler.sample_length(0.27, 0.34),
@@ -224,7 +231,7 @@ def make_microwave(sampler: Sampler) -> ObjectBuilder:
     builder.base.add_box((-0.03, -width / 2, 0.02), (depth, edge, height), colour)
     for y in (-width / 2 + 0.04, width / 2 - 0.04):
         builder.base.add_box((0.03, y - 0.02, 0), (depth - 0.03, y + 0.02, 0.02), "dark")  # feet
-    leaf = _leaf(
+    leaf = _add_leaf(
         builder,
         (edge + 0.003, width / 2, 0.03, height - 0.005),
         0.03,
@@ -234,7 +241,7 @@ def make_microwave(sampler: Sampler) -> ObjectBuilder:
         sampler.sample_length(1.6, 1.9),
     )
     length = round(min(sampler.sample_length(0.14, 0.2), height - 0.12), 3)
-    _handle(
+    _add_handle(
         builder,
         leaf,
         (width / 2 - edge, 0.03, height),
@@ -247,7 +254,7 @@ def make_microwave(sampler: Sampler) -> ObjectBuilder:
     return builder
 
 
-def _leaf(
+def _add_leaf(
     builder: ObjectBuilder,
     extent: tuple[float, float, float, float],
     thick: float,
@@ -256,9 +263,18 @@ def _leaf(
     colour: str,
     upper: float,
 ) -> LinkBuilder:
-    """Add a leaf before a case's face, y and z from lowest to highest; its hinge is on the left or right of who looks at it.
+    """Add a door in front of a case, hinged on the left or right as seen by the user.
 
-    The leaf's frame is on the hinge line, half as high as the leaf.
+    The door's frame is on the hinge line, at half the door's height.
+
+    Args:
+        builder: Object under construction.
+        extent: Lowest and highest y, lowest and highest z [m].
+        thick: Thickness [m].
+        side: Side of the hinge: "left" or "right".
+        suffix: Suffix of the names of joint and link.
+        colour: Colour.
+        upper: Upper limit of the joint [rad].
     """
     y0, y1, z0, z1 = extent
     right = side == "right"
@@ -275,7 +291,7 @@ def _leaf(
     return link
 
 
-def _handle(
+def _add_handle(
     builder: ObjectBuilder,
     leaf: LinkBuilder,
     extent: tuple[float, float, float],
@@ -286,7 +302,19 @@ def _handle(
     named: bool,
     name: str | None = None,
 ) -> None:
-    """Add a bar (length and distance to the face) to a leaf of a width and between two heights, or a knob (length 0)."""
+    """Add a bar, or a knob for a bar of length 0, to a door.
+
+    Args:
+        builder: Object under construction.
+        leaf: Door.
+        extent: Width of the door, and its lowest and highest z [m].
+        thick: Thickness of the door [m].
+        side: Side of the hinge: "left" or "right".
+        height: Desired height of the handle [m].
+        bar: Length of the bar and distance to the face [m].
+        named: Whether the attachment's name has the suffix `name` or, by default, `side`.
+        name: Suffix.
+    """
     width, z0, z1 = extent
     length, out = bar
     margin = length / 2 + 0.04

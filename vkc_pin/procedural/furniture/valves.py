@@ -1,4 +1,4 @@
-"""What is turned: taps over a counter, and valves on a pipe before a wall."""
+"""Generates objects that are turned: taps on a counter, and valves on a pipe in front of a wall."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from vkc_pin.procedural.furniture.draws import Sampler
 
 __all__ = ["make_faucet", "make_valve"]
 
-_SIDES = 8  # of a hand wheel's rim
+_SIDES = 8  # rods that form a hand wheel's rim
 
 
 def make_faucet(sampler: Sampler) -> ObjectBuilder:
-    """Return a tap for a counter: a spout, and one lever over it or two beside it, which turn about upright axes."""
+    """Return a tap for a counter with one or two levers, which turn about vertical axes.
+
+    One lever is above the spout; two are beside it.
+    """
     builder = ObjectBuilder("faucet", LinkBuilder("spout"))
     height, reach, two = (
         sampler.sample_length(0.16, 0.24),
@@ -26,14 +29,13 @@ def make_faucet(sampler: Sampler) -> ObjectBuilder:
     builder.base.add_cylinder(
         (-reach / 2, 0, height - 0.015 if two else height - 0.06), 0.012, reach, "x", "steel"
     )
-    length = sampler.sample_length(0.11, 0.16) + (
-        0.0 if two else max(reach - 0.1, 0.0)
-    )  # the hand stays before the spout
+    # The hand stays in front of the spout.
+    length = sampler.sample_length(0.11, 0.16) + (0.0 if two else max(reach - 0.1, 0.0))
     for suffix, y in names:
         if two:
             builder.base.add_cylinder((0, y, low / 2 - 0.01), 0.018, low - 0.02, "z", "steel")
         lower, upper = (0.0, 1.2) if two else (-0.8, 0.8)
-        axis = (0, 0, -1 if y > 0.0 else 1)  # of two, each away from the spout
+        axis = (0, 0, -1 if y > 0.0 else 1)  # two levers turn away from the spout
         lever = builder.add_joint(
             f"turn{suffix}",
             "revolute",
@@ -53,7 +55,10 @@ def make_faucet(sampler: Sampler) -> ObjectBuilder:
 
 
 def make_valve(sampler: Sampler) -> ObjectBuilder:
-    """Return a valve on a pipe before a wall, with a hand wheel or with a lever, which turn about the level axis of the valve."""
+    """Return a valve on a pipe in front of a wall, with a hand wheel or a lever.
+
+    Its axis is horizontal.
+    """
     builder = ObjectBuilder("valve", LinkBuilder("pipe"))
     height, out, thick = (
         sampler.sample_length(0.7, 1.15),

@@ -1,1 +1,1 @@
-"""Rooms made by rule and number."""
+"""Generates random rooms."""

@@ -1,4 +1,4 @@
-"""What opens in a room: which object it is, how large, and where such a thing stands."""
+"""Defines the objects of a room that can be opened: their type, size and support."""
 
 from __future__ import annotations
 
@@ -40,22 +40,25 @@ OPENABLE = {
     "refrigerator": 0.7,
     "cabinet": 0.7,
 }
-"""Objects that open: type → how far to either side of it the floor before it stays free, for the robot and for a door [m]."""
+"""Types of objects that can be opened → free floor in front of them on either side [m].
+
+The robot and the object's doors need it.
+"""
 RANDOM = "random_"
-"""What the names of objects begin with that are made at random: `random_oven`."""
+"""Prefix of the types of random objects: `random_oven`."""
 _IN_WALL = ("door", "narrow_door", "wide_door")
-_BESIDE = 0.7  # [m] as `OPENABLE`, for objects that only their file describes
-_SLIT = 0.03  # [m] of air above a door's panel, where its frame has no lintel
-_ON = 0.001  # [m] of air below what stands on a counter
+_BESIDE = 0.7  # [m] as in `OPENABLE`, for objects known by their description only
+_SLIT = 0.03  # [m] above a door's panel, if its frame has no lintel
+_ON = 0.001  # [m] between an object and the counter
 
 
 @dataclass(frozen=True)
 class Counter:
-    """What a small thing stands on, against a wall.
+    """A counter against a wall that supports a small object.
 
     Attributes:
         size: Depth, width and height [m].
-        setback: How far behind the counter's edge the thing's face is [m].
+        setback: Distance of the object's front behind the counter's edge [m].
     """
 
     size: tuple[float, float, float]
@@ -64,19 +67,18 @@ class Counter:
 
 @dataclass(frozen=True)
 class Fixture:
-    """Something that opens, before it has a place.
+    """An object that can be opened, before it is placed.
 
     Attributes:
-        type: Of the object in a scene: a name, a path, or a description.
-        low, high: Corners of its base link and of what is shut, in its own frame, shape (3,) each
-            [m]. Of a door in a wall it is the frame alone, as handles stick out of the wall, and as
-            high as the panel needs it.
-        in_wall: Whether it stands in an opening of a wall.
-        beside: How far to either side of it the floor before it stays free [m].
-        lift: How high its frame is above what it stands on [m].
-        counter: What it stands on, if not on the floor.
-        face: Where it ends towards the room without what moves and sticks out, in its own frame,
-            along x [m].
+        type: Type of the object in a scene: a name, a path, or a description.
+        low, high: Corners of the bounding box of the closed object in its own frame, shape (3,)
+            each [m]. For a door in a wall it is that of the frame alone, as handles stick out of
+            the wall, raised to the height that the panel needs.
+        in_wall: Whether it is in an opening of a wall.
+        beside: Width of the free floor in front of it on either side [m].
+        lift: Height of its frame above its support [m].
+        counter: Counter that supports it; None: the floor.
+        face: x of the front of its fixed part, in its own frame [m].
     """
 
     type: str | dict[str, Any]
@@ -90,7 +92,7 @@ class Fixture:
 
 
 def list_openable_types() -> list[str]:
-    """Return the names of all objects that a room can be asked for."""
+    """Return the names of all types of objects that can be opened."""
     return [
         *OPENABLE,
         *(RANDOM + kind for kind in KINDS),
@@ -99,56 +101,61 @@ def list_openable_types() -> list[str]:
 
 
 def make_fixture_name(kind: str | Mapping[str, Any]) -> str:
-    """Return what something that opens is called in a room: its type, the stem of its file, or the name in its URDF."""
+    """Return the name of an object in a room: its type, file stem, or name in its URDF."""
     if isinstance(kind, Mapping):
         return load_object(kind).name.replace(".", "_")
     return Path(kind).stem.replace(".", "_") if _is_path(kind) else kind.removeprefix(RANDOM)
 
 
 def make_fixture(kind: str | Mapping[str, Any], seed: int = 0) -> Fixture:
-    """Return something that opens.
+    """Return an object that can be opened.
 
     Args:
-        kind: One of `known_objects()`, the path of a description (.yaml), or a description.
-        seed: Of sizes that are random.
+        kind: One of `list_openable_types()`, the path of a description (.yaml), or a description.
+        seed: Random seed of random sizes.
 
     Raises:
         UnknownNameError: There is no such object.
-        InputError: Its description is wrong, or it is carried and not opened.
+        InputError: Its description is invalid, or it is a free object.
     """
     if isinstance(kind, str) and kind.startswith(RANDOM):
         if kind.removeprefix(RANDOM) not in KINDS:
             raise UnknownNameError(
                 "object that opens", kind, list_openable_types(), field="objects"
             )
-        return _random(kind.removeprefix(RANDOM), seed)
+        return _make_random_fixture(kind.removeprefix(RANDOM), seed)
     if isinstance(kind, str) and not _is_path(kind):
-        return _named(kind)
+        return _make_named_fixture(kind)
     own = load_object(kind)
-    return _other(str(Path(kind).resolve()) if isinstance(kind, str) else dict(kind), own)
+    return _make_described_fixture(
+        str(Path(kind).resolve()) if isinstance(kind, str) else dict(kind), own
+    )
 
 
 @functools.cache
-def _named(kind: str) -> Fixture:
+def _make_named_fixture(kind: str) -> Fixture:
     if kind not in list_openable_types():
         raise UnknownNameError("object that opens", kind, list_openable_types(), field="objects")
     own = load_object(kind)
     if kind not in OPENABLE:
-        return _other(kind, own)
-    low, high = _extent(own, in_wall=kind in _IN_WALL)
+        return _make_described_fixture(kind, own)
+    low, high = _compute_extent(own, in_wall=kind in _IN_WALL)
     return Fixture(kind, low, high, kind in _IN_WALL, OPENABLE[kind])
 
 
-def _other(kind: str | dict[str, Any], own: ArticulatedObject) -> Fixture:
-    """Return an object that only its description tells of: it stands on the floor, with its back to a wall."""
+def _make_described_fixture(kind: str | dict[str, Any], own: ArticulatedObject) -> Fixture:
+    """Return an object that is known by its description only.
+
+    It stands on the floor with its back to a wall.
+    """
     if own.free:
         raise InputError(
-            "this is carried, not opened",
+            "a free object cannot be a fixture",
             field="objects",
-            expected="an object that is not free",
+            expected="a fixed object",
             got=own.name,
         )
-    low, high = _extent(own, in_wall=False)
+    low, high = _compute_extent(own, in_wall=False)
     fixed = [
         compute_world_box(shape.geometry, shape.placement)[0]
         for shape in own.collision.geometryObjects
@@ -160,9 +167,9 @@ def _other(kind: str | dict[str, Any], own: ArticulatedObject) -> Fixture:
     )
 
 
-def _random(kind: str, seed: int) -> Fixture:
+def _make_random_fixture(kind: str, seed: int) -> Fixture:
     own, about = random_object(kind, seed), KINDS[kind]
-    low, high = _extent(load_object(own), in_wall=about.place == "wall")
+    low, high = _compute_extent(load_object(own), in_wall=about.place == "wall")
     counter = None
     if about.place == "counter":
         rng = np.random.default_rng([5, seed])
@@ -170,9 +177,8 @@ def _random(kind: str, seed: int) -> Fixture:
             float(rng.uniform(*interval))
             for interval in ((0.01, 0.06), (0.0, 0.1), (0.2, 0.8), (0.72, 0.9))
         )
-        setback = (
-            float(-low[0]) + before
-        )  # so that nothing of it, levers and handles too, is beyond the counter's edge
+        # No part of it, levers and handles included, is beyond the counter's edge.
+        setback = float(-low[0]) + before
         depth = max(0.5, setback + float(high[0]) + 0.02) + extra
         sizes = [
             math.ceil(100.0 * size) / 100.0 for size in (depth, high[1] - low[1] + width, height)
@@ -187,7 +193,7 @@ def _is_path(kind: str) -> bool:
     return kind.endswith((".yaml", ".yml")) or "/" in kind
 
 
-def _extent(own: ArticulatedObject, *, in_wall: bool) -> tuple[Floats, Floats]:
+def _compute_extent(own: ArticulatedObject, *, in_wall: bool) -> tuple[Floats, Floats]:
     """Return lowest and highest corner, shape (3,) each [m]; see `Fixture`."""
     placed = PlacedObject("it", own, pin.SE3.Identity(), np.clip(0.0, own.lower, own.upper))
     boxes = np.array(

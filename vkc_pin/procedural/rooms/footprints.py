@@ -1,4 +1,4 @@
-"""Rectangles on the floor: what stands there, what is to stay free, and whether a robot gets from one place to another."""
+"""Defines rectangles on the floor of a room, and checks whether a robot can move between places."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.utils.arrays import Floats
 
 __all__ = ["Floor", "Frame", "Rectangle"]
 
-_CELL = 0.1  # [m] of the grid on which a way for the robot is looked for
+_CELL = 0.1  # [m] of the grid for path searches
 _QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
@@ -48,7 +48,7 @@ class Rectangle:
         )
 
     def compute_gap(self, other: Rectangle) -> float:
-        """Return how far two rectangles are apart along the axis that separates them most [m]; negative: they overlap."""
+        """Return the largest separation of two rectangles along an axis [m]; negative: overlap."""
         gaps = []
         for axis in np.vstack([self.axes, other.axes]):
             one, two = self.corners @ axis, other.corners @ axis
@@ -56,7 +56,10 @@ class Rectangle:
         return float(max(gaps))
 
     def compute_distances(self, points: ArrayLike) -> Floats:
-        """Return the distances [m] of points, shape (n, 2), to the rectangle, shape (n,); 0 inside."""
+        """Return the distances of points, shape (n, 2), to the rectangle, shape (n,) [m].
+
+        They are 0 inside.
+        """
         local = np.abs((np.asarray(points, float) - (self.x, self.y)) @ self.axes.T)
         return np.linalg.norm(
             np.maximum(local - (self.length / 2.0, self.width / 2.0), 0.0), axis=-1
@@ -65,19 +68,22 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame on the floor, x and y in the world frame [m] and yaw [rad]; x points away from who stands before a thing."""
+    """A frame on the floor: x and y in the world frame [m], and yaw [rad].
+
+    x points from the user's side into the part that stands there.
+    """
 
     x: float
     y: float
     yaw: float
 
     def transform_point(self, x: float, y: float) -> tuple[float, float]:
-        """Return a point of this frame in the world frame [m], to the millimetre."""
+        """Return a point of this frame in the world frame, rounded to the millimetre [m]."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return round(self.x + c * x - s * y, 3), round(self.y + s * x + c * y, 3)
 
     def make_rectangle(self, x: tuple[float, float], y: tuple[float, float]) -> Rectangle:
-        """Return the rectangle between lowest and highest x and y of this frame [m]."""
+        """Return the rectangle between two values of x and two values of y in this frame [m]."""
         centre = self.transform_point((x[0] + x[1]) / 2.0, (y[0] + y[1]) / 2.0)
         return Rectangle(*centre, x[1] - x[0], y[1] - y[0], self.yaw)
 
@@ -87,8 +93,8 @@ class Floor:
     """The floor of a room between its walls, centred at the world's origin.
 
     Attributes:
-        width: Along x [m].
-        depth: Along y [m].
+        width: Length along x [m].
+        depth: Length along y [m].
     """
 
     width: float
@@ -99,18 +105,18 @@ class Floor:
         return (self.width if side % 2 else self.depth) / 2.0
 
     def make_wall_frame(self, side: int, along: float) -> Frame:
-        """Return the frame on a wall's inner face, its x out of the room and its y along the wall.
+        """Return a frame on a wall's inner face, with x out of the room and y along the wall.
 
         Args:
             side: 0 east, 1 north, 2 west, 3 south.
-            along: How far from the wall's middle, towards the left of who looks at it [m].
+            along: Distance from the wall's middle, to the left as seen from the room [m].
         """
         c, s = _QUARTERS[side]
         out = self.compute_half_length(side + 1)
         return Frame(round(c * out - s * along, 3), round(s * out + c * along, 3), math.atan2(s, c))
 
     def contains(self, rectangle: Rectangle) -> bool:
-        """Return whether all of a rectangle lies between the walls."""
+        """Return whether a rectangle lies between the walls."""
         return bool(
             (np.abs(rectangle.corners) <= np.array([self.width, self.depth]) / 2.0 + 1e-6).all()
         )
@@ -118,7 +124,13 @@ class Floor:
     def find_free(
         self, standing: Sequence[Rectangle], radius: float, points: ArrayLike
     ) -> NDArray[np.bool_]:
-        """Return at which points, shape (n, 2) [m], a disc of a radius [m] touches neither walls nor what stands there."""
+        """Return at which points a disc is free of collisions, shape (n,).
+
+        Args:
+            standing: Occupied rectangles.
+            radius: Radius of the disc [m].
+            points: Positions of its centre, shape (n, 2) [m].
+        """
         points = np.asarray(points, float)
         free = np.asarray(
             (np.array([self.width, self.depth]) / 2.0 - np.abs(points)).min(axis=1) >= radius
@@ -130,12 +142,12 @@ class Floor:
     def is_connected(
         self, standing: Sequence[Rectangle], radius: float, places: Sequence[tuple[float, float]]
     ) -> bool:
-        """Return whether a disc can get from each of some places to all others without touching anything.
+        """Return whether a disc can move between any two of some places without collision.
 
         Args:
-            standing: What stands on the floor.
-            radius: Of the disc [m].
-            places: Where its centre is to get, in the world frame [m].
+            standing: Occupied rectangles.
+            radius: Radius of the disc [m].
+            places: Positions of its centre in the world frame [m].
         """
         from scipy.ndimage import label
 
@@ -145,11 +157,11 @@ class Floor:
         cells = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
         free = self.find_free(standing, radius, cells.reshape(-1, 2)).reshape(cells.shape[:2])
         regions, _ = label(free)
-        found = set()
+        found_regions = set()
         for place in places:
             i, j = (
                 int(np.argmin(np.abs(axis - value)))
                 for axis, value in zip(ticks, place, strict=True)
             )
-            found.add(int(regions[i, j]))
-        return 0 not in found and len(found) <= 1
+            found_regions.add(int(regions[i, j]))
+        return 0 not in found_regions and len(found_regions) <= 1

@@ -1,4 +1,4 @@
-"""What random rooms are to be like."""
+"""Defines the settings of random rooms."""
 
 from __future__ import annotations
 
@@ -15,28 +15,27 @@ from vkc_pin.world.files.resources import file_path
 
 __all__ = ["RoomSettings"]
 
-_CARRIED = 4  # on one table
+_MAX_CARRIED = 4  # on one table
 
 
 @dataclass(frozen=True)
 class RoomSettings:
-    """What random rooms are like. Every field is checked when the object is made.
+    """Settings of random rooms. All fields are checked when an instance is created.
 
     Attributes:
-        clutter: How much furniture there is, from 0, nothing but `tables`, to 1.
-        objects: What can be opened; None: one or two, at random, of `door`, `narrow_door`,
-            `wide_door`, `drawer`, `low_drawer`, `refrigerator` and `cabinet`, which are always the
-            same. `random_door`, `random_oven` and others have sizes of their own in every room, see
-            `random_object`. Objects can also be given by path, or as what `random_object` returns:
-            they stand on the floor with their face, -x, towards the room.
-        tables: How many tables there are at least, each with a side at which a robot can stand.
-        carried: Types of free objects, up to four of `cup` and `ball`, which stand on the first
-            table.
-        width: Lowest and highest inner length of a wall [m].
-        height: Of the walls [m].
-        front: Depth of the floor that stays free before what can be opened [m].
-        gap: Least distance between what stands there [m].
-        robot: The robot's name, or the path of its file or folder.
+        clutter: Amount of furniture, from 0, nothing but `tables`, to 1.
+        objects: Types of objects that can be opened; None: one or two, at random, of `door`,
+            `narrow_door`, `wide_door`, `drawer`, `low_drawer`, `refrigerator` and `cabinet`, which
+            have fixed sizes. `random_door`, `random_oven` and others have other sizes in every
+            room, see `random_object`. Objects can also be given by path, or as results of
+            `random_object`: they stand on the floor with their front, -x, towards the room.
+        tables: Minimum number of tables, each with a side at which a robot can stand.
+        carried: Types of free objects, up to four of `cup` and `ball`, on the first table.
+        width: Shortest and longest inner length of a wall [m].
+        height: Height of the walls [m].
+        front: Depth of the free floor in front of objects that can be opened [m].
+        gap: Minimum distance between the parts of a room [m].
+        robot: Name of the robot, or path of its file or folder.
     """
 
     clutter: float = 0.5
@@ -50,16 +49,16 @@ class RoomSettings:
     robot: str = "husky_ur5e"
 
     def __post_init__(self) -> None:
-        _within("clutter", self.clutter, 0.0, 1.0)
+        _check_range("clutter", self.clutter, 0.0, 1.0)
         for name, low, high in (("height", 2.1, 10.0), ("front", 1.5, 3.0), ("gap", 0.02, 1.0)):
-            _within(name, getattr(self, name), low, high)
+            _check_range(name, getattr(self, name), low, high)
         expected = "two lengths of 4 to 20 m, the lower one first"
         if not isinstance(self.width, tuple | list) or len(self.width) != 2:
             raise InputError(
                 "not an interval", field="width", expected=expected, got=shown(self.width)
             )
         for value in self.width:
-            _within("width", value, 4.0, 20.0)
+            _check_range("width", value, 4.0, 20.0)
         if self.width[0] > self.width[1]:
             raise InputError(
                 "the interval is empty", field="width", expected=expected, got=shown(self.width)
@@ -70,7 +69,7 @@ class RoomSettings:
             object.__setattr__(
                 self,
                 "objects",
-                tuple(map(_opened, items(self.objects, "objects", "a list of types"))),
+                tuple(map(_parse_openable, items(self.objects, "objects", "a list of types"))),
             )
         kinds: tuple[Any, ...] = items(self.carried, "carried", "a list of types")
         object.__setattr__(
@@ -78,48 +77,54 @@ class RoomSettings:
             "carried",
             tuple(known(kind, CARRIED, "object that is carried", "carried") for kind in kinds),
         )
-        object.__setattr__(self, "robot", _robot(self.robot))
-        if len(self.carried) > _CARRIED:
+        object.__setattr__(self, "robot", _parse_robot(self.robot))
+        if len(self.carried) > _MAX_CARRIED:
             raise InputError(
-                "too many", field="carried", expected=f"at most {_CARRIED}", got=len(self.carried)
+                "too many",
+                field="carried",
+                expected=f"at most {_MAX_CARRIED}",
+                got=len(self.carried),
             )
         if self.carried and not self.tables:
             raise InputError(
-                "there is nothing for it to stand on",
+                "there is no table for it",
                 field="carried",
-                expected="tables of at least 1",
+                expected="at least one table",
                 got=self.tables,
             )
 
 
-def _opened(kind: Any) -> str | dict[str, Any]:
-    """Return what a thing that opens is given by. Raises an error if nothing is called that."""
+def _parse_openable(kind: Any) -> str | dict[str, Any]:
+    """Return the type of an object that can be opened. Raises an error for an unknown name."""
     if isinstance(kind, Mapping):
         return mapping(kind, "objects")
-    path = isinstance(kind, Path) or (
+    is_path = isinstance(kind, Path) or (
         isinstance(kind, str) and (kind.endswith((".yaml", ".yml")) or "/" in kind)
     )
     return (
         str(file_path(kind, "objects"))
-        if path
+        if is_path
         else known(kind, list_openable_types(), "object that opens", "objects")
     )
 
 
-def _robot(robot: Any) -> str:
-    """Return a robot's name, or the whole path of its file or folder: a room is written with no folder in mind."""
-    path = isinstance(robot, Path) or (
+def _parse_robot(robot: Any) -> str:
+    """Return a robot's name, or the absolute path of its file or folder.
+
+    Rooms are saved without a folder that paths could be relative to.
+    """
+    is_path = isinstance(robot, Path) or (
         isinstance(robot, str) and (robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot)
     )
     return (
         str(file_path(robot, "robot").resolve())
-        if path
+        if is_path
         else text(robot, "robot", "a robot's name, or the path of its file")
     )
 
 
-def _within(name: str, value: Any, low: float, high: float) -> None:
-    """Raise an error unless a setting is a number from the lowest to the highest."""
+def _check_range(name: str, value: Any, low: float, high: float) -> None:
+    """Raise an error unless a setting is a number from `low` to `high`."""
     if not is_number(value) or not low <= value <= high:
         raise InputError(
             "out of range",

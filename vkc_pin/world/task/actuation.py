@@ -198,8 +198,8 @@ def check_actuation(
         if latch.released_by in path:
             wanted.setdefault(release, max(latch.threshold, state[release]))
         elif state[release] < latch.threshold:
-            problem = f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, does not move when "
-            problem += f"'{name}' is held at '{attachment.name}'"
+            problem = f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, "
+            problem += f"does not move when '{name}' is held at '{attachment.name}'"
             raise InputError(
                 problem,
                 field=f"{where}.attachment",

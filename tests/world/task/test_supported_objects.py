@@ -52,7 +52,7 @@ def test_a_turntable_stays_level_and_a_flap_does_not() -> None:
         ("cup", "plate.plate")
     ]
     with pytest.raises(
-        InputError, match=r"'cup' stands on 'plate\.plate', which would tip"
+        InputError, match=r"'cup' rests on 'plate\.plate', which would tilt too much"
     ) as caught:
         compiled(plates("flap"), vkc.Actuate("plate", {"tip": 0.5}))
     assert caught.value.field == "steps[0]"

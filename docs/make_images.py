@@ -359,7 +359,7 @@ def main() -> int:
         else vkc.plan(vkc.load_scene("init_3"), use, initialization="astar")
     )
     home = vkc.load_scene("household")
-    chore = saved[2] if len(saved) > 2 else vkc.plan_chore(home, chores.home(home))
+    chore = saved[2] if len(saved) > 2 else vkc.plan(home, chores.home(home), window=2)
     through = saved[3] if len(saved) > 3 else vkc.plan(gap.started(0, SHOWN), [vkc.Reach(gap.POSE)])
     for plan in (door, stick, chore, through):
         sys.stdout.write(plan.report() + "\n")

@@ -16,7 +16,6 @@ from .importing.robots.robot_import import ImportedRobot, import_robot
 from .options import Options
 from .planning.chain.chain import VirtualKinematicChain, consolidate
 from .planning.chain.inversion import invert
-from .planning.chore import plan_chore
 from .planning.nlp.inspection import build
 from .planning.nlp.problem import TrajectoryProblem
 from .planning.plan import Plan
@@ -115,7 +114,6 @@ __all__ = [
     "load_robot",
     "load_scene",
     "plan",
-    "plan_chore",
     "propose_attachments",
     "random_object",
     "random_room",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import fake_plan, with_metrics
 from helpers.markdown import cells
 from helpers.pages import clips, commands_of
 
@@ -22,7 +22,7 @@ from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
 from vkc_pin.benchmarks.harness.record import peaks
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.planning.outcome import spent
+from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -73,7 +73,7 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     plan = fake_plan(scene)
     metrics = {
         **plan.trajectory.metrics(),
-        **spent(1.0 + number + k, 0.5, iterations=12, rounds=3),
+        **PlanningStatistics(1.0 + number + k, 0.5, 12, 3).to_metrics(),
         "base_effort": 4.0 + number - k,
         "arm_effort": 7.0,
         "clearance": np.inf,
@@ -81,9 +81,7 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     }
     validation = Report() if good else Report(BLAME, -0.03)
     status = "success" if good else "rejected" if method == "VKC" else "collision"
-    return dataclasses.replace(
-        plan, metrics=metrics, status=status, validation=validation, seed=spec["seed"]
-    )
+    return with_metrics(plan, metrics, status=status, validation=validation, seed=spec["seed"])
 
 
 class Counting:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.fake_plan import with_metrics
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
@@ -91,9 +91,7 @@ def stay(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """Return a plan whose success hangs on the number of the trial."""
     plan = vkc.plan(scene, [vkc.GoTo(*scene.start[:2])], seed=spec["seed"])
     status = "success" if spec["number"] else "not converged"
-    return dataclasses.replace(
-        plan, status=status, metrics={**plan.metrics, "planning_time": 1.0 + spec["number"]}
-    )
+    return with_metrics(plan, {"planning_time": 1.0 + spec["number"]}, status=status)
 
 
 def test_every_trial_is_on_record(tmp_path: Path) -> None:
@@ -123,10 +121,7 @@ def test_what_hangs_on_seeds_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
         scene: vkc.Scene, steps: list[vkc.Step], *, options: vkc.Options, seed: int
     ) -> list[vkc.Plan]:
         plans = [stay(scene, {"seed": seed, "number": number}) for number in (1, 0)]
-        return [
-            dataclasses.replace(one, metrics={**one.metrics, "arm_effort": float(seed)})
-            for one in plans
-        ]
+        return [with_metrics(one, {**one.metrics, "arm_effort": float(seed)}) for one in plans]
 
     monkeypatch.setattr(stepwise, "step_by_step", two)
     settings = {
@@ -186,7 +181,7 @@ def test_every_chore_is_really_planned(
         chores.CHORES[name].planned(),
         chores.CHORES[name].options,
     )
-    plan = vkc.plan_chore(scene, steps, options=options, seed=7)
+    plan = vkc.plan(scene, steps, options=options, seed=7, window=2)
     assert plan.success, plan.report()
     assert vkc.validate(scene, plan.steps, plan.trajectory, options).ok
     last = plan.end_scene()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import fake_plan, with_metrics
 from helpers.markdown import cells
 from helpers.small_problems import program_of
 
@@ -75,10 +74,10 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     }
     validation = Report() if good else Report((BLAME,), -0.03)
     status = "success" if good else "no inverse kinematics"
-    return dataclasses.replace(
+    return with_metrics(
         plan,
+        metrics,
         scene=scene,
-        metrics=metrics,
         status=status,
         validation=validation,
         seed=spec["seed"],

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import fake_plan, with_metrics
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import initialization
@@ -53,8 +53,8 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     }
     status = "success" if good else "rejected"
     report = Report() if good else Report((BLAME,))
-    return dataclasses.replace(
-        fake_plan(scene), metrics=metrics, status=status, validation=report, seed=spec["seed"]
+    return with_metrics(
+        fake_plan(scene), metrics, status=status, validation=report, seed=spec["seed"]
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import fake_plan, with_metrics
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import scale
@@ -65,9 +65,7 @@ def planned(
         }
         status = "rejected" if count == 300 and number == 1 else "success"
         report = Report((BLAME,)) if status == "rejected" else Report()
-        return dataclasses.replace(
-            fake_plan(scene), metrics=metrics, status=status, validation=report
-        )
+        return with_metrics(fake_plan(scene), metrics, status=status, validation=report)
 
     monkeypatch.setattr(scale, "plan", plan)
     scale._warm.cache_clear()

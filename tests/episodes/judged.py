@@ -51,7 +51,6 @@ def saved(episode: Episode, path: Path) -> Path:
             trajectory=episode.trajectory,
             validation=episode.claimed,
             status="success",
-            metrics={},
             terms=episode.terms,
         )
         return plan.save(path)

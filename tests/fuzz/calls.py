@@ -326,7 +326,7 @@ CALLS: dict[str, Call] = {
             **_planning(),
             "callback": None,
             "seed": 0,
-            "joint": True,
+            "simultaneous": True,
             "perturbation": 0.0,
             "progress": False,
             "terms": (),
@@ -334,8 +334,8 @@ CALLS: dict[str, Call] = {
         },
         2.0,
     ),
-    "plan_chore": Call(
-        vkc.plan_chore,
+    "plan_window": Call(
+        vkc.plan,
         lambda: {
             **_planning(),
             "window": 1,

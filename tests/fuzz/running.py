@@ -162,7 +162,7 @@ def _plans(case: dict[str, Any]) -> bool:
     planning = (
         *pictures,
         "plan",
-        "plan_chore",
+        "plan_window",
         "plan_separately",
         "Constraint",
         "Cost",

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
 import numpy as np
 
 from vkc_pin.options import Options
@@ -14,6 +18,23 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 HINGE = 1.2
+
+
+@dataclass(frozen=True, eq=False)
+class PlanWithMetrics(Plan):
+    """A plan with metrics that no trajectory has, for tests of records."""
+
+    replaced: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        return {**super().metrics, **self.replaced}
+
+
+def with_metrics(plan: Plan, metrics: Mapping[str, float], **changes: Any) -> Plan:
+    """Return a plan with other metrics, and other fields."""
+    fields = {name: value for name, value in vars(plan).items() if name != "replaced"}
+    return PlanWithMetrics(**{**fields, **changes}, replaced=metrics)
 
 
 def fake_plan(scene: Scene | None = None) -> Plan:
@@ -55,5 +76,4 @@ def fake_plan(scene: Scene | None = None) -> Plan:
         trajectory=Trajectory(names, times, positions, phases, len(robot)),
         validation=Report((blame,), -0.03, states=100),
         status="rejected",
-        metrics={},
     )

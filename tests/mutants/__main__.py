@@ -24,7 +24,7 @@ MODULES = [
     "planning/solver",
     "planning/nlp/merit.py",
 ]
-MODULES += ["world/scene/contact_rules.py", "planning/one_problem.py"]
+MODULES += ["world/scene/contact_rules.py", "planning/solve_task.py"]
 TESTS = [
     "tests/validation",
     "tests/planning/solver",
@@ -49,8 +49,7 @@ TESTS += [
 TESTS += [
     f"tests/planning/test_{name}.py"
     for name in (
-        "one_problem",
-        "one_problem_parts",
+        "solve_task",
         "pushes",
         "near_grasps",
         "riding",

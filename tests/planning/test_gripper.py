@@ -243,7 +243,7 @@ def test_own_terms_about_a_finger_see_it_where_it_stands(robot: Path) -> None:
 
 def test_a_chore_rests_where_its_parts_change_the_opening(robot: Path) -> None:
     """Driving is planned by itself, and without a thought of the drawer: the fingers move before the hand reaches for it."""
-    found = vkc.plan_chore(
+    found = vkc.plan(
         between_cheeks(robot, opening=NARROW), [vkc.GoTo(-0.3, 0.2), PULL[0]], window=1
     )
     assert found.success, found.report()
@@ -294,7 +294,7 @@ def test_a_plan_ends_and_goes_on_with_the_fingers_where_they_are(
 
 
 def test_openings_are_saved(plan: vkc.Plan, tmp_path: Path) -> None:
-    loaded = vkc.Plan.load(plan.save(tmp_path / "plan.npz"), check=True)
+    loaded = vkc.Plan.load(plan.save(tmp_path / "plan.npz"))
     assert loaded.success
     assert loaded.trajectory.phases == plan.trajectory.phases
     for read, write in (

@@ -43,7 +43,7 @@ def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
 
 def test_the_value_of_a_cell_is_an_overview(jupyter: Kernel) -> None:
     jupyter.run(
-        "from vkc_pin.planning.outcome import joined\nfrom vkc_pin.planning.settings import Settings"
+        "from vkc_pin.planning.results import joined\nfrom vkc_pin.planning.request import Settings"
     )
     jupyter.run("plan = joined(scene, steps, Settings('auto', vkc.Options()), [])")
     for code, text in (("plan", "FAILED, interrupted"), ("scene", "obstacles")):
@@ -70,15 +70,15 @@ def test_progress_is_one_line_that_is_written_over(jupyter: Kernel) -> None:
     [
         ("seeds", "vkc_pin.planning.initialization.methods._GuessSearch, '_search'"),
         ("solver", "vkc_pin.planning.solver.subproblem.Subproblem, 'solve'"),
-        ("validation", "vkc_pin.planning.one_problem, 'validate'"),
-        ("building", "vkc_pin.planning.one_problem, 'TrajectoryProblem'"),
+        ("validation", "vkc_pin.planning.solve_task, 'validate'"),
+        ("building", "vkc_pin.planning.solve_task, 'TrajectoryProblem'"),
     ],
 )
 def test_an_interrupted_cell_leaves_a_plan(jupyter: Kernel, where: str, code: str) -> None:
     """The kernel is interrupted once planning has come to a place where it stays for a while."""
     slow = f"""
 import time, importlib
-import vkc_pin.planning.initialization.methods, vkc_pin.planning.solver.loop, vkc_pin.planning.one_problem
+import vkc_pin.planning.initialization.methods, vkc_pin.planning.solver.loop, vkc_pin.planning.solve_task
 owner, name = {code}
 original = getattr(owner, name)
 def slow(*arguments, **options):

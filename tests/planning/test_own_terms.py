@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -173,7 +174,12 @@ def test_a_link_of_an_object_that_stands_fixed() -> None:
 
 
 @pytest.mark.parametrize(
-    "planner", [vkc.plan, vkc.plan_chore, lambda *a, **k: vkc.plan(*a, joint=False, **k)]
+    "planner",
+    [
+        vkc.plan,
+        functools.partial(vkc.plan, window=2),
+        lambda *a, **k: vkc.plan(*a, simultaneous=False, **k),
+    ],
 )
 def test_several_steps_keep_their_terms(planner: Callable[..., vkc.Plan]) -> None:
     """`during` names a phase of one step only, and is no mistake where the other is planned alone."""

@@ -378,9 +378,8 @@ def test_plain_data(door_plan: vkc.Plan) -> None:
         "held": {},
         "by": {},
     }
-    endless = dataclasses.replace(
-        door_plan, metrics={**door_plan.metrics, "clearance": float("inf")}
-    )
+    open_space = dataclasses.replace(door_plan.validation, clearance=float("inf"))
+    endless = dataclasses.replace(door_plan, validation=open_space)
     assert (
         json.loads(json.dumps(endless.to_dict(), allow_nan=False))["metrics"]["clearance"] is None
     )

@@ -226,7 +226,7 @@ def test_a_stick_is_put_elsewhere(joint: bool) -> None:
         scene,
         [vkc.Grasp("stick"), vkc.Place("stick", aside), vkc.GoTo(-1.0, 0.0)],
         options=SEEN,
-        joint=joint,
+        simultaneous=joint,
     )
     confirm(plan)
     assert max(apart(left_at(plan, "stick"), aside)) <= 1e-3

@@ -16,8 +16,8 @@ import pytest
 from helpers.drives import hall
 
 import vkc_pin as vkc
-from vkc_pin.planning import one_problem
 from vkc_pin.planning import progress as module
+from vkc_pin.planning import solve_task
 from vkc_pin.planning.progress import Progress, shown
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -113,7 +113,7 @@ def test_ctrl_c_leaves_a_line_as_well(terminal: Terminal, monkeypatch: pytest.Mo
         signal.raise_signal(signal.SIGINT)
         return iter(())
 
-    monkeypatch.setattr(one_problem, "initialize", stop)
+    monkeypatch.setattr(solve_task, "initialize", stop)
     plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
     assert plan.status == "interrupted"
     assert "FAILED, interrupted" in terminal.lines()[0]
@@ -155,7 +155,7 @@ def test_true_or_false(value: Any) -> None:
 def test_a_chore_says_which_step(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[str] = []
     monkeypatch.setattr(module, "_screen", lambda: lambda text, last: seen.append(text))
-    plan = vkc.plan_chore(hall(), [vkc.GoTo(-1.0, 0.5), vkc.GoTo(-0.5, 0.3)], progress=True)
+    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5), vkc.GoTo(-0.5, 0.3)], progress=True, window=2)
     assert plan.success
     parts = [match[0] for text in seen if (match := re.search(r"steps? \d[\w ]* of 2", text))]
     assert list(dict.fromkeys(parts)) == ["step 1 of 2", "step 2 of 2", "steps 1 to 2 of 2"]

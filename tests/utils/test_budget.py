@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from vkc_pin.utils.budget import Budget, SpentError, spend, unlimited
+from vkc_pin.utils.budget import Budget, SpentError, current_ending, reserve_time, spend, unlimited
 
 
 @pytest.fixture(autouse=True)
@@ -103,9 +103,12 @@ def test_the_clock_keeps_time_for_checking(monkeypatch: pytest.MonkeyPatch) -> N
     budget = Budget(seconds=10.0)
     now[0] = 108.0
     assert budget.ended == ""
-    budget.checking, budget.decided = 1.5, 1.0
-    assert budget.ended == "time limit"
-    budget.decided = 0.0
+    with budget.running():
+        reserve_time("validation", 1.5)
+        reserve_time("planned steps", 1.0)
+        assert current_ending() == "time limit"
+        reserve_time("validation", 9.0, default=True)
+        reserve_time("planned steps", 0.0)
     assert budget.ended == ""
     budget.pressed = True
     assert budget.ended == "interrupted"

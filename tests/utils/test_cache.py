@@ -117,7 +117,7 @@ def test_a_planner_lends_each_a_cache_of_its_own() -> None:
     planner, met, seen = vkc.Planner(), threading.Barrier(2, timeout=30), list[Cache]()
 
     def borrow() -> None:
-        with planner.lent() as cache:
+        with planner.acquire() as cache:
             seen.append(cache)
             cache.get(threading.get_ident(), lambda: sized(5))
             met.wait()
@@ -129,20 +129,20 @@ def test_a_planner_lends_each_a_cache_of_its_own() -> None:
         thread.join()
     assert len(set(map(id, seen))) == 2
     assert planner.info() == CacheInfo(entries=2, nbytes=10, hits=0, misses=2)
-    with planner.lent() as again:
+    with planner.acquire() as again:
         assert any(again is cache for cache in seen)
     assert planner.info().entries == 2
 
 
 def test_a_planner_stays_within_its_bounds() -> None:
     planner = vkc.Planner(entries=2, megabytes=1e-5)  # ten bytes
-    with planner.lent() as first, planner.lent() as second:
+    with planner.acquire() as first, planner.acquire() as second:
         for cache in (first, second):
             for key in range(3):
                 cache.get(key, lambda: sized(4))
     assert planner.info().entries == 2
     assert planner.info().nbytes == 8
-    with planner.lent() as cache:
+    with planner.acquire() as cache:
         cache.get("large", lambda: sized(9))
     assert (planner.info().entries, planner.info().nbytes) == (1, 9)
     planner.clear()
@@ -152,9 +152,9 @@ def test_a_planner_stays_within_its_bounds() -> None:
 
 def test_a_plan_that_raises_gives_its_cache_back() -> None:
     planner = vkc.Planner()
-    with planner.lent() as cache:
+    with planner.acquire() as cache:
         cache.get("kept", lambda: sized(1))
-    with pytest.raises(ZeroDivisionError), planner.lent() as again:
+    with pytest.raises(ZeroDivisionError), planner.acquire() as again:
         again.get("bad", lambda: sized(1 // 0))
     assert again is cache
     assert planner.info().entries == 1

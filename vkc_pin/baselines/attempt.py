@@ -20,10 +20,11 @@ from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_sm
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.outcome import TIMES, still
+from vkc_pin.planning.results import make_stationary_trajectory
 from vkc_pin.planning.solver.loop import solve
-from vkc_pin.planning.solver.to_trajectory import make_trajectory
-from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
+from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.trust_region import CLOSE_ENOUGH
+from vkc_pin.planning.statistics import STAGES
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import SpentError, spend
 from vkc_pin.utils.cache import Cache
@@ -52,7 +53,7 @@ class Attempt:
     """One try; collects the motion stage by stage.
 
     Attributes:
-        times: What it spent on the parts of `outcome.TIMES` [s].
+        times: What it spent on the parts of `outcome.STAGES` [s].
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class Attempt:
         self.scene, self.options, self.refine, self.finer = scene, options, refine, finer
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
-        self.times = dict.fromkeys([*TIMES, "following"], 0.0)
+        self.times = dict.fromkeys([*STAGES, "following"], 0.0)
         self.iterations, self.cache = 0, cache or Cache()
 
     def run(self, steps: Sequence[Doable]) -> tuple[Trajectory, float, str]:
@@ -98,7 +99,9 @@ class Attempt:
                     )
         except (FailedError, SpentError) as error:
             failure = error if isinstance(error, FailedError) else FailedError(str(error))
-            parts = [*self.parts, *failure.parts] or [still(self.scene, self.options)]
+            parts = [*self.parts, *failure.parts] or [
+                make_stationary_trajectory(self.scene, self.options)
+            ]
             return (
                 concatenate_trajectories(parts, pause=self.options.grasp_time),
                 len(self.parts) + failure.came,

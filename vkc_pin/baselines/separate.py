@@ -43,12 +43,14 @@ from collections.abc import Sequence
 from vkc_pin.baselines.attempt import FINER, Attempt, Doable
 from vkc_pin.errors import InputError, shown
 from vkc_pin.options import Options
-from vkc_pin.planning.outcome import outcome, spent
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import Planner, borrowed
-from vkc_pin.planning.retiming.repair import retime_and_repair
-from vkc_pin.planning.settings import budget_for, check_arguments
+from vkc_pin.planning.planner import Planner, acquire_cache
+from vkc_pin.planning.request import check_arguments, make_budget
+from vkc_pin.planning.results import build_plan
+from vkc_pin.planning.retime_validated import retime_validated
+from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.utils.arguments import known, whole
+from vkc_pin.utils.budget import reserve_time
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
@@ -104,7 +106,7 @@ def plan_separately(
         InputError: Steps that cannot be done or are of another kind, or an argument is wrong.
     """
     options = Options() if options is None else options
-    budget = budget_for(time_limit, effort)
+    budget = make_budget(time_limit, effort)
     check_arguments(scene, options, seed)
     known(method, BASELINES, "method", "method")
     whole(retries, "retries", low=1)
@@ -121,7 +123,7 @@ def plan_separately(
                 got=shown(step),
             )
         actions.append(step)
-    with borrowed(planner) as cache, budget.running():
+    with acquire_cache(planner) as cache, budget.running():
         began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.building
         best: tuple[float, str, int, Trajectory, Report] | None = None
         for number in range(retries):
@@ -138,10 +140,9 @@ def plan_separately(
             trajectory, report = _timed(
                 scene, task.steps, trajectory, options, attempt.times, failed=cause != ""
             )
-            budget.checking = time.perf_counter() - checked
-            attempt.times["retiming"] += budget.checking - (
-                attempt.times["validation"] - before_checks
-            )
+            took = time.perf_counter() - checked
+            reserve_time("validation", took)
+            attempt.times["retiming"] += took - (attempt.times["validation"] - before_checks)
             status = "success" if report.ok else cause or "rejected"
             iterations += attempt.iterations
             times.update(attempt.times)
@@ -156,17 +157,22 @@ def plan_separately(
     if ended and status not in ("success", ended):
         status, notes = ended, (*report.notes, f"the try that came furthest failed with: {status}")
         report = dataclasses.replace(report, notes=notes)
-    counts = {"iterations": iterations, "rounds": number + 1, "effort": budget.used}
-    took = spent(time.perf_counter() - began - built, built, **counts, times=times)
+    statistics = PlanningStatistics(
+        planning_time=time.perf_counter() - began - built,
+        build_time=built,
+        iterations=iterations,
+        rounds=number + 1,
+        evaluations=budget.used,
+    ).with_times(times)
     name = f"{method}, try {tried + 1}"
-    return outcome(
+    return build_plan(
         scene,
         task.steps,
         options,
         trajectory,
         report,
         status,
-        took=took,
+        statistics=statistics,
         random_seed=int(seed),
         initialization=name,
     )
@@ -193,7 +199,7 @@ def _timed(
         return report
 
     if not failed:
-        timed, report = retime_and_repair(scene, trajectory, check, jerk_time=options.jerk_time)
+        timed, report = retime_validated(scene, trajectory, check, jerk_time=options.jerk_time)
         if report.ok:
             return timed, report
     return trajectory, check(trajectory)

@@ -19,8 +19,8 @@ from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, Solve, distribution, trial, values
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
 from vkc_pin.options import Options
-from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
 from vkc_pin.procedural.rooms.clutter import add_clutter
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
@@ -177,7 +177,7 @@ CHORES = {
 def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
     """Plan the chore of one trial."""
     chore = CHORES[spec["scene"]]
-    return plan_chore(
+    return plan(
         scene,
         chore.steps(scene),
         window=WINDOW,

@@ -50,7 +50,7 @@ def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
     """Plan the task of one trial: `method`, `perturbation` and `seed` say how."""
     how: dict[str, Any] = {
         "initialization": "auto" if spec["method"] == STEPWISE else spec["method"],
-        "joint": spec["method"] != STEPWISE,
+        "simultaneous": spec["method"] != STEPWISE,
         "perturbation": spec["perturbation"],
     }
     return plan(

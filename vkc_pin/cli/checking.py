@@ -52,7 +52,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         raise InputError(
             "a plan has pictures of its own", field="--plot", expected="a scene", got=arguments.what
         )
-    plan = vkc.Plan.load(arguments.what, check=True)
+    plan = vkc.Plan.load(arguments.what)
     otherwise = plan.contradictions()
     sys.stdout.write(
         "\n".join(

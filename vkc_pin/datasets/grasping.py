@@ -47,7 +47,7 @@ def grasped(
     holding = scene.with_held(
         {name: attachment}
     )  # wherever the hand is: the chain does not depend on it
-    with planner.lent() as cache:
+    with planner.acquire() as cache:
         problem = TrajectoryProblem(
             holding,
             compile_task(holding, [step], options),

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
+from vkc_pin.planning.statistics import PlanningStatistics
+from vkc_pin.utils.arguments import flag
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import check_arguments, validate
@@ -37,31 +39,27 @@ if TYPE_CHECKING:
 
 __all__ = ["Plan"]
 
-T = TypeVar("T")
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
-    """A motion and everything there is to say about it.
+    """A trajectory, its validation and the statistics of planning.
 
     Attributes:
-        scene: The scene it was planned in.
-        steps: What was asked for.
-        options: How it was planned.
-        trajectory: The motion; if planning failed, the best there was.
-        validation: What the independent check says of it. For a loaded plan it is made when it is
-            first asked for.
+        scene: Scene it was planned in.
+        steps: Steps to be done.
+        options: Options of planning.
+        trajectory: The trajectory; after a failure, the best one found.
+        validation: Report of the independent validation.
         status: "success", "infeasible", "not converged", "time limit", "effort spent",
             "interrupted", "rejected"; of baselines that fail, the stage.
-        metrics: planning_time [s], build_time [s], base_effort [m], base_effort_l1 [m], arm_effort
-            [rad], clearance [m], closure_error [m], duration [s], torque [share of what a motor
-            has], iterations, rounds, effort [units, see `planner.plan`], and what it was spent on:
-            time_initialization, _coal, _casadi, _ipopt, _retiming, _validation [s].
-        seed, initialization: Of the random numbers; which seed trajectory it came from.
+        statistics: Times and counts of planning.
+        seed: Random seed.
+        initialization: Name of the initial guess it came from.
         history: One row per round of the solver.
-        terms: The user's own constraints and costs, with their expressions as data.
-        claimed: What the file says that a plan was loaded from, on which nothing here relies; else
-            None.
+        terms: Constraints and costs of the user, with their expressions as data.
+        claimed: Report in the file that the plan was loaded from; else None.
+        is_validated: Whether `validation` is this program's own; False for a plan that was loaded
+            without validation, whose report is its file's claim.
     """
 
     scene: Scene
@@ -70,17 +68,29 @@ class Plan:
     trajectory: Trajectory
     validation: Report
     status: str
-    metrics: Mapping[str, float]
+    statistics: PlanningStatistics = field(default_factory=PlanningStatistics)
     seed: int = 0
     initialization: str = ""
     history: Sequence[Mapping[str, float]] = field(default_factory=tuple)
     terms: tuple[Term, ...] = ()
-    claimed: Report | None = field(default=None, repr=False, compare=False)
+    claimed: Report | None = field(default=None, repr=False)
+    is_validated: bool = True
 
     @property
     def success(self) -> bool:
-        """Whether the independent validation found nothing wrong with a motion that does what was asked for."""
-        return self.validation.ok and self.status == "success"
+        """Whether the independent validation found no violation, and all steps are done."""
+        return self.is_validated and self.validation.ok and self.status == "success"
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Metrics of the trajectory, its validation and planning, by name.
+
+        duration [s], base_effort and base_effort_l1 [m], arm_effort [rad], clearance and
+        closure_error [m], torque [share of the limit], and those of `PlanningStatistics.to_metrics`.
+        """
+        statistics = self.statistics.to_metrics()
+        times = {name: statistics.pop(name) for name in ("planning_time", "build_time")}
+        return {**times, **_measure(self), **statistics}
 
     def end_scene(self) -> Scene:
         """Return the scene at the end of the motion, to plan on from: robot, objects and what is held as it leaves them.
@@ -219,7 +229,7 @@ class Plan:
             "trajectory": self.trajectory.to_dict(),
             "validation": self.validation.to_dict(),
             "status": self.status,
-            "metrics": {**self.metrics, **_measured(self)},
+            "metrics": self.metrics,
             "seed": self.seed,
             "initialization": self.initialization,
             "history": [dict(row) for row in self.history],
@@ -228,36 +238,34 @@ class Plan:
         return write_archive(path, about)
 
     @classmethod
-    def load(cls, path: str | Path, *, check: bool = False) -> Plan:
+    def load(cls, path: str | Path, *, validate: bool = True) -> Plan:
         """Return the plan that `save` wrote to `path`.
 
-        What the file says of its motion is kept as `claimed`, and not relied on: `validation`,
-        `success`, `status` and `metrics` are those of a check that is made when they are first
-        asked for, which takes as long as the check after planning. The file's are only what
-        planning took, and what it found out about the task: the notes, and why a task is
-        infeasible.
+        The report, the status and the metrics of the file are not trusted: the trajectory is
+        validated again, which takes as long as after planning. From the file come the statistics of
+        planning, the notes, and the reasons of an infeasible task. `claimed` is the file's report.
 
         Args:
             path: The file.
-            check: Check the motion at once; then not even that is the file's.
+            validate: Validate the trajectory; otherwise the report is the file's claim, and
+                `success` is False.
 
         Raises:
-            InputError: The file is missing, damaged, no plan, or of another format, something in it
-                does not fit, the motion is none of its scene's robot and objects, or what the scene
-                names is not there.
+            InputError: The file is missing, damaged, of another format or no plan, something in it
+                is inconsistent, or the scene has no such robot, object or file.
         """
         path = file_path(path, "path", "a saved plan (.npz)")
         about, arrays = read_archive(path)
         try:
-            plan = cls._made_of(about, arrays, path, _checked if check else _recalled)
+            plan = cls._from_archive(about, arrays, path)
             check_arguments(plan.scene, plan.steps, plan.trajectory, plan.terms)
-            if check:
-                plan.validation  # noqa: B018 - makes it
+            return _revalidate(plan) if flag(validate, "validate") else plan
         except InputError as error:
             if error.file is not None:
                 raise
+            problem, field = error.problem, error.field
             raise InputError(
-                error.problem, file=path, field=error.field, expected=error.expected, got=error.got
+                problem, file=path, field=field, expected=error.expected, got=error.got
             ) from error
         except (
             ValueError,
@@ -268,101 +276,62 @@ class Plan:
             OverflowError,
             RecursionError,
         ) as error:
+            expected = "a file written by Plan.save"
             raise InputError(
-                "not a saved plan",
-                file=path,
-                expected="a file written by Plan.save",
-                got=str(error),
+                "not a saved plan", file=path, expected=expected, got=str(error)
             ) from error
-        return plan
 
     @classmethod
-    def _made_of(
-        cls,
-        about: Mapping[str, Any],
-        arrays: Mapping[str, Floats],
-        path: Path,
-        validation: Callable[[Plan], Report],
+    def _from_archive(
+        cls, about: Mapping[str, Any], arrays: Mapping[str, Floats], path: Path
     ) -> Plan:
-        trajectory, status = (
-            Trajectory.from_dict({**about["trajectory"], **arrays}),
-            about["status"],
-        )
+        """Return the plan of a file as the file describes it."""
+        trajectory = Trajectory.from_dict({**about["trajectory"], **arrays})
         claimed, metrics = Report.from_dict(about["validation"]), about["metrics"]
         for name, value in {**trajectory.metrics(), **claimed.measures()}.items():
             if metrics[name] != value and not abs(metrics[name] - value) <= 1e-9 * max(
                 1.0, abs(value)
             ):
-                raise InputError(
-                    "not that of motion and report",
-                    field=f"metrics.{name}",
-                    expected=value,
-                    got=metrics[name],
-                )
+                problem = "not that of motion and report"
+                got = metrics[name]
+                raise InputError(problem, field=f"metrics.{name}", expected=value, got=got)
+        options = [item.name for item in fields(Options)]
         for name in about["options"]:
-            if name not in (options := [item.name for item in fields(Options)]):
+            if name not in options:
                 raise UnknownNameError("option", name, options, field=f"options.{name}")
         return cls(
             scene=Scene.from_document(about["scene"], resolve_folder(about["folder"], path)),
             steps=tuple(step_from_dict(step) for step in about["steps"]),
             options=_saved(about["options"]),
             trajectory=trajectory,
-            validation=cast(Report, validation),
-            status=cast(str, lambda plan: "success" if plan.validation.ok else "rejected")
-            if status == "success"
-            else status,
-            metrics=cast(Mapping[str, float], lambda plan: {**metrics, **_measured(plan)}),
+            validation=claimed,
+            status=about["status"],
+            statistics=PlanningStatistics.from_metrics(metrics),
             seed=about["seed"],
             initialization=about["initialization"],
             history=tuple(about["history"]),
             terms=tuple(term_from_dict(term) for term in about["terms"]),
             claimed=claimed,
+            is_validated=False,
         )
 
 
-def _checked(plan: Plan) -> Report:
-    """Return what validation says of a loaded plan."""
-    return validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)
+def _revalidate(plan: Plan) -> Plan:
+    """Return a loaded plan with a report of its own."""
+    report = validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)
+    status, claimed = plan.status, plan.validation
+    if status == "success" and not report.ok:
+        status = "rejected"
+    if not report.ok:
+        report = replace(report, notes=claimed.notes)
+        if status == "infeasible":
+            report = report.with_reasons(claimed.violations or report.violations)
+    return replace(plan, validation=report, status=status, is_validated=True)
 
 
-def _recalled(plan: Plan) -> Report:
-    """Return the same with what its file says of the task."""
-    report, claimed = _checked(plan), plan.claimed
-    if claimed is None or report.ok:
-        return report
-    report = replace(report, notes=claimed.notes)
-    return (
-        report.with_reasons(claimed.violations or report.violations)
-        if vars(plan)["status"] == "infeasible"
-        else report
-    )
-
-
-def _measured(plan: Plan) -> dict[str, float]:
-    """Return the metrics of a plan but for what planning took."""
+def _measure(plan: Plan) -> dict[str, float]:
+    """Return the metrics of a plan's trajectory and its validation."""
     return {**plan.trajectory.metrics(), **plan.validation.measures()}
-
-
-class _OnDemand(Generic[T]):
-    """A field that may be given as a function of the plan, which is called when the field is first asked for."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __get__(self, plan: Plan | None, owner: type[Plan]) -> T:
-        if plan is None:
-            raise AttributeError(self.name)
-        value = vars(plan)[self.name]
-        if callable(value):
-            value = vars(plan)[self.name] = value(plan)
-        return cast(T, value)
-
-    def __set__(self, plan: Plan, value: T | Callable[[Plan], T]) -> None:
-        vars(plan)[self.name] = value
-
-
-for _name in ("validation", "status", "metrics"):
-    setattr(Plan, _name, _OnDemand(_name))
 
 
 def _saved(options: Mapping[str, Any]) -> Options:

@@ -12,7 +12,16 @@ from types import FrameType
 
 from vkc_pin.utils.interrupt import handled
 
-__all__ = ["ENDINGS", "Budget", "SpentError", "spend", "unlimited"]
+__all__ = [
+    "ENDINGS",
+    "Budget",
+    "SpentError",
+    "count_evaluations",
+    "current_ending",
+    "reserve_time",
+    "spend",
+    "unlimited",
+]
 
 ENDINGS = ("interrupted", "effort spent", "time limit")
 """Why a budget may be at its end; what becomes the status of plans."""
@@ -23,27 +32,26 @@ class SpentError(Exception):
 
 
 class Budget:
-    """What one call may take. It runs from when it is made.
+    """Limits of one planning call, which start with its construction.
 
-    A unit of effort is a configuration that is looked at: where its frames are, or how far it is
-    from collisions. Every iteration of Ipopt looks at all waypoints.
+    One evaluation is a configuration whose frames or distances are computed. Every iteration of
+    Ipopt evaluates all waypoints.
 
     Args:
-        seconds: Time by the clock; None: any.
-        effort: Units; None: any.
+        seconds: Wall-clock time; None: unlimited.
+        effort: Evaluations; None: unlimited.
 
     Attributes:
-        pressed: Whether Ctrl-C was.
-        used: Units of effort so far.
-        checking: Time to keep for checking the best motion in the end [s].
-        decided: The same for all that was decided before [s].
+        pressed: Whether Ctrl-C was pressed.
+        used: Evaluations so far.
+        reserved: Purpose → time that is kept for validating the best trajectory at the end [s].
     """
 
     def __init__(self, seconds: float | None = None, effort: int | None = None) -> None:
         self._deadline = math.inf if seconds is None else time.perf_counter() + seconds
         self._effort = math.inf if effort is None else effort
         self.pressed, self.used = False, 0
-        self.checking = self.decided = 0.0
+        self.reserved: dict[str, float] = {}
 
     @property
     def ended(self) -> str:
@@ -52,12 +60,12 @@ class Budget:
             return "interrupted"
         if self.used > self._effort:
             return "effort spent"
-        late = time.perf_counter() + self.checking + self.decided > self._deadline
+        late = time.perf_counter() + sum(self.reserved.values()) > self._deadline
         return "time limit" if late else ""
 
     @contextlib.contextmanager
     def running(self) -> Iterator[Budget]:
-        """Let all that this thread does count, and note the first Ctrl-C instead of raising; the second one raises.
+        """Make this the budget of the thread, and note the first Ctrl-C instead of raising; the second one raises.
 
         CasADi swallows KeyboardInterrupt inside a solve and reports some failure instead. Signals
         reach the main thread only: elsewhere nothing changes.
@@ -95,6 +103,31 @@ def spend(units: int = 0) -> None:
         budget.used += units
         if budget.ended:
             raise SpentError(budget.ended)
+
+
+def count_evaluations() -> int:
+    """Return the evaluations so far in the budget of this thread; 0 without one."""
+    budget = _RUNNING.get()
+    return 0 if budget is None else budget.used
+
+
+def current_ending() -> str:
+    """Return which of `ENDINGS` has ended the budget of this thread, or "" while it lasts."""
+    budget = _RUNNING.get()
+    return "" if budget is None else budget.ended
+
+
+def reserve_time(purpose: str, seconds: float, *, default: bool = False) -> None:
+    """Keep time at the end of this thread's budget, as for validating the best trajectory.
+
+    Args:
+        purpose: What it is kept for; a later call with the same purpose replaces the time.
+        seconds: How much [s].
+        default: Keep an earlier time of the same purpose.
+    """
+    budget = _RUNNING.get()
+    if budget is not None and not (default and budget.reserved.get(purpose)):
+        budget.reserved[purpose] = seconds
 
 
 @contextlib.contextmanager

@@ -32,7 +32,7 @@ def test_the_objective_of_what_failed_or_is_no_single_problem(drawn: vkc.Plan) -
     apart = vkc.plan(
         scene,
         [vkc.Grasp("drawer"), vkc.Actuate("drawer", {"slide": 0.2}), vkc.GoTo(-0.8, 0.5)],
-        joint=False,
+        simultaneous=False,
     )
     found = trials.objective(apart)
     assert found is None or np.isfinite(found)

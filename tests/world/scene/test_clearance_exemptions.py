@@ -295,7 +295,7 @@ def test_plans_open_and_shut_what_stands_in_others(tmp_path: Path) -> None:
     assert both.validation.clearance > 0.015  # of what must be apart
     both.save(tmp_path / "both.npz")
     with pytest.warns(UserWarning, match="overlap by 50"):
-        assert vkc.Plan.load(tmp_path / "both.npz", check=True).success
+        assert vkc.Plan.load(tmp_path / "both.npz").success
 
 
 def test_what_a_cup_stands_in_it_may_leave_but_not_enter() -> None:

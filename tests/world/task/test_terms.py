@@ -209,7 +209,7 @@ def test_phases_that_there_are_not() -> None:
             check_terms_active([wrong], phases)
 
 
-@pytest.mark.parametrize("function", [vkc.plan, vkc.build, vkc.plan_chore])
+@pytest.mark.parametrize("function", [vkc.plan, vkc.build])
 def test_wrong_terms_are_found_before_anything_is_planned(function: Callable[..., Any]) -> None:
     steps = [vkc.Place("stick", (0.8, 0.5, 0.56)), vkc.GoTo(0.0, 0.0)]
     for terms, message in (

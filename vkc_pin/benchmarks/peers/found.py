@@ -11,9 +11,10 @@ import numpy as np
 
 from vkc_pin.benchmarks.peers.tasks import Given
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.outcome import outcome, spent, still
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.retiming.repair import retime_and_repair
+from vkc_pin.planning.results import build_plan, make_stationary_trajectory
+from vkc_pin.planning.retime_validated import retime_validated
+from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
@@ -102,7 +103,7 @@ def judged(
         return validate(own.scene, own.steps, motion, problem.options)
 
     if path is None:
-        trajectory = still(own.scene, problem.options)
+        trajectory = make_stationary_trajectory(own.scene, problem.options)
         report = check(trajectory)
     else:
         (phase,) = problem.task.phases
@@ -111,16 +112,16 @@ def judged(
         waypoints = Trajectory(
             problem.chain.names, times, path, (span,), problem.chain.robot.coordinates.size
         )
-        trajectory, report = retime_and_repair(own.scene, waypoints, check)
+        trajectory, report = retime_validated(own.scene, waypoints, check)
     said = "success" if report.ok else "rejected" if path is not None else status
-    return outcome(
+    return build_plan(
         own.scene,
         own.steps,
         problem.options,
         trajectory,
         report,
         said,
-        took=spent(),
+        statistics=PlanningStatistics(),
         random_seed=seed,
         initialization=name,
     )

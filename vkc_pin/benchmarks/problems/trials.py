@@ -13,7 +13,7 @@ from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import Planner, borrowed, plan
+from vkc_pin.planning.planner import Planner, acquire_cache, plan
 from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
@@ -91,7 +91,7 @@ def objective(found: Plan, planner: Planner | None = None) -> float | None:
     spans = found.trajectory.phases
     if [span.name for span in spans][: len(task.phases)] != [phase.name for phase in task.phases]:
         return None  # motions of single steps, one after the other
-    with borrowed(planner) as cache:
+    with acquire_cache(planner) as cache:
         problem = TrajectoryProblem(found.scene, task, found.options, (), cache=cache)
         # Pauses for the gripper, at the beginning of a phase, are no waypoints of the program.
         rows = np.concatenate(

@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.planning.outcome import spent
 from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.results import spent
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.formats.rosbag import TOPICS
 from vkc_pin.world.trajectory.trajectory import Trajectory

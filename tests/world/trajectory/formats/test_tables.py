@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 import os
 import re
@@ -17,7 +16,6 @@ from hypothesis import given
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.planning.outcome import spent
 from vkc_pin.planning.plan import Plan
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
@@ -26,7 +24,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return dataclasses.replace(fake_plan(), metrics=spent())
+    return fake_plan()
 
 
 # There and back

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -26,11 +27,10 @@ from helpers.small_problems import full_scene, program_of, with_objects
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of, hall
-from vkc_pin.planning import stepwise as module
-from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.planning.outcome import TIMES
-from vkc_pin.planning.settings import Settings
-from vkc_pin.utils.budget import Budget
+from vkc_pin.planning import sequential as module
+from vkc_pin.planning.request import PlanningRequest
+from vkc_pin.planning.solve_task import TaskResult
+from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -152,15 +152,7 @@ def test_what_is_held_through_another_thing_stays_there() -> None:
     assert after.holds[1].at == tuple(values)
 
 
-def fake(status: str, spent: float) -> vkc.Plan:
-    metrics = {
-        "planning_time": spent,
-        "build_time": 0.0,
-        "iterations": spent,
-        "rounds": 1.0,
-        "effort": spent,
-        "own": spent,
-    }
+def make_plan(status: str, seconds: float) -> vkc.Plan:
     return vkc.Plan(
         scene=None,  # type: ignore[arg-type]
         steps=(),
@@ -168,48 +160,52 @@ def fake(status: str, spent: float) -> vkc.Plan:
         trajectory=None,  # type: ignore[arg-type]
         validation=SimpleNamespace(ok=status == "success"),  # type: ignore[arg-type]
         status=status,
-        metrics=metrics | {f"time_{key}": 0.0 for key in TIMES},
+        statistics=PlanningStatistics(seconds, iterations=int(seconds), rounds=1),
     )
 
 
 @pytest.mark.parametrize(
-    ("whole", "apart", "status", "spent", "own"),
+    ("whole", "apart", "status", "seconds"),
     [
-        ("success", None, "success", 10, 10),
-        # Where all at once fails, the steps one after the other may be a motion all the same.
-        ("rejected", "success", "success", 10 + 3, 3),
-        ("not converged", "rejected", "not converged", 10 + 3, 10),
-        # Where the steps could do no better, or nobody waits for them, they are left alone.
-        ("infeasible", None, "infeasible", 10, 10),
-        ("time limit", None, "time limit", 10, 10),
-        ("interrupted", None, "interrupted", 10, 10),
+        ("success", None, "success", 10),
+        # Where the problem of all steps fails, the steps planned sequentially may succeed.
+        ("rejected", "success", "success", 10 + 3),
+        ("not converged", "rejected", "not converged", 10 + 3),
+        # Steps planned sequentially are no better, or the budget has ended.
+        ("infeasible", None, "infeasible", 10),
+        ("time limit", None, "time limit", 10),
+        ("interrupted", None, "interrupted", 10),
     ],
 )
-def test_what_is_returned_and_what_it_took(
-    monkeypatch: pytest.MonkeyPatch,
-    whole: str,
-    apart: str | None,
-    status: str,
-    spent: float,
-    own: float,
+def test_steps_are_planned_sequentially_only_after_a_failure_that_this_may_help(
+    monkeypatch: pytest.MonkeyPatch, whole: str, apart: str | None, status: str, seconds: float
 ) -> None:
-    budgets: list[Budget] = []
-    monkeypatch.setattr(
-        module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake(whole, 10.0))
-    )
+    result = SimpleNamespace(plan=make_plan(whole, 10.0))
+    monkeypatch.setattr(module, "solve_task", lambda *_: result)
 
-    def step_by_step(scene: Any, task: Any, settings: Settings) -> vkc.Plan:
+    def plan_sequentially(scene: Any, task: Any, request: PlanningRequest) -> vkc.Plan:
         assert apart is not None
-        budgets.append(settings.budget)
-        return fake(apart, 3.0)
+        return make_plan(apart, 3.0)
 
-    monkeypatch.setattr(module, "step_by_step", step_by_step)
-    settings = Settings("auto", vkc.Options())
-    result = module.all_at_once(None, SimpleNamespace(steps=(1, 2), holds=()), settings)  # type: ignore[arg-type]
-    assert result.status == status
-    assert result.metrics["planning_time"] == pytest.approx(spent)
-    assert result.metrics["own"] == own  # what is no time stays that of the plan that is returned
-    assert budgets == ([] if apart is None else [settings.budget]), "what is left of it"
+    monkeypatch.setattr(module, "plan_sequentially", plan_sequentially)
+    task: Any = SimpleNamespace(steps=(1, 2), holds=())
+    scene: Any = None
+    plan = module.plan_simultaneously(scene, task, PlanningRequest("auto", vkc.Options()))
+    assert plan.status == status
+    assert plan.statistics.planning_time == pytest.approx(seconds)
+
+
+def replace_results(
+    monkeypatch: pytest.MonkeyPatch, change: Callable[[TaskResult], vkc.Plan]
+) -> None:
+    """Let `change` replace the plan of every solved task."""
+    real = module.solve_task
+
+    def solve_task(*arguments: Any, **named: Any) -> TaskResult:
+        result = real(*arguments, **named)
+        return dataclasses.replace(result, plan=change(result))
+
+    monkeypatch.setattr(module, "solve_task", solve_task)
 
 
 def test_where_one_problem_fails_the_steps_are_really_planned_apart(
@@ -222,26 +218,23 @@ def test_where_one_problem_fails_the_steps_are_really_planned_apart(
         vkc.Release("drawer"),
         vkc.GoTo(*scene.start[:2]),
     ]
-    real, lengths, efforts = OneProblem.run, list[int](), list[float]()
+    lengths, evaluations = list[int](), list[int]()
 
-    def run(self: OneProblem) -> vkc.Plan:
-        plan = real(self)
-        lengths.append(len(self.task.steps))
-        efforts.append(plan.metrics["effort"])
-        return (
-            plan
-            if lengths[-1] == 1
-            else dataclasses.replace(plan, status="not converged", validation=wrong)
-        )
+    def change(result: TaskResult) -> vkc.Plan:
+        lengths.append(len(result.task.steps))
+        evaluations.append(result.plan.statistics.evaluations)
+        if lengths[-1] == 1:
+            return result.plan
+        return dataclasses.replace(result.plan, status="not converged", validation=wrong)
 
     wrong = vkc.Report(
         (vkc.Violation("goal", "base", waypoint=0, time=0.0, amount=1.0, unit="m", detail=""),)
     )
-    monkeypatch.setattr(OneProblem, "run", run)
+    replace_results(monkeypatch, change)
     plan = vkc.plan(scene, steps)
     assert plan.success, plan.report()
     assert lengths == [3, 1, 1, 1]
-    assert plan.metrics["effort"] == pytest.approx(sum(efforts))
+    assert plan.statistics.evaluations == sum(evaluations)
     assert plan.steps == tuple(steps)
     assert validate(scene, steps, plan.trajectory).ok
     after = plan.end_scene()
@@ -251,12 +244,14 @@ def test_where_one_problem_fails_the_steps_are_really_planned_apart(
 
 
 def test_one_step_that_fails_is_not_planned_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        module, "OneProblem", lambda *_: SimpleNamespace(run=lambda: fake("rejected", 10.0))
+    calls: list[int] = []
+    replace_results(
+        monkeypatch,
+        lambda result: calls.append(1) or dataclasses.replace(result.plan, status="rejected"),
     )
-    monkeypatch.setattr(module, "step_by_step", lambda *_: pytest.fail("the same again"))
-    task = SimpleNamespace(steps=(1,), holds=())
-    assert module.all_at_once(None, task, Settings("auto", vkc.Options())).status == "rejected"  # type: ignore[arg-type]
+    scene = vkc.load_scene("door")
+    plan = vkc.plan(scene, [vkc.GoTo(*scene.start[:2] + 0.1)])
+    assert (plan.status, len(calls)) == ("rejected", 1)
 
 
 @pytest.mark.made_up
@@ -268,16 +263,16 @@ def test_what_cannot_be_moved_as_it_is_held_is_taken_anew(
     scene = vkc.load_scene("drawer")
     if held:
         scene = vkc.plan(scene, [vkc.Grasp("drawer", "handle")]).end_scene()
-    tried, efforts = list[str](), list[float]()
-    real = OneProblem.run
+    tried, evaluations = list[str](), list[int]()
 
-    def run(self: OneProblem) -> vkc.Plan:
-        tried.append(type(self.task.steps[0]).__name__)
-        plan = real(self)
-        efforts.append(plan.metrics["effort"])
-        return plan if tried[-1] == "Release" else dataclasses.replace(plan, status="not converged")
+    def change(result: TaskResult) -> vkc.Plan:
+        tried.append(type(result.task.steps[0]).__name__)
+        evaluations.append(result.plan.statistics.evaluations)
+        if tried[-1] == "Release":
+            return result.plan
+        return dataclasses.replace(result.plan, status="not converged")
 
-    monkeypatch.setattr(OneProblem, "run", run)
+    replace_results(monkeypatch, change)
     plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.2}, asked)])
     if not held:
         assert (plan.success, tried) == (False, ["Actuate"])
@@ -285,7 +280,7 @@ def test_what_cannot_be_moved_as_it_is_held_is_taken_anew(
     assert plan.success
     assert tried == ["Actuate", "Release"]
     assert plan.steps == (vkc.Release("drawer"), vkc.Actuate("drawer", {"slide": 0.2}, "handle"))
-    assert plan.metrics["effort"] == pytest.approx(sum(efforts))
+    assert plan.statistics.evaluations == sum(evaluations)
     after = plan.end_scene()
     assert dict(after.held) == {"drawer": "handle"}
     assert after.objects["drawer"].state[0] == pytest.approx(0.2, abs=1e-3)
@@ -316,23 +311,19 @@ def test_what_is_taken_anew_is_taken_anew_among_other_steps_too(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Then the steps of the plan are more than those that were asked for, and the motion is one of them all."""
-    real = OneProblem.run
 
-    def run(self: OneProblem) -> vkc.Plan:
-        plan = real(self)
-        return (
-            dataclasses.replace(plan, status="not converged")
-            if isinstance(self.task.steps[0], vkc.Actuate)
-            else plan
-        )
+    def change(result: TaskResult) -> vkc.Plan:
+        if isinstance(result.task.steps[0], vkc.Actuate):
+            return dataclasses.replace(result.plan, status="not converged")
+        return result.plan
 
-    monkeypatch.setattr(OneProblem, "run", run)
+    replace_results(monkeypatch, change)
     scene, grasp, opened = (
         vkc.load_scene("drawer"),
         vkc.Grasp("drawer", "handle"),
         vkc.Actuate("drawer", {"slide": 0.2}, "handle"),
     )
-    plan = vkc.plan(scene, [grasp, opened], joint=False)
+    plan = vkc.plan(scene, [grasp, opened], simultaneous=False)
     assert plan.success, plan.report()
     assert plan.steps == (grasp, vkc.Release("drawer"), opened)
     assert validate(scene, plan.steps, plan.trajectory).ok
@@ -343,13 +334,13 @@ def test_a_goal_beyond_a_limit_is_not_asked_of_other_attachments(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """No grasp helps, and the report says why."""
-    tried, real = list[str](), OneProblem.run
+    tried = list[str]()
 
-    def run(self: OneProblem) -> vkc.Plan:
-        tried.append(str(self.task.holds[0]))
-        return real(self)
+    def note(result: TaskResult) -> vkc.Plan:
+        tried.append(str(result.task.holds[0]))
+        return result.plan
 
-    monkeypatch.setattr(OneProblem, "run", run)
+    replace_results(monkeypatch, note)
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 3.0})])
     assert (plan.status, tried) == ("infeasible", ["door.handle"])
     assert plan.validation.notes == ()
@@ -396,7 +387,7 @@ def refrigerator() -> Scene:
     )
 
 
-@pytest.mark.parametrize("planned", [vkc.plan, vkc.plan_chore])
+@pytest.mark.parametrize("planned", [vkc.plan, functools.partial(vkc.plan, window=2)])
 def test_where_the_first_attachment_leads_nowhere_another_does(
     planned: Callable[..., vkc.Plan],
 ) -> None:
@@ -480,5 +471,5 @@ def test_one_leaf_opened_here_and_then_there_is_planned_step_by_step() -> None:
     ended = vkc.plan(begun.end_scene(), [second])
     assert ended.success, ended.report()
     assert "it.handle_left" not in ended.trajectory.names
-    chore = vkc.plan_chore(refrigerator(), [first, second])
+    chore = vkc.plan(refrigerator(), [first, second], window=2)
     assert chore.success, chore.report()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.planning.window import SlidingWindow
+from vkc_pin.planning import window as module
+from vkc_pin.planning.solve_task import TaskResult
 from vkc_pin.world.trajectory.splicing import extract_phases
 from vkc_pin.world.trajectory.world_model import World
 
@@ -32,10 +32,16 @@ def home() -> vkc.Scene:
     return vkc.load_scene("household")
 
 
+def plan_actions(
+    scene: vkc.Scene, steps: Sequence[vkc.Step], *, window: int = 2, **how: Any
+) -> vkc.Plan:
+    return vkc.plan(scene, steps, window=window, **how)
+
+
 @cache
 def fridge() -> vkc.Plan:
     """Take the cup out of the refrigerator, and shut it again."""
-    return vkc.plan_chore(home(), [OPEN, *CUP, SHUT])
+    return plan_actions(home(), [OPEN, *CUP, SHUT])
 
 
 # --- what is foreseen
@@ -47,7 +53,7 @@ def test_one_hand_cannot_open_a_door_with_a_cup_in_it() -> None:
     with pytest.raises(
         InputError, match=r"steps\[2\].object: the robot has one hand, and it holds cold_cup.side"
     ) as caught:
-        vkc.plan_chore(home(), steps)
+        plan_actions(home(), steps)
     assert caught.value.expected == "Place or Release before"
 
 
@@ -67,7 +73,7 @@ def test_what_cannot_be_done_is_said_at_once(
     wrong: vkc.Grasp, kind: type, field: str, says: str
 ) -> None:
     with pytest.raises(kind) as caught:
-        vkc.plan_chore(home(), [OPEN, G("cold_cup"), P("cold_cup", TABLE), wrong, SHUT])
+        plan_actions(home(), [OPEN, G("cold_cup"), P("cold_cup", TABLE), wrong, SHUT])
     assert caught.value.field == field
     assert says in str(caught.value)
 
@@ -75,14 +81,14 @@ def test_what_cannot_be_done_is_said_at_once(
 @pytest.mark.parametrize("steps", [[], OPEN, 3])
 def test_steps_are_a_list(steps: object) -> None:
     with pytest.raises(InputError) as caught:
-        vkc.plan_chore(home(), steps)
+        plan_actions(home(), steps)
     assert caught.value.field == "steps"
 
 
 @pytest.mark.parametrize("window", [0, -1, 1.5, True, "2"])
 def test_window_is_a_number_of_actions(window: object) -> None:
     with pytest.raises(InputError, match="window: out of range"):
-        vkc.plan_chore(home(), [OPEN], window=window)
+        plan_actions(home(), [OPEN], window=window)
 
 
 @pytest.mark.parametrize(
@@ -91,13 +97,13 @@ def test_window_is_a_number_of_actions(window: object) -> None:
 )
 def test_other_arguments_are_those_of_plan(field: str, value: object) -> None:
     with pytest.raises(InputError) as caught:
-        vkc.plan_chore(home(), [OPEN], **{field: value})
+        plan_actions(home(), [OPEN], **{field: value})
     assert caught.value.field == field
 
 
 def test_only_what_holds_already_is_nothing_to_do() -> None:
     with pytest.raises(InputError, match="nothing to do"):
-        vkc.plan_chore(home().with_held({"cup": "side"}), [G("cup")])
+        plan_actions(home().with_held({"cup": "side"}), [G("cup")])
 
 
 # --- how the window slides
@@ -111,26 +117,26 @@ class Problems:
         self, patch: pytest.MonkeyPatch, fails: Callable[[tuple[vkc.Step, ...]], bool]
     ) -> None:
         self.asked: list[tuple[tuple[vkc.Step, ...], bool]] = []
-        solved = SlidingWindow._solved
+        solved = module.solve_task
 
-        def solve(
-            chore: SlidingWindow, first: int, one: OneProblem, seed: object = None
-        ) -> vkc.Plan:
-            plan = solved(chore, first, one, seed)
-            self.asked.append((one.task.steps, seed is not None))
-            if not fails(one.task.steps):
-                return plan
+        def solve(*arguments: Any, guess: object = None, **named: Any) -> TaskResult:
+            result = solved(*arguments, guess=guess, **named)
+            self.asked.append((result.task.steps, guess is not None))
+            if not fails(result.task.steps):
+                return result
+            plan = result.plan
             trajectory = extract_phases(plan.trajectory, plan.trajectory.names, 0, 1)
-            return dataclasses.replace(plan, status="not converged", trajectory=trajectory)
+            failed = dataclasses.replace(plan, status="not converged", trajectory=trajectory)
+            return dataclasses.replace(result, plan=failed)
 
-        patch.setattr(SlidingWindow, "_solved", solve)
+        patch.setattr(module, "solve_task", solve)
 
 
 def test_each_action_is_planned_once_alone_and_with_the_next(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problems = Problems(monkeypatch, lambda steps: False)
-    plan = vkc.plan_chore(home(), [OPEN, *CUP, SHUT])
+    plan = plan_actions(home(), [OPEN, *CUP, SHUT])
     assert plan.success, plan.report()
     asked = [
         item for k, item in enumerate(problems.asked) if item not in problems.asked[:k]
@@ -148,7 +154,7 @@ def test_where_the_next_cannot_be_done_both_are_planned_anew(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
-    plan = vkc.plan_chore(home(), [OPEN, SHUT])
+    plan = plan_actions(home(), [OPEN, SHUT])
     assert plan.success, plan.report()
     alone = [(SHUT,)] * vkc.Options().max_restarts
     assert [steps for steps, _ in problems.asked] == [(OPEN,), *alone, (OPEN, SHUT)]
@@ -164,7 +170,7 @@ def test_no_attachment_is_tried_beside_one_that_is_asked_for(
         [G("door", "handle_free"), A("door", {"hinge": 0.3})],
         vkc.Options(max_restarts=1),
     )
-    plan = vkc.plan_chore(vkc.load_scene("door"), steps, options=options)
+    plan = plan_actions(vkc.load_scene("door"), steps, options=options)
     assert (plan.success, plan.status) == (False, "not converged")
     assert [asked for asked, _ in problems.asked] == [tuple(steps)] * len(problems.asked)
 
@@ -173,7 +179,7 @@ def test_no_attachment_is_tried_beside_one_that_is_asked_for(
 def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a window of one nothing is foreseen: only a step back helps."""
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
-    plan = vkc.plan_chore(home(), [OPEN, SHUT], window=1)
+    plan = plan_actions(home(), [OPEN, SHUT], window=1)
     assert plan.success, plan.report()
     alone = [steps for steps, _ in problems.asked]
     assert alone[0] == (OPEN,)
@@ -184,7 +190,7 @@ def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPat
 @pytest.mark.long
 def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     Problems(monkeypatch, lambda steps: CUP[0] in steps)
-    plan = vkc.plan_chore(
+    plan = plan_actions(
         home(),
         [vkc.GoTo(0.5, -0.5), OPEN, *CUP],
         window=1,
@@ -202,24 +208,23 @@ def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_time_is_for_all_steps_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if the first action had taken all of it: the second gets none, no other is tried, and what was decided is kept."""
-    real, run, asked = time.perf_counter, OneProblem.run, list[OneProblem]()
+    real, solve, asked = time.perf_counter, module.solve_task, list[TaskResult]()
 
-    def noted(one: OneProblem, seed: Any = None) -> vkc.Plan:
-        asked.append(one)
-        plan = run(one, seed)
+    def delayed(*arguments: Any, **named: Any) -> TaskResult:
+        asked.append(solve(*arguments, **named))
         monkeypatch.setattr(time, "perf_counter", lambda: real() + 101.0)
-        return plan
+        return asked[-1]
 
-    monkeypatch.setattr(OneProblem, "run", noted)
-    plan = vkc.plan_chore(home(), [OPEN, *CUP], time_limit=100.0)
+    monkeypatch.setattr(module, "solve_task", delayed)
+    plan = plan_actions(home(), [OPEN, *CUP], time_limit=100.0)
     assert [one.task.steps for one in asked] == [(OPEN,)]
     assert (plan.status, plan.success) == ("time limit", False)
     assert plan.trajectory.phases[1].name == "move refrigerator.hinge"
 
 
 def test_effort_is_for_all_steps_together() -> None:
-    alone = vkc.plan_chore(home(), [OPEN])
-    plan = vkc.plan_chore(home(), [OPEN, *CUP], effort=int(alone.metrics["effort"]) + 1000)
+    alone = plan_actions(home(), [OPEN])
+    plan = plan_actions(home(), [OPEN, *CUP], effort=int(alone.metrics["effort"]) + 1000)
     assert (plan.status, plan.success) == ("effort spent", False)
     assert "steps[1]" in plan.validation.notes[0]
     assert plan.trajectory.phases[1].name == "move refrigerator.hinge"
@@ -233,7 +238,7 @@ def test_ctrl_c_leaves_what_is_done() -> None:
         if len(seen) > 1 and row.round == 1 and row.objective != seen[0].objective:
             signal.raise_signal(signal.SIGINT)
 
-    plan = vkc.plan_chore(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], callback=stop)
+    plan = plan_actions(home(), [vkc.GoTo(0.5, -0.5), OPEN, *CUP], callback=stop)
     assert (plan.status, plan.success) == ("interrupted", False)
     assert plan.trajectory.phases[0].name == "go to"
     assert plan.trajectory.positions[plan.trajectory.phases[0].last, :2] == pytest.approx(
@@ -243,7 +248,7 @@ def test_ctrl_c_leaves_what_is_done() -> None:
 
 def test_the_robot_does_not_stop_between_ways() -> None:
     """It rests where its hand closes or opens; a motion that goes on from one step to the next is not cut there."""
-    plan = vkc.plan_chore(home(), [vkc.GoTo(1.0, -0.9), vkc.GoTo(0.4, -0.7), vkc.GoTo(0.2, -0.2)])
+    plan = plan_actions(home(), [vkc.GoTo(1.0, -0.9), vkc.GoTo(0.4, -0.7), vkc.GoTo(0.2, -0.2)])
     assert plan.success, plan.report()
     speed = np.linalg.norm(plan.trajectory.velocities()[:, :2], axis=1)
     first = plan.trajectory.phases[0].last
@@ -308,7 +313,7 @@ def test_with_the_next_in_mind_less_is_moved(start: int) -> None:
     """Where the stick is taken depends on where its tip has to go."""
     scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(start))
     steps = [G("stick"), vkc.Touch("stick.tip", TARGET)]
-    blind, seeing = (vkc.plan_chore(scene, steps, window=window) for window in (1, 2))
+    blind, seeing = (plan_actions(scene, steps, window=window) for window in (1, 2))
     assert blind.success, blind.report()
     assert seeing.success, seeing.report()
     assert price(seeing) < price(blind)

@@ -1,4 +1,4 @@
-"""How to plan: what `plan` and `plan_chore` are asked for beside scene and steps, checked."""
+"""Checks the arguments of planning and holds them in one immutable request."""
 
 from __future__ import annotations
 
@@ -16,19 +16,25 @@ from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.terms import Term, trace_terms
 
-__all__ = ["Settings", "budget_for", "check_arguments", "settings_for"]
+__all__ = ["PlanningRequest", "check_arguments", "make_budget", "make_request"]
 
-LARGEST_NOISE = 3.0  # [m] and [rad]: seeds with more are further apart than rooms are wide
+MAX_PERTURBATION = 3.0
+"""Largest standard deviation of noise on initial guesses, [m] and [rad]."""
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How to plan; see `planner.plan`.
+class PlanningRequest:
+    """Arguments of one planning call; see `planner.plan`.
 
     Attributes:
-        progress: Is told what is being done.
-        budget: What all of it may take; copies for parts of a task share it.
-        cache: What was built before; they share that, too.
+        initialization: Initialization method.
+        options: Options of planning.
+        callback: Called after every round of the solver.
+        random_seed: Random seed.
+        perturbation: Standard deviation of noise on initial guesses, [m] and [rad].
+        terms: Constraints and costs of the user.
+        progress: Progress line.
+        cache: Symbolic programs and other results that can be reused.
     """
 
     initialization: str
@@ -38,60 +44,44 @@ class Settings:
     perturbation: float = 0.0
     terms: tuple[Term, ...] = ()
     progress: Progress = field(default_factory=Progress)
-    budget: Budget = field(default_factory=Budget)
     cache: Cache = field(default_factory=Cache)
 
 
-def settings_for(
+def make_request(
     scene: Scene,
     *,
     initialization: str,
     options: Options | None,
     callback: Callable[[Iteration], None] | None,
-    time_limit: float | None,
-    effort: int | None,
     seed: int,
     perturbation: float = 0.0,
     terms: Sequence[Term] = (),
-) -> Settings:
-    """Return arguments of `plan` as settings, whose budget runs from now on.
+) -> PlanningRequest:
+    """Return the arguments of `plan` as a request.
 
     Raises:
-        InputError: One of them is wrong.
+        InputError: An argument is invalid.
     """
     options = Options() if options is None else options
-    budget = budget_for(time_limit, effort)
     check_arguments(scene, options, seed)
     known(initialization, INITIALIZATIONS, "initialization", "initialization")
-    if (
-        noise := number(perturbation, "perturbation", "a number of at least 0", low=0.0)
-    ) > LARGEST_NOISE:
-        raise InputError(
-            "out of range", field="perturbation", expected=f"at most {LARGEST_NOISE:g}", got=noise
-        )
+    noise = number(perturbation, "perturbation", "a number of at least 0", low=0.0)
+    if noise > MAX_PERTURBATION:
+        expected = f"at most {MAX_PERTURBATION:g}"
+        raise InputError("out of range", field="perturbation", expected=expected, got=noise)
     if callback is not None and not callable(callback):
-        raise InputError(
-            "cannot be called",
-            field="callback",
-            expected="a function of an Iteration",
-            got=shown(callback),
-        )
-    return Settings(
-        initialization,
-        options,
-        callback,
-        int(seed),
-        noise,
-        trace_terms(scene, terms),
-        budget=budget,
+        expected, got = "a function of an Iteration", shown(callback)
+        raise InputError("cannot be called", field="callback", expected=expected, got=got)
+    return PlanningRequest(
+        initialization, options, callback, int(seed), noise, trace_terms(scene, terms)
     )
 
 
-def budget_for(time_limit: object, effort: object) -> Budget:
-    """Return the budget of a call, which runs from now on; see `plan`.
+def make_budget(time_limit: object, effort: object) -> Budget:
+    """Return the budget of a planning call, which starts now; see `plan`.
 
     Raises:
-        InputError: One of these is wrong.
+        InputError: A limit is invalid.
     """
     if time_limit is not None:
         time_limit = number(time_limit, "time_limit", "seconds, more than 0", low=0.0, above=True)
@@ -99,7 +89,7 @@ def budget_for(time_limit: object, effort: object) -> Budget:
 
 
 def check_arguments(scene: object, options: object, seed: object) -> None:
-    """Raise an InputError that says what is wrong if one of these is not what planning needs; see `plan`."""
+    """Check the types of a scene, options and a random seed. Raises `InputError`."""
     for name, value, kind in (("scene", scene, Scene), ("options", options, Options)):
         instance(value, kind, name)
     whole(seed, "seed", low=0)

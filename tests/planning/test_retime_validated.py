@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.planning.retiming.repair import retime_and_repair
+from vkc_pin.planning.retime_validated import retime_validated
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
@@ -59,7 +59,7 @@ def test_the_curve_comes_closer_where_it_is_wrong(allowed: float, most: int) -> 
         looked.append(float(far.max()))
         return Said(tuple(Found(int(k)) for k in np.flatnonzero(far > allowed)))
 
-    motion, report = retime_and_repair(scene, corner(scene), check)
+    motion, report = retime_validated(scene, corner(scene), check)
     np.testing.assert_array_equal(motion.positions, corner(scene).positions)
     assert len(looked) <= most
     assert looked == sorted(looked, reverse=True)
@@ -74,6 +74,6 @@ def test_without_repairs_it_is_looked_at_once() -> None:
         looked.append(motion)
         return Said((Found(0),))
 
-    motion, report = retime_and_repair(scene, corner(scene), check, repairs=0)
+    motion, report = retime_validated(scene, corner(scene), check, repairs=0)
     assert looked == [motion]
     assert not report.ok

@@ -14,15 +14,14 @@ from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import problem as drawn_problem
-from vkc_pin.planning import one_problem as module
-from vkc_pin.planning.initialization.initial_guess import InitialGuess
-from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.planning.outcome import TIMES
+from vkc_pin.planning import solve_task as module
+from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.retiming.retime import retime_trajectory
-from vkc_pin.planning.settings import Settings
 from vkc_pin.planning.solver.solution import Iteration, Solution
-from vkc_pin.planning.solver.to_trajectory import make_trajectory
-from vkc_pin.utils.budget import spend
+from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.statistics import STAGES
+from vkc_pin.utils.budget import Budget, spend
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
 
@@ -116,11 +115,12 @@ class Scripted:
         self, steps: Sequence[Any] = PULL, *, scene: vkc.Scene | None = None, **settings: Any
     ) -> vkc.Plan:
         scene = scene or drawer_scene()
-        self.one = OneProblem(
-            scene, compile_task(scene, steps, SHORT), Settings("auto", SHORT, **settings)
-        )
-        with self.one.settings.budget.running():
-            return self.one.run()
+        self.budget, guess = Budget(), settings.pop("guess", None)
+        request = PlanningRequest("auto", SHORT, **settings)
+        task = compile_task(scene, steps, SHORT)
+        with self.budget.running():
+            self.result = module.solve_task(scene, task, request, guess=guess)
+        return self.result.plan
 
 
 @pytest.mark.made_up
@@ -243,7 +243,7 @@ def test_rounds_of_all_seeds_count(monkeypatch: pytest.MonkeyPatch) -> None:
         0.5,
         0.25,
     )
-    assert set(TIMES) <= {key.removeprefix("time_") for key in plan.metrics}
+    assert set(STAGES) <= {key.removeprefix("time_") for key in plan.metrics}
     assert list(plan.history) == [dataclasses.asdict(ROUND)] * 2
     assert rows == [ROUND] * 2
 
@@ -255,14 +255,12 @@ def test_the_ends_of_a_seed_are_free_or_not() -> None:
     for x, free in ((4.0, True), (2.0, False)):
         z = np.tile(drive.start, (drive.segments, 1))
         z[:, 0] = np.linspace(drive.start[0], x, drive.segments)
-        assert module._ends_free(drive, InitialGuess("straight", z)) == free
+        assert module._has_free_ends(drive, Seed("straight", z)) == free
 
 
 def test_a_seed_of_ones_own_is_the_only_one(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Scripted(monkeypatch, [3.0, 1.0])
-    script.run()
-    script.events.clear()
-    plan = script.one.run(lambda problem: InitialGuess("mine", script.z(problem, "d", 1.0)))
+    plan = script.run(guess=lambda problem: Seed("mine", script.z(problem, "d", 1.0)))
     assert script.events == ["d*"]
     assert plan.initialization == "mine"
 
@@ -277,7 +275,7 @@ def test_of_failures_the_least_violated_is_returned(monkeypatch: pytest.MonkeyPa
     plan = script.run()
     assert script.events[-1] == "c*"
     assert (plan.initialization, plan.status) == ("b", "rejected")
-    np.testing.assert_array_equal(script.one.z, script.z(script.one.problem, "b", 2.0))
+    np.testing.assert_array_equal(script.result.z, script.z(script.result.problem, "b", 2.0))
 
 
 # --- time is up, or Ctrl-C
@@ -340,7 +338,9 @@ def test_ctrl_c_in_the_solver_returns_the_best(
     plan = script.run()
     assert script.events[-1] == "b*", "nothing more is begun"
     assert (plan.status, plan.initialization, plan.success) == ("interrupted", name, False)
-    np.testing.assert_array_equal(script.one.z, script.z(script.one.problem, name, leads[name][0]))
+    np.testing.assert_array_equal(
+        script.result.z, script.z(script.result.problem, name, leads[name][0])
+    )
     alone = program_of(drawer_scene(), PULL, options=SHORT)
     own = script.z(alone, name, leads[name][0])
     expected = retime_trajectory(alone.scene, make_trajectory(alone, own, alone.timing_for(own).dt))
@@ -355,7 +355,7 @@ def test_ctrl_c_anywhere(when: str, name: str, monkeypatch: pytest.MonkeyPatch) 
     script = Scripted(monkeypatch, [2.0, 1.0, 3.0])
 
     def stop(event: str) -> None:
-        script.one.settings.budget.pressed |= event == when
+        script.budget.pressed |= event == when
 
     script.stop = stop
     plan = script.run()
@@ -364,7 +364,7 @@ def test_ctrl_c_anywhere(when: str, name: str, monkeypatch: pytest.MonkeyPatch) 
     if name == "none":
         assert [phase.name for phase in plan.trajectory.phases] == ["stand"]
     else:
-        np.testing.assert_array_equal(script.one.z, script.z(script.one.problem, name, 2.0))
+        np.testing.assert_array_equal(script.result.z, script.z(script.result.problem, name, 2.0))
 
 
 # --- what is weighed
@@ -418,10 +418,7 @@ def test_standing_still_costs_nothing() -> None:
 def test_what_a_problem_leaves_is_trimmed_at_its_end() -> None:
     """Not only when a call ends: a chore has many problems."""
     scene, cache = drawer_scene(), Cache(nbytes=1.0)
-    assert (
-        OneProblem(scene, compile_task(scene, PULL, SHORT), Settings("auto", SHORT, cache=cache))
-        .run()
-        .success
-    )
+    request = PlanningRequest("auto", SHORT, cache=cache)
+    assert module.solve_task(scene, compile_task(scene, PULL, SHORT), request).plan.success
     assert cache.info().entries == 1
     assert cache.info().misses > 1

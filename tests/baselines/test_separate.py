@@ -27,7 +27,7 @@ from vkc_pin.baselines.following import Followed, follow
 from vkc_pin.baselines.paths import BasePaths
 from vkc_pin.benchmarks.household import TASKS
 from vkc_pin.planning.results import TIMES
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 
 ROOT = Path(__file__).resolve().parents[2]
 PULL = vkc.Actuate("drawer", {"slide": 0.3})

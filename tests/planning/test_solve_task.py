@@ -15,11 +15,11 @@ from helpers.small_problems import door_scene, program_of
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import problem as drawn_problem
 from vkc_pin.planning import solve_task as module
-from vkc_pin.planning.initialization.initial_guess import Seed
+from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.planning.solver.solution import Iteration, Solution
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.planning.statistics import STAGES
 from vkc_pin.utils.budget import Budget, spend
 from vkc_pin.utils.cache import Cache
@@ -255,12 +255,12 @@ def test_the_ends_of_a_seed_are_free_or_not() -> None:
     for x, free in ((4.0, True), (2.0, False)):
         z = np.tile(drive.start, (drive.segments, 1))
         z[:, 0] = np.linspace(drive.start[0], x, drive.segments)
-        assert module._has_free_ends(drive, Seed("straight", z)) == free
+        assert module._has_free_ends(drive, InitialGuess("straight", z)) == free
 
 
 def test_a_seed_of_ones_own_is_the_only_one(monkeypatch: pytest.MonkeyPatch) -> None:
     script = Scripted(monkeypatch, [3.0, 1.0])
-    plan = script.run(guess=lambda problem: Seed("mine", script.z(problem, "d", 1.0)))
+    plan = script.run(guess=lambda problem: InitialGuess("mine", script.z(problem, "d", 1.0)))
     assert script.events == ["d*"]
     assert plan.initialization == "mine"
 

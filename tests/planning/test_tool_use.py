@@ -12,7 +12,7 @@ from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
-from vkc_pin.planning.initialization.initial_guess import Seed, seed_of
+from vkc_pin.planning.initialization.initial_guess import InitialGuess, make_initial_guess
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.sequential import plan_each_step
 from vkc_pin.planning.solve_task import TaskResult, solve_task
@@ -106,7 +106,7 @@ def solve(
     return solve_task(scene, compile_task(scene, steps, request.options), request, guess=guess)
 
 
-def going_on(fixed: TaskResult, problem: vkc.TrajectoryProblem) -> Seed:
+def going_on(fixed: TaskResult, problem: vkc.TrajectoryProblem) -> InitialGuess:
     """Return the motion found with the fixed grasp, which is the middle of all: 0 along and about the stick."""
     z = np.zeros((problem.segments, problem.chain.size))
     z[:, [problem.chain.index(name) for name in fixed.problem.chain.names]] = fixed.z
@@ -120,9 +120,9 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     parts = plan_each_step(start(), compile_task(start(), steps, request.options), request)
     assert [part.result.plan.success for part in parts] == [True, True]
     pieces = [part.result.phase_waypoints() for part in parts]
-    one = solve(start(), steps, request, lambda problem: seed_of(problem, pieces))
+    one = solve(start(), steps, request, lambda problem: make_initial_guess(problem, pieces))
     assert one.plan.success, one.plan.report()
-    before = objective(one.problem, seed_of(one.problem, pieces).z)
+    before = objective(one.problem, make_initial_guess(one.problem, pieces).z)
     assert objective(one.problem, one.z) < before
     assert (
         np.abs(one.z[39, :3] - parts[0].result.z[39, :3]).max() > 1e-3

@@ -11,11 +11,15 @@ from functools import cached_property
 
 import numpy as np
 
-from vkc_pin.planning.diagnosis.diagnosis import Blocked, blocked, impossible
-from vkc_pin.planning.diagnosis.paths import ways
-from vkc_pin.planning.diagnosis.proofs import proofs
-from vkc_pin.planning.diagnosis.swept_volumes import swept
-from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, Seed
+from vkc_pin.planning.diagnosis.diagnosis import (
+    BlockedGoal,
+    diagnose_goal,
+    find_impossible_conditions,
+)
+from vkc_pin.planning.diagnosis.paths import diagnose_paths
+from vkc_pin.planning.diagnosis.proofs import find_proofs
+from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
+from vkc_pin.planning.initialization.initial_guess import InitialGuess, PhaseWaypoints
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
@@ -24,7 +28,7 @@ from vkc_pin.planning.results import build_plan, make_stationary_trajectory
 from vkc_pin.planning.retime_validated import MAX_REPAIRS, retime_validated
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.solution import Iteration, Solution
-from vkc_pin.planning.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.planning.statistics import STAGES, PlanningStatistics
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import (
@@ -47,7 +51,7 @@ __all__ = ["TaskResult", "solve_task"]
 _CHECK_TIME = 2e-3
 """Time per waypoint [s] that validation takes, until it was measured; rather too long."""
 
-Guess = Callable[[TrajectoryProblem], Seed]
+Guess = Callable[[TrajectoryProblem], InitialGuess]
 """Makes an initial guess for a problem."""
 
 
@@ -192,7 +196,7 @@ class _Search:
         self._best: _Candidate | None = None
         # The solution nearest to feasibility of those that are too far from it to be validated.
         self._infeasible: tuple[Solution, str] | None = None
-        self._goals: dict[int, Blocked | None] = {}
+        self._goals: dict[int, BlockedGoal | None] = {}
         self._proofs: list[str] | None = None
 
     def run(self, guess: Guess | None, check_goals_first: bool) -> tuple[_Candidate, str]:
@@ -201,7 +205,7 @@ class _Search:
         problem = TrajectoryProblem(self.scene, self.task, options, terms, cache=cache)
         self.problem = problem
         reserve_time("validation", _CHECK_TIME * problem.segments, default=True)
-        reasons = impossible(problem)
+        reasons = find_impossible_conditions(problem)
         if reasons:
             self.is_grasp_independent = True
             best = self._make_stationary(problem)
@@ -214,16 +218,16 @@ class _Search:
         return self._try_guesses(problem, guesses, is_search=guess is None)
 
     def _try_guesses(
-        self, problem: TrajectoryProblem, guesses: Iterator[Seed], *, is_search: bool
+        self, problem: TrajectoryProblem, guesses: Iterator[InitialGuess], *, is_search: bool
     ) -> tuple[_Candidate, str]:
         """Return the best candidate and the status, with notes on what prevents success."""
-        goals: list[Blocked] = []
+        goals: list[BlockedGoal] = []
         for number, guess in enumerate(guesses, start=1):
             solution = self._solve(problem, guess)
-            if solution.astray:
+            if solution.shortfall:
                 found = (solution, guess.name)
                 known = self._infeasible or found
-                self._infeasible = min(known, found, key=lambda one: one[0].astray)
+                self._infeasible = min(known, found, key=lambda one: one[0].shortfall)
             else:
                 candidate = self._evaluate(problem, solution, guess.name)
                 if self._best is None or candidate.is_better(self._best):
@@ -239,7 +243,7 @@ class _Search:
                 goals = self._find_blocked_goals(problem)
             elif goals:  # two guesses failed, and sampling finds no free goal configuration either
                 break
-            if any(goal.deep for goal in goals):
+            if any(goal.is_deep for goal in goals):
                 break
         spend()
         return self._explain_failure(problem, [goal.text for goal in goals], is_search=is_search)
@@ -259,7 +263,9 @@ class _Search:
             lines = [*lines, *self._blocked_phases]
         elif is_search and not lines:
             seed = self.request.random_seed
-            lines, is_cut_off = ways(problem, best.z, best.report, self._blocked_phases, seed)
+            lines, is_cut_off = diagnose_paths(
+                problem, best.z, best.report, self._blocked_phases, seed
+            )
             status = "infeasible" if is_cut_off else status
         return best.with_notes(lines), status
 
@@ -272,22 +278,22 @@ class _Search:
     def _find_proofs(self, problem: TrajectoryProblem) -> list[str]:
         """Return proofs of infeasibility, computed once and only after a failure."""
         if self._proofs is None:
-            hits = swept(problem)
-            self.is_grasp_independent, self._proofs = bool(hits), hits or proofs(problem)
+            hits = find_swept_collisions(problem)
+            self.is_grasp_independent, self._proofs = bool(hits), hits or find_proofs(problem)
         return self._proofs
 
     def _find_blocked_goals(
         self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None
-    ) -> list[Blocked]:
+    ) -> list[BlockedGoal]:
         """Return the goals of some phases, None: of all, without a known collision-free configuration."""
         found = []
         for number in range(len(problem.task.phases)) if numbers is None else numbers:
             if number not in self._goals:
-                self._goals[number] = blocked(problem, number, self.request.random_seed)
+                self._goals[number] = diagnose_goal(problem, number, self.request.random_seed)
             found.append(self._goals[number])
         return [goal for goal in found if goal is not None]
 
-    def _initial_guesses(self, problem: TrajectoryProblem) -> Iterator[Seed]:
+    def _initial_guesses(self, problem: TrajectoryProblem) -> Iterator[InitialGuess]:
         request = self.request
         guesses = initialize(
             problem,
@@ -296,9 +302,9 @@ class _Search:
             count=request.options.max_restarts,
             perturbation=request.perturbation,
             notes=self._blocked_phases,
-            hopeless=lambda phases: (
+            is_infeasible=lambda phases: (
                 bool(self._find_proofs(problem))
-                or any(goal.deep for goal in self._find_blocked_goals(problem, phases))
+                or any(goal.is_deep for goal in self._find_blocked_goals(problem, phases))
             ),
         )
         while True:
@@ -313,7 +319,7 @@ class _Search:
                 return
             yield guess
 
-    def _solve(self, problem: TrajectoryProblem, guess: Seed) -> Solution:
+    def _solve(self, problem: TrajectoryProblem, guess: InitialGuess) -> Solution:
         """Return the solution from an initial guess."""
         solution = solve(problem, guess.z, callback=self._report_round, radius=guess.radius)
         self.rounds += solution.rounds
@@ -331,7 +337,7 @@ class _Search:
     def _evaluate(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Candidate:
         """Retime and validate a solution; where that finds violations, retime closer to its segments."""
         with unlimited():
-            waypoints = as_trajectory(problem, solution.z, solution.dt)
+            waypoints = make_trajectory(problem, solution.z, solution.dt)
         began, validated = time.perf_counter(), self.times["validation"]
         if self._has_velocity_terms:
             trajectory, report = waypoints, self._validate(waypoints)
@@ -378,7 +384,7 @@ class _Search:
         return _Candidate("none", np.zeros((0, 0)), trajectory, report, "not converged")
 
 
-def _has_free_ends(problem: TrajectoryProblem, guess: Seed) -> bool:
+def _has_free_ends(problem: TrajectoryProblem, guess: InitialGuess) -> bool:
     """Return whether the configurations of a guess at the ends of the phases are feasible."""
     contacts = problem.evaluate_contacts(guess.z, reach=problem.options.largest_margin)
     free = contacts.compute_shortfall(problem.segments)[problem.ends - 1] <= 0.0

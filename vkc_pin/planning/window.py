@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, seed_of
+from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, make_initial_guess
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import FINAL, concatenate_plans
@@ -138,7 +138,10 @@ class _SlidingWindow:
         if failed is None and sum(part.plan is not None for part in self.ahead) > 1:
             pieces = [part.waypoints for part in self.ahead]
             result = self._solve(
-                first, self._current_scene, task, guess=lambda problem: seed_of(problem, pieces)
+                first,
+                self._current_scene,
+                task,
+                guess=lambda problem: make_initial_guess(problem, pieces),
             )
             if result.plan.success:
                 self.ahead = self._divide(result, first, last)
@@ -271,7 +274,7 @@ class _SlidingWindow:
                 until = end if end < len(result.task.phases) else None
                 trajectory = extract_phases(result.plan.trajectory, names, begin, until)
                 # The initial guess that the action was planned from at first.
-                known = ahead[number].waypoints.seed if number in ahead else None
+                known = ahead[number].waypoints.initialization if number in ahead else None
                 name = result.plan.initialization if known is None else known
                 part = dataclasses.replace(
                     result.plan,

@@ -1,4 +1,4 @@
-"""Curves drawn closer to the straight lines between waypoints until a check accepts them."""
+"""Tests repairs that pull a curve towards straight lines until a check accepts it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
+class FakeViolation:
     waypoint: int
     constraint: str = "closure"
 
 
 @dataclasses.dataclass(frozen=True)
-class Said:
-    violations: tuple[Found, ...]
+class FakeReport:
+    violations: tuple[FakeViolation, ...]
 
     @property
     def ok(self) -> bool:
@@ -41,7 +41,7 @@ def corner(scene: vkc.Scene) -> Trajectory:
     )
 
 
-def off_the_lines(scene: vkc.Scene, motion: Trajectory) -> np.ndarray:
+def compute_deviation(scene: vkc.Scene, motion: Trajectory) -> np.ndarray:
     """Return how far the base leaves the two straight lines in every segment [m]."""
     far = []
     for begin, end in zip(motion.times, motion.times[1:], strict=False):
@@ -54,25 +54,25 @@ def off_the_lines(scene: vkc.Scene, motion: Trajectory) -> np.ndarray:
 def test_the_curve_comes_closer_where_it_is_wrong(allowed: float, most: int) -> None:
     scene, looked = vkc.load_scene("door"), list[float]()
 
-    def check(motion: Trajectory) -> Said:
-        far = off_the_lines(scene, motion)
+    def check(motion: Trajectory) -> FakeReport:
+        far = compute_deviation(scene, motion)
         looked.append(float(far.max()))
-        return Said(tuple(Found(int(k)) for k in np.flatnonzero(far > allowed)))
+        return FakeReport(tuple(FakeViolation(int(k)) for k in np.flatnonzero(far > allowed)))
 
     motion, report = retime_validated(scene, corner(scene), check)
     np.testing.assert_array_equal(motion.positions, corner(scene).positions)
     assert len(looked) <= most
     assert looked == sorted(looked, reverse=True)
     assert report.ok == (allowed > 1e-6)
-    assert off_the_lines(scene, motion).max() == looked[-1]
+    assert compute_deviation(scene, motion).max() == looked[-1]
 
 
 def test_without_repairs_it_is_looked_at_once() -> None:
     scene, looked = vkc.load_scene("door"), list[Trajectory]()
 
-    def check(motion: Trajectory) -> Said:
+    def check(motion: Trajectory) -> FakeReport:
         looked.append(motion)
-        return Said((Found(0),))
+        return FakeReport((FakeViolation(0),))
 
     motion, report = retime_validated(scene, corner(scene), check, repairs=0)
     assert looked == [motion]

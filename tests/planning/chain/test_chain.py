@@ -1,4 +1,4 @@
-"""Consolidation: the chain against the robot and the objects it was made of."""
+"""Compares the virtual kinematic chain with the robot and the objects it consists of."""
 
 from __future__ import annotations
 
@@ -339,7 +339,7 @@ def test_geometry_is_the_robots_and_that_of_the_links_that_move(
         assert all(found[i].parentJoint >= robot.model.njoints - 1 for i in indices)
 
 
-def test_side_branches_stay_as_they_are() -> None:
+def test_side_branches_are_locked() -> None:
     chain = consolidate(full_scene(), {"cabinet": "grip"})
     assert not {"cabinet.flap_hinge", "cabinet.lid_hinge"} & set(chain.names)
     z = random_configurations(chain.lower, chain.upper, 1, np.random.default_rng(2))[0]
@@ -377,7 +377,7 @@ def test_joint_placements_of_many_configurations_are_pinocchios() -> None:
             )
 
 
-def test_scene_and_robot_are_left_as_they_were() -> None:
+def test_scene_and_robot_are_not_modified() -> None:
     scene = door_scene()
     before = (
         scene.robot.model.njoints,
@@ -395,7 +395,7 @@ def test_scene_and_robot_are_left_as_they_were() -> None:
     assert before[0] > 3
 
 
-def test_nothing_grasped_is_the_robot_alone() -> None:
+def test_chain_without_holds_is_the_robot() -> None:
     scene = door_scene()
     chain = consolidate(scene, {})
     assert chain.names == scene.robot.coordinates.names
@@ -403,7 +403,7 @@ def test_nothing_grasped_is_the_robot_alone() -> None:
     assert len(chain.collision.geometryObjects) == len(scene.robot.collision.geometryObjects)
 
 
-def test_unknown_names_are_said() -> None:
+def test_unknown_names_are_rejected() -> None:
     scene = full_scene()
     with pytest.raises(UnknownNameError, match=r"dor.*door"):
         consolidate(scene, {"dor": "handle"})
@@ -413,7 +413,7 @@ def test_unknown_names_are_said() -> None:
         consolidate(scene, {"door": "handle"}).index("door.hing")
 
 
-def test_a_grasp_that_is_called_like_a_joint_is_refused() -> None:
+def test_attachment_named_like_a_joint_is_rejected() -> None:
     scene = full_scene()
     bar = dataclasses.replace(scene.objects["door"].object.attachments["handle_free"], name="hinge")
     twice = with_objects(scene, {"door": with_attachment(scene.objects["door"], bar)})
@@ -460,7 +460,7 @@ def carried_scene() -> Scene:
 def expected_frames(
     chain: VirtualKinematicChain, scene: Scene, hold: Hold, z: np.ndarray
 ) -> tuple[pin.SE3, dict[str, pin.SE3]]:
-    """Return where an object's base is, and each of its links, by multiplying: robot, grasp, object, and so on outwards."""
+    """Return the placements of an object's base and links, multiplied from the robot outwards."""
     thing, grasp = (
         scene.objects[hold.object].object,
         scene.objects[hold.object].object.attachments[hold.attachment],
@@ -482,7 +482,7 @@ def expected_frames(
 
 
 @pytest.mark.parametrize("holds", CARRIED, ids=lambda holds: " ".join(str(hold) for hold in holds))
-def test_what_is_carried_is_where_the_hand_and_the_grasp_have_it(holds: tuple[Hold, ...]) -> None:
+def test_carried_objects_follow_hand_and_grasp(holds: tuple[Hold, ...]) -> None:
     scene = carried_scene()
     chain = consolidate(scene, holds)
     assert (
@@ -555,8 +555,8 @@ def test_every_hold_has_its_own_shapes_joints_and_names() -> None:
     assert len(set(body)) == len(body)
 
 
-def test_one_attachment_held_in_two_ways_is_refused() -> None:
-    """Its freedom would have one name for two coordinates; without a freedom there is nothing to mix up."""
+def test_attachment_held_twice_is_rejected() -> None:
+    """Its freedom would have one name for two coordinates; without freedoms there is no ambiguity."""
     with pytest.raises(InputError, match="two coordinates share this name") as caught:
         consolidate(carried_scene(), [STICK, PULLED, Hold("ball", "pull")])
     assert str(caught.value.field).startswith("ball.pull_")

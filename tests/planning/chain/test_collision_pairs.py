@@ -1,4 +1,4 @@
-"""Margins of single pairs: what the hand keeps from what it holds, what a scene allows, and who can hit the floor."""
+"""Tests margins of single pairs: hand and grasped object, exemptions, and the floor."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def pairing(*find_clearance_exemptions: ClearanceExemption, **fields: Any) -> An
         ("hand", "lever", False, 0.0, -CONTACT_DEPTH),  # it touches it
     ],
 )
-def test_what_is_kept_from_what_is_held(
+def test_margin_from_grasped_object(
     one: str,
     link: str,
     as_one: bool,
@@ -77,8 +77,8 @@ def allowed(*find_clearance_exemptions: ClearanceExemption, within: Any = WITHIN
     return table.tolist(), [(place[0].tolist(), place[1]) for place in near]
 
 
-def test_what_a_scene_allows_keeps_what_it_says() -> None:
-    """All shapes of both links, whichever comes first; if that is less than what they keep anyway."""
+def test_exemptions_reduce_margins() -> None:
+    """An exemption applies to all shapes of both links in any order, if it reduces their margin."""
     rows = [list(row) for row in TABLE]
     assert allowed() == (rows, [])
     for pair in (("side", "tray"), ("tray", "side")):
@@ -101,7 +101,7 @@ def test_what_a_scene_allows_keeps_what_it_says() -> None:
     )
 
 
-def test_what_may_overlap_is_no_pair_any_more() -> None:
+def test_pairs_allowed_to_overlap_are_removed() -> None:
     kept, near = allowed(ClearanceExemption("tray", "side", -np.inf, -np.inf))
     assert kept == [[0.0, 1.0, 0.02], [0.0, 4.0, 0.02], [3.0, 4.0, 0.02], [2.0, 4.0, 0.02]]
     assert near == []
@@ -111,7 +111,7 @@ def test_what_may_overlap_is_no_pair_any_more() -> None:
     ("margin", "distance", "expected"),
     [(0.0, 0.008, 0.004), (0.0, -0.003, 0.0), (-0.003, -0.002, -0.003), (-np.inf, 0.01, -np.inf)],
 )
-def test_neighbours_keep_half_of_what_they_have_where_they_are(
+def test_neighbours_keep_half_their_initial_distance(
     margin: float, distance: float, expected: float
 ) -> None:
     """Rows are those of the table without what is no pair."""
@@ -144,8 +144,8 @@ def within(ranges: dict[str, tuple[float, float]], before: dict[str, float]) -> 
     return made._resolve_ranges(SimpleNamespace(initial_values=before), ranges)
 
 
-def test_where_neighbours_are_such() -> None:
-    """Coordinates that move have limits; of what stands the place decides, at the start or where it was left."""
+def test_joint_ranges_of_exemptions() -> None:
+    """Moving coordinates get limits; fixed ones must be in range at the start of the phase."""
     columns, low, high = within({"drawer.slide": (0.0, 0.1), "door.hinge": (-1.0, 1.0)}, {})
     assert (columns.tolist(), low.tolist(), high.tolist()) == ([2, 1], [0.0, -1.0], [0.1, 1.0])
     for limits, inside in (
@@ -165,7 +165,7 @@ def test_where_neighbours_are_such() -> None:
     assert within({"cupboard.right": (0.4, 0.6)}, left) is None
 
 
-def test_only_what_is_above_the_floor_can_hit_it() -> None:
+def test_only_floor_movers_are_paired_with_the_floor() -> None:
     scene = SimpleNamespace(obstacle_labels=("wall", FLOOR, "box"))
     made = pairing(scene=scene, _obstacles=[None] * 3)
     found = made._pair_with_obstacles(10, [0, 3, 5], [3])
@@ -183,7 +183,7 @@ def test_only_what_is_above_the_floor_can_hit_it() -> None:
     assert none._pair_with_obstacles(10, [0, 1], [0]).shape == (0, 3)
 
 
-def test_links_of_an_object_that_can_meet() -> None:
+def test_links_of_an_object_that_can_collide() -> None:
     own = {frozenset(("door", "rack"))}
     made = pairing(
         scene=SimpleNamespace(
@@ -194,7 +194,7 @@ def test_links_of_an_object_that_can_meet() -> None:
     assert not made._can_self_collide("washer", "washer.rack", "washer.case")
 
 
-def test_boxes_around_shapes_and_where_they_are() -> None:
+def test_bounding_boxes_and_placements() -> None:
     place = pin.SE3(pin.utils.rotate("z", 0.5), np.array([1.0, 2.0, 3.0]))
     shapes = [
         pin.GeometryObject("a", 0, place, coal.Box(0.2, 0.4, 0.6)),
@@ -208,7 +208,7 @@ def test_boxes_around_shapes_and_where_they_are() -> None:
     assert [part.shape for part in _compute_boxes([])] == [(0, 3), (0, 3), (0, 3, 3), (0, 3)]
 
 
-def test_contacts_in_numbers() -> None:
+def test_contact_statistics() -> None:
     distance, margin = np.array([0.01, 0.03, -0.02, 0.5]), np.array([0.02, 0.02, 0.005, 0.0])
     vectors = np.zeros((4, 3))
     found = Contacts(

@@ -1,4 +1,4 @@
-"""What can collide with what, how close it is, and the planes that stand for distances in the program."""
+"""Tests collision pairs, their distances, and witness planes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def waypoint_in(problem: TrajectoryProblem, phase: str) -> int:
 def pairs(
     problem: TrajectoryProblem, phase: int, *, waypoint: int | None = None
 ) -> dict[tuple[str, str], list[float]]:
-    """Return (link, link or obstacle) → the margins of the pairs between them, at a waypoint or where nothing is eased."""
+    """Return (link, link or obstacle) → margins of their pairs at a waypoint, or without reductions."""
     part = problem.contacts.phases[phase]
     every = np.arange(len(part.pairs))
     margins = (
@@ -125,13 +125,13 @@ def test_labels_name_links_and_obstacles() -> None:
     }
 
 
-def test_nothing_that_stands_is_paired_with_what_stands() -> None:
+def test_static_geometries_are_not_paired() -> None:
     for part in door_problem().contacts.phases:
         assert not np.any((part.joint[part.pairs] == 0).all(axis=1))
 
 
 @pytest.mark.parametrize("phase", [0, 1, 2, 3])
-def test_the_robots_own_pairs_are_those_of_its_srdf(phase: int) -> None:
+def test_self_collision_pairs_are_those_of_the_srdf(phase: int) -> None:
     problem = door_problem()
     collision, part = problem.scene.robot.collision, problem.contacts.phases[phase]
     count = len(collision.geometryObjects)
@@ -140,7 +140,7 @@ def test_the_robots_own_pairs_are_those_of_its_srdf(phase: int) -> None:
 
 
 @pytest.mark.parametrize("phase", [0, 1, 2, 3])
-def test_only_what_does_not_stand_on_the_floor_can_hit_it(phase: int) -> None:
+def test_only_links_off_the_floor_can_hit_it(phase: int) -> None:
     problem = door_problem()
     robot = problem.scene.robot
     meets_floor = {first for first, second in pairs(problem, phase) if second == FLOOR}
@@ -336,7 +336,7 @@ def test_a_scene_in_which_nothing_can_collide_is_refused() -> None:
 
 
 def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.ndarray:
-    """Return the signed distance of every pair at every configuration, shape (W, P), all asked of coal afresh."""
+    """Return the signed distance of every pair at every configuration from coal, shape (W, P)."""
     part = problem.contacts.phases[phase]
     geometry, model = all_pairs(part), problem.chain.model
     data, placed = model.createData(), pin.GeometryData(geometry)
@@ -442,7 +442,7 @@ def test_contacts_do_not_depend_on_how_many_configurations_are_looked_at_at_once
         np.testing.assert_array_equal(one, other)
 
 
-def test_contacts_are_sorted_by_what_they_lack() -> None:
+def test_contacts_are_sorted_by_shortfall() -> None:
     problem = door_problem()
     z, _ = sampled(0)
     waypoints = np.full(len(z), problem.ends[0])
@@ -459,7 +459,7 @@ def test_contacts_are_sorted_by_what_they_lack() -> None:
         )
 
 
-def test_nothing_within_reach_gives_nothing() -> None:
+def test_no_contacts_within_reach() -> None:
     problem = door_problem()
     contacts = problem.contacts.evaluate(problem.start[None], np.array([1]), reach=1e-6)
     assert contacts.pair.shape == (0, 2)
@@ -595,7 +595,7 @@ def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> No
     assert (sorts["object"] > 50) == (phase == 2)
 
 
-def test_more_contacts_than_slots_keep_the_worst() -> None:
+def test_planes_of_the_worst_contacts_are_kept() -> None:
     problem = door_problem()
     z, _ = sampled(0)
     z = z[:10]
@@ -619,7 +619,7 @@ def test_margins_follow_the_options(steps: list[Step]) -> None:
     assert margins == ({0.05, 0.03, 0.01} if isinstance(steps[0], Grasp) else {0.05, 0.03})
 
 
-def test_every_configuration_that_is_looked_at_is_spent() -> None:
+def test_every_evaluated_configuration_is_charged() -> None:
     problem = door_problem()
     z = np.tile(problem.start, (7, 1))
     for look in (
@@ -632,7 +632,7 @@ def test_every_configuration_that_is_looked_at_is_spent() -> None:
         assert budget.used == 7
 
 
-def test_what_comes_after_what_is_blocked_is_not_spent() -> None:
+def test_configurations_after_a_blocked_one_are_not_charged() -> None:
     problem = door_problem()
     z = np.tile(problem.start, (5, 1))
     z[2:, :2] = door_scene().objects["door"].placement.translation[:2]  # amid the door
@@ -641,7 +641,7 @@ def test_what_comes_after_what_is_blocked_is_not_spent() -> None:
     assert budget.used == 3
 
 
-def test_pairing_ends_with_the_budget() -> None:
+def test_pairing_stops_when_the_budget_is_exhausted() -> None:
     problem = door_problem()
     with Budget(seconds=0.0).running(), pytest.raises(SpentError):
         build_phase_geometries(door_scene(), problem.chain, problem.task, SHORT)
@@ -657,7 +657,7 @@ def side_by_side(*, out: float = 0.0) -> Scene:
     return Scene.from_document({**scene.document, "objects": pair, "obstacles": []}, scene.folder)
 
 
-def test_neighbours_may_be_close_as_long_as_both_are_where_they_are() -> None:
+def test_neighbours_are_exempt_at_their_initial_positions() -> None:
     """Half as close as they stand; not where one that stands still has left the other's side."""
     shut = program_of(side_by_side(), [Actuate("near", {"slide": 0.3})], options=SHORT)
     (allowance,) = find_clearance_exemptions(side_by_side(), SHORT.dist_safe)
@@ -684,7 +684,7 @@ def test_neighbours_may_be_close_as_long_as_both_are_where_they_are() -> None:
         assert bool(part.margin_regions) == beside
 
 
-def test_what_a_scene_allows_is_no_pair_or_keeps_what_it_says() -> None:
+def test_exemptions_remove_pairs_or_reduce_margins() -> None:
     document = side_by_side().document
     for said, margin in (({"margin": 0.007}, 0.007), ({}, None)):
         allowed = Scene.from_document(

@@ -1,4 +1,4 @@
-"""What can collide with what when things are carried, and where things stand that the motion itself leaves somewhere."""
+"""Tests collision pairs of carried objects, and of objects released where the motion chooses."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def placing() -> TrajectoryProblem:
 
 @cache
 def fetching() -> TrajectoryProblem:
-    """Return the problem of taking the ball with the stick, and letting go of it where the motion wants, then of the stick."""
+    """Return the problem of grasping the ball with the stick, then releasing ball and stick."""
     steps = [
         Grasp("stick"),
         Grasp("ball", "pull", "stick.tip"),
@@ -52,7 +52,7 @@ def fetching() -> TrajectoryProblem:
 def margins(
     problem: TrajectoryProblem, phase: int, *, at: str = ""
 ) -> dict[tuple[str, str], set[float]]:
-    """Return (link, link or obstacle) → the margins of pairs between them, at "first" or "last" or where nothing is eased."""
+    """Return (link, link or obstacle) → margins of pairs, at "first" or "last" or without reductions."""
     part, every = (
         problem.contacts.phases[phase],
         np.arange(len(problem.contacts.phases[phase].pairs)),
@@ -69,7 +69,7 @@ def partners(problem: TrajectoryProblem, phase: int, label: str) -> set[str]:
     return {a if b == label else b for a, b in margins(problem, phase) if label in (a, b)}
 
 
-def test_what_stands_hits_the_robot_and_what_it_carries() -> None:
+def test_static_objects_are_paired_with_robot_and_carried_object() -> None:
     robots = set(scene().robot.links)
     for phase in (0, 2):
         for label in ("stick.stick", "stick.tip", "ball.ball"):
@@ -77,7 +77,7 @@ def test_what_stands_hits_the_robot_and_what_it_carries() -> None:
     assert partners(placing(), 1, "ball.ball") == robots | {"stick.stick", "stick.tip"}
 
 
-def test_what_is_carried_hits_everything_but_itself_and_the_hand() -> None:
+def test_carried_object_is_paired_with_all_but_itself_and_the_hand() -> None:
     robot = scene().robot
     for label in ("stick.stick", "stick.tip"):
         hand = set(robot.touch_links) if label == "stick.stick" else set()
@@ -114,7 +114,7 @@ def test_a_tip_touches_what_it_will_hold_and_holds_it() -> None:
 
 
 @pytest.mark.parametrize("phase", [0, 1, 2])
-def test_a_placed_thing_stands_where_it_was_put(phase: int) -> None:
+def test_placed_object_is_at_its_target(phase: int) -> None:
     part = placing().contacts.phases[phase]
     for name, where in (("stick", (STICK, None, ASIDE)[phase]), ("ball", BALL)):
         shapes = {shape.name: shape for shape in part.shapes if shape.parentJoint == 0}
@@ -140,8 +140,8 @@ def expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_is_let_go_of_somewhere_stands_there(seed: int) -> None:
-    """Where the motion had it: the planes, bounding volumes and distances of what follows are to that place."""
+def test_released_object_is_where_the_motion_released_it(seed: int) -> None:
+    """Planes, bounding volumes and distances of later phases refer to that placement."""
     problem = fetching()
     names = [phase.name for phase in problem.task.phases]
     assert names[3:] == ["go to", "place stick", "go to"]

@@ -1,4 +1,4 @@
-"""Where the planner lets things be close for a while: picked up, put down, touched."""
+"""Tests temporarily reduced margins: lifting, placing and touching."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def only_near(
     np.testing.assert_allclose(row, expected, rtol=0.0, atol=within)
 
 
-def test_nothing_is_eased_without_need() -> None:
+def test_margins_are_not_reduced_without_need() -> None:
     p = problem(room(table(gap=GAP)), GoTo(0.0, 1.0))
     assert margins(p, 0) == {}
     far = problem(room(table(gap=0.03)), Place("stick", ASIDE))
@@ -226,7 +226,7 @@ def test_in_a_short_phase_both_ends_must_be_possible() -> None:
     np.testing.assert_allclose(margins(p, 1)["stick.stick", "table"], np.zeros(NEAR + 1), atol=1e-6)
 
 
-def test_the_floor_too() -> None:
+def test_margin_from_the_floor_is_reduced() -> None:
     low = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.051]))
     p = problem(room(), Place("stick", low))
     found = margins(p, 1)
@@ -257,7 +257,7 @@ def test_a_tip_may_be_close_to_what_is_at_its_target_before_and_after(
     assert margins(p, 2) == {}
 
 
-def test_a_target_in_the_air_eases_nothing() -> None:
+def test_target_in_the_air_reduces_no_margin() -> None:
     p, _ = tip_at_a_wall(0.021, GoTo(0.0, 0.0))
     assert [margins(p, phase) for phase in (0, 1)] == [{}, {}]
 

@@ -1,4 +1,4 @@
-"""What begins or ends to be carried in a phase, with phases that are made up."""
+"""Tests the moments at which transport begins or ends, with made-up phases."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ def test_what_stands_around_a_box(seed: int) -> None:
         ]
 
 
-def test_margins_are_eased_between_waypoints() -> None:
+def test_margins_are_reduced_between_waypoints() -> None:
     part = random_geometry(np.random.default_rng(2))
     object.__setattr__(
         part, "reduced_margins", {3: [(2, 4, 0.001), (4, 6, 0.004)], 5: [(0, 1, 1.0)]}

@@ -1,4 +1,4 @@
-"""Many rows at once against one by one."""
+"""Tests that batch evaluation equals evaluation one by one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pinocchio's algorithms as CasADi functions, against numeric Pinocchio."""
+"""Compares the CasADi functions of Pinocchio's algorithms with numeric Pinocchio."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def composite() -> pin.JointModelComposite:
 
 
 def unbounded_unaligned() -> pin.JointModel:
-    """Return a continuous joint about a slanted axis; Python's class takes no axis, a URDF does."""
+    """Return a continuous joint about a slanted axis, as loaded from a URDF."""
     axis = f'<parent link="a"/><child link="b"/><axis xyz="{" ".join(map(str, AXIS))}"/>'
     urdf = f'<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">{axis}</joint></robot>'
     return pin.buildModelFromXML(urdf).joints[1]
@@ -65,7 +65,7 @@ MINIMAL = [
 
 
 def tree(*kinds: str) -> pin.Model:
-    """Return a model with one joint of each kind, one hanging from the other, each with a body and a fixed frame."""
+    """Return a model with a chain of one joint of each kind, each with a body and a fixed frame."""
     pin.seed(7)
     model, parent = pin.Model(), 0
     for kind in kinds:
@@ -222,8 +222,8 @@ def test_functions_name_their_inputs_and_outputs(arm: pin.Model) -> None:
     assert cpin.frame_jacobian(arm, "planar_tip").name_out() == ["J"]
 
 
-def test_quarter_turns_cost_no_instructions() -> None:
-    """Placements of rounded quarter turns give expressions as lean as exact ones, and constants stay constants."""
+def test_rounded_quarter_turns_add_no_instructions() -> None:
+    """Rounded quarter turns give the same expressions as exact ones, with constant entries."""
     exact = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     counts = []
     for rotation in (exact, pin.rpy.rpyToMatrix(0, 0, np.pi / 2)):
@@ -251,7 +251,7 @@ def test_infinite_limits_do_not_matter(arm: pin.Model) -> None:
     )
 
 
-def test_model_is_left_alone(arm: pin.Model) -> None:
+def test_model_is_not_modified(arm: pin.Model) -> None:
     before = arm.copy()
     cpin.joint_placements(arm)
     assert arm == before
@@ -272,7 +272,7 @@ def test_frames_by_index_and_single_name(arm: pin.Model) -> None:
     np.testing.assert_array_equal(by_name(q).full(), by_index(q).full())
 
 
-def test_unknown_names_are_named(arm: pin.Model) -> None:
+def test_unknown_names_are_rejected(arm: pin.Model) -> None:
     with pytest.raises(UnknownNameError, match=r"frames\[1\].*did you mean 'revolute_x_tip'"):
         cpin.frame_placements(arm, ["planar_tip", "revolut_x_tip"])
     with pytest.raises(UnknownNameError, match="frame"):

@@ -1,4 +1,4 @@
-"""The folder of compiled functions: only its owner's files are used, whole ones, and not too many."""
+"""Tests the folder of compiled functions: ownership, integrity and size limits."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def age(path: Path, seconds: float) -> None:
     os.utime(path, (time.time() - seconds,) * 2)
 
 
-def test_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def here() -> Path | None:
         found = Libraries.open_default()
         return found.path if found else None
@@ -87,7 +87,7 @@ def test_a_folder_in_which_others_may_write_is_not_used(
     assert Libraries.open_default() is None, "it is somebody else's"
 
 
-def test_what_is_no_folder_is_not_used(
+def test_paths_that_are_no_folder_are_not_used(
     tmp_path: Path, folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "link").symlink_to(folder.path)
@@ -106,7 +106,7 @@ def test_what_is_no_folder_is_not_used(
     assert Libraries.open_default() is None
 
 
-def test_what_was_published_is_found(folder: Libraries) -> None:
+def test_published_libraries_are_found(folder: Libraries) -> None:
     assert not folder.exists(A)
     assert folder.find(A) is None
     folder.mark_attempt(A)
@@ -122,7 +122,7 @@ def test_what_was_published_is_found(folder: Libraries) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, 31, 32, 5000, len(LIBRARY), len(LIBRARY) + 31])
-def test_a_library_that_was_cut_off_is_removed(folder: Libraries, size: int) -> None:
+def test_truncated_library_is_removed(folder: Libraries, size: int) -> None:
     folder.publish(A, LIBRARY)
     path = folder.path / f"{A}.so"
     path.write_bytes(path.read_bytes()[:size])
@@ -130,7 +130,7 @@ def test_a_library_that_was_cut_off_is_removed(folder: Libraries, size: int) -> 
     assert names(folder) == []
 
 
-def test_a_library_that_changed_is_removed(folder: Libraries) -> None:
+def test_modified_library_is_removed(folder: Libraries) -> None:
     folder.publish(A, LIBRARY)
     data = bytearray((folder.path / f"{A}.so").read_bytes())
     data[100] ^= 1
@@ -154,7 +154,7 @@ def test_a_library_that_others_may_have_written_is_not_used(
     assert folder.find(A) is None
 
 
-def test_wishes(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_requests(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
     assert folder.list_jobs() == []
     assert folder.request(B, b"what")
     assert folder.request(A, b"more")
@@ -171,7 +171,7 @@ def test_wishes(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
     assert folder.list_jobs() == [A, B]
 
 
-def test_what_failed_is_tried_again_after_a_day(folder: Libraries) -> None:
+def test_failed_compilation_is_retried_after_a_day(folder: Libraries) -> None:
     folder.mark_attempt(A)
     assert not folder.request(A, b"what")
     age(folder.path / f"{A}.failed", 80000)
@@ -181,7 +181,7 @@ def test_what_failed_is_tried_again_after_a_day(folder: Libraries) -> None:
     assert folder.read_job(A) == b"what"
 
 
-def test_libraries_that_were_not_used_for_long_go_first(
+def test_least_recently_used_libraries_are_evicted_first(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for index, key in enumerate([A, B, C, D, E]):
@@ -196,7 +196,7 @@ def test_libraries_that_were_not_used_for_long_go_first(
     assert names(folder) == [f"{A}.so", f"{E}.so"]
 
 
-def test_what_dead_processes_left_goes_after_a_day(folder: Libraries) -> None:
+def test_files_of_dead_processes_are_removed_after_a_day(folder: Libraries) -> None:
     lock = folder.lock()
     assert lock is not None
     os.close(lock)
@@ -251,7 +251,7 @@ FOREIGN = (
 """Files that the package never creates in its cache, some with names like those that it creates."""
 
 
-def test_tidying_leaves_files_of_others(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_eviction_keeps_files_of_others(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both in the folder that the variable names, and in the cache's own folder."""
     monkeypatch.setattr(libraries, "_MAX_FILES", 2)
     monkeypatch.setattr(libraries, "_MAX_BYTES", 100)
@@ -268,7 +268,7 @@ def test_tidying_leaves_files_of_others(folder: Libraries, monkeypatch: pytest.M
     assert folder.list_jobs() == [], "none of them is compiled, and removed after that"
 
 
-def test_tidying_does_not_follow_links(
+def test_eviction_does_not_follow_links(
     folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(libraries, "_MAX_FILES", 0)
@@ -313,7 +313,7 @@ def test_compiling_with_a_folder_that_has_other_files(
     assert {name: after[name] for name in after if not name.startswith("vkc_pin/")} == before
 
 
-def test_one_compiles_at_a_time(folder: Libraries) -> None:
+def test_only_one_process_compiles(folder: Libraries) -> None:
     first = folder.lock()
     assert first is not None
     assert folder.lock() is None
@@ -332,9 +332,7 @@ def test_one_compiles_at_a_time(folder: Libraries) -> None:
     os.close(third)
 
 
-def test_files_appear_whole_or_not_at_all(
-    folder: Libraries, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_are_written_atomically(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(self: Path, target: Path) -> Path:
         raise OSError("no space left on device")
 

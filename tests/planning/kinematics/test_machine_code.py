@@ -1,4 +1,4 @@
-"""Compiled functions equal interpreted ones bit for bit, and whatever goes wrong, the interpreter does it."""
+"""Tests that compiled functions equal interpreted ones bit for bit, and the fallback if it fails."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_waypoints_are_equal_bit_for_bit(task: str, folder: Libraries) -> None:
     assert folder.list_jobs() == []
 
 
-def test_a_program_is_built_anew_when_machine_code_has_come(folder: Libraries) -> None:
+def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) -> None:
     short = program_of(door_scene(), TASKS["reach"], options=OPTIONS).transcription
     assert not short.uncompiled_functions, "three waypoints are not worth it"
     options = Options(reach_waypoints=8, contact_slots=2)
@@ -127,7 +127,7 @@ def evaluated(program: Transcription, x: np.ndarray, parameters: np.ndarray) -> 
     return np.array(values.nonzeros()).tobytes(), np.array(jacobian.nonzeros()).tobytes()
 
 
-def test_batches_that_are_used_much_become_machine_code(
+def test_frequently_used_batch_functions_are_compiled(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(0)
@@ -178,7 +178,7 @@ def test_the_process_that_compiles_leaves_no_zombie(
     assert folder.list_jobs() == []
 
 
-def test_threads(folder: Libraries) -> None:
+def test_concurrent_loading(folder: Libraries) -> None:
     MachineCode(make()).try_load()
     assert wait()
     right: list[bool] = []
@@ -224,7 +224,7 @@ def test_the_compiler_may_have_options(
 
 
 @pytest.mark.parametrize("command", ["/nowhere/cc", "no-such-compiler", "'unbalanced"])
-def test_without_a_compiler_nothing_is_asked_for(
+def test_nothing_is_requested_without_a_compiler(
     command: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", command)
@@ -261,7 +261,7 @@ def test_a_broken_compiler_is_tried_once(
     assert folder.list_jobs() == [], "not again today"
 
 
-def test_a_compiler_that_hangs_is_ended(
+def test_hanging_compiler_is_killed(
     folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pid = tmp_path / "pid"
@@ -279,7 +279,7 @@ def test_a_compiler_that_hangs_is_ended(
     until(lambda: ended(int(pid.read_text())))
 
 
-def test_what_cannot_be_put_away_is_tried_once(
+def test_unwritable_library_is_tried_once(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(machine_code, "_has_python", lambda: False)
@@ -289,9 +289,7 @@ def test_what_cannot_be_put_away_is_tried_once(
     assert len(folder.list_jobs()) == 1
 
 
-def test_waiting_has_an_end(
-    folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wait_times_out(folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(
         "CC",
         script(
@@ -306,7 +304,7 @@ def test_waiting_has_an_end(
     assert code.try_load()
 
 
-def test_a_library_that_was_cut_off_is_made_anew(folder: Libraries) -> None:
+def test_truncated_library_is_rebuilt(folder: Libraries) -> None:
     MachineCode(make()).try_load()
     assert wait()
     (path,) = folder.path.glob("*.so")
@@ -320,7 +318,7 @@ def test_a_library_that_was_cut_off_is_made_anew(folder: Libraries) -> None:
 
 
 @pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
-def test_a_program_with_python_in_it_is_not_started_again(
+def test_embedding_program_is_not_started_as_worker(
     executable: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "executable", executable)
@@ -349,7 +347,7 @@ def ended(pid: int) -> bool:
 
 
 def planned(planner: vkc.Planner | None = None) -> list[bytes]:
-    """Return a motion, planned by a planner that knows nothing if none is given."""
+    """Return a plan by the given planner, or by a new one without caches."""
     steps, options = [Grasp("door")], vkc.Options(reach_waypoints=10)
     plan = vkc.plan(door_scene(), steps, options=options, planner=planner or vkc.Planner())
     assert plan.success, plan.report()
@@ -385,7 +383,7 @@ def test_plans_are_equal_bit_for_bit(
 @pytest.mark.parametrize(
     "trouble", ["no compiler", "broken compiler", "truncated", "open to others", "no folder", "off"]
 )
-def test_plans_do_without(
+def test_planning_works_without_a_compiler(
     trouble: str,
     folder: Libraries,
     tmp_path: Path,

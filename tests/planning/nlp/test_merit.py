@@ -149,7 +149,7 @@ def test_its_directional_derivative_is_that_of_finite_differences(kind: str, see
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_step_is_refused_that_makes_more_of_any_kind_missing(kind: str) -> None:
+def test_step_that_increases_any_violation_is_rejected(kind: str) -> None:
     """However much shorter the motion gets."""
     p = problem("drive")
     loop = _Loop(p, p.still, 200.0)
@@ -174,7 +174,7 @@ def test_a_step_is_refused_that_makes_more_of_any_kind_missing(kind: str) -> Non
         assert loop.is_acceptable(trial, *loop.compute_penalties(trial)) == expected
 
 
-def test_weights_grow_where_something_is_missing() -> None:
+def test_weights_of_violated_kinds_increase() -> None:
     merit, amounts = Merit(200.0), {kind: np.zeros(3) for kind in KINDS}
     amounts["terms"][1] = 0.01
     found = Infeasibility(amounts, np.zeros((3, 0, 7)), np.zeros(0), np.zeros(0))

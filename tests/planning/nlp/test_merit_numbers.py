@@ -1,4 +1,4 @@
-"""What is missing, and what it costs, of numbers that are made up."""
+"""Tests violations and penalties with made-up numbers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def contacts(*rows: tuple[int, float, float]) -> Contacts:
 NEAR = contacts((0, 0.01, 0.03), (0, 0.5, 0.02), (0, 0.0, 0.5), (2, -0.25, 0.25), (2, 0.02, 0.02))
 
 
-def test_shortfalls_are_of_as_many_pairs_as_there_are_planes() -> None:
+def test_shortfalls_of_pairs_with_planes() -> None:
     np.testing.assert_allclose(
         compute_shortfalls(NEAR, 3, 2), [[0.02, 0.0], [0.0, 0.0], [0.5, 0.0]]
     )
@@ -54,7 +54,7 @@ def goal(kind: str, waypoints: tuple[int, ...]) -> Any:
     )
 
 
-def look(*, rates: bool = False, goals: Any = None) -> Infeasibility:
+def measure_example(*, rates: bool = False, goals: Any = None) -> Infeasibility:
     """Return what is missing along three waypoints of one coordinate.
 
     The second joint is at (3, 4, 12) · waypoint, turned about z by a tenth of it.
@@ -91,8 +91,8 @@ def look(*, rates: bool = False, goals: Any = None) -> Infeasibility:
     return found
 
 
-def test_how_much_is_missing_of_each_kind_at_each_waypoint() -> None:
-    found = look()
+def test_violation_of_each_kind_at_each_waypoint() -> None:
+    found = measure_example()
     assert {kind: amount.tolist() for kind, amount in found.amounts.items()} == {
         "poses": pytest.approx([13.0 + 0.1, 26.0, 39.0 + 0.3]),
         "rolling": [1.0, 0.0, 0.0],
@@ -114,7 +114,7 @@ def test_how_much_is_missing_of_each_kind_at_each_waypoint() -> None:
 
 
 def test_rates_beyond_their_limits_count_if_they_are_rows() -> None:
-    found = look(rates=True)
+    found = measure_example(rates=True)
     assert found.rate_excess.tolist() == [3.0, -1.0, 0.0, -5.0, 0.0]
     assert found.amounts["rates"].tolist() == [8.0, 1.0, 0.0]
 
@@ -129,19 +129,19 @@ def amounts(**given: list[float]) -> Infeasibility:
     )
 
 
-def test_the_most_that_is_missing_besides_clearance() -> None:
+def test_max_violation_excludes_clearance() -> None:
     assert amounts(clearance=[9.0, 9.0], poses=[0.25, 0.5], terms=[0.75, 0.0]).max_violation == 0.75
     assert amounts(clearance=[9.0, 9.0]).max_violation == 0.0
 
 
-def test_what_it_costs() -> None:
+def test_penalty() -> None:
     merit, found = Merit(2.0), amounts(clearance=[1.0, 3.0], poses=[0.25, 0.0], rates=[0.0, 0.5])
     merit.weights["poses"] = 8.0
     assert merit.compute_penalty(found, clearance=True).tolist() == [4.0, 7.0]
     assert merit.compute_penalty(found, clearance=False).tolist() == [2.0, 1.0]
 
 
-def test_what_is_missing_somewhere_becomes_dearer() -> None:
+def test_weights_of_violated_kinds_increase() -> None:
     merit = Merit(2.0)
     found = amounts(clearance=[0.0, 0.2], poses=[0.09, 0.0], terms=[0.11, 0.0])
     assert merit.increase_weights(found, 0.1)

@@ -1,4 +1,4 @@
-"""What a motion costs: as squares and as a length, and the quadratic function that stands for it."""
+"""Tests the motion cost, as squares and as path length, and its quadratic model."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def random_path(seed: int, scale: float = 1.0) -> np.ndarray:
 
 
 def by_hand(path: np.ndarray) -> float:
-    """Return the length, phase by phase; changes of the step belong to the waypoint where they are, or to the first."""
+    """Return the path length, phase by phase, from its definition."""
     changes, at = [], []
     for begin, end in itertools.pairwise([0, *STOPS, ENDS[-1]]):
         step = np.diff(path[begin : end + 1], axis=0)
@@ -76,19 +76,19 @@ def test_squares_are_equation_1(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_length_is_that_of_its_definition(seed: int) -> None:
+def test_path_length_equals_its_definition(seed: int) -> None:
     path = random_path(seed)
     assert effort().value(*parts(path)) == pytest.approx(by_hand(path), rel=1e-12)
 
 
-def test_nothing_that_moves_costs_nothing() -> None:
+def test_stationary_motion_costs_nothing() -> None:
     still = np.tile(random_path(0)[0], (ENDS[-1] + 1, 1))
     for length in (False, True):
         assert effort(length=length).value(*parts(still)) == 0.0
     assert np.isfinite(effort().weights(*parts(still))[0]).all()
 
 
-def test_a_way_at_even_speed_costs_its_length_however_many_waypoints_it_has() -> None:
+def test_motion_at_constant_speed_costs_its_length() -> None:
     """4 m on a slant and 2 rad of a joint, in two phases of which one has nine times the waypoints."""
     for ends in ((4, 40), (36, 40)):
         path = np.zeros((41, 6))
@@ -107,7 +107,7 @@ def test_a_way_at_even_speed_costs_its_length_however_many_waypoints_it_has() ->
 
 
 @given(st.integers(0, 10**6), st.integers(0, 10**6), st.floats(0.01, 3.0), st.floats(0.01, 3.0))
-def test_the_quadratic_touches_a_length_and_nowhere_lies_below(
+def test_quadratic_model_bounds_the_length_from_above(
     one: int, other: int, here: float, there: float
 ) -> None:
     f, at, away = effort(), random_path(one, here), random_path(other, there)

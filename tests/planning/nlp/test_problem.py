@@ -1,4 +1,4 @@
-"""A task in a scene as a program: what may move when, how fast, and what must hold."""
+"""Tests the program of a task: bounds, pose goals, rates and rows."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_the_hands_freedom_in_a_grasp_has_its_limits(two_grasps: TrajectoryProbl
         assert np.all(column(two_grasps, f"cabinet.ball_{letter}") == (-0.7, 0.6))
 
 
-def test_what_is_grasped_only_does_not_move(two_grasps: TrajectoryProblem) -> None:
+def test_objects_that_are_only_grasped_do_not_move(two_grasps: TrajectoryProblem) -> None:
     assert np.all(column(two_grasps, "cabinet.swing") == 0.3)
     assert np.all(column(two_grasps, "cabinet.slide") == 0.1)
     slide = column(two_grasps, "drawer.slide")
@@ -172,7 +172,7 @@ def test_what_is_grasped_only_does_not_move(two_grasps: TrajectoryProblem) -> No
     assert np.all(slide[last - 1 :] == 0.2)
 
 
-def test_the_start_is_the_scenes() -> None:
+def test_start_is_that_of_the_scene() -> None:
     scene = (
         door_scene()
         .with_state("door", {"hinge": 0.3, "knob": 0.2})
@@ -394,7 +394,7 @@ def test_free_objects_are_grasped_where_they_stand_and_closed_nowhere_else() -> 
     assert not any(problem.closed(phase) for phase in problem.task.phases)
 
 
-def test_what_is_held_at_the_start_stays_where_the_hand_has_it(fetching: TrajectoryProblem) -> None:
+def test_initially_held_object_stays_in_the_hand(fetching: TrajectoryProblem) -> None:
     """The values at which it is clamped are the scene's, until it is let go of."""
     problem = fetching
     assert [str(hold) for hold in problem.scene.holds] == ["stick.grip"]
@@ -483,7 +483,7 @@ def carrying() -> TrajectoryProblem:
     return program_of(scene, steps, options=SHORT, terms=terms)
 
 
-def test_excess_is_how_far_rows_are_outside_their_bounds(carrying: TrajectoryProblem) -> None:
+def test_excess_is_the_signed_bound_violation(carrying: TrajectoryProblem) -> None:
     """With a sign: what must be taken away to bring them to the nearest bound; nothing where they are within."""
     p, t = carrying, carrying.transcription
     dt = np.random.default_rng(1).uniform(0.1, 0.4, p.segments)
@@ -533,7 +533,7 @@ def test_excess_is_how_far_rows_are_outside_their_bounds(carrying: TrajectoryPro
         np.testing.assert_allclose(found[equal], values[equal], rtol=0.0, atol=1e-12)
 
 
-def test_what_has_only_rows_of_waypoints_has_no_excess(opened: TrajectoryProblem) -> None:
+def test_program_with_only_waypoint_rows_has_no_excess(opened: TrajectoryProblem) -> None:
     z = random_path(opened)
     assert opened.excess(z, opened.timing_for(z)).shape == (0,)
     assert all(of.shape == (0,) for of in opened.row_kinds.values())
@@ -666,7 +666,7 @@ def runs(problem: TrajectoryProblem) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(stops)]
 
 
-def test_a_way_that_is_too_long_gets_more_time() -> None:
+def test_long_runs_get_more_time() -> None:
     """Only where it is too long, and so much that the profile 3s² − 2s³ is within all rates; then less again."""
     problem = program_of(
         full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT
@@ -722,7 +722,7 @@ def test_a_step_that_is_too_fast_gets_more_time_within_reason() -> None:
         assert np.all(again.dt <= 1.5 * before.dt)  # however often that is asked for
 
 
-def test_standing_still_violates_nothing(opened: TrajectoryProblem) -> None:
+def test_stationary_motion_violates_nothing(opened: TrajectoryProblem) -> None:
     timing = opened.timing_for(opened.still)
     assert timing.compute_violation(*opened.rates(opened.still)) <= 0.0
     assert opened.objective(opened.still, timing.dt) == 0.0
@@ -762,7 +762,7 @@ def test_contacts_are_those_of_each_waypoints_phase(opened: TrajectoryProblem) -
     assert with_door == set(range(begin, end))
 
 
-def test_it_says_what_it_is(opened: TrajectoryProblem) -> None:
+def test_repr(opened: TrajectoryProblem) -> None:
     text = repr(opened)
     for part in (
         "reach door.handle → turn door.knob → move door.hinge, door.knob → go to",
@@ -786,7 +786,7 @@ def test_options_have_defaults() -> None:
     assert program_of(door_scene(), [Reach(POSE)]).options == Options()
 
 
-def test_scene_steps_and_options_are_left_as_they_were() -> None:
+def test_scene_steps_and_options_are_not_modified() -> None:
     scene, steps = door_scene(), [Actuate("door", {"hinge": 1.2})]
     start, state, pairs = (
         scene.start.copy(),
@@ -816,7 +816,7 @@ def test_scene_steps_and_options_are_left_as_they_were() -> None:
         (["open the door"], InputError, "not a step"),
     ],
 )
-def test_steps_that_cannot_be_are_refused(
+def test_impossible_steps_are_rejected(
     steps: list[Step], error: type[Exception], match: str
 ) -> None:
     with pytest.raises(error, match=match):

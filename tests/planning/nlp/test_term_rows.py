@@ -1,4 +1,4 @@
-"""The user's own rows: against numeric Pinocchio and the definitions of grasps, and against finite differences."""
+"""Compares rows of user-defined terms with numeric Pinocchio and finite differences."""
 
 from __future__ import annotations
 
@@ -337,7 +337,7 @@ def test_a_hand_left_where_it_was_counts_after_it_was_let_go_of() -> None:
         assert touched == ({waypoint, release} if waypoint > release else {waypoint}), waypoint
 
 
-def test_programs_with_different_terms_are_told_apart() -> None:
+def test_different_terms_give_different_programs() -> None:
     def made(limit: float, upper: float, *, terms: bool = True) -> vkc.TrajectoryProblem:
         near = vkc.Constraint("near", lambda s: s.position("tool")[2] - limit, upper=upper)
         return program_of(
@@ -405,7 +405,7 @@ def test_steps_take_longer_where_a_speed_asks_for_it() -> None:
     assert hopeless.timing_for(z).dt[0] <= 8.0 * dt[0]
 
 
-def test_terms_without_a_slope_are_refused() -> None:
+def test_terms_without_a_derivative_are_rejected() -> None:
     for expression in (
         lambda s: ca.acos(s.rotation("stick.stick")[2, 2]),
         lambda s: 1 / ca.sumsqr(s.velocity("tool")),
@@ -423,7 +423,7 @@ def test_terms_without_a_slope_are_refused() -> None:
                 )
 
 
-def test_what_nothing_can_change_is_no_row() -> None:
+def test_constant_terms_have_no_rows() -> None:
     here = vkc.Constraint("here", lambda s: s.position("stick.tip"), upper=-9.0, during="go to")
     p = program_of(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[here])
     assert p.terms == ()

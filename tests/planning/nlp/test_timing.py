@@ -1,4 +1,4 @@
-"""Times of steps: long enough for the profile they are made for, and stretched where bounds are exceeded."""
+"""Tests step durations: the profile fits, and runs that exceed a bound are stretched."""
 
 from __future__ import annotations
 

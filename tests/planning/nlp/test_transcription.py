@@ -1,4 +1,4 @@
-"""The nonlinear program, row by row against its definitions, and its derivatives against finite differences."""
+"""Compares the nonlinear program with its definitions, and its derivatives with differences."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def rows(point: Point, *, rates: bool = False) -> np.ndarray:
     return np.asarray(value).ravel()
 
 
-def taken_away(point: Point, waypoints: list[int], excess: np.ndarray) -> np.ndarray:
+def relaxed_excess(point: Point, waypoints: list[int], excess: np.ndarray) -> np.ndarray:
     """Return the share of the excess of rows, given the waypoint that each row belongs to."""
     assert len(waypoints) == len(excess)
     return np.asarray(point.shares[np.array(waypoints, int) - 1] * excess)
@@ -279,7 +279,7 @@ def test_witness_rows_are_planes_over_the_placements_plus_slack(name: str) -> No
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_pose_rows_are_what_is_missing_to_the_pose(name: str) -> None:
+def test_pose_rows_are_residuals_to_the_relaxed_target(name: str) -> None:
     """To where the target has relaxed."""
     p = problem(name)
     point, model = random_point(p), p.chain.model
@@ -324,20 +324,20 @@ def test_clamped_coordinates_keep_their_values(name: str) -> None:
     path = p.waypoints(point.z)
     steps = [(column, t) for column, first, last in clamped(p) for t in range(first + 1, last + 1)]
     expected = np.array([path[t, column] - path[t - 1, column] for column, t in steps])
-    expected -= taken_away(point, [t for _, t in steps], excess_at(point, clamp_rows(p)))
+    expected -= relaxed_excess(point, [t for _, t in steps], excess_at(point, clamp_rows(p)))
     np.testing.assert_allclose(rows(point)[clamp_rows(p)], expected, rtol=0.0, atol=1e-12)
     assert p.transcription.structure.clamped == tuple(clamped(p))
     assert len(expected) == {"stick": 2 * 8, "fetch": 3 * 5}.get(name, 0)
 
 
-def test_what_is_pushed_goes_one_way() -> None:
+def test_pushed_coordinates_move_in_one_direction() -> None:
     """A row for every step of the phase, the first from the start: how far the hinge goes in it, which is 0 at least."""
     p = problem("push")
     point, column, t = random_point(p), p.chain.index("door.hinge"), p.transcription
     path, phase = p.waypoints(point.z)[:, column], p.task.phases[0]
     assert (phase.name, phase.pushed) == ("move door.hinge", {"door.hinge": 1})
     expected = np.diff(path)[: phase.segments]
-    expected -= taken_away(
+    expected -= relaxed_excess(
         point, list(range(1, phase.segments + 1)), excess_at(point, t.pushed_rows)
     )
     np.testing.assert_allclose(rows(point)[t.pushed_rows], expected, rtol=0.0, atol=1e-12)
@@ -352,7 +352,7 @@ def test_what_is_pushed_goes_one_way() -> None:
     back, there = other.task.phases[0].pushed, random_point(other)
     assert back == {"door.hinge": -1}
     moved = -np.diff(other.waypoints(there.z)[:, column])[: phase.segments]
-    moved -= taken_away(
+    moved -= relaxed_excess(
         there, list(range(1, phase.segments + 1)), excess_at(there, other.transcription.pushed_rows)
     )
     np.testing.assert_allclose(
@@ -380,7 +380,7 @@ def test_rows_of_a_base_on_wheels() -> None:
         wheels = [along - robot.wheels.track / 2 * turn, along + robot.wheels.track / 2 * turn]
         expected = np.column_stack([aside, *steered, *wheels])
         owners = np.repeat(np.arange(1, p.segments + 1), expected.shape[1]).tolist()
-        expected = expected.ravel() - taken_away(
+        expected = expected.ravel() - relaxed_excess(
             point, owners, excess_at(point, p.transcription.base_rows)
         )
         np.testing.assert_allclose(
@@ -425,7 +425,7 @@ def test_rate_rows_are_steps_and_their_changes(name: str) -> None:
     raw = point.at_shares(0.0)
     np.testing.assert_allclose(rows(raw, rates=True)[t.rows :], expected, rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(t.rate_waypoints, np.repeat(np.array(owners) - 1, t.n))
-    expected = expected - taken_away(point, np.repeat(owners, t.n).tolist(), point.rate_excess)
+    expected = expected - relaxed_excess(point, np.repeat(owners, t.n).tolist(), point.rate_excess)
     np.testing.assert_allclose(g[t.rows :], expected, rtol=0.0, atol=1e-12)
     assert len(expected) == p.chain.size * (p.segments + p.segments + len(changes))
 
@@ -562,7 +562,7 @@ def test_wherever_it_is_set_up_it_is_feasible_there_with_shares_of_one(name: str
 
 @pytest.mark.parametrize("off", [0.0, 1e-9, 1e-6, 1e-4, 1e-3, 0.01])
 @pytest.mark.parametrize("axis", [*np.eye(3), None], ids=["x", "y", "z", "random"])
-def test_what_is_turned_round_is_feasible_there_too(axis: np.ndarray | None, off: float) -> None:
+def test_relaxed_program_is_feasible_near_half_turns(axis: np.ndarray | None, off: float) -> None:
     """Next to a half turn the rows themselves all but vanish, and the residual has two signs."""
     p, rng = problem("reach"), np.random.default_rng(22)
     for z in iterates(p, 3)[:3]:
@@ -580,7 +580,7 @@ def test_what_is_turned_round_is_feasible_there_too(axis: np.ndarray | None, off
         )
 
 
-def test_where_poses_hold_there_is_nothing_to_take_away() -> None:
+def test_satisfied_poses_need_no_relaxation() -> None:
     p = problem("reach")
     z = iterates(p, 1)[0]
     pose, data = p.transcription.structure.poses[0], p.chain.model.createData()
@@ -687,7 +687,7 @@ def test_functions_of_waypoints_are_shared_by_structures() -> None:
     assert len({id(one) for one in [first, *others]}) == 7
 
 
-def test_the_same_solver_is_not_made_twice() -> None:
+def test_solvers_are_cached() -> None:
     structure, cache = problem("reach").transcription.structure, Cache()
     t = transcribe(structure, cache)
     assert transcribe(structure, cache) is t

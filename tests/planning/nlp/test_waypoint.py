@@ -1,4 +1,4 @@
-"""The rows of one waypoint: values by numeric Pinocchio, derivatives by finite differences."""
+"""Compares the rows of one waypoint with numeric Pinocchio, derivatives with differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jerks are limited, accelerations do not jump, and the path stays what it was."""
+"""Tests that jerk is limited, accelerations are continuous, and the path is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits of coordinates, and the factor by which a curve must be slower for them."""
+"""Tests limits of coordinates and the slowdown they require."""
 
 from __future__ import annotations
 

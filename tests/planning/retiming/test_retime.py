@@ -1,4 +1,4 @@
-"""Motions through waypoints in as little time as limits allow, checked at a thousand moments a second, in numbers alone."""
+"""Tests retimed trajectories against their limits, at a thousand samples per second."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_it_rests_where_nothing_moves() -> None:
     assert one.times[7] - one.times[6] < 0.01
 
 
-def test_what_does_not_move_at_all_stays() -> None:
+def test_stationary_trajectory_is_kept() -> None:
     scene = vkc.load_scene("door")
     still = straight(scene)
     still = dataclasses.replace(still, positions=np.tile(still.positions[:1], (13, 1)))

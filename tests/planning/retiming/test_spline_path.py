@@ -1,4 +1,4 @@
-"""Paths through waypoints."""
+"""Tests paths through waypoints."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_two_points_are_a_straight_line() -> None:
     np.testing.assert_allclose(path(path.x[-1] / 4), [0.25, 0.5, 1.0])
 
 
-def test_what_waypoints_have_in_common_the_path_has() -> None:
+def test_linear_constraints_of_waypoints_hold_along_the_path() -> None:
     """It is linear in them: a combination of coordinates that is zero at all of them is zero all along."""
     given_points = points(5)
     given_points[:, 2] = 2.0 * given_points[:, 0] - given_points[:, 1]
@@ -47,7 +47,7 @@ def test_what_waypoints_have_in_common_the_path_has() -> None:
 
 
 @given(st.integers(0, 10**6))
-def test_limits_are_not_left(seed: int) -> None:
+def test_path_stays_within_limits(seed: int) -> None:
     given_points = points(seed)
     lower, upper = given_points.min(axis=0), given_points.max(axis=0)
     path = fit_path(given_points, np.ones(3), (lower, upper))

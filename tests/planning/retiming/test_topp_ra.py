@@ -1,4 +1,4 @@
-"""Speeds along paths, against what is known of them."""
+"""Tests speeds along paths against analytic results."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ def duration(places: np.ndarray, speeds: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(("length", "fastest", "strongest"), [(1.0, 10.0, 2.0), (3.0, 0.5, 1.0)])
-def test_a_straight_way_takes_as_long_as_it_must(
-    length: float, fastest: float, strongest: float
-) -> None:
+def test_duration_of_a_straight_path(length: float, fastest: float, strongest: float) -> None:
     """Up with all there is and down again, with a stretch at full speed between them if it is long enough."""
     path = fit_path(np.array([[0.0, 0.0], [length, 0.0]]), np.ones(2), FREE)
     places = np.linspace(0.0, length, 201)
@@ -56,6 +54,6 @@ def test_limits_hold_all_along(seed: int) -> None:
     assert (np.abs(found) <= acceleration * 1.3).all()
 
 
-def test_without_limits_nothing_is_known() -> None:
+def test_no_speeds_without_limits() -> None:
     path = fit_path(np.array([[0.0, 0.0], [1.0, 0.0]]), np.ones(2), FREE)
     assert compute_speeds(path, path.x, np.full(2, np.inf), np.full(2, np.inf)) is None

@@ -1,4 +1,4 @@
-"""How torques bound the speed along a path."""
+"""Tests how torque limits bound the speed along a path."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.world.trajectory.dynamics.torques import Torques
 
 
 def opening(**resistance: float) -> tuple[TorqueBounds, CubicHermiteSpline]:
-    """Return the bounds of the last phase, in which the door opens, and its path over time of the plan."""
+    """Return the bounds of the last phase, in which the door opens, and its path over time."""
     plan, scene = door_plan(), closer(**resistance)
     phase = plan.trajectory.phases[-1]
     rows = slice(phase.first + 1, phase.last + 1)
@@ -26,7 +26,7 @@ def opening(**resistance: float) -> tuple[TorqueBounds, CubicHermiteSpline]:
 
 
 @pytest.mark.parametrize(("speed", "change"), [(0.3, 0.0), (1.0, -0.7), (1.8, 0.4)])
-def test_torques_are_linear_in_what_the_search_knows(speed: float, change: float) -> None:
+def test_linearized_torques_equal_torques(speed: float, change: float) -> None:
     bounds, path = opening(damping=200.0, friction=4.0, stiffness=5.0, springref=-2.0)
     places = np.linspace(path.x[2], path.x[-3], 5)
     push, square, rest = bounds.linearize(path, path.x, np.full(len(path.x), speed), places)
@@ -42,7 +42,7 @@ def test_torques_are_linear_in_what_the_search_knows(speed: float, change: float
     np.testing.assert_allclose(push * change + square * speed**2 + rest, direct, atol=1e-9)
 
 
-def test_a_curve_is_slowed_by_as_much_as_it_takes() -> None:
+def test_curve_is_slowed_down_to_the_torque_limit() -> None:
     bounds, _ = opening(damping=500.0)
     plan = door_plan()
     phase = plan.trajectory.phases[-1]
@@ -56,7 +56,7 @@ def test_a_curve_is_slowed_by_as_much_as_it_takes() -> None:
     assert bounds.slow_down(slower) is slower
 
 
-def test_what_is_too_heavy_at_rest_keeps_its_time() -> None:
+def test_curve_too_heavy_at_rest_is_not_slowed_down() -> None:
     bounds, _ = opening()
     plan = door_plan()
     phase = plan.trajectory.phases[-1]

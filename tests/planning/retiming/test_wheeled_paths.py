@@ -1,4 +1,4 @@
-"""Paths on which a base rolls, against what wheels do: looked at closely, in numbers alone."""
+"""Tests that a base rolls along fitted paths without slip."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TANK = RollingLimits(track=1.0, wheel_speed=1.0)
 
 
 def arcs(steps: list[tuple[float, float]]) -> np.ndarray:
-    """Return the poses to which arcs of some lengths [m] and turns [rad] lead, and a coordinate beside them."""
+    """Return poses reached by arcs of given lengths [m] and turns [rad], and another coordinate."""
     poses = [np.array([0.3, -0.2, 0.9, 0.0])]
     for length, turn in steps:
         way = length * np.sinc(turn / (2 * np.pi)) * np.exp(1j * (poses[-1][2] + turn / 2))
@@ -38,7 +38,7 @@ def slip(path: np.ndarray, slopes: np.ndarray) -> float:
 
 @settings(deadline=None)
 @given(STEPS)
-def test_whatever_arcs_lead_to_is_passed_rolling(steps: list[tuple[float, float]]) -> None:
+def test_base_rolls_through_waypoints_on_arcs(steps: list[tuple[float, float]]) -> None:
     points = arcs(steps)
     passed = [points[:1]]
     for path, own in fit_rolling_paths(points, np.array([1.0, 1.0, 0.5, 0.3]), FAR, TANK):
@@ -54,7 +54,7 @@ def test_whatever_arcs_lead_to_is_passed_rolling(steps: list[tuple[float, float]
 
 
 def smooth_drive(count: int) -> np.ndarray:
-    """Return poses on a curve that winds, turns round in place, and drives back a little, by many small arcs."""
+    """Return poses on a winding curve of small arcs that turns in place and reverses."""
     s = np.linspace(0.0, 1.0, 3000 * count + 1)
     speed, turn = 2.0 * np.cos(1.5 * np.pi * s), 2.0 * np.sin(4.0 * s)
     yaw = np.concatenate([[0.0], np.cumsum((turn[1:] + turn[:-1]) / 2 * np.diff(s))])
@@ -105,7 +105,7 @@ def drives(base: str) -> Trajectory:
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
-def test_motions_keep_to_what_wheels_can(
+def test_trajectories_keep_wheel_limits(
     base: str, known: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also from stop to stop, where nobody knows how fast the path can be gone along."""

@@ -158,9 +158,9 @@ class StepRows:
     """Constraint rows of all steps of a wheeled base, from one pose (x, y, yaw) to the next.
 
     The rows of one step, all in metres, use its longitudinal displacement c, lateral displacement s
-    and rotation δθ (see `RollingLimits.compute_steps`): s, which must be zero; for steered bases, gear·c ∓
-    radius·δθ, which must not be negative; and, if the wheel speed is limited, the wheel travel c ∓
-    track/2·δθ.
+    and rotation δθ (see `RollingLimits.compute_steps`): s, which must be zero; for steered bases,
+    gear·c ∓ radius·δθ, which must not be negative; and, if the wheel speed is limited, the wheel
+    travel c ∓ track/2·δθ.
 
     Args:
         rolling: Limits of the base.

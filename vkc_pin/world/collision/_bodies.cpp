@@ -1,4 +1,5 @@
-// Forward kinematics by libpinocchio, whose own instantiations are called: the same bits as from Python.
+// Forward kinematics by the instantiations in libpinocchio, so that results equal those from Python
+// bit for bit.
 
 #include "bodies.hpp"
 
@@ -8,7 +9,7 @@
 #include <utility>
 #include <vector>
 
-#undef PINOCCHIO_WITH_COLLISION // it would bring octomap
+#undef PINOCCHIO_WITH_COLLISION // it would require octomap
 #include <pinocchio/algorithm/kinematics.hpp>
 #include <pinocchio/config.hpp>
 #include <pinocchio/multibody.hpp>
@@ -41,7 +42,7 @@ struct Bodies::Known
   pinocchio::Model model;
   std::vector<std::size_t> joints;
   std::vector<pinocchio::SE3> placements;
-  // What nobody works with at the moment: it takes longer to make than to use.
+  // Pool of unused work buffers, whose construction takes longer than their use.
   std::vector<std::unique_ptr<Placing::Work>> idle;
   std::mutex mutex;
 };
@@ -59,8 +60,8 @@ Bodies::Bodies(const std::string & model, std::size_t shapes, const std::int64_t
   buffer.commit(boost::asio::buffer_copy(buffer.prepare(model.size()), boost::asio::buffer(model)));
   pinocchio::Model loaded;
   loaded.loadFromBinary(buffer);
-  // Pinocchio 4.1 forgets on the way how many numbers a joint takes from the one that it follows (`m_nqExtended`), and reads
-  // what is not there; to cast it makes it anew.
+  // Pinocchio 4.1 does not serialize `m_nqExtended` of mimic joints and would read out of bounds; a
+  // cast initializes it.
   known_->model = loaded.cast<double>();
   for (std::size_t k = 0; k < shapes; ++k)
   {

@@ -1,4 +1,5 @@
-// Signed distances of placed shapes, by coal, for many pairs at many states at once.
+// Python module: signed distances of many pairs of placed shapes at many states at once, computed
+// by coal.
 //
 // A placement is twelve numbers: the columns of its rotation, then its translation.
 
@@ -24,7 +25,7 @@
 NB_MODULE(_distances, module)
 {
   module.doc() = "Signed distances of placed shapes, by coal, for many pairs at many states at once.";
-  nb::set_leak_warnings(false); // what caches and globals keep lives until the process ends
+  nb::set_leak_warnings(false); // caches and globals hold objects until the process ends
   module.attr("COAL_VERSION") = COAL_VERSION;
   module.attr("PINOCCHIO_VERSION") = vkc_pin::PINOCCHIO_RELEASE;
   nb::class_<Solid>(module, "Solid");
@@ -85,6 +86,6 @@ NB_MODULE(_distances, module)
       nb::keep_alive<1, 5>())
     .def("looked", &Lines::looked)
     .def(
-      "straight", // good for as long as these lines are
+      "straight", // valid as long as this object lives
       [](Lines & self) { return nb::capsule(static_cast<vkc_pin::StraightLines *>(&self), vkc_pin::STRAIGHT_LINES); });
 }

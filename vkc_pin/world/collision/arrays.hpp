@@ -1,4 +1,4 @@
-// Arrays that cross the border to Python, and work that is shared among threads.
+// Array types for the Python interface, and parallel loops.
 #pragma once
 
 #include <algorithm>
@@ -24,7 +24,8 @@ using Indices = nb::ndarray<const Index, nb::ndim<dimensions>, nb::c_contig, nb:
 template<typename T>
 using Array = nb::ndarray<nb::numpy, T, nb::c_contig, nb::device::cpu>;
 
-// Calls work(first, last) on parts of 0..count, each in a thread of its own; an exception of any of them is thrown here.
+// Calls work(part, first, last) on parts of 0..count, each in its own thread, and rethrows the
+// first exception of any part.
 template<typename Work>
 void in_parts(std::size_t count, std::size_t threads, const Work & work)
 {
@@ -49,7 +50,7 @@ void in_parts(std::size_t count, std::size_t threads, const Work & work)
     for (; started < threads; ++started)
       others.emplace_back(part, started);
   }
-  catch (const std::system_error &) // no more threads to be had: what is left is done here
+  catch (const std::system_error &) // no more threads available: the remaining parts run in this thread
   {
   }
   part(0);

@@ -1,7 +1,8 @@
-// Where shapes on the joints of a Pinocchio model are, at one configuration after the other.
+// Placements of the shapes on the joints of a Pinocchio model.
 //
-// A model comes in as Pinocchio serialises it, so that this module shares no C++ object with Pinocchio's Python bindings; the
-// kinematics are computed by the same libpinocchio as theirs. In a unit of its own, which alone includes Pinocchio.
+// Models are passed in serialized form, so that this module shares no C++ objects with Pinocchio's
+// Python bindings; the kinematics are computed by the same libpinocchio. Only the translation unit
+// of this class includes Pinocchio.
 #pragma once
 
 #include <cstddef>
@@ -16,15 +17,16 @@ constexpr std::size_t PLACEMENT = 12; // numbers: the columns of a rotation, the
 class Bodies
 {
 public:
-  // The model; of `shapes` shapes the joints that carry them (0: the world) and their placements there, 12 numbers each.
+  // Serialized model; number of shapes, their joints (0: the world) and placements on these, 12
+  // numbers each.
   Bodies(const std::string & model, std::size_t shapes, const std::int64_t * joints, const double * placements);
   ~Bodies();
 
   std::size_t shapes() const;
-  std::size_t joints() const; // with joint 0, the world
+  std::size_t joints() const; // including joint 0, the world
   std::size_t coordinates() const;
 
-  // Where they are; for one thread at a time.
+  // Evaluates the kinematics; not thread-safe.
   class Placing
   {
   public:
@@ -34,7 +36,7 @@ public:
     void at(const double * configuration);
 
     const double * shapes() const;       // placements of the shapes, 12 numbers each
-    const double * rotations() const;    // of the joints, 9 numbers each, by rows
+    const double * rotations() const;    // of the joints, 9 numbers each, row-major
     const double * translations() const; // of the joints, 3 numbers each
 
   private:
@@ -49,6 +51,6 @@ private:
   std::unique_ptr<Known> known_;
 };
 
-extern const char * const PINOCCHIO_RELEASE; // that this was compiled against
+extern const char * const PINOCCHIO_RELEASE; // release that this module was compiled against
 
 } // namespace vkc_pin

@@ -1,7 +1,9 @@
-// Which pairs of shapes may be close: boxes around shapes on joints, and around others that stand in the world.
+// Oriented bounding boxes of shapes on joints and of fixed shapes, and the pairs of them that may
+// be close.
 //
-// What moves are a few tens of shapes, what stands may be thousands. So first the boxes, along the world's axes, around
-// what each joint carries are compared with those of all that stands. Only what is left is looked at pair by pair.
+// There are tens of moving shapes, but possibly thousands of fixed ones. Therefore an axis-aligned
+// box around all shapes of each joint is compared with those of all fixed shapes first. Only the
+// remaining pairs are tested one by one.
 #pragma once
 
 #include <array>
@@ -19,7 +21,8 @@ namespace {
 class Boxes
 {
 public:
-  // Joints (0: stands), rotations and centres of boxes in these, half extents; pairs, of which at least the first moves.
+  // Joints (0: fixed), rotations and centres of the boxes on these, half extents; pairs, of which
+  // at least the first moves.
   Boxes(
     const Indices<1> & joints,
     const Numbers<3> & rotations,
@@ -73,7 +76,7 @@ public:
     corners();
   }
 
-  // The same with some that stand placed elsewhere.
+  // Returns a copy with some fixed boxes at other placements.
   Boxes placed(const Indices<1> & which, const Numbers<3> & rotations, const Numbers<2> & centers) const
   {
     if (
@@ -92,7 +95,8 @@ public:
     return other;
   }
 
-  // (configuration, pair) of what boxes cannot prove to be `reach` apart, in this order, and by how much they prove it.
+  // Returns all (configuration, pair), sorted, that boxes cannot prove to be `reach` apart, with
+  // lower bounds of distances.
   std::tuple<Array<Index>, Array<Index>, Array<double>> near(
     double reach, const Numbers<4> & rotations, const Numbers<3> & translations, bool standing, std::size_t threads) const
   {
@@ -135,27 +139,27 @@ public:
   Index most_joints() const { return pairs_->most_joints; }
 
 private:
-  struct Own // a pair of which both move
+  struct Own // a pair of two moving boxes
   {
     Index pair, first, second;
     double radii;
   };
 
-  // What is the same wherever shapes stand.
+  // Data that do not depend on the placements of fixed boxes; shared between copies.
   struct Pairs
   {
     std::size_t moving = 0, standing = 0;
     Index most_joints = 0;
     std::vector<std::array<Index, 2>> pairs;
-    std::vector<Index> joints, number; // number: of the pair of one that moves with one that stands; -1: none
+    std::vector<Index> joints, number; // number: index of the pair of a moving and a fixed box, or -1
     std::vector<Vector> halves;
     std::vector<double> radii;
     std::vector<Own> own;
-    std::vector<std::vector<std::size_t>> groups; // what can hit something that stands, by the joint that carries it
+    std::vector<std::vector<std::size_t>> groups; // moving boxes with fixed partners, by joint
   };
 
 public:
-  // Looks at one configuration after the other.
+  // Evaluates one configuration at a time.
   class Looking
   {
   public:
@@ -251,8 +255,8 @@ public:
       return true;
     }
 
-    // By how much the face normals of either box separate them. That is a lower bound of their signed distance also where it
-    // is negative: moved apart by as much, they are separate.
+    // Largest separation along the face normals of either box. It is a lower bound of the signed
+    // distance even if negative, since a translation by that amount separates the boxes.
     double gap(std::size_t a, std::size_t b, const Matrix & turn_b, const Vector & center_b) const
     {
       const Vector between = difference(center_b, centers_[a]), &half_a = pairs_.halves[a], &half_b = pairs_.halves[b];
@@ -276,7 +280,7 @@ public:
   };
 
 private:
-  // Corners of boxes along the world's axes around what stands.
+  // Computes the corners of axis-aligned boxes around fixed shapes.
   void corners()
   {
     lows_ = highs_ = std::vector<Vector>(pairs_->standing);
@@ -293,8 +297,8 @@ private:
   }
 
   std::shared_ptr<Pairs> pairs_;
-  std::vector<Matrix> turns_;  // of what moves in its joint's frame, of what stands in the world
-  std::vector<Vector> centers_, lows_, highs_; // the same; corners, see above
+  std::vector<Matrix> turns_;  // in the frame of the joint, or in the world frame for fixed boxes
+  std::vector<Vector> centers_, lows_, highs_; // centres likewise; corners of axis-aligned boxes
 };
 
 } // namespace

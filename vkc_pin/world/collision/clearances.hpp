@@ -1,4 +1,5 @@
-// Which pairs of shapes fall shortest of their margins at configurations: kinematics, bounding volumes and distances in one go.
+// Pairs of shapes with least distance − margin at given configurations: kinematics, bounding
+// volumes and distances.
 #pragma once
 
 #include <algorithm>
@@ -17,7 +18,8 @@ namespace {
 
 using vkc_pin::Bodies;
 
-// What is looked at: shapes that bodies carry and others that stand, boxes around them with their pairs, and these pairs' margins.
+// The shapes, moved by bodies or fixed, with their bounding boxes, the pairs to check, and the
+// margins of these.
 struct Parts
 {
   const Bodies & bodies;
@@ -26,7 +28,7 @@ struct Parts
   const Margins & margins;
 };
 
-// Configurations, and the coordinates z that margins are looked up by.
+// Configurations q, and the coordinates z that select margins.
 struct States
 {
   const double *q, *z;
@@ -54,7 +56,7 @@ struct States
   }
 };
 
-// Looks at one configuration after the other.
+// Evaluates one configuration at a time.
 class Clearing
 {
 public:
@@ -64,7 +66,8 @@ public:
   {
   }
 
-  // The pairs closer than `reach` that fall shortest of their margins at a configuration, those first, at most so many.
+  // Returns at most `most` pairs closer than `reach` at a configuration, sorted by distance −
+  // margin.
   const std::vector<Shapes::Found> & nearest(std::size_t state, Index waypoint, bool standing, Index most)
   {
     prepare(state, waypoint, standing);
@@ -73,14 +76,14 @@ public:
     return near_;
   }
 
-  // Whether any pair closer than `reach` falls short of its margin by more than `allowed`.
+  // Returns whether any pair closer than `reach` violates its margin by more than `allowed`.
   bool blocked(std::size_t state, Index waypoint, double allowed)
   {
     prepare(state, waypoint, true);
     for (const auto & candidate : candidates_)
     {
       if (candidate.bound > rounding_ - allowed)
-        return false; // nor is any after it
+        return false; // since candidates are sorted by their bounds
       const double distance = ask_.distance(candidate.first, candidate.second);
       if (distance < reach_ && candidate.margin - distance > allowed)
         return true;
@@ -89,7 +92,8 @@ public:
   }
 
 private:
-  // Finds the pairs that may be close, those first that fall shortest of their margins as far as boxes tell.
+  // Finds candidate pairs by their bounding boxes, sorted by their lower bounds of distance −
+  // margin.
   void prepare(std::size_t state, Index waypoint, bool standing)
   {
     placing_.at(states_.q + state * states_.coordinates);
@@ -122,7 +126,7 @@ private:
   std::vector<Shapes::Found> near_;
 };
 
-// Placements of bodies' shapes, (W, n, 12).
+// Placements of the shapes of bodies, (W, n, 12).
 Array<double> placements(const Bodies & bodies, const Numbers<2> & q)
 {
   if (q.shape(1) != bodies.coordinates())
@@ -141,7 +145,8 @@ Array<double> placements(const Bodies & bodies, const Numbers<2> & q)
   return handed_over(std::move(found), {states, shapes, PLACEMENT});
 }
 
-// State, pair, distance, margin, normal and both witness points of what falls shortest; see clearances.py.
+// State, pair, distance, margin, normal and witness points of the pairs with least distance −
+// margin; see clearances.py.
 std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<double>, Array<double>, Array<double>> nearest(
   const Bodies & bodies,
   const Boxes & boxes,
@@ -192,7 +197,8 @@ std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<doubl
           handed_over(std::move(second), {count, 3})};
 }
 
-// The first configuration in which a pair closer than `reach` falls short of its margin by more than `allowed`; W: none.
+// First configuration in which a pair closer than `reach` violates its margin by more than
+// `allowed`; W if there is none.
 Index first_blocked(
   const Bodies & bodies,
   const Boxes & boxes,

@@ -1,4 +1,5 @@
-// Straight lines between configurations of a robot, all else standing still, looked at step by step by coal.
+// Checks straight lines between configurations of a robot in fixed steps, with all other
+// coordinates constant.
 #pragma once
 
 #include <algorithm>
@@ -12,10 +13,10 @@
 
 namespace {
 
-// Where the numbers of Pinocchio's configurations come from: places there and in z, (K, 2) each.
+// Maps minimal coordinates z to Pinocchio's q: index pairs (in q, in z).
 struct Places
 {
-  std::vector<std::pair<std::size_t, std::size_t>> plain, angles, quaternions; // cos and sin; four numbers each
+  std::vector<std::pair<std::size_t, std::size_t>> plain, angles, quaternions; // angles map to cos and sin, quaternions have four entries
 
   void configuration(const double * z, double * q) const
   {
@@ -35,12 +36,13 @@ struct Places
   }
 };
 
-// For one thread at a time.
+// Not thread-safe.
 class Lines : public vkc_pin::StraightLines
 {
 public:
-  // `z`: a configuration; of it, the first coordinates, as many as there are `weights`, move. Along a line each coordinate times
-  // its weight goes at most a `step` from one configuration that is looked at to the next. See clearances.py for the rest.
+  // The first coordinates of `z`, one per entry of `weights`, vary. Between successive checks no
+  // coordinate changes by more than `step` divided by its weight. See clearances.py for the other
+  // arguments.
   Lines(
     const Bodies & bodies,
     const Boxes & boxes,
@@ -87,7 +89,7 @@ public:
     return 1.0;
   }
 
-  // How many configurations were looked at since this was asked last.
+  // Returns the number of configurations checked since the last call.
   Index looked() { return std::exchange(looked_, 0); }
 
 private:

@@ -1,4 +1,5 @@
-// Which clearance each pair must keep where: usually one of its own, for a while or in some places less.
+// Margins of pairs: a default each, reduced between some waypoints and in some regions of the
+// configuration space.
 #pragma once
 
 #include <algorithm>
@@ -15,10 +16,10 @@ class Margins
 public:
   explicit Margins(const Numbers<1> & usual) : usual_(usual.data(), usual.data() + usual.shape(0)), changes_(usual.shape(0), -1) {}
 
-  // A pair may come closer between two waypoints.
+  // Reduces the margin of a pair between two waypoints.
   void ease(Index pair, Index first, Index last, double margin) { change(pair).spans.push_back({first, last, margin}); }
 
-  // Pairs may come closer where some coordinates are within limits.
+  // Reduces the margin of pairs in the region in which some coordinates are within limits.
   void near(
     const Indices<1> & pairs,
     double margin,
@@ -41,7 +42,7 @@ public:
     places_.push_back(std::move(place));
   }
 
-  // What a pair must keep at a waypoint and coordinates; -inf: nothing.
+  // Margin of a pair at a waypoint and configuration; -inf: no check.
   double at(Index pair, Index waypoint, const double * z) const
   {
     double margin = usual_[std::size_t(pair)];
@@ -57,7 +58,7 @@ public:
     return margin;
   }
 
-  // The same of many at once; of `rows`, which of z each is looked at in.
+  // Margins of many pairs; `rows` gives the row of z for each.
   Array<double> at_all(const Indices<1> & pairs, const Indices<1> & waypoints, const Numbers<2> & z, const Indices<1> & rows) const
   {
     if (waypoints.shape(0) != pairs.shape(0) || rows.shape(0) != pairs.shape(0) || z.shape(1) < coordinates_)
@@ -75,7 +76,7 @@ public:
 
   std::size_t size() const { return usual_.size(); }
 
-  std::size_t coordinates() const { return coordinates_; } // that are looked at, at least
+  std::size_t coordinates() const { return coordinates_; } // minimum number of columns of z
 
 private:
   struct Span
@@ -123,7 +124,7 @@ private:
   }
 
   std::vector<double> usual_;
-  std::vector<Index> changes_; // by pair: its number in changed_; -1: none
+  std::vector<Index> changes_; // for each pair, its index in changed_, or -1
   std::vector<Change> changed_;
   std::vector<Place> places_;
   std::size_t coordinates_ = 0;

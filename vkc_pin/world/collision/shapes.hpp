@@ -1,7 +1,8 @@
-// Shapes that move and shapes that stand, and signed distances of pairs of them at many states at once, by coal.
+// Moving and fixed shapes, and signed distances of pairs of them at many states at once, computed
+// by coal.
 //
-// Shapes are rebuilt here from their numbers, so that this module shares no C++ object with coal's Python bindings; the
-// distances are computed by the same libcoal as theirs.
+// Shapes are rebuilt here from their dimensions, so that this module shares no C++ objects with
+// coal's Python bindings; the distances are computed by the same libcoal.
 #pragma once
 
 #include <algorithm>
@@ -29,12 +30,12 @@ coal::Transform3s transform(const double * numbers)
     Eigen::Map<const Eigen::Matrix3d>(numbers), Eigen::Map<const Eigen::Vector3d>(numbers + 9));
 }
 
-std::atomic<std::uint64_t> asked{0}; // distances, since the process began
+std::atomic<std::uint64_t> asked{0}; // number of distances computed since the process began
 
 class Shapes
 {
 public:
-  // A pair at a state: `bound` says how large distance − margin is at least; of two that are equal, the lesser `rank` goes first.
+  // A pair at a state, with a lower bound of distance − margin; ties are broken by `rank`.
   struct Candidate
   {
     Index first, second, rank, index;
@@ -51,7 +52,8 @@ public:
     }
   };
 
-  // Asks coal at one state after the other; nothing is kept from one distance to the next, which would change its last digits.
+  // Queries coal at one state at a time. Results are cleared between queries, since a warm start
+  // would change the last digits.
   class Asking
   {
   public:
@@ -69,7 +71,7 @@ public:
       placements_ = placements;
     }
 
-    // The numbers where it is have changed.
+    // Must be called when the numbers behind the current placements have changed.
     void moved() { ++state_; }
 
     double distance(Index first, Index second)
@@ -81,8 +83,8 @@ public:
         shapes_.shapes_[first].get(), one, shapes_.shapes_[second].get(), other, request_, result_);
     }
 
-    // Of candidates, in the order of their bounds, those closer than `reach` that fall shortest of their margins, at most so many;
-    // see shapes.py.
+    // Of candidates sorted by their bounds, selects at most `most` closer than `reach` with least
+    // distance − margin; see shapes.py.
     template<typename Candidates>
     void nearest(
       std::size_t count, double reach, Index most, double rounding, std::vector<Found> & near, const Candidates & candidates)
@@ -91,7 +93,7 @@ public:
       {
         const Candidate candidate = candidates(k);
         if (most >= 0 && Index(near.size()) >= most && (most == 0 || candidate.bound > near[most - 1].shortfall + rounding))
-          break; // neither this one nor any after it is among those
+          break; // neither this candidate nor any later one can be among them
         Found found;
         found.distance = distance(candidate.first, candidate.second);
         if (!(found.distance < reach))
@@ -192,7 +194,8 @@ public:
     return handed_over(std::move(found), {count});
   }
 
-  // Of each state, the candidates `edges[state]` to `edges[state + 1]` that fall shortest of their margins; see shapes.py.
+  // For each state, the candidates from `edges[state]` to `edges[state + 1]` with least distance −
+  // margin; see shapes.py.
   std::tuple<Array<Index>, Array<double>> shortest(
     const Numbers<3> & moving,
     const Indices<1> & edges,

@@ -1,4 +1,4 @@
-// coal's shapes, made of their numbers.
+// Creates coal shapes from their dimensions, or from points and faces.
 #pragma once
 
 #include <memory>
@@ -24,7 +24,7 @@ coal::Vec3s vector(const std::vector<double> & numbers, std::size_t first)
   return coal::Vec3s(numbers.at(first), numbers.at(first + 1), numbers.at(first + 2));
 }
 
-// Lengths are halves, as coal keeps them: doubled and halved again, they are the same numbers.
+// Lengths are half-lengths, as coal stores them; doubling and halving them is exact.
 Solid primitive(const std::string & kind, const std::vector<double> & numbers, double swept_sphere_radius)
 {
   std::shared_ptr<coal::ShapeBase> shape;
@@ -45,7 +45,7 @@ Solid primitive(const std::string & kind, const std::vector<double> & numbers, d
   else if (kind == "Halfspace")
   {
     auto space = std::make_shared<coal::Halfspace>(vector(numbers, 0), numbers.at(3));
-    space->n = vector(numbers, 0); // as it is: to make it a unit vector once more could change it
+    space->n = vector(numbers, 0); // unchanged: normalizing it again could change its last digits
     space->d = numbers.at(3);
     shape = space;
   }

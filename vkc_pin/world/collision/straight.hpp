@@ -1,4 +1,5 @@
-// Straight lines between configurations of a robot: what searches ask, whoever answers.
+// Interface of collision checkers for straight lines between configurations, as used by sampling-
+// based searches.
 #pragma once
 
 #include <cstddef>
@@ -11,10 +12,10 @@ struct StraightLines
 
   virtual std::size_t size() const = 0; // coordinates of the robot
 
-  // Which share of the line from one configuration to another is free, up to the last that is looked at before the first that is not.
+  // Returns the collision-free fraction of a line, up to the last check before the first collision.
   virtual double free(const double * from, const double * to) = 0;
 };
 
-constexpr const char * STRAIGHT_LINES = "vkc_pin.StraightLines"; // of capsules that carry a pointer to such
+constexpr const char * STRAIGHT_LINES = "vkc_pin.StraightLines"; // name of capsules that hold a pointer to a checker
 
 } // namespace vkc_pin

@@ -1,4 +1,4 @@
-// Vectors and matrices of three dimensions; sums go from the first term to the last.
+// Three-dimensional vectors and matrices. Sums are evaluated from left to right.
 #pragma once
 
 #include <cmath>
@@ -10,7 +10,7 @@ struct Vector
   double x[3];
 };
 
-struct Matrix // by rows
+struct Matrix // row-major
 {
   double x[3][3];
 };

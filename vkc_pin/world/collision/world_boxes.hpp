@@ -1,4 +1,5 @@
-// Boxes along the world's axes around shapes, moment by moment, and which pairs of them may come close.
+// Axis-aligned boxes around shapes at many states, and the pairs that may come close between two
+// states.
 #pragma once
 
 #include <algorithm>
@@ -15,7 +16,8 @@ using Flags = nb::ndarray<const std::uint8_t, nb::ndim<2>, nb::c_contig, nb::dev
 class WorldBoxes
 {
 public:
-  // Corners of the boxes around what moves at all states, (W, M, 3), and around what stands, (S, 3) [m].
+  // Corners of the boxes of moving shapes at all states, (W, M, 3), and of fixed shapes, (S, 3)
+  // [m].
   WorldBoxes(const Numbers<3> & lower, const Numbers<3> & upper, const Numbers<2> & standing_lower, const Numbers<2> & standing_upper)
   : lower_(lower), upper_(upper), standing_lower_(standing_lower), standing_upper_(standing_upper), moving_(lower.shape(1))
   {
@@ -25,9 +27,10 @@ public:
       throw std::invalid_argument("corners of what stands are of shape (S, 3)");
   }
 
-  // All (k, pair) whose distance may be less than `limit` [m] at some time in a stretch k from one state to another, by k.
-  // In a stretch shapes move by no more than `moved`, (K, M + S) [m]; pairs, (P, 2), count where one of both is one of those
-  // that `moves` says, (phases, M + S), in the phase of the stretch.
+  // Returns all (interval, pair), sorted by interval, whose distance may be less than `limit` [m]
+  // during the interval. Shapes move by at most `moved`, (K, M + S) [m], during an interval. Pairs,
+  // (P, 2), are skipped if neither shape moves in the phase of the interval according to `moves`,
+  // (phases, M + S).
   std::pair<Array<Index>, Array<Index>> near(
     const Indices<2> & stretches, const Indices<1> & phases, const Flags & moves, const Indices<2> & pairs,
     const Numbers<2> & moved, double limit) const
@@ -44,7 +47,7 @@ public:
   }
 
 private:
-  static constexpr std::size_t TOGETHER = 16; // stretches of which one box around all boxes of a shape is looked at first
+  static constexpr std::size_t TOGETHER = 16; // intervals per batch; pairs are first culled by boxes around all states of a batch
 
   struct Box
   {

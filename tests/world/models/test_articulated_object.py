@@ -1,4 +1,4 @@
-"""Articulated objects, and how attachments move."""
+"""Tests articulated objects and the kinematics of attachments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
 
-def test_door() -> None:
+def test_door_properties() -> None:
     door = load_object("door")
     assert door.coordinates.names == ("hinge", "knob")
     assert (door.base_link, door.links) == ("frame", ("frame", "panel", "lever"))
@@ -58,7 +58,7 @@ def test_door() -> None:
     assert caught.value.nearest == "handle"
 
 
-def test_the_door_moves_as_its_description_says() -> None:
+def test_door_kinematics() -> None:
     door = load_object("door")
     closed, pushed = (
         door.link_placement("lever", [hinge, 0.0]).translation for hinge in (0.0, 1.0)
@@ -85,7 +85,7 @@ def test_the_door_moves_as_its_description_says() -> None:
     )
 
 
-def test_drawer() -> None:
+def test_drawer_properties() -> None:
     drawer = load_object("drawer")
     assert drawer.coordinates.names == ("slide",)
     assert (drawer.lower[0], drawer.upper[0], drawer.velocity[0], drawer.acceleration[0]) == (
@@ -100,15 +100,11 @@ def test_drawer() -> None:
         drawer.link_placement("tray", [0.4]).translation
         - drawer.link_placement("tray", [0.0]).translation
     )
-    np.testing.assert_allclose(
-        moved, [-0.4, 0.0, 0.0], atol=1e-12
-    )  # out of the cabinet, towards whoever pulls
+    np.testing.assert_allclose(moved, [-0.4, 0.0, 0.0], atol=1e-12)  # out of the cabinet
 
 
 @pytest.mark.parametrize(("name", "steps"), [("door", (158, 3)), ("drawer", (41,))])
-def test_moving_parts_keep_away_from_the_base_over_the_whole_range(
-    name: str, steps: tuple[int, ...]
-) -> None:
+def test_moving_links_do_not_collide_with_the_base(name: str, steps: tuple[int, ...]) -> None:
     thing = load_object(name)
     still = [s for s in thing.collision.geometryObjects if s.parentJoint == 0]
     assert len(still) >= 3
@@ -145,7 +141,7 @@ GRASPS = [
 
 @pytest.mark.parametrize(("joint", "fields", "suffixes"), GRASPS)
 @pytest.mark.parametrize("standoff", [0.0, 0.07])
-def test_an_attachment_moves_as_its_joint_does(
+def test_attachments_move_with_their_virtual_joint(
     joint: str, fields: str, suffixes: tuple[str, ...], standoff: float
 ) -> None:
     entry = ", ".join(
@@ -185,8 +181,8 @@ def test_an_attachment_moves_as_its_joint_does(
         grip.motion([*v, 0.0])
 
 
-def test_the_freedoms_of_a_region_follow_each_other() -> None:
-    """A rim of radius 0.3, along which the hand goes, then tilts, then slides: against rotations about points by SciPy."""
+def test_listed_freedoms_are_applied_in_order() -> None:
+    """On a rim of radius 0.3 m the hand moves around, tilts, then slides; checked with SciPy."""
     entry = """
   - name: rim
     link: panel
@@ -208,9 +204,7 @@ def test_the_freedoms_of_a_region_follow_each_other() -> None:
     down = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
     for around, tilt, slide in rng.uniform([-3, -0.5, 0], [3, 0.5, 0.02], (20, 3)):
         tool = rim.tool([around, tilt, slide])
-        spin = Rotation.from_euler(
-            "z", -around
-        ).as_matrix()  # seen from above the hand goes the other way
+        spin = Rotation.from_euler("z", -around).as_matrix()  # opposite direction, seen from above
         turn = spin @ down @ Rotation.from_euler("y", tilt).as_matrix()
         np.testing.assert_allclose(tool.rotation, turn, rtol=0.0, atol=1e-12)
         at = spin @ [0.3, 0.0, 0.0] + [0.0, 0.0, 0.1] + turn @ [0.6 * slide, 0.0, 0.8 * slide]

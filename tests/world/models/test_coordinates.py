@@ -1,4 +1,4 @@
-"""Minimal coordinates: one number per degree of freedom, and seven for what can be anywhere."""
+"""Tests minimal coordinates: one per degree of freedom, and seven per free joint."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FREE = ("thing_x", "thing_y", "thing_z", "thing_qx", "thing_qy", "thing_qz", "th
 
 
 def mixed() -> pin.Model:
-    """Return a planar base with a wheel, a free thing beside it with a lid on it, and a lift."""
+    """Return a planar base with a wheel, a free body with a lid, and a lift."""
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
     model.addJoint(base, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
@@ -34,7 +34,7 @@ def random_z(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return z
 
 
-def test_names_joints_and_limits() -> None:
+def test_names_joints_and_limits_of_coordinates() -> None:
     coordinates = Coordinates(mixed())
     assert coordinates.names == ("base_x", "base_y", "base_yaw", "wheel", *FREE, "lid", "lift")
     assert coordinates.joints == (1, 1, 1, 2, *[3] * 7, 4, 5)
@@ -53,7 +53,7 @@ def test_names_joints_and_limits() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_q_and_back(seed: int) -> None:
+def test_configurations_round_trip(seed: int) -> None:
     coordinates, rng = Coordinates(mixed()), np.random.default_rng(seed)
     z = random_z(rng, 4, 3)
     q = coordinates.q(z)
@@ -63,7 +63,7 @@ def test_q_and_back(seed: int) -> None:
         assert pin.isNormalized(mixed(), row, 1e-12)
     np.testing.assert_allclose(coordinates.z(q), z, atol=1e-12)
     np.testing.assert_array_equal(coordinates.q(z[0, 0]), q[0, 0])
-    # A quaternion of another length means the same.
+    # The length of a quaternion has no effect.
     longer = z.copy()
     longer[..., 7:11] *= rng.uniform(0.1, 9.0, (4, 3, 1))
     np.testing.assert_allclose(coordinates.q(longer), q, atol=1e-12)
@@ -71,7 +71,7 @@ def test_q_and_back(seed: int) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_a_free_joint_is_where_its_numbers_say(seed: int) -> None:
+def test_free_joints_are_placed_by_their_coordinates(seed: int) -> None:
     model = mixed()
     coordinates, data, (z,) = (
         Coordinates(model),
@@ -90,8 +90,8 @@ def test_a_free_joint_is_where_its_numbers_say(seed: int) -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.1, 1.0, 2.0, np.pi - 1e-6, np.pi])
-def test_half_way_between_two_orientations(angle: float) -> None:
-    """Interpolating the numbers turns about one axis, and half-way is half of the angle; up to half a turn and with it."""
+def test_quaternions_interpolate_about_one_axis(angle: float) -> None:
+    """Linear interpolation rotates about one axis; the midpoint is at half the angle, up to π."""
     model, rng = mixed(), np.random.default_rng(0)
     coordinates = Coordinates(model)
     for _ in range(20):
@@ -103,9 +103,7 @@ def test_half_way_between_two_orientations(angle: float) -> None:
         )
         ends = np.zeros((2, coordinates.size))
         ends[:, 4:11] = [pin.SE3ToXYZQUAT(first), pin.SE3ToXYZQUAT(second)]
-        if (
-            ends[0, 7:11] @ ends[1, 7:11] < 0.0
-        ):  # of the two quaternions of one orientation the nearer
+        if ends[0, 7:11] @ ends[1, 7:11] < 0.0:  # the nearer of both quaternions of an orientation
             ends[1, 7:11] *= -1.0
         data = model.createData()
         angles = []
@@ -129,7 +127,7 @@ def test_half_way_between_two_orientations(angle: float) -> None:
         assert angles[3] - angles[2] == pytest.approx(angles[2] - angles[1], abs=1e-6)  # symmetric
 
 
-def test_symbols_are_the_numbers_where_there_is_no_free_joint() -> None:
+def test_symbolic_configurations_match_numeric_ones() -> None:
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
     model.addJoint(base, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
@@ -143,7 +141,7 @@ def test_symbols_are_the_numbers_where_there_is_no_free_joint() -> None:
         )
 
 
-def test_what_does_not_fit() -> None:
+def test_invalid_arguments_raise() -> None:
     coordinates = Coordinates(mixed())
     with pytest.raises(InputError, match="coordinates"):
         coordinates.q(np.zeros(12))
@@ -157,6 +155,6 @@ def test_what_does_not_fit() -> None:
 
 
 @given(st.floats(-50.0, 50.0))
-def test_wrapped_angles(angle: float) -> None:
+def test_angles_are_wrapped(angle: float) -> None:
     assert -np.pi <= wrap_angle(angle) <= np.pi
     assert np.exp(1j * wrap_angle(angle)) == pytest.approx(np.exp(1j * angle), abs=1e-9)

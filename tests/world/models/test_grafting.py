@@ -1,4 +1,4 @@
-"""Grafting: what is added to a tree moves as it did alone."""
+"""Tests that grafted trees move as they did on their own."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ KINDS = (
 
 
 def random_tree(rng: np.random.Generator, joints: int) -> pin.Model:
-    """Return a random tree with a body, a frame and limits of its own at every joint, and some fixed to its root."""
+    """Return a random tree with a body, frame and limits at every joint, and fixed bodies."""
     model = pin.Model()
     for k in range(joints + 1):
         if k:
@@ -49,8 +49,8 @@ def random_tree(rng: np.random.Generator, joints: int) -> pin.Model:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(0, 5))
-def test_a_grafted_tree_moves_as_it_did(seed: int, below: int, above: int) -> None:
-    """And the tree that carries it moves as before."""
+def test_grafted_trees_move_as_before(seed: int, below: int, above: int) -> None:
+    """The tree that carries it also moves as before."""
     pin.seed(seed % 2**31)
     rng = np.random.default_rng(seed)
     trunk, branch = random_tree(rng, below), random_tree(rng, above)
@@ -94,8 +94,8 @@ def test_a_grafted_tree_moves_as_it_did(seed: int, below: int, above: int) -> No
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_no_mass_is_lost(seed: int) -> None:
-    """Not even that of bodies fixed to the root of what is grafted: the centre of mass is that of both trees."""
+def test_grafting_preserves_mass(seed: int) -> None:
+    """The centre of mass is that of both trees, including bodies fixed to the roots."""
     pin.seed(seed % 2**31)
     rng = np.random.default_rng(seed)
     trunk, branch = random_tree(rng, 3), random_tree(rng, 3)
@@ -122,7 +122,7 @@ def test_no_mass_is_lost(seed: int) -> None:
     )
 
 
-def test_what_is_grafted_is_not_changed() -> None:
+def test_grafting_does_not_change_the_grafted_tree() -> None:
     rng = np.random.default_rng(1)
     branch = random_tree(rng, 3)
     before = branch.copy()
@@ -130,8 +130,8 @@ def test_what_is_grafted_is_not_changed() -> None:
     assert branch == before
 
 
-def test_a_joint_and_a_link_of_one_name() -> None:
-    """A URDF may have them; the link is what is looked for by that name."""
+def test_joint_and_link_of_the_same_name() -> None:
+    """URDFs may have them; a frame look-up finds the link."""
     branch = pin.Model()
     branch.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "lid")
     branch.addJointFrame(1)
@@ -145,7 +145,7 @@ def test_a_joint_and_a_link_of_one_name() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_shapes_go_along(seed: int) -> None:
+def test_shapes_move_with_the_grafted_tree(seed: int) -> None:
     pin.seed(seed % 2**31)
     rng = np.random.default_rng(seed)
     branch, trunk = random_tree(rng, 3), random_tree(rng, 2)
@@ -193,7 +193,7 @@ def test_shapes_go_along(seed: int) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_clean_changes_nothing_that_counts(seed: int) -> None:
+def test_rounding_preserves_placements(seed: int) -> None:
     pin.seed(seed % 2**31)
     placement = pin.SE3.Random()
     np.testing.assert_array_equal(round_placement(placement).homogeneous, placement.homogeneous)

@@ -1,4 +1,4 @@
-"""Descriptions of objects: what they say, and how wrong ones are refused."""
+"""Tests object descriptions and the errors of invalid ones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ latches:
 """
 
 
-def test_an_object_may_say_that_it_has_no_attachment_but_not_forget_it() -> None:
+def test_attachments_may_be_empty_but_not_missing() -> None:
     item = load_text(URDF, "urdf: thing.urdf\nattachments: []")
     assert dict(item.attachments) == {}
     with pytest.raises(InputError, match="no attachment"):
@@ -40,7 +40,7 @@ def test_an_object_may_say_that_it_has_no_attachment_but_not_forget_it() -> None
         load_text(URDF, "urdf: thing.urdf")
 
 
-def test_limits_that_are_not_stated_have_documented_defaults() -> None:
+def test_default_limits() -> None:
     thing = load_text(URDF, BASE)
     np.testing.assert_array_equal(thing.velocity, [1.0, DEFAULT_VELOCITY])
     np.testing.assert_array_equal(thing.acceleration, [3.0, DEFAULT_ACCELERATION])
@@ -50,14 +50,15 @@ def test_limits_that_are_not_stated_have_documented_defaults() -> None:
     ("free", "stated", "firm"),
     [(0, "", 0), (1, "", 1), (0, "firm: true", 1), (1, "firm: false", 0)],
 )
-def test_a_hand_clamps_what_is_free_unless_told_otherwise(
-    free: int, stated: str, firm: int
-) -> None:
-    text = f"urdf: thing.urdf\nfree: {bool(free)}\nattachments: [{{name: grip, link: panel, {stated}}}]"
+def test_grasps_of_free_objects_are_firm_by_default(free: int, stated: str, firm: int) -> None:
+    text = (
+        f"urdf: thing.urdf\nfree: {bool(free)}\n"
+        f"attachments: [{{name: grip, link: panel, {stated}}}]"
+    )
     assert load_text(URDF, text).attachment().firm is bool(firm)
 
 
-def test_what_stands_free_cannot_be_pushed() -> None:
+def test_free_objects_cannot_be_pushed() -> None:
     with pytest.raises(InputError, match="cannot be pushed") as caught:
         load_text(
             URDF,
@@ -66,9 +67,12 @@ def test_what_stands_free_cannot_be_pushed() -> None:
     assert (caught.value.line, caught.value.field) == (3, "attachments[0].contact")
 
 
-def test_two_grasps_cannot_share_a_coordinate() -> None:
+def test_duplicate_coordinate_names_raise() -> None:
     slide = "name: grip_slide, link: panel, joint: prismatic, axis: [1, 0, 0], limits: [0, 1]"
-    both = f"{{name: grip, link: panel, joint: cylindrical, axis: [1, 0, 0], limits: [0, 1], turn: [0, 1]}}, {{{slide}}}"
+    grip = (
+        "name: grip, link: panel, joint: cylindrical, axis: [1, 0, 0], limits: [0, 1], turn: [0, 1]"
+    )
+    both = f"{{{grip}}}, {{{slide}}}"
     with pytest.raises(InputError, match="grip_slide") as caught:
         load_text(URDF, f"urdf: thing.urdf\nattachments: [{both}]")
     assert caught.value.field == "attachments[1].name"
@@ -86,7 +90,7 @@ def test_two_grasps_cannot_share_a_coordinate() -> None:
         ("latches:", "latch:", 7, "latch", "latches"),
     ],
 )
-def test_unknown_names_in_a_description(
+def test_unknown_names_raise_with_a_suggestion(
     old: str, new: str, line: int, field: str, nearest: str
 ) -> None:
     with pytest.raises(UnknownNameError) as caught:
@@ -218,7 +222,9 @@ def test_unknown_names_in_a_description(
         ("link: panel", "link: [panel", 7, None),
     ],
 )
-def test_wrong_values_in_a_description(old: str, new: str, line: int, field: str | None) -> None:
+def test_invalid_values_raise_with_their_line(
+    old: str, new: str, line: int, field: str | None
+) -> None:
     with pytest.raises(InputError) as caught:
         load_text(URDF, BASE.replace(old, new))
     assert (caught.value.line, caught.value.field) == (line, field), str(caught.value)
@@ -252,7 +258,7 @@ def test_wrong_values_in_a_description(old: str, new: str, line: int, field: str
         ),
     ],
 )
-def test_wrong_urdfs_are_refused(urdf: str, message: str) -> None:
+def test_invalid_urdfs_raise(urdf: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
         load_text(urdf, BASE)
     assert message in str(caught.value)
@@ -275,7 +281,7 @@ def test_wrong_urdfs_are_refused(urdf: str, message: str) -> None:
     ],
 )
 @pytest.mark.parametrize("kind", ["visual", "collision"])
-def test_wrong_shapes_are_refused(kind: str, shape: str, problem: str) -> None:
+def test_invalid_shapes_raise(kind: str, shape: str, problem: str) -> None:
     good = f"<collision><geometry>{SHAPES[0]}</geometry></collision>"
     wrong = f'<link name="panel">{good}<{kind}><geometry>{shape}</geometry></{kind}></link>'
     with pytest.raises(InputError, match=re.escape(problem)) as caught:
@@ -285,7 +291,7 @@ def test_wrong_shapes_are_refused(kind: str, shape: str, problem: str) -> None:
         assert str(caught.value.field).startswith("panel_")
 
 
-def test_shapes_stand_where_pinocchio_has_them(tmp_path: Path) -> None:
+def test_shape_placements_match_pinocchio(tmp_path: Path) -> None:
     rng, shapes = np.random.default_rng(0), ""
     for xyz, rpy in zip(
         rng.uniform(-1.0, 1.0, (20, 3)).tolist(),
@@ -308,10 +314,13 @@ def test_shapes_stand_where_pinocchio_has_them(tmp_path: Path) -> None:
         assert (ours.parentJoint, ours.parentFrame) == (other.parentJoint, other.parentFrame)
 
 
-def test_capsules_and_colours_of_an_object() -> None:
+def test_capsules_and_colours_are_read() -> None:
     capsule = '<geometry><capsule radius="0.1" length="0.4"/></geometry>'
     red = '<material name="red"><color rgba="1 0 0 1"/></material>'
-    panel = f'<link name="panel"><collision>{capsule}</collision><visual>{capsule}{red}</visual><visual>{capsule}</visual></link>'
+    panel = (
+        f'<link name="panel"><collision>{capsule}</collision>'
+        f"<visual>{capsule}{red}</visual><visual>{capsule}</visual></link>"
+    )
     thing = load_text(URDF.replace('<link name="panel"/>', panel), BASE)
     (solid,) = (shape.geometry for shape in thing.collision.geometryObjects)
     assert (solid.radius, solid.halfLength) == (0.1, 0.2)
@@ -323,7 +332,7 @@ def test_capsules_and_colours_of_an_object() -> None:
 
 
 @pytest.mark.parametrize("filename", ["wedge.obj", "package://things/wedge.obj"])
-def test_collision_meshes_become_their_convex_hulls(tmp_path: Path, filename: str) -> None:
+def test_collision_meshes_become_convex_hulls(tmp_path: Path, filename: str) -> None:
     folder = tmp_path / "things"
     folder.mkdir()
     (folder / "wedge.obj").write_text(
@@ -331,7 +340,8 @@ def test_collision_meshes_become_their_convex_hulls(tmp_path: Path, filename: st
     )
     mesh = f'<geometry><mesh filename="{filename}" scale="2 2 1"/></geometry>'
     (folder / "t.urdf").write_text(
-        f'<robot name="t"><link name="l"><visual>{mesh}</visual><collision>{mesh}</collision></link></robot>'
+        f'<robot name="t"><link name="l"><visual>{mesh}</visual>'
+        f"<collision>{mesh}</collision></link></robot>"
     )
     (folder / "t.yaml").write_text("urdf: t.urdf\nattachments: [{name: a, link: l}]\n")
     (shape,) = load_object(folder / "t.yaml").collision.geometryObjects
@@ -342,7 +352,7 @@ def test_collision_meshes_become_their_convex_hulls(tmp_path: Path, filename: st
         load_object(folder / "t.yaml")
 
 
-def test_unknown_objects_are_refused(tmp_path: Path) -> None:
+def test_unknown_objects_raise(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError) as caught:
         load_object("dor")
     assert caught.value.nearest == "door"
@@ -355,7 +365,7 @@ def test_unknown_objects_are_refused(tmp_path: Path) -> None:
     assert lost.value.file == tmp_path / "none.urdf"
 
 
-def test_a_description_that_is_handed_over(tmp_path: Path) -> None:
+def test_descriptions_can_be_mappings(tmp_path: Path) -> None:
     (tmp_path / "wedge.obj").write_text(
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     )

@@ -31,7 +31,7 @@ def husky() -> Robot:
 
 
 def ur5e(q: np.ndarray) -> np.ndarray:
-    """Forward kinematics by the Denavit-Hartenberg parameters that Universal Robots publishes."""
+    """Compute forward kinematics with the Denavit-Hartenberg parameters of the manufacturer."""
     d, a = [0.1625, 0, 0, 0.1333, 0.0997, 0.0996], [0, -0.425, -0.3922, 0, 0, 0]
     total = np.eye(4)
     for k, twist in enumerate([np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]):
@@ -45,7 +45,7 @@ def ur5e(q: np.ndarray) -> np.ndarray:
     return total
 
 
-def test_coordinates_and_limits(husky: Robot) -> None:
+def test_coordinates_and_limits_of_husky(husky: Robot) -> None:
     assert husky.coordinates.names == ("base_x", "base_y", "base_yaw", *ARM)
     assert husky.model.names[1] == "base"
     assert husky.model.joints[1].shortname() == "JointModelPlanar"
@@ -58,7 +58,7 @@ def test_coordinates_and_limits(husky: Robot) -> None:
     assert husky.touch_links == ("gripper_link", "gripper_left_finger", "gripper_right_finger")
 
 
-def test_husky_is_as_large_as_the_data_sheet_says(husky: Robot) -> None:
+def test_husky_dimensions_match_the_data_sheet(husky: Robot) -> None:
     corners = [
         husky.collision.geometryObjects[k].placement.act(point)
         for k in range(husky.collision.ngeoms)
@@ -70,7 +70,7 @@ def test_husky_is_as_large_as_the_data_sheet_says(husky: Robot) -> None:
     assert placement(husky, "top_plate_link", np.zeros(9)).translation[2] == pytest.approx(0.39)
 
 
-def test_forward_kinematics_against_the_makers_parameters(husky: Robot) -> None:
+def test_forward_kinematics_match_the_manufacturer(husky: Robot) -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         z = np.concatenate([rng.uniform(-3, 3, 3), rng.uniform(-np.pi, np.pi, 6)])
@@ -84,13 +84,13 @@ def test_forward_kinematics_against_the_makers_parameters(husky: Robot) -> None:
         )
 
 
-def test_foot_is_turned_by_pi(husky: Robot) -> None:
+def test_arm_base_is_rotated_by_pi(husky: Robot) -> None:
     np.testing.assert_allclose(
         placement(husky, "ur_base_link", np.zeros(9)).rotation, np.diag([-1, -1, 1]), atol=1e-12
     )
 
 
-def test_fingers_leave_the_opening_free(husky: Robot) -> None:
+def test_fingers_do_not_obstruct_the_opening(husky: Robot) -> None:
     data, placed = husky.model.createData(), husky.collision.createData()
     pin.updateGeometryPlacements(
         husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky))
@@ -115,14 +115,14 @@ def test_fingers_leave_the_opening_free(husky: Robot) -> None:
 
     assert (
         0.0 < gap(coal.Box(0.085, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.002
-    )  # what the fingers close on lies along x
+    )  # the fingers close along x
     assert gap(coal.Box(0.09, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.0
-    assert gap(coal.Box(0.02, 0.3, 0.03), (0.0, 0.0, 0.0)) > 0.02  # and passes through along y
+    assert gap(coal.Box(0.02, 0.3, 0.03), (0.0, 0.0, 0.0)) > 0.02  # the opening is free along y
     assert gap(coal.Box(0.02, 0.02, 0.3), (0.0, 0.0, 0.15)) > 0.02  # z points away from the palm
     assert gap(coal.Box(0.02, 0.02, 0.3), (0.0, 0.0, -0.15)) < 0.0
 
 
-def test_collision_pieces_contain_the_links(husky: Robot) -> None:
+def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
     for link in husky.links:
         shapes = [
             shape
@@ -148,7 +148,7 @@ def test_collision_pieces_contain_the_links(husky: Robot) -> None:
         assert outside.max() < 1e-6, link
 
 
-def test_home_is_free_of_collisions_by_far(husky: Robot) -> None:
+def test_home_has_large_clearance(husky: Robot) -> None:
     data, placed = husky.model.createData(), husky.collision.createData()
     pin.computeDistances(
         husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky))
@@ -156,7 +156,7 @@ def test_home_is_free_of_collisions_by_far(husky: Robot) -> None:
     assert min(result.min_distance for result in placed.distanceResults) > 0.05
 
 
-def test_pairs(husky: Robot) -> None:
+def test_collision_pairs_of_husky(husky: Robot) -> None:
     everything = load_robot("husky_ur5e", pairs="all")
     assert len(husky.collision.geometryObjects) == 18
     # 4 shapes on the base, 1, 3, 2, 1, 1 on the arm's links, 6 on the hand: all but those on the
@@ -175,15 +175,15 @@ def test_pairs(husky: Robot) -> None:
     assert frozenset(("upper_arm_link", "forearm_link")) not in links
 
 
-def test_a_scene_takes_a_robot_yaml_beside_it(tmp_path: Path) -> None:
+def test_scenes_find_a_robot_yaml_beside_them(tmp_path: Path) -> None:
     small_urdf(tmp_path)
     (tmp_path / "mine.yaml").write_text("urdf: small.urdf\ntool_frame: l2\n")
     document = {"robot": "mine.yaml", "start": {"base": [0, 0, 0]}}
     assert Scene.from_document(document, tmp_path).robot.tool_frame == "l2"
 
 
-def test_the_lever_is_how_far_a_radian_moves_the_hand(husky: Robot) -> None:
-    """By finite differences of the hand's place over random postures; the same for two equal robots."""
+def test_lever_matches_finite_differences(husky: Robot) -> None:
+    """Differences of the hand position at random configurations; equal for equal robots."""
     robot = husky
     rng, steps = np.random.default_rng(1), []
     tool = robot.model.getFrameId(robot.tool_frame)
@@ -203,8 +203,8 @@ def test_the_lever_is_how_far_a_radian_moves_the_hand(husky: Robot) -> None:
     assert robot.lever == load_robot("husky_ur5e").lever
 
 
-def test_the_front_is_as_far_ahead_as_the_hand_reaches(husky: Robot) -> None:
-    """Of all corners of the touch links, in the tool frame; without such a link it is the tool frame itself."""
+def test_front_is_the_foremost_corner_of_the_hand(husky: Robot) -> None:
+    """Covers all corners of touch links; without touch links it is the tool frame."""
     frame = husky.model.frames[husky.model.getFrameId(husky.tool_frame)]
     hand = [
         s
@@ -223,7 +223,7 @@ def test_the_front_is_as_far_ahead_as_the_hand_reaches(husky: Robot) -> None:
     )
 
 
-def test_an_arm_that_does_not_turn_has_the_least_lever(husky: Robot) -> None:
+def test_arms_without_revolute_joints_have_the_minimum_lever(husky: Robot) -> None:
     units = tuple("m" for _ in husky.coordinates.units)
     straight = dataclasses.replace(husky, coordinates=SimpleNamespace(units=units))  # type: ignore[arg-type]
     assert straight.lever == _MIN_LEVER

@@ -1,4 +1,4 @@
-"""Robots from files: defaults, options, and how wrong ones are refused."""
+"""Tests the loading of robots: defaults, options and errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def husky() -> Robot:
     return load_robot("husky_ur5e")
 
 
-def test_bases() -> None:
+def test_base_types() -> None:
     fixed = load_robot("husky_ur5e", base="fixed")
     np.testing.assert_array_equal(fixed.lower[:3], fixed.upper[:3])
     assert load_robot("husky_ur5e", base="differential").base == "differential"
@@ -33,7 +33,7 @@ def test_bases() -> None:
         load_robot("husky_ur5e", base="wheels")  # type: ignore[arg-type]
 
 
-def test_wheels_and_the_least_radius_of_a_turn(tmp_path: Path) -> None:
+def test_wheels_and_turning_radius(tmp_path: Path) -> None:
     husky = load_robot("husky_ur5e", base="ackermann", turning_radius=0.8)
     assert (husky.turning_radius, load_robot("husky_ur5e", base="differential").turning_radius) == (
         0.8,
@@ -42,7 +42,8 @@ def test_wheels_and_the_least_radius_of_a_turn(tmp_path: Path) -> None:
     assert husky.wheels is not None
     assert husky.wheels.rim_speed == pytest.approx(husky.wheels.radius * husky.wheels.speed)
     source = (FOLDER / "husky_ur5e.urdf").as_posix()
-    text = f"urdf: {source}\npackages: [airo_models]\ntool_frame: tool\nsrdf: {(FOLDER / 'husky_ur5e.srdf').as_posix()}\n"
+    srdf = (FOLDER / "husky_ur5e.srdf").as_posix()
+    text = f"urdf: {source}\npackages: [airo_models]\ntool_frame: tool\nsrdf: {srdf}\n"
     file = tmp_path / "robot.yaml"
     file.write_text(text + "base: {turning_radius: 1.2}\n")
     assert load_robot(file, base="ackermann").turning_radius == 1.2
@@ -66,7 +67,7 @@ def test_wheels_and_the_least_radius_of_a_turn(tmp_path: Path) -> None:
             load_robot(file)
 
 
-def test_locked_joints_and_another_tool_frame() -> None:
+def test_locked_joints_and_tool_frame() -> None:
     robot = load_robot("husky_ur5e", tool_frame="wrist_2_link", locked_joints={"elbow_joint": -1.5})
     assert robot.coordinates.names[3:] == (
         "shoulder_pan_joint",
@@ -93,7 +94,9 @@ def test_locked_joints_and_another_tool_frame() -> None:
         ("kinova", None, 6),
     ],
 )
-def test_robots_of_example_robot_data(name: str, tool: str | None, joints: int) -> None:
+def test_robots_of_example_robot_data_can_be_loaded(
+    name: str, tool: str | None, joints: int
+) -> None:
     robot = load_robot(name)
     assert tool in (None, robot.tool_frame)
     assert len(robot.home) == joints == robot.coordinates.size - 3
@@ -104,7 +107,7 @@ def test_robots_of_example_robot_data(name: str, tool: str | None, joints: int) 
     placement(robot, robot.tool_frame, at_rest(robot))
 
 
-def test_tiago_with_its_hand() -> None:
+def test_tiago_with_its_hand_can_be_loaded() -> None:
     robot = load_robot("tiago", tool_frame="hand_tool_link", pairs="all")
     assert robot.coordinates.names[3:] == (
         "torso_lift_joint",
@@ -112,10 +115,11 @@ def test_tiago_with_its_hand() -> None:
     )
 
 
-def test_any_urdf_has_sensible_defaults(tmp_path: Path) -> None:
+def test_defaults_of_a_urdf(tmp_path: Path) -> None:
     wheel = (
         '<joint name="wheel" type="continuous"><parent link="l0"/><child link="w"/></joint>'
-        '<joint name="follower" type="revolute"><parent link="l3"/><child link="f"/><mimic joint="j0"/>'
+        '<joint name="follower" type="revolute">'
+        '<parent link="l3"/><child link="f"/><mimic joint="j0"/>'
         '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
     )
     robot = load_robot(
@@ -125,17 +129,18 @@ def test_any_urdf_has_sensible_defaults(tmp_path: Path) -> None:
     assert robot.name == "small"
     np.testing.assert_allclose(
         robot.velocity, [1, 1, 2, 1.0, 1.5, 1.5]
-    )  # the first is as slow as what follows it
+    )  # the first is limited by its follower
     np.testing.assert_allclose(robot.acceleration, [3, 3, 6, 1.4, 1.4, 1.4])
     np.testing.assert_array_equal(
         robot.model.jointPlacements[3].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
     )
 
 
-def test_robot_yaml_beside_a_urdf_is_used(tmp_path: Path) -> None:
+def test_robot_yaml_beside_the_urdf_is_used(tmp_path: Path) -> None:
     file = small_urdf(tmp_path)
     (tmp_path / "robot.yaml").write_text(
-        "urdf: small.urdf\ntool_frame: l3\nhome: {j1: 0.5}\njoints: {j2: {velocity: 0.2, acceleration: 9}}\n"
+        "urdf: small.urdf\ntool_frame: l3\nhome: {j1: 0.5}\n"
+        "joints: {j2: {velocity: 0.2, acceleration: 9}}\n"
     )
     robot = load_robot(file, pairs="all")
     assert (robot.tool_frame, robot.home.tolist(), robot.velocity[5], robot.acceleration[5]) == (
@@ -151,14 +156,14 @@ def test_robot_yaml_beside_a_urdf_is_used(tmp_path: Path) -> None:
     ]
 
 
-def test_a_robot_is_called_as_its_folder_or_its_file(tmp_path: Path) -> None:
+def test_robots_are_named_after_folder_or_file(tmp_path: Path) -> None:
     small_urdf(tmp_path)
     for name, called in (("robot.yaml", tmp_path.name), ("mine.yaml", "mine")):
         (tmp_path / name).write_text("urdf: small.urdf\n")
         assert load_robot(tmp_path / name, pairs="all").name == called
 
 
-def test_a_copied_urdf_finds_the_meshes_of_example_robot_data(tmp_path: Path) -> None:
+def test_copied_urdfs_find_meshes_of_example_robot_data(tmp_path: Path) -> None:
     original = load_robot("panda", pairs="all")
     copy = tmp_path / "copy.urdf"
     copy.write_text(original.urdf.read_text())
@@ -172,7 +177,7 @@ def test_a_copied_urdf_finds_the_meshes_of_example_robot_data(tmp_path: Path) ->
         load_robot(copy, pairs="all")
 
 
-def test_unknown_names() -> None:
+def test_unknown_names_raise() -> None:
     with pytest.raises(UnknownNameError) as caught:
         load_robot("husky_ur5")
     assert caught.value.nearest == "husky_ur5e"
@@ -186,7 +191,7 @@ def test_unknown_names() -> None:
         load_robot("nowhere/robot.urdf")
 
 
-def test_broken_files(tmp_path: Path) -> None:
+def test_invalid_files_raise(tmp_path: Path) -> None:
     (tmp_path / "a.urdf").write_text("<robot><link>")
     with pytest.raises(InputError, match="XML") as caught:
         load_robot(tmp_path / "a.urdf")
@@ -218,7 +223,7 @@ def test_broken_files(tmp_path: Path) -> None:
         load_robot(file)
 
 
-def test_srdf_with_an_unknown_link(tmp_path: Path) -> None:
+def test_unknown_links_in_an_srdf_raise(tmp_path: Path) -> None:
     file = small_urdf(tmp_path)
     (tmp_path / "small.srdf").write_text(
         '<robot name="small">\n<disable_collisions link1="l0" link2="l5" reason="Never"/>\n</robot>'
@@ -228,10 +233,10 @@ def test_srdf_with_an_unknown_link(tmp_path: Path) -> None:
     assert (caught.value.file, caught.value.line) == (tmp_path / "small.srdf", 2)
     assert (
         len(load_robot(file, pairs="sampled").collision.collisionPairs) == 0
-    )  # it cannot touch itself
+    )  # no self-collision is possible
 
 
-def test_no_pair_left(tmp_path: Path) -> None:
+def test_srdf_that_allows_all_pairs_raises(tmp_path: Path) -> None:
     pairs = "".join(
         f'<disable_collisions link1="l{i}" link2="l{j}"/>' for i in range(4) for j in range(i)
     )
@@ -240,23 +245,23 @@ def test_no_pair_left(tmp_path: Path) -> None:
         load_robot(small_urdf(tmp_path))
 
 
-def test_a_copy_of_the_robot_works_elsewhere(husky: Robot, tmp_path: Path) -> None:
+def test_copied_robots_can_be_loaded(husky: Robot, tmp_path: Path) -> None:
     shutil.copytree(FOLDER, tmp_path / "husky_ur5e")
-    twin = load_robot(tmp_path / "husky_ur5e" / "husky_ur5e.urdf")
-    assert twin.urdf.parent == (tmp_path / "husky_ur5e").resolve()
-    assert (twin.name, twin.tool_frame, len(twin.collision.collisionPairs)) == (
+    copy = load_robot(tmp_path / "husky_ur5e" / "husky_ur5e.urdf")
+    assert copy.urdf.parent == (tmp_path / "husky_ur5e").resolve()
+    assert (copy.name, copy.tool_frame, len(copy.collision.collisionPairs)) == (
         husky.name,
         "tool",
         95,
     )
     with pytest.raises(dataclasses.FrozenInstanceError):
-        twin.name = "other"  # type: ignore[misc]
+        copy.name = "other"  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("field", ["locked_joints", "home"])
 @pytest.mark.parametrize("by_file", [True, False])
-def test_joints_outside_their_limits_are_refused(tmp_path: Path, field: str, by_file: bool) -> None:
-    """Planned or locked, in robot.yaml or as an argument."""
+def test_positions_outside_limits_raise(tmp_path: Path, field: str, by_file: bool) -> None:
+    """Holds for planned and locked joints, in robot.yaml and as arguments."""
     small_urdf(tmp_path)
     for joint in ("j1", "j2"):
         about = [
@@ -279,7 +284,7 @@ def test_joints_outside_their_limits_are_refused(tmp_path: Path, field: str, by_
 def driving_urdf(
     folder: Path, *, order: str = "xyt", shape: bool = False, tilted: bool = False
 ) -> Path:
-    """The small robot on joints of its own that drive it about, as simulators have them; with links of nothing between."""
+    """Write the small robot on a planar base of joints and empty links, as in simulators."""
     file = small_urdf(folder)
     names, joints, solid = (
         ["world", *(f"m{k}" for k in range(2)), "l0"],
@@ -290,7 +295,8 @@ def driving_urdf(
     for k, letter in enumerate(order):
         kind = "continuous" if letter == "t" else "prismatic"
         axis, origin = axes[letter], '<origin rpy="0.3 0 0"/>' if tilted and not k else ""
-        joints += f'<joint name="drive_{k}" type="{kind}"><parent link="{names[k]}"/><child link="{names[k + 1]}"/>{origin}'
+        joints += f'<joint name="drive_{k}" type="{kind}"><parent link="{names[k]}"/>'
+        joints += f'<child link="{names[k + 1]}"/>{origin}'
         joints += f'<axis xyz="{axis}"/><limit lower="-9" upper="9"/></joint>'
     links = "".join(f'<link name="{name}"/>' for name in names[:3])
     text = file.read_text().replace("</robot>", f"{links}{joints}</robot>")
@@ -303,7 +309,7 @@ def driving_urdf(
 
 
 @pytest.mark.parametrize("order", ["xyt", "yxt", "txy", "xty"])
-def test_a_base_of_its_own_is_noticed(tmp_path: Path, order: str) -> None:
+def test_planar_bases_in_the_urdf_are_locked(tmp_path: Path, order: str) -> None:
     file = driving_urdf(tmp_path, order=order)
     with pytest.warns(
         UserWarning, match=r"small.urdf: the virtual base .* are locked: drive_0, drive_1, drive_2$"
@@ -311,7 +317,7 @@ def test_a_base_of_its_own_is_noticed(tmp_path: Path, order: str) -> None:
         robot = load_robot(file)
     assert robot.coordinates.names == ("base_x", "base_y", "base_yaw", "j0", "j1", "j2")
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # who says where they are locked knows of them
+        warnings.simplefilter("error")  # no warning if their positions are given
         load_robot(file, locked_joints={f"drive_{k}": 0.0 for k in range(3)})
     (tmp_path / "plain").mkdir()
     plain = load_robot(small_urdf(tmp_path / "plain"))
@@ -319,7 +325,7 @@ def test_a_base_of_its_own_is_noticed(tmp_path: Path, order: str) -> None:
     assert placement(robot, "l3", z).isApprox(placement(plain, "l3", z), 1e-12)
 
 
-def test_a_base_that_stands_still_leaves_it_alone(tmp_path: Path) -> None:
+def test_fixed_bases_keep_planar_joints_of_the_urdf(tmp_path: Path) -> None:
     robot = load_robot(driving_urdf(tmp_path), base="fixed")
     assert robot.coordinates.names[3:] == ("drive_0", "drive_1", "drive_2", "j0", "j1", "j2")
 
@@ -328,13 +334,13 @@ def test_a_base_that_stands_still_leaves_it_alone(tmp_path: Path) -> None:
     "change",
     [{"shape": True}, {"tilted": True}, {"order": "xxt"}, {"order": "xyx"}, {"order": "ttx"}],
 )
-def test_what_is_no_base_of_its_own(tmp_path: Path, change: dict[str, object]) -> None:
-    """Something on it that could collide, slides that climb, too few directions."""
+def test_other_joints_are_not_a_planar_base(tmp_path: Path, change: dict[str, object]) -> None:
+    """Collision shapes, non-horizontal axes or parallel axes exclude a planar base."""
     assert len(load_robot(driving_urdf(tmp_path, **change)).coordinates.names) == 9  # type: ignore[arg-type]
 
 
-def test_height_of_the_root(tmp_path: Path) -> None:
-    """All of the robot is that much higher, wherever it drives and turns; the argument counts before the file."""
+def test_height_of_the_root_link(tmp_path: Path) -> None:
+    """The whole robot is raised at any base pose; the argument overrides the file."""
     file = small_urdf(tmp_path)
     low, z = load_robot(file), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {height: 0.25}\n")
@@ -360,7 +366,7 @@ def test_height_of_the_root(tmp_path: Path) -> None:
         load_robot(file, height=float("nan"))
 
 
-def test_a_group_of_the_srdf_says_what_grasps(tmp_path: Path) -> None:
+def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
     file = small_urdf(tmp_path)
     (tmp_path / "small.srdf").write_text(
         '<robot name="small"><group name="short"><chain base_link="l0" tip_link="l2"/></group>'
@@ -384,8 +390,8 @@ def test_a_group_of_the_srdf_says_what_grasps(tmp_path: Path) -> None:
     assert (both.value.file, both.value.line) == (tmp_path / "robot.yaml", 3)
 
 
-def test_a_folder_here_is_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What has a slash in it is a path, and so is a `Path`, though there is a robot of that name."""
+def test_folders_do_not_shadow_robot_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Strings with a slash and `Path` objects are paths, even if a robot has that name."""
     folder = write_arms(tmp_path / "husky_ur5e").parent
     (folder / "robot.yaml").write_text("urdf: robot.urdf\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)

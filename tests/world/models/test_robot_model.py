@@ -1,4 +1,4 @@
-"""Models of robots whose other joints are locked."""
+"""Tests robot models with locked joints."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def husky() -> Robot:
     return load_robot("husky_ur5e")
 
 
-def test_joint_placements_are_clean(husky: Robot) -> None:
+def test_joint_placements_are_rounded(husky: Robot) -> None:
     for joint in husky.model.jointPlacements:
         for entry in np.asarray(joint.homogeneous).ravel():
             assert entry in (0.0, 1.0, -1.0) or abs(entry) > 1e-3
 
 
-def test_visual_geometry_is_light_and_coloured(husky: Robot) -> None:
+def test_visual_geometry_is_simplified_and_coloured(husky: Robot) -> None:
     shapes = husky.visual.geometryObjects
     triangles = sum(
         shape.geometry.num_tris for shape in shapes if isinstance(shape.geometry, coal.BVHModelBase)
@@ -33,7 +33,7 @@ def test_visual_geometry_is_light_and_coloured(husky: Robot) -> None:
     assert husky.visual is husky.visual
 
 
-def test_locking_agrees_with_the_whole_model() -> None:
+def test_locked_models_match_the_full_model() -> None:
     robot = load_robot("panda")
     full = pin.buildModelFromUrdf(str(robot.urdf), pin.JointModelPlanar())
     rng = np.random.default_rng(2)

@@ -1,4 +1,4 @@
-"""What a robot.yaml may say."""
+"""Tests the validation of robot.yaml."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from vkc_pin.world.models.robot_file import load_robot
         ("srdf: none.srdf", None, "none.srdf"),
     ],
 )
-def test_mistakes_in_a_robot_yaml(
+def test_invalid_robot_yaml_raises_with_its_line(
     tmp_path: Path, text: str, line: int | None, problem: str
 ) -> None:
     small_urdf(tmp_path)

@@ -27,24 +27,24 @@ def husky() -> Robot:
     return load_robot("husky_ur5e")
 
 
-def test_committed_list_is_what_sampling_finds(husky: Robot) -> None:
+def test_committed_srdf_matches_sampling(husky: Robot) -> None:
     assert (
         sample_allowed_pairs(husky, samples=3000, seed=7)
         == read_srdf(SRDF, links=husky.file.links).allowed
     )
 
 
-def test_a_free_home_is_one_from_which_plans_can_begin() -> None:
+def test_home_distance_equals_the_planning_margin() -> None:
     assert Options().self_distance == self_collisions.HOME_DISTANCE
 
 
-def test_same_seed_same_pairs(husky: Robot) -> None:
+def test_same_seed_gives_same_pairs(husky: Robot) -> None:
     assert sample_allowed_pairs(husky, samples=100, seed=3) == sample_allowed_pairs(
         husky, samples=100, seed=3
     )
 
 
-def test_reasons(husky: Robot) -> None:
+def test_reasons_of_allowed_pairs(husky: Robot) -> None:
     allowed = read_srdf(SRDF, links=husky.file.links).allowed
     assert allowed["shoulder_link", "upper_arm_link"] == "Adjacent"
     assert allowed["gripper_link", "wrist_2_link"] == "Never"
@@ -52,14 +52,17 @@ def test_reasons(husky: Robot) -> None:
     assert "Always" not in allowed.values()
 
 
-def test_always_and_never(tmp_path: Path) -> None:
+def test_pairs_that_always_or_never_collide(tmp_path: Path) -> None:
     links = "".join(
-        f'<link name="{name}"><collision><geometry><sphere radius="{radius}"/></geometry></collision></link>'
+        f'<link name="{name}"><collision>'
+        f'<geometry><sphere radius="{radius}"/></geometry></collision></link>'
         for name, radius in (("foot", 1.0), ("middle", 0.1), ("inner", 0.2), ("outer", 0.1))
     )
     joints = "".join(
-        f'<joint name="{child}_joint" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{x} 0 0"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
+        f'<joint name="{child}_joint" type="revolute">'
+        f'<parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{x} 0 0"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
         for parent, child, x in (
             ("foot", "middle", 0.3),
             ("middle", "inner", 0.2),
@@ -78,7 +81,7 @@ def test_always_and_never(tmp_path: Path) -> None:
     }
 
 
-def test_written_file_reads_back(husky: Robot, tmp_path: Path) -> None:
+def test_written_srdf_can_be_read(husky: Robot, tmp_path: Path) -> None:
     file = write_srdf(husky, tmp_path / "new.srdf", samples=50)
     again = read_srdf(file, links=husky.file.links)
     assert again.allowed == sample_allowed_pairs(husky, samples=50)
@@ -106,10 +109,12 @@ def hinge(
     limit = (
         ""
         if kind == "fixed"
-        else f'<axis xyz="{axis}"/><limit lower="{-upper}" upper="{upper}" velocity="1" effort="1"/>'
+        else f'<axis xyz="{axis}"/>'
+        f'<limit lower="{-upper}" upper="{upper}" velocity="1" effort="1"/>'
     )
     return (
-        f'<joint name="{child}_joint" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{x} 0 0"/>'
+        f'<joint name="{child}_joint" type="{kind}"><parent link="{parent}"/>'
+        f'<child link="{child}"/><origin xyz="{x} 0 0"/>'
         f"{limit}</joint>"
     )
 
@@ -123,7 +128,7 @@ def arm(folder: Path, *parts: str, srdf: str | None = None) -> Path:
 
 
 def bracket(folder: Path, *, far: float, srdf: str | None = None) -> Path:
-    """A post with a bracket fixed to it; on the post a shoulder turns, on which a cover and, out of reach, an elbow are fixed."""
+    """Write a post with a fixed bracket, and a shoulder with a fixed cover and a remote elbow."""
     return arm(
         folder,
         *(
@@ -141,8 +146,8 @@ def bracket(folder: Path, *, far: float, srdf: str | None = None) -> Path:
     )
 
 
-def test_neighbours_across_fixed_links_are_neighbours(tmp_path: Path) -> None:
-    """As long as they are always close: what can get far away from each other may hit each other in earnest."""
+def test_links_fixed_to_neighbours_are_adjacent(tmp_path: Path) -> None:
+    """Holds only if they are always close; links that can separate must be checked."""
     robot = load_robot(bracket(tmp_path, far=0.5), pairs="all")
     allowed = sample_allowed_pairs(robot, samples=200)
     assert allowed["bracket", "cover"] == "Adjacent"  # from an overlap to a few cm
@@ -160,7 +165,7 @@ def test_neighbours_across_fixed_links_are_neighbours(tmp_path: Path) -> None:
     )
 
 
-def test_neighbours_that_an_srdf_leaves_out(tmp_path: Path) -> None:
+def test_close_neighbours_missing_in_the_srdf_are_adjacent(tmp_path: Path) -> None:
     robot = load_robot(bracket(tmp_path, far=0.5, srdf=""))
     kept_apart = {
         tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
@@ -176,7 +181,7 @@ def test_neighbours_that_an_srdf_leaves_out(tmp_path: Path) -> None:
 
 
 def slider(folder: Path, *, room: float, srdf: str | None = None, at: float = 0.0) -> Path:
-    """A finger of radius 20 mm on two slides between two walls; the wall in front of it is at most `room` away from it."""
+    """Write a finger of radius 20 mm on two slides, at most `room` away from the wall ahead."""
     slides = [hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=room)]
     slides.append(hinge("carriage", "finger", 0.0, kind="prismatic", axis="0 1 0", upper=1e-6))
     return arm(
@@ -189,12 +194,12 @@ def slider(folder: Path, *, room: float, srdf: str | None = None, at: float = 0.
     )
 
 
-def test_links_that_are_always_close_keep_half_of_what_they_can(tmp_path: Path) -> None:
+def test_tight_pairs_have_half_their_distance_as_margin(tmp_path: Path) -> None:
     robot = load_robot(slider(tmp_path, room=0.012, at=0.004))
     assert list(robot.tight) == [("finger", "wall")]
     assert robot.tight["finger", "wall"] == pytest.approx(
         0.004, abs=1e-9
-    )  # at home; at most it would be 16 mm
+    )  # at home; the maximum would be 16 mm
     assert robot.own_margin(("finger", "wall"), 0.02) == pytest.approx(0.002, abs=1e-9)
     assert robot.own_margin(("finger", "wall"), 0.001) == 0.001
     assert robot.own_margin(("carriage", "wall"), 0.02) == 0.02
@@ -206,7 +211,7 @@ def test_links_that_are_always_close_keep_half_of_what_they_can(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("srdf", [None, ""], ids=["sampled", "srdf"])
-def test_links_that_touch_wherever_they_are(tmp_path: Path, srdf: str | None) -> None:
+def test_links_that_always_touch_are_not_checked(tmp_path: Path, srdf: str | None) -> None:
     file = slider(tmp_path, room=0.0005, srdf=srdf)
     other = (
         ball("far", 0.01)
@@ -231,7 +236,7 @@ def test_links_that_touch_wherever_they_are(tmp_path: Path, srdf: str | None) ->
     assert ("end", "wall") in kept_apart
 
 
-def test_a_home_that_is_stated_may_overlap_with_a_warning(tmp_path: Path) -> None:
+def test_overlap_at_a_stated_home_warns(tmp_path: Path) -> None:
     file = slider(tmp_path, room=0.1, at=0.02, srdf="")
     home = {"carriage_joint": -0.03, "finger_joint": 0.0}
     with pytest.warns(
@@ -241,8 +246,8 @@ def test_a_home_that_is_stated_may_overlap_with_a_warning(tmp_path: Path) -> Non
     assert robot.home.tolist() == [-0.03, 0.0]
 
 
-def test_a_home_that_nobody_states_is_free(tmp_path: Path) -> None:
-    """Only what is not said to rest somewhere is moved, as little as was found; the same every time."""
+def test_unstated_homes_are_collision_free(tmp_path: Path) -> None:
+    """Only joints without stated position are moved, as little as possible, reproducibly."""
     file = slider(tmp_path, room=0.1, at=-0.01)
     with pytest.warns(
         UserWarning,
@@ -254,10 +259,8 @@ def test_a_home_that_nobody_states_is_free(tmp_path: Path) -> None:
         np.testing.assert_array_equal(load_robot(file).home, robot.home)
 
 
-def test_a_survey_is_kept_by_all_it_depends_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The second time nothing is sampled; other shapes, limits, homes and lists are other robots."""
+def test_analysis_is_cached_by_its_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second call does not sample; changed shapes, limits, homes or lists do."""
     monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
     sampled, real = [], self_collisions._compute_analysis
     monkeypatch.setattr(
@@ -288,7 +291,7 @@ def test_a_survey_is_kept_by_all_it_depends_on(
     assert len(sampled) == 6
 
 
-def test_tiago_rests_free(tmp_path: Path) -> None:
+def test_home_of_tiago_is_collision_free(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="links overlap at the default home"):
         robot = load_robot("tiago")
     from vkc_pin.world.models.shapes import ShapeDistances
@@ -299,7 +302,7 @@ def test_tiago_rests_free(tmp_path: Path) -> None:
         assert distances.compute_distance([(i, j)]) >= margin
 
 
-def test_a_robot_whose_name_xml_forbids(husky: Robot, tmp_path: Path) -> None:
+def test_special_characters_in_robot_names_are_escaped(husky: Robot, tmp_path: Path) -> None:
     robot = dataclasses.replace(husky, name='a\x01"b\udcff\n')
     file = write_srdf(robot, tmp_path / "new.srdf", samples=20)
     again = read_srdf(file, links=husky.file.links)

@@ -1,4 +1,4 @@
-"""Distances by brute force, surfaces and boxes by formulas."""
+"""Tests distances by brute force, and surfaces and boxes by formulas."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def random_solids(rng: np.random.Generator, count: int, size: float) -> list[Sol
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.4, 1.0, 3.0]))
-def test_clearance_is_the_smallest_distance(seed: int, size: float) -> None:
+def test_clearance_is_the_smallest_pair_distance(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     first, second = random_solids(rng, 4, size), random_solids(rng, 6, size)
     least = min(compute_shape_distance(*one, *other) for one in first for other in second)
@@ -66,13 +66,13 @@ def test_clearance_is_the_smallest_distance(seed: int, size: float) -> None:
     )
 
 
-def test_clearance_of_nothing() -> None:
+def test_clearance_of_empty_groups() -> None:
     some = random_solids(np.random.default_rng(0), 2, 1.0)
     assert compute_clearance(some, []) == compute_clearance([], some) == np.inf
 
 
 @pytest.mark.parametrize("number", range(len(SOLIDS)))
-def test_surfaces_are_closed_and_enclose_the_volume(number: int) -> None:
+def test_surfaces_are_closed_and_have_the_right_volume(number: int) -> None:
     make, volume = SOLIDS[number]
     mesh = trimesh.Trimesh(*triangulate(make()))
     assert mesh.is_watertight
@@ -84,7 +84,7 @@ def test_surfaces_are_closed_and_enclose_the_volume(number: int) -> None:
     assert (mesh.bounds[1] <= center + half + 1e-9).all()
 
 
-def test_meshes_give_back_their_triangles() -> None:
+def test_meshes_keep_their_triangles() -> None:
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     mesh = to_bvh(MeshPart(np.asarray(box.vertices), np.asarray(box.faces)))
     mesh.buildConvexRepresentation(False)
@@ -93,14 +93,14 @@ def test_meshes_give_back_their_triangles() -> None:
         assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(0.006)
 
 
-def test_what_has_no_end_cannot_be_drawn() -> None:
+def test_unbounded_shapes_raise() -> None:
     with pytest.raises(InputError, match="cannot be drawn"):
         triangulate(coal.Halfspace(0.0, 0.0, 1.0, 0.0))
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_boxes_along_the_worlds_axes_hold_the_surface(seed: int) -> None:
+def test_world_boxes_enclose_the_surface(seed: int) -> None:
     ((shape, placement),) = random_solids(np.random.default_rng(seed), 1, 1.0)
     low, high = compute_world_box(shape, placement)
     points = triangulate(shape)[0] @ placement.rotation.T + placement.translation
@@ -115,18 +115,18 @@ def test_boxes_along_the_worlds_axes_hold_the_surface(seed: int) -> None:
 @pytest.mark.parametrize(
     ("value", "expected"), [(0.5, 0.5), (1.0 + LIMIT_SLACK / 2, 1.0), (-LIMIT_SLACK / 2, 0.0)]
 )
-def test_values_outside_by_rounding_are_moved_to_the_limit(value: float, expected: float) -> None:
+def test_rounding_errors_are_clamped(value: float, expected: float) -> None:
     assert clamp_to_limits(value, 0.0, 1.0, "joint") == expected
 
 
 @pytest.mark.parametrize("value", [1.0 + 2 * LIMIT_SLACK, -1.0, np.nan, np.inf])
-def test_values_further_outside_are_refused(value: float) -> None:
+def test_values_outside_limits_raise(value: float) -> None:
     with pytest.raises(InputError) as caught:
         clamp_to_limits(value, 0.0, 1.0, "joint")
     assert caught.value.field == "joint"
 
 
-def test_copies_stand_in_the_world() -> None:
+def test_copies_are_fixed_in_the_world() -> None:
     shape = pin.GeometryObject("arm_3", 4, 7, pin.SE3.Random(), coal.Sphere(0.1))
     place = pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
     copy = copy_shape(shape, "cup.arm_3", place)
@@ -157,15 +157,17 @@ import numpy as np, coal, vkc_pin
 vkc_pin.load_scene
 def distance(shape, at, turned=np.eye(3)):
     here, there = coal.Transform3s(), coal.Transform3s(turned, np.array(at))
-    return coal.distance(shape, here, coal.Box(1.0, 2.0, 0.04), there, coal.DistanceRequest(), coal.DistanceResult())
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    return coal.distance(shape, here, coal.Box(1.0, 2.0, 0.04), there, request, result)
 turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 if {first}:
     distance(coal.Capsule(0.1, 0.5), (3.0, 0.0, 0.0))
-print(*(distance(coal.Capsule(0.1, 0.5), (x, 0.1, 0.2), turned).hex() for x in (0.1, 0.2, 0.3, 3.0)))
+capsule = coal.Capsule(0.1, 0.5)
+print(*(distance(capsule, (x, 0.1, 0.2), turned).hex() for x in (0.1, 0.2, 0.3, 3.0)))
 """
 
 
-def test_the_first_question_of_a_process_does_not_change_the_others() -> None:
+def test_distances_do_not_depend_on_the_first_query() -> None:
     found = []
     for first in (False, True):
         command = [sys.executable, "-c", FIRST.format(first=first)]
@@ -175,9 +177,9 @@ def test_the_first_question_of_a_process_does_not_change_the_others() -> None:
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize("worth", [0.0, 0.05, np.inf])
-def test_distances_of_links_are_those_of_their_shapes(worth: float) -> None:
-    """At random configurations, however many pairs of links are left: exact up to what they are worth, above it otherwise."""
+@pytest.mark.parametrize("cutoff", [0.0, 0.05, np.inf])
+def test_link_distances_match_shape_distances(cutoff: float) -> None:
+    """Distances are exact up to the cutoff, and bounds above it, after any selection."""
     robot, rng = load_robot("husky_ur5e"), np.random.default_rng(5)
     shapes = robot.collision.geometryObjects
     groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
@@ -206,8 +208,8 @@ def test_distances_of_links_are_those_of_their_shapes(worth: float) -> None:
                 compute_shape_distance(*placed[one], *placed[other]) for one, other in groups[name]
             )
             assert bounds[k] <= exact + 1e-6
-            found = links.compute_distance(k, worth)
-            assert found == pytest.approx(exact, abs=1e-6) if exact <= worth else found > worth
+            found = links.compute_distance(k, cutoff)
+            assert found == pytest.approx(exact, abs=1e-6) if exact <= cutoff else found > cutoff
         links.select([k % 3 > 0 for k in range(len(links.links))])
         if not links.links:
             break

@@ -14,7 +14,7 @@ from vkc_pin.world.models.couplings.coupled_joints import JointCoupling, find_fo
 
 
 def file_of(tmp_path: Path, *inside: str, kinds: str = "prismatic") -> Path:
-    """Write a chain of joints j1, j2, ..., each with something inside it, and shapes on every other link."""
+    """Write a chain of joints j1, j2, ... with given contents, and shapes on every other link."""
     parts = [link("root", "0.1 0.1 0.1")]
     for k, text in enumerate(inside, start=1):
         parts += [
@@ -34,8 +34,8 @@ def read(path: Path) -> UrdfFile:
     return read_urdf(path)
 
 
-def test_chains_end_at_the_one_that_leads(tmp_path: Path) -> None:
-    """j3 = -0.5·j2 + 0.2 and j2 = 2·j1 + 0.1, whatever comes first in the file."""
+def test_chains_are_resolved_to_their_leader(tmp_path: Path) -> None:
+    """j3 = -0.5·j2 + 0.2 and j2 = 2·j1 + 0.1, in any order of the file."""
     found = find_followers(
         read(file_of(tmp_path, "", mimic("j1", 2.0, 0.1), mimic("j2", -0.5, 0.2))).root
     )
@@ -48,7 +48,7 @@ def test_chains_end_at_the_one_that_leads(tmp_path: Path) -> None:
     )
 
 
-def test_a_leader_that_hangs_on_its_follower_follows(tmp_path: Path) -> None:
+def test_a_leader_below_its_follower_becomes_a_follower(tmp_path: Path) -> None:
     """j1 = 2·j3 + 0.1 makes j3 = 0.5·j1 - 0.05, and j2 = -4·j3 makes j2 = -2·j1 + 0.2."""
     found = find_followers(
         read(file_of(tmp_path, mimic("j3", 2.0, 0.1), mimic("j3", -4.0), "")).root
@@ -56,7 +56,7 @@ def test_a_leader_that_hangs_on_its_follower_follows(tmp_path: Path) -> None:
     assert found == {"j3": JointCoupling("j1", 0.5, -0.05), "j2": JointCoupling("j1", -2.0, 0.2)}
 
 
-def test_the_second_coupling_of_a_joint_in_a_urdf_is_not_read(tmp_path: Path) -> None:
+def test_only_the_first_coupling_of_a_joint_is_read(tmp_path: Path) -> None:
     found = find_followers(read(file_of(tmp_path, "", "", mimic("j1") + mimic("j2"))).root)
     assert found == {"j3": JointCoupling("j1", 1.0, 0.0)}
 
@@ -90,18 +90,21 @@ def test_leaders_that_cannot_move_raise(
     assert caught.value.line == 1
 
 
-def test_elsewhere_it_counts_for_nothing(tmp_path: Path) -> None:
-    """Published robots have such fingers."""
+def test_invalid_couplings_off_the_tool_path_are_ignored(tmp_path: Path) -> None:
+    """The fingers of published robots have such couplings."""
     path = file_of(tmp_path, "", "", mimic("other"))
     with pytest.warns(UserWarning, match="there is no joint 'other'"):
         robot = vkc.load_robot(path, pairs="all", tool_frame="l2")
     assert robot.coordinates.names[3:] == ("j1", "j2")
 
 
-def test_a_robot_yaml_has_the_last_word(tmp_path: Path) -> None:
-    """And says it in short or in full."""
+def test_couplings_of_robot_yaml_override_the_urdf(tmp_path: Path) -> None:
+    """Both the short and the full form are read."""
     file_of(tmp_path, "", mimic("j1", 3.0), "")
-    text = "urdf: robot.urdf\ntool_frame: l3\ncouplings:\n  j2: j1\n  j3: {joint: j2, multiplier: -2.0, offset: 0.5}\n"
+    text = (
+        "urdf: robot.urdf\ntool_frame: l3\ncouplings:\n  j2: j1\n"
+        "  j3: {joint: j2, multiplier: -2.0, offset: 0.5}\n"
+    )
     (tmp_path / "robot.yaml").write_text(text)
     found = find_followers(vkc.load_robot(tmp_path, pairs="all").file.root)
     assert found == {"j2": JointCoupling("j1", 1.0, 0.0), "j3": JointCoupling("j1", -2.0, 0.5)}
@@ -150,7 +153,7 @@ def test_invalid_couplings_raise(tmp_path: Path, couplings: str, field: str, mes
     [
         (
             "locked_joints: {out_3: 0.0}",
-            "locked_joints.out_3: a locked joint follows one that is not locked.*'out_1' is not locked",
+            "locked_joints.out_3: .* follows one that is not locked.*'out_1' is not locked",
         ),
         (
             "home: {out_1: 0.1, out_3: 0.0}",

@@ -1,4 +1,4 @@
-"""Limits of joints that move together: as far as all of them can, as fast as the slowest."""
+"""Tests that coordinates of coupled joints have the tightest limits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vkc_pin.world.models.robot_model import (
 from vkc_pin.world.models.robot_schema import RobotSchema
 
 
-def two(
+def make_coupled_robot(
     tmp_path: Path,
     inside: str,
     *,
@@ -31,7 +31,7 @@ def two(
     kinds: tuple[str, str] = ("revolute", "revolute"),
     yaml: str = "",
 ) -> vkc.Robot:
-    """Return a robot of two joints, of which the second follows the first."""
+    """Return a robot with two joints, of which the second follows the first."""
     parts = [link(f"l{k}", "0.1 0.1 0.1", f"0 0 {k}") for k in range(3)]
     parts += [joint("one", kinds[0], "l0", "l1", limits=first, velocity=0.4)]
     parts += [
@@ -61,14 +61,14 @@ def two(
         ('multiplier="0" offset="0.3"', (-1.0, 1.0), (-1.0, 1.0), 0.4),
     ],
 )
-def test_the_nearest_limit_and_the_slowest_joint_count(
+def test_the_tightest_limits_apply(
     tmp_path: Path,
     inside: str,
     second: tuple[float, float],
     limits: tuple[float, float],
     velocity: float,
 ) -> None:
-    robot = two(tmp_path, inside, second=second)
+    robot = make_coupled_robot(tmp_path, inside, second=second)
     assert robot.coordinates.names[3:] == ("one",)
     np.testing.assert_allclose(
         [robot.lower[3], robot.upper[3], robot.velocity[3]], [*limits, velocity], rtol=1e-12
@@ -76,13 +76,15 @@ def test_the_nearest_limit_and_the_slowest_joint_count(
     assert robot.lower[3] <= robot.home[0] <= robot.upper[3]
 
 
-def test_the_home_is_where_all_can_be(tmp_path: Path) -> None:
-    """0 is within the limits of the joint that leads, but the other one cannot follow there."""
-    assert two(tmp_path, 'multiplier="1"', second=(0.2, 0.6)).home[0] == pytest.approx(0.4)
+def test_home_respects_the_limits_of_followers(tmp_path: Path) -> None:
+    """0 is within the limits of the leader, but not of the follower."""
+    assert make_coupled_robot(tmp_path, 'multiplier="1"', second=(0.2, 0.6)).home[
+        0
+    ] == pytest.approx(0.4)
 
 
-def test_a_robot_yaml_may_slow_any_of_them(tmp_path: Path) -> None:
-    robot = two(
+def test_robot_yaml_limits_any_coupled_joint(tmp_path: Path) -> None:
+    robot = make_coupled_robot(
         tmp_path,
         'multiplier="2"',
         yaml="joints: {one: {acceleration: 3.0}, two: {velocity: 0.1, acceleration: 4.0}}\n",
@@ -90,15 +92,18 @@ def test_a_robot_yaml_may_slow_any_of_them(tmp_path: Path) -> None:
     assert (robot.velocity[3], robot.acceleration[3]) == (0.05, 2.0)
 
 
-def test_where_no_file_says_how_fast(tmp_path: Path) -> None:
+def test_default_velocity_and_acceleration_limits(tmp_path: Path) -> None:
     text = write_telescope(tmp_path).parent / "robot.urdf"
     text.write_text(text.read_text().replace('velocity="0.5" ', ""))
     robot = vkc.load_robot(tmp_path)
     assert (robot.velocity[4], robot.acceleration[4]) == (np.pi, 1.4)
 
 
-def test_without_limits_the_fastest_joint_has_the_usual_ones(tmp_path: Path) -> None:
-    couplings = "out_2: {joint: out_1, multiplier: 0.5}, out_3: {joint: out_1, multiplier: -2.0, offset: 0.15}"
+def test_default_limits_apply_to_the_fastest_joint(tmp_path: Path) -> None:
+    couplings = (
+        "out_2: {joint: out_1, multiplier: 0.5}, "
+        "out_3: {joint: out_1, multiplier: -2.0, offset: 0.15}"
+    )
     file = write_telescope(tmp_path, couplings=couplings).parent / "robot.urdf"
     file.write_text(file.read_text().replace('velocity="0.5" ', ""))
     robot = vkc.load_robot(tmp_path)
@@ -109,29 +114,29 @@ def test_without_limits_the_fastest_joint_has_the_usual_ones(tmp_path: Path) -> 
     ("kinds", "limits"),
     [(("continuous", "revolute"), (-0.5, 0.5)), (("continuous", "continuous"), (-np.inf, np.inf))],
 )
-def test_what_turns_without_end_leads_as_far_as_the_others_can(
+def test_continuous_leaders_become_revolute(
     tmp_path: Path, kinds: tuple[str, str], limits: tuple[float, float]
 ) -> None:
-    """A turn is not nothing to one that follows at another rate."""
-    robot = two(tmp_path, 'multiplier="2"', kinds=kinds)
+    """A full turn of the leader changes the position of a follower with another factor."""
+    robot = make_coupled_robot(tmp_path, 'multiplier="2"', kinds=kinds)
     assert (robot.lower[3], robot.upper[3]) == limits
     z = np.array([0.0, 0.0, 0.0, 2.0 * np.pi / 2.0])
     np.testing.assert_allclose(robot.coordinates.z(robot.coordinates.q(z)), z)
     assert robot.model.joints[2].nq == 1
 
 
-def test_limits_that_leave_nothing_are_refused(tmp_path: Path) -> None:
+def test_incompatible_limits_raise(tmp_path: Path) -> None:
     with pytest.raises(
         vkc.InputError,
         match=r"one: no position satisfies the limits of its follower 'two'.*2 to 3.*-1 to 1",
     ):
-        two(tmp_path, 'multiplier="1"', second=(2.0, 3.0))
+        make_coupled_robot(tmp_path, 'multiplier="1"', second=(2.0, 3.0))
 
 
 @settings(max_examples=80, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_within_the_limits_of_a_coordinate_all_joints_are_within_theirs(seed: int) -> None:
-    """And at its speed none is faster than it may be; at one end, and at that speed, one of them is at its own."""
+def test_limits_of_coordinates_are_tight_for_all_joints(seed: int) -> None:
+    """No joint exceeds its limits, and at each limit of a coordinate one joint attains its own."""
     rng = np.random.default_rng(seed)
     parts, bounds, speeds = [link("l0", "0.1 0.1 0.1")], {}, {}
     for k in range(4):

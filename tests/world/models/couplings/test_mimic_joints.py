@@ -1,4 +1,4 @@
-"""Models in which joints follow others, against models in which all joints are put where they have to be."""
+"""Tests models with mimic joints against models with independent joints."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ KINDS = ("revolute", "prismatic", "continuous")
 
 
 def random_robot(rng: np.random.Generator) -> tuple[str, str]:
-    """Return a URDF of a random tree whose joints follow each other at random, and its tool's link."""
+    """Return a URDF of a random tree with random couplings, and its tool link."""
     count = int(rng.integers(3, 8))
     parts, order = [link("l0", "0.1 0.1 0.1")], rng.permutation(count)
     leads = {
@@ -58,8 +58,8 @@ def random_robot(rng: np.random.Generator) -> tuple[str, str]:
 
 @settings(max_examples=80, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_all_links_are_where_all_joints_have_them(seed: int) -> None:
-    """Coordinates, and derivatives by all of Pinocchio's ways, against the model of independent joints."""
+def test_kinematics_match_independent_joints(seed: int) -> None:
+    """Compares placements and all Jacobians of Pinocchio with independent joints."""
     rng = np.random.default_rng(seed)
     text, tool = random_robot(rng)
     file = read_urdf(Path("robot.urdf"), text=text)
@@ -113,7 +113,7 @@ def test_all_links_are_where_all_joints_have_them(seed: int) -> None:
 
     differences = np.column_stack(
         [column(k) for k in range(2, coordinates.size)]
-    )  # x and y are those of the world in z
+    )  # x and y in z are in the world frame
     numeric = pin.computeFrameJacobian(
         model, data, coordinates.q(z), model.getFrameId(tool), pin.LOCAL_WORLD_ALIGNED
     )
@@ -127,8 +127,8 @@ def test_all_links_are_where_all_joints_have_them(seed: int) -> None:
     np.testing.assert_allclose(slope[:, 2:], differences[:3], atol=1e-6)
 
 
-def test_masses_move_with_all_joints(tmp_path: Path) -> None:
-    """Centre of mass and inverse dynamics know the followers: what holds the robot is the slope of its energy."""
+def test_dynamics_include_followers(tmp_path: Path) -> None:
+    """Gravity torques equal the gradient of the potential energy."""
     robot = vkc.load_robot(write_telescope(tmp_path))
     model, rng = pin.Model(robot.model), np.random.default_rng(0)
     for j in range(1, model.njoints):
@@ -154,8 +154,8 @@ def test_masses_move_with_all_joints(tmp_path: Path) -> None:
     np.testing.assert_allclose(pin.rnea(model, data, q, 0.0 * v, 0.0 * a)[3:], slopes, atol=1e-5)
 
 
-def test_a_model_that_is_kept_is_the_same(tmp_path: Path) -> None:
-    """Programs are found again by what a model looks like as text: another multiplier is another model."""
+def test_models_are_distinguished_by_their_couplings(tmp_path: Path) -> None:
+    """Cached programs are found by the model's text, which depends on multipliers."""
     texts = set()
     for k, multiplier in enumerate((1.0, 2.0)):
         attributes = ", ".join(
@@ -170,8 +170,8 @@ def test_a_model_that_is_kept_is_the_same(tmp_path: Path) -> None:
     assert len(texts) == 2
 
 
-def test_joints_wait_for_those_that_lead_them() -> None:
-    """Two branches: what is on the first comes after what leads it on the second; otherwise nothing changes."""
+def test_joints_are_sorted_after_their_leaders() -> None:
+    """Followers on the first branch come after their leaders on the second one."""
     model = pin.Model()
     first = model.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "first")
     model.addJoint(first, pin.JointModelRX(), pin.SE3.Identity(), "on it")
@@ -182,8 +182,8 @@ def test_joints_wait_for_those_that_lead_them() -> None:
         sort_joints(model, {first: {second}, second: {first}})
 
 
-def test_a_leader_may_be_on_another_branch_and_come_later(tmp_path: Path) -> None:
-    """As the bars of a palletizer: the follower is on the way to the tool, what it follows is not."""
+def test_leaders_may_be_on_another_branch(tmp_path: Path) -> None:
+    """As in a palletizer, the follower is on the path to the tool, its leader is not."""
     parts = [
         link("root", "0.1 0.1 0.1"),
         link("a", "0.1 0.1 0.1"),

@@ -1,4 +1,4 @@
-"""Friction, damping and springs of objects' joints: where they come from, and what they come to."""
+"""Tests how friction, damping and springs of joints are read, and their forces."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def with_dynamics(attributes: str) -> str:
     return URDF.replace('<axis xyz="0 0 1"/>', f'<axis xyz="0 0 1"/><dynamics {attributes}/>')
 
 
-def test_nothing_resists_where_nothing_is_stated() -> None:
+def test_resistance_is_zero_by_default() -> None:
     thing = load_text(URDF, f"urdf: thing.urdf\n{TAIL}")
     assert thing.resistance == {"hinge": Resistance(), "knob": Resistance()}
     assert Resistance().force(0.7, -0.3) == 0.0
 
 
-def test_a_urdf_states_friction_and_damping_and_a_description_overrides_each_by_itself() -> None:
+def test_the_description_overrides_the_urdf_per_value() -> None:
     urdf = with_dynamics('friction="2" damping="0.5"')
     plain = load_text(urdf, f"urdf: thing.urdf\n{TAIL}").resistance["hinge"]
     assert plain == Resistance(friction=2.0, damping=0.5)
@@ -39,10 +39,11 @@ def test_a_urdf_states_friction_and_damping_and_a_description_overrides_each_by_
     )
 
 
-def test_limits_and_resistance_of_a_joint_stand_side_by_side() -> None:
+def test_limits_and_resistance_can_be_combined() -> None:
     thing = load_text(
         URDF,
-        f"urdf: thing.urdf\njoints: {{hinge: {{acceleration: 3, velocity: 0.5, damping: 1}}}}\n{TAIL}",
+        "urdf: thing.urdf\n"
+        f"joints: {{hinge: {{acceleration: 3, velocity: 0.5, damping: 1}}}}\n{TAIL}",
     )
     assert (thing.velocity[0], thing.acceleration[0], thing.resistance["hinge"].damping) == (
         0.5,
@@ -102,7 +103,7 @@ def test_unknown_fields_raise_with_a_suggestion() -> None:
 @pytest.mark.parametrize(
     "attributes", ['friction="-1"', 'damping="much"', 'damping="1 2"', 'friction="inf"']
 )
-def test_wrong_dynamics_of_a_urdf_are_refused_by_file_line_and_joint(attributes: str) -> None:
+def test_invalid_urdf_dynamics_raise_with_their_line(attributes: str) -> None:
     with pytest.raises(InputError) as caught:
         load_text(
             with_dynamics(attributes).replace("<link", "\n<link"), f"urdf: thing.urdf\n{TAIL}"
@@ -112,6 +113,6 @@ def test_wrong_dynamics_of_a_urdf_are_refused_by_file_line_and_joint(attributes:
     assert str(caught.value.file).endswith("thing.urdf")
 
 
-def test_a_urdf_in_one_piece_states_them_as_well() -> None:
+def test_resistance_is_read_from_inline_urdfs() -> None:
     thing = load_object({"urdf": with_dynamics('damping="0.25"'), "attachments": []})
     assert math.isclose(thing.resistance["hinge"].damping, 0.25)

@@ -1,4 +1,4 @@
-"""What the motors of robots have, and where that cannot be relied upon."""
+"""Tests torque limits of robots, and which of them are discarded."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def of(robot: Robot, model: pin.Model) -> TorqueLimits:
     return compute_torque_limits(model, robot.coordinates, robot.lower, robot.upper)
 
 
-def test_motors_have_what_the_urdf_says_and_the_base_has_no_limit(husky: Robot) -> None:
+def test_limits_are_those_of_the_urdf(husky: Robot) -> None:
     assert husky.efforts.is_known
     assert husky.efforts.notes == ()
     np.testing.assert_array_equal(husky.efforts.limits, [np.inf] * 3 + [150.0] * 3 + [28.0] * 3)
 
 
-def test_without_masses_nothing_is_known(husky: Robot) -> None:
+def test_limits_are_unknown_without_masses(husky: Robot) -> None:
     model = pin.Model(husky.model)
     for joint in range(2, model.njoints):
         model.inertias[joint] = pin.Inertia.Zero()
@@ -54,18 +54,18 @@ def test_joints_without_effort_limit_are_noted(husky: Robot, stated: float) -> N
 def test_limits_that_cannot_hold_the_arm_are_discarded(husky: Robot) -> None:
     model, data = pin.Model(husky.model), husky.model.createData()
     outstretched = husky.coordinates.q(np.zeros(9))
-    weight = abs(pin.computeGeneralizedGravity(husky.model, data, outstretched)[4])
+    gravity = abs(pin.computeGeneralizedGravity(husky.model, data, outstretched)[4])
     limits = np.array(model.effortLimit)
-    limits[4] = 0.5 * weight
+    limits[4] = 0.5 * gravity
     model.effortLimit = limits
     found = of(husky, model)
     assert np.isinf(found.limits[4])
     assert len(found.notes) == 1
     assert "shoulder_lift_joint" in found.notes[0]
     assert "cannot hold the arm" in found.notes[0]
-    limits[4] = 1.2 * weight
+    limits[4] = 1.2 * gravity
     model.effortLimit = limits
-    assert of(husky, model).limits[4] == pytest.approx(1.2 * weight)
+    assert of(husky, model).limits[4] == pytest.approx(1.2 * gravity)
 
 
 def described(folder: Path, effort: object) -> Path:
@@ -79,7 +79,7 @@ def described(folder: Path, effort: object) -> Path:
 
 
 @pytest.mark.parametrize(("effort", "limit"), [(90.0, 90.0), (0, np.inf)])
-def test_a_robot_yaml_overrides_the_urdf(tmp_path: Path, effort: float, limit: float) -> None:
+def test_robot_yaml_overrides_the_urdf(tmp_path: Path, effort: float, limit: float) -> None:
     robot = vkc.load_robot(described(tmp_path, effort))
     assert robot.efforts.limits[5] == limit
     assert robot.efforts.limits[4] == 150.0

@@ -1,4 +1,4 @@
-"""How fingers open, and what a robot.yaml may say of them."""
+"""Tests the opening of grippers and their description in robot.yaml."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
     return vkc.load_robot(write_gripper(tmp_path_factory.mktemp("gripper")))
 
 
-def faces(robot: Robot) -> list[np.ndarray]:
-    """Return the middles of the fingers' shapes in the tool frame."""
+def finger_centers(robot: Robot) -> list[np.ndarray]:
+    """Return the centres of the fingers' shapes in the tool frame."""
     data, shapes = robot.model.createData(), robot.collision.createData()
     pin.updateGeometryPlacements(
         robot.model, data, robot.collision, shapes, robot.coordinates.q(at_rest(robot))
@@ -32,7 +32,7 @@ def faces(robot: Robot) -> list[np.ndarray]:
     return [tool.actInv(shapes.oMg[k]).translation for k in fingers]
 
 
-def test_a_gripper_stands_open_and_the_joint_that_mimics_follows(robot: Robot) -> None:
+def test_grippers_are_open_by_default_and_mimic_joints_follow(robot: Robot) -> None:
     gripper = robot.gripper
     assert gripper is not None
     assert gripper.names == ("finger_a_joint", "finger_b_joint")
@@ -45,9 +45,11 @@ def test_a_gripper_stands_open_and_the_joint_that_mimics_follows(robot: Robot) -
 
 @settings(max_examples=20, deadline=None)
 @given(opening=st.floats(0.0, 0.0799))
-def test_fingers_stand_so_far_apart_on_both_sides_of_the_tool(robot: Robot, opening: float) -> None:
+def test_fingers_are_symmetric_at_the_given_opening(robot: Robot, opening: float) -> None:
     opened = robot.opened(opening)
-    for middle, side in zip(faces(opened), (1.0, -1.0), strict=True):  # fingers are 10 mm thick
+    for middle, side in zip(
+        finger_centers(opened), (1.0, -1.0), strict=True
+    ):  # fingers are 10 mm thick
         assert middle[0] == pytest.approx(side * (opening / 2.0 + 0.005), abs=1e-5)
     for link in ("finger_a", "finger_b", "hand", "tool"):
         own = placement(opened, link, at_rest(robot)).actInv(placement(robot, link, at_rest(robot)))
@@ -55,7 +57,7 @@ def test_fingers_stand_so_far_apart_on_both_sides_of_the_tool(robot: Robot, open
         assert np.linalg.norm(own.translation) == pytest.approx(away, abs=1e-5)
 
 
-def test_only_the_fingers_move(robot: Robot) -> None:
+def test_opening_moves_only_the_fingers(robot: Robot) -> None:
     opened = robot.opened(0.03)
     assert opened is robot.opened(0.03)
     assert list(opened.model.names) == list(robot.model.names)
@@ -93,7 +95,10 @@ def test_openings_of_revolute_fingers(tmp_path: Path) -> None:
     text = urdf.read_text(encoding="utf-8")
     for name, sign in (("a", 1), ("b", -1)):
         straight = f'<joint name="finger_{name}_joint" type="prismatic"><origin xyz="0 0 0.06"/>'
-        turning = f'<joint name="finger_{name}_joint" type="revolute"><origin xyz="0 {sign * 0.01} 0.06"/>'
+        turning = (
+            f'<joint name="finger_{name}_joint" type="revolute">'
+            f'<origin xyz="0 {sign * 0.01} 0.06"/>'
+        )
         assert straight in text
         text = text.replace(straight, turning).replace(
             f'<axis xyz="0 {sign} 0"/>', f'<axis xyz="{-sign} 0 0"/>'

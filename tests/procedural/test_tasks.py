@@ -1,4 +1,4 @@
-"""What can be asked for in a scene, and tasks at random: each of them planned, and judged by the oracle."""
+"""Tests possible and random tasks; all are planned and judged by the oracle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import vkc_pin as vkc
 from vkc_pin.procedural.furniture.catalogue import KINDS
 
 
-def test_everything_in_a_home_is_offered_once() -> None:
+def test_goals_lists_every_joint_and_free_object_once() -> None:
     home = vkc.load_scene("household")
     offered = {
         (step.object, *getattr(step, "joints", ())): step for step in vkc.goals(home, share=0.5)
@@ -27,14 +27,14 @@ def test_everything_in_a_home_is_offered_once() -> None:
     )
 
 
-def test_what_is_open_is_closed() -> None:
+def test_open_joints_are_closed() -> None:
     scene = vkc.load_scene("drawer")
     (step,) = vkc.goals(scene.with_state("drawer", {"slide": 0.4}), share=0.75)
     assert isinstance(step, vkc.Actuate)
     assert step.joints == {"slide": pytest.approx(0.1)}
 
 
-def test_joints_without_limits_are_turned_by_a_share_of_a_turn() -> None:
+def test_joints_without_limits_turn_by_a_fraction_of_a_turn() -> None:
     description = vkc.random_object("valve", 0)
     urdf = description["urdf"].replace('type="revolute"', 'type="continuous"')
     here = {"name": "valve", "type": {**description, "urdf": urdf}, "position": [2.0, 0.0, 0.0]}
@@ -57,13 +57,13 @@ def test_no_goal_is_beyond_a_limit() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 1.1, -0.5, "half", float("nan")])
-def test_wrong_shares(share: object) -> None:
+def test_invalid_shares_are_rejected(share: object) -> None:
     with pytest.raises(vkc.InputError) as found:
         vkc.goals(vkc.load_scene("drawer"), share=share)  # type: ignore[arg-type]
     assert found.value.field == "share"
 
 
-def test_a_number_stands_for_one_task() -> None:
+def test_random_tasks_are_reproducible() -> None:
     (room, steps), (same, again), (other, _) = (vkc.random_task(seed) for seed in (3, 3, 4))
     assert (room.document, steps) == (same.document, again)
     assert room.document != other.document
@@ -71,7 +71,7 @@ def test_a_number_stands_for_one_task() -> None:
     assert vkc.random_room(3, objects=kinds).document == room.document
 
 
-def test_tasks_in_rooms_of_ones_own() -> None:
+def test_random_tasks_accept_room_settings() -> None:
     room, (step,) = vkc.random_task(2, clutter=0.0, objects=("drawer",), carried=("cup",))
     assert list(room.objects) == ["drawer", "cup"]
     assert step.object in room.objects  # type: ignore[union-attr]

@@ -1,4 +1,4 @@
-"""What is built of shapes: masses and inertias as Pinocchio has them, and a URDF that says the same."""
+"""Tests built objects: masses and inertias against Pinocchio, and their URDF."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def built() -> ObjectBuilder:
     return builder
 
 
-def test_masses_and_inertias_are_those_of_the_shapes() -> None:
+def test_masses_and_inertias_match_pinocchio() -> None:
     thing = load_object(built().description)
     shapes = (
         (pin.Inertia.FromBox(500.0 * 0.2 * 0.2 * 0.1, 0.2, 0.2, 0.1), pin.SE3.Identity()),
@@ -73,7 +73,7 @@ def test_masses_and_inertias_are_those_of_the_shapes() -> None:
     np.testing.assert_allclose(found.inertia, expected.inertia, rtol=0.0, atol=1e-4)
 
 
-def test_limits_and_rates_are_those_that_were_asked_for() -> None:
+def test_limits_and_rates_match_the_request() -> None:
     thing = load_object(built().description)
     assert (thing.name, thing.links, thing.urdf) == ("thing", ("base", "tray"), None)
     assert (thing.lower[0], thing.upper[0], thing.velocity[0], thing.acceleration[0]) == (
@@ -87,7 +87,7 @@ def test_limits_and_rates_are_those_that_were_asked_for() -> None:
     )
 
 
-def test_what_is_drawn_is_what_collides() -> None:
+def test_visual_shapes_equal_collision_shapes() -> None:
     thing = load_object(built().description)
     drawn, solid = (
         [

@@ -1,4 +1,4 @@
-"""Furniture made at random: sound in every size, the same in every run, and as files."""
+"""Tests random furniture: valid for all sizes, reproducible, and written to files."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_links_pass_each_other(kind: str, seed: int) -> None:
 
 @FEW
 @given(EACH, st.integers(0, 5000))
-def test_what_opens_comes_towards_who_opens_it(kind: str, seed: int) -> None:
+def test_doors_open_towards_the_user(kind: str, seed: int) -> None:
     own = placed(kind, seed)
     for attachment in own.object.attachments.values():
         joint = (
@@ -147,7 +147,7 @@ def test_doors_are_pushed_and_pulled_to_either_side() -> None:
     assert len(seen) == 8
 
 
-def test_a_number_stands_for_one_object() -> None:
+def test_random_objects_are_reproducible() -> None:
     for kind in KINDS:
         one, same, other = (vkc.random_object(kind, seed) for seed in (3, 3, 4))
         assert one == same != other
@@ -159,7 +159,7 @@ def test_a_number_stands_for_one_object() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_objects_become_files(kind: str, tmp_path: Path) -> None:
+def test_objects_are_written_to_files(kind: str, tmp_path: Path) -> None:
     made = vkc.random_object(kind, 5)
     file = vkc.write_object(made, tmp_path / "new" / "thing.yaml")
     assert sorted(path.name for path in file.parent.iterdir()) == ["thing.urdf", "thing.yaml"]
@@ -170,7 +170,7 @@ def test_objects_become_files(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(kept.acceleration, described.acceleration)
 
 
-def test_wrong_arguments(tmp_path: Path) -> None:
+def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'refrigerator'"):
         vkc.random_object("refigerator")
     with pytest.raises(vkc.InputError, match="whole number"):

@@ -1,4 +1,4 @@
-"""Handles: the hand is at the bar wherever the attachment lets it be, and open fingers find room around it."""
+"""Tests handles: the hand grasps the bar on its whole range, with clearance for open fingers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def builder(kind: str, height: float = 0.9) -> ObjectBuilder:
 
 
 @pytest.mark.parametrize(("kind", "along"), [("upright", 2), ("level", 1)])
-def test_a_bar_is_held_anywhere_between_its_posts(kind: str, along: int) -> None:
+def test_bar_can_be_grasped_anywhere_between_its_posts(kind: str, along: int) -> None:
     thing = load_object(builder(kind).description)
     fixed, free = thing.attachment("handle"), thing.attachment("handle_free")
     centre = np.array(FACE) - [0.06, 0.0, 0.0]
@@ -49,7 +49,7 @@ def test_a_bar_is_held_anywhere_between_its_posts(kind: str, along: int) -> None
 
 
 @pytest.mark.parametrize(("height", "down"), [(0.9, 0.0), (0.55, 0.0), (0.3, 0.65), (0.1, 0.65)])
-def test_low_bars_are_taken_from_above(height: float, down: float) -> None:
+def test_low_bars_are_grasped_from_above(height: float, down: float) -> None:
     approach = (
         load_object(builder("level", height).description)
         .attachment("handle")
@@ -58,7 +58,7 @@ def test_low_bars_are_taken_from_above(height: float, down: float) -> None:
     np.testing.assert_allclose(approach, [np.cos(down), 0.0, -np.sin(down)], atol=1e-6)
 
 
-def test_a_knob_is_held_from_any_direction_before_it() -> None:
+def test_knob_can_be_grasped_from_any_direction_in_front() -> None:
     free = load_object(builder("knob").description).attachment("handle_free")
     rng = np.random.default_rng(0)
     for _ in range(20):

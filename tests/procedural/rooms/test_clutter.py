@@ -1,4 +1,4 @@
-"""Clutter: it stands or hangs where there is something to stand or hang on, and nowhere else."""
+"""Tests that clutter rests or hangs on surfaces without collisions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def parts(scene: vkc.Scene) -> tuple[list, list]:
 
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 60))
-def test_everything_stands_or_hangs_and_hits_nothing(seed: int, things: int) -> None:
+def test_clutter_rests_or_hangs_without_collisions(seed: int, things: int) -> None:
     old, new = parts(add_clutter(home(), things, seed=seed, clear=[PLACE]))
     assert len(new) == things
     for shape in new:
@@ -57,7 +57,7 @@ def test_everything_stands_or_hangs_and_hits_nothing(seed: int, things: int) -> 
         )
 
 
-def test_hands_have_room_and_so_have_places_that_stay_clear() -> None:
+def test_clutter_keeps_free_places_clear() -> None:
     _, new = parts(add_clutter(home(), 250, seed=2, clear=[PLACE]))
     shapes = [(shape.geometry, shape.placement) for shape in new]
     ball = vkc.load_scene("household").objects["cup"].placement.copy()
@@ -69,13 +69,13 @@ def test_hands_have_room_and_so_have_places_that_stay_clear() -> None:
         assert compute_clearance(shapes, [(coal.Sphere(radius), ball)]) > -1e-6
 
 
-def test_the_same_seed_gives_the_same_and_another_another() -> None:
+def test_clutter_depends_on_the_seed() -> None:
     one, same, other = (add_clutter(home(), 20, seed=seed).document for seed in (3, 3, 4))
     assert one == same
     assert one != other
 
 
-def test_there_is_an_end_to_it() -> None:
+def test_too_much_clutter_is_rejected() -> None:
     with pytest.raises(InputError, match="no place"):
         add_clutter(home(), 5000)
     with pytest.raises(InputError, match="no place"):

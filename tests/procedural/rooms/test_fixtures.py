@@ -1,4 +1,4 @@
-"""What opens in rooms: known by name, by path, or described; with measures that are looked at."""
+"""Tests objects that can be opened, given by name, path or description, and their sizes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vkc_pin.procedural.rooms.fixtures import (
 )
 
 
-def test_measures_are_those_of_what_is_shut() -> None:
+def test_bounding_box_is_that_of_the_closed_object() -> None:
     drawer = make_fixture("drawer")
     np.testing.assert_allclose(
         [drawer.low, drawer.high], [[-0.125, -0.3, 0.0], [0.55, 0.3, 0.9]], atol=6e-3
@@ -48,7 +48,7 @@ def test_sizes_follow_from_the_seed() -> None:
     assert one.counter != other.counter
 
 
-def test_what_stands_high_in_its_file_stands_on_the_floor(tmp_path: Path) -> None:
+def test_raised_object_is_lowered_to_the_floor(tmp_path: Path) -> None:
     description = vkc.random_object("oven", 1)
     description["urdf"] = description["urdf"].replace('<link name="body">', '<link name="root"/><joint name="up" type="fixed">'
         '<parent link="root"/><child link="body"/><origin xyz="0 0 0.7"/></joint><link name="body">')  # fmt: skip
@@ -64,6 +64,6 @@ def test_unknown_objects(kind: str, nearest: str) -> None:
     assert (found.value.field, found.value.nearest) == ("objects", nearest)
 
 
-def test_what_is_carried_is_refused() -> None:
+def test_free_objects_are_rejected() -> None:
     with pytest.raises(vkc.InputError, match="carried, not opened"):
         make_fixture("cup")

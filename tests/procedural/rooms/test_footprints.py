@@ -1,4 +1,4 @@
-"""Rectangles on the floor, compared with coal's boxes, and ways between them."""
+"""Tests rectangles on the floor against coal's boxes, and paths between places."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ def as_box(one: Rectangle) -> tuple[coal.Box, pin.SE3]:
 
 
 @given(RECTANGLES, RECTANGLES)
-def test_the_gap_is_no_more_than_the_distance_and_positive_where_that_is(
-    one: Rectangle, other: Rectangle
-) -> None:
+def test_gap_bounds_the_distance_from_below(one: Rectangle, other: Rectangle) -> None:
     distance = compute_shape_distance(*as_box(one), *as_box(other))
     gap = one.compute_gap(other)
     assert gap == pytest.approx(other.compute_gap(one))
@@ -48,7 +46,7 @@ def test_the_distance_of_a_point(one: Rectangle, x: float, y: float) -> None:
 @pytest.mark.parametrize(
     ("side", "expected"), [(0, (3.0, 1.0)), (1, (-1.0, 2.0)), (2, (-3.0, -1.0)), (3, (1.0, -2.0))]
 )
-def test_frames_at_walls_look_out_of_the_room(side: int, expected: tuple[float, float]) -> None:
+def test_wall_frames_point_out_of_the_room(side: int, expected: tuple[float, float]) -> None:
     frame = Floor(6.0, 4.0).make_wall_frame(side, 1.0)
     assert (frame.x, frame.y) == pytest.approx(expected)
     out = np.subtract(frame.transform_point(0.5, 0.0), (frame.x, frame.y))
@@ -56,7 +54,7 @@ def test_frames_at_walls_look_out_of_the_room(side: int, expected: tuple[float, 
     assert out == pytest.approx(0.5 * np.array(middle) / np.linalg.norm(middle))
 
 
-def test_what_a_floor_holds() -> None:
+def test_floor_contains_rectangles_between_the_walls() -> None:
     floor = Floor(4.0, 6.0)
     assert floor.contains(Rectangle(1.5, 2.5, 1.0, 1.0))
     assert not floor.contains(Rectangle(1.5, 2.5, 1.0, 1.0, 0.5))
@@ -74,13 +72,13 @@ def test_what_a_floor_holds() -> None:
 
 
 @pytest.mark.parametrize(("width", "expected"), [(2.4, True), (2.8, False)])
-def test_a_way_needs_room_for_the_disc(width: float, expected: bool) -> None:
+def test_path_must_be_wide_enough_for_the_disc(width: float, expected: bool) -> None:
     """A wall across a room 4 m wide leaves a passage at one end."""
     barrier = Frame(2.0, 0.0, 0.0).make_rectangle((-width, 0.0), (-0.1, 0.1))
     assert Floor(4.0, 6.0).is_connected([barrier], 0.65, [(0.0, -2.0), (0.0, 2.0)]) is expected
     assert Floor(4.0, 6.0).is_connected([barrier], 0.65, [(0.0, -2.0), (0.5, -2.0)])
 
 
-def test_a_place_that_is_not_free_is_connected_to_nothing() -> None:
+def test_occupied_place_is_not_connected() -> None:
     assert not Floor(4.0, 4.0).is_connected([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [(0.0, 0.0)])
     assert Floor(4.0, 4.0).is_connected([], 0.5, [])

@@ -1,4 +1,4 @@
-"""What rooms are made of, each kind by itself, looked at as a scene with coal."""
+"""Tests each kind of room part as a scene, with coal."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_box() -> None:
 
 @pytest.mark.parametrize("kind", [*OPENABLE, "random_oven", "random_door", "random_chest"])
 @pytest.mark.parametrize("side", range(4))
-def test_what_opens_stands_at_its_wall_and_has_room_to(kind: str, side: int) -> None:
+def test_openable_object_is_at_its_wall_with_free_floor(kind: str, side: int) -> None:
     part = parts.make_openable(kind, make_fixture(kind, side), FLOOR, side, 0.5, 1.8)
     room = scene(part, walls=True)
     placed = room.objects[kind]
@@ -102,7 +102,7 @@ def test_what_opens_stands_at_its_wall_and_has_room_to(kind: str, side: int) -> 
 
 @pytest.mark.parametrize("kind", ["random_microwave", "random_faucet"])
 @pytest.mark.parametrize("seed", range(4))
-def test_small_things_stand_on_a_counter(kind: str, seed: int) -> None:
+def test_small_objects_are_on_a_counter(kind: str, seed: int) -> None:
     part = parts.make_openable("it", make_fixture(kind, seed), FLOOR, 2, 0.3, 1.8)
     low, high = extent(scene(part))
     room = scene(part)
@@ -143,7 +143,7 @@ def test_walls_close_the_room_but_for_doors() -> None:
 
 
 @pytest.mark.parametrize("kind", parts.CARRIED)
-def test_what_is_carried_stands_on_its_table(kind: str) -> None:
+def test_free_object_rests_on_its_table(kind: str) -> None:
     table = parts.make_table("table", Frame(1.0, -0.5, np.pi), (0.8, 1.4, 0.74))
     room = scene(table, parts.make_carried_object(kind, kind, table, -0.2, 0.3))
     placed = room.objects[kind]

@@ -1,4 +1,4 @@
-"""Random rooms: the same every time, nothing overlaps, and a robot gets where it has to stand."""
+"""Tests random rooms: reproducible, free of overlaps, with reachable places for the robot."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_room_is_sound(
     )
 
 
-def test_a_number_stands_for_one_room() -> None:
+def test_random_rooms_are_reproducible() -> None:
     one, same, other = (vkc.random_room(number, clutter=0.7).document for number in (5, 5, 6))
     assert one == same
     assert one != other
@@ -142,7 +142,7 @@ def test_a_room_can_be_saved(tmp_path: Path) -> None:
         )
 
 
-def test_objects_made_at_random_differ_from_room_to_room_and_are_kept_with_it(
+def test_random_objects_differ_between_rooms_and_are_saved(
     tmp_path: Path,
 ) -> None:
     asked = ("random_drawers", "random_drawers", "random_microwave", "refrigerator")
@@ -186,7 +186,7 @@ def test_objects_by_path_and_by_description(
         assert low == pytest.approx(0.0, abs=1e-4)
 
 
-def test_what_was_asked_for_is_there() -> None:
+def test_requested_parts_are_present() -> None:
     room = vkc.random_room(
         3, objects=("drawer", "drawer", "door"), tables=2, carried=("cup", "ball"), clutter=0.0
     )
@@ -200,7 +200,7 @@ def test_what_was_asked_for_is_there() -> None:
 
 
 @pytest.mark.parametrize("number", [-1, 1.5, True, "1"])
-def test_wrong_numbers(number: object) -> None:
+def test_invalid_numbers_are_rejected(number: object) -> None:
     with pytest.raises(vkc.InputError) as found:
         vkc.random_room(number)  # type: ignore[arg-type]
     assert (found.value.field, found.value.expected, found.value.got) == (
@@ -210,23 +210,21 @@ def test_wrong_numbers(number: object) -> None:
     )
 
 
-def test_unknown_settings_and_parts() -> None:
+def test_unknown_settings_and_parts_are_rejected() -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'clutter'"):
         vkc.random_room(0, cluter=0.5)
     with pytest.raises(vkc.UnknownNameError, match="table_9"):
         sample_layout(0).part("table_9")
 
 
-def test_what_finds_no_place_is_said() -> None:
+def test_error_if_parts_do_not_fit() -> None:
     with pytest.raises(vkc.InputError) as found:
         vkc.random_room(0, width=(4.0, 4.0), objects=("cabinet",) * 6)
     assert found.value.field == "clutter"
     assert "fewer objects" in str(found.value.expected)
 
 
-def test_things_and_robots_as_imports_write_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_imported_objects_and_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Imported objects have their frame in their middle: the floor is free before their face, not from inside of them."""
     box = '<collision><origin xyz="{} 0 0.2"/><geometry><box size="{} 0.5 0.4"/></geometry></collision>'
     body, door = box.format(0.03, 0.64), box.format(-0.3, 0.02)

@@ -28,7 +28,7 @@ import vkc_pin as vkc
         ({"carried": ("cup",), "tables": 0}, "carried", "at least 1"),
     ],
 )
-def test_wrong_settings(changes: dict[str, Any], field: str, expected: str) -> None:
+def test_invalid_settings_are_rejected(changes: dict[str, Any], field: str, expected: str) -> None:
     with pytest.raises(vkc.InputError) as found:
         vkc.RoomSettings(**changes)
     assert found.value.field == field

@@ -1,4 +1,4 @@
-"""The scenes of the second experiment: a door at the end of a corridor, and a drawer in a narrow aisle."""
+"""Tests the scenes of the second experiment: a door in a corridor, a drawer in a narrow aisle."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def half_extents(shape: coal.CollisionGeometry) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_robot_and_arena_are_the_papers(name: str) -> None:
+def test_robot_and_arena_match_the_paper(name: str) -> None:
     here = scene(name)
     assert here.name == name
     assert (here.robot.name, here.robot.base) == ("husky_ur5e", "omni")
@@ -110,7 +110,7 @@ def test_goal_is_within_limits_and_joints_have_rates(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_starts_lie_in_the_papers_region_and_are_free(name: str) -> None:
+def test_starts_are_in_the_region_of_the_paper_and_collision_free(name: str) -> None:
     here, rng = scene(name), np.random.default_rng(0)
     low, high = {
         "corridor_door": ((-2.5, -3.0), (-0.5, 3.0)),
@@ -131,7 +131,7 @@ def test_starts_lie_in_the_papers_region_and_are_free(name: str) -> None:
 
 
 # --- the door
-# ---------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def test_a_corridor_leads_to_the_door() -> None:
@@ -153,7 +153,7 @@ def test_a_corridor_leads_to_the_door() -> None:
     assert {*scene(name).obstacle_names} == {*BLOCKS, *WALLS, "wall_south"}
 
 
-def test_the_panel_is_as_wide_as_the_papers_opening_and_hangs_at_its_edge() -> None:
+def test_panel_width_matches_the_paper() -> None:
     placed = thing("corridor_door")
     np.testing.assert_allclose(
         bounds(parts(placed, "panel")), [[4.975, -0.55, 0.01], [5.025, 0.55, 2.06]], atol=1e-9
@@ -174,7 +174,7 @@ def test_the_panel_is_as_wide_as_the_papers_opening_and_hangs_at_its_edge() -> N
         )
 
 
-def test_handle_is_where_the_papers_is() -> None:
+def test_handle_position_matches_the_paper() -> None:
     placed = thing("corridor_door")
     spindle, bar = parts(placed, "lever")
     assert bar[0].radius == pytest.approx(0.013)
@@ -213,7 +213,7 @@ def test_lever_holds_the_door_shut() -> None:
 
 
 # --- the drawer
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def test_counters_leave_an_aisle() -> None:
@@ -245,7 +245,7 @@ def test_counters_leave_an_aisle() -> None:
     ), "they stand on them"
 
 
-def test_drawer_is_as_large_as_the_papers() -> None:
+def test_drawer_size_matches_the_paper() -> None:
     placed = thing("aisle_drawer")
     front, left, right, back, bottom, *handle = parts(placed, "tray")
     case = parts(placed, "case")[:-1]  # without its plinth
@@ -264,7 +264,7 @@ def test_drawer_is_as_large_as_the_papers() -> None:
     assert compute_clearance([handle[0]], [front]) == pytest.approx(0.07 - 0.01, abs=1e-6)
 
 
-def test_pulled_out_it_leaves_no_room_for_the_robot_before_it() -> None:
+def test_open_drawer_blocks_the_aisle() -> None:
     name = "aisle_drawer"
     for slide in np.linspace(0.0, 0.65, 14):
         placed = thing(name, slide=float(slide))
@@ -282,7 +282,7 @@ def test_pulled_out_it_leaves_no_room_for_the_robot_before_it() -> None:
 
 
 # --- the robot at both
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def robot_shapes(robot: Robot, z: np.ndarray) -> list[tuple[str, coal.CollisionGeometry, pin.SE3]]:
@@ -362,7 +362,7 @@ def test_the_arm_reaches_the_handle_without_touching_anything(name: str, moved: 
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_the_hand_has_room_all_the_way(name: str) -> None:
+def test_hand_is_collision_free_along_the_whole_range(name: str) -> None:
     """Hand and wrist at the handle are far from all but what they hold; the fingers keep grasp_clearance from that."""
     robot, (_, goal) = scene(name).robot, GOALS[name]
     z = np.concatenate([np.zeros(3), robot.home])

@@ -1,4 +1,4 @@
-"""What stands close to something: found, warned of, and for which values of joints it may stay so."""
+"""Tests close pairs of shapes: exemptions, their joint ranges, and warnings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def beside(gap: float, begin: float = 1.7) -> Scene:
 
 
 def in_wall(depth: float = 0.05, **fields: Any) -> Scene:
-    """Return a room with a door whose leaf stands in the wall on the side of its hinges, at y = 0."""
+    """Return a room with a door whose leaf overlaps the wall at its hinges, at y = 0."""
     walls = [
         {
             "name": "wall",
@@ -84,7 +84,7 @@ def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(
     )
 
 
-def test_the_distance_of_two_links_is_that_of_their_closest_shapes() -> None:
+def test_link_distance_is_that_of_the_closest_shapes() -> None:
     scene = beside(0.012).with_state("drawer", {"slide": 0.2})
     shapes = [
         (f"drawer.{get_link_name(shape.name)}", shape)
@@ -106,7 +106,7 @@ def test_the_distance_of_two_links_is_that_of_their_closest_shapes() -> None:
     assert {"side", "wall_east"} <= set(found)
 
 
-def test_what_is_remembered_is_of_these_obstacles_and_states() -> None:
+def test_cache_depends_on_obstacles_and_states() -> None:
     scene = beside(0.004, 1.4)
     (one,) = find_clearance_exemptions(scene, SAFE)
     kept = [k for k, label in enumerate(scene.obstacle_labels) if label != "side"]
@@ -147,14 +147,14 @@ def test_two_drawers_side_by_side_are_neighbours_until_either_is_past_the_other(
     assert one.is_active(["near.slide", "next.slide"], out).tolist() == [True, True, False, False]
 
 
-def test_nothing_is_close_in_scenes_that_come_along() -> None:
+def test_packaged_scenes_have_no_close_pairs() -> None:
     for name in ("door", "drawer", "fetch", "household", "corridor_door", "aisle_drawer"):
         scene = load_scene(name)
         assert find_clearance_exemptions(scene, SAFE) == ()
         assert find_close_pairs(scene, SAFE) == []
 
 
-def test_a_leaf_in_its_wall_is_warned_of_by_name() -> None:
+def test_warning_names_overlapping_links() -> None:
     with pytest.warns(
         UserWarning, match=r"tight: .*door\.panel – wall overlap by 50\.0 mm.*`allow:`"
     ) as caught:
@@ -166,7 +166,7 @@ def test_a_leaf_in_its_wall_is_warned_of_by_name() -> None:
     assert one.ranges == {"door.hinge": (-np.inf, np.inf)}  # its hinge is in the wall for ever
 
 
-def test_a_door_that_stands_open_is_still_built_into_its_wall() -> None:
+def test_open_door_keeps_the_exemption_of_its_wall() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scene = in_wall(0.003)
@@ -178,7 +178,7 @@ def test_a_door_that_stands_open_is_still_built_into_its_wall() -> None:
     assert {one.ranges["door.hinge"] for one in shut} == {ajar}
 
 
-def test_a_drawer_that_stands_open_is_a_neighbour_of_what_it_was_built_beside() -> None:
+def test_open_drawer_keeps_the_exemption_of_its_neighbour() -> None:
     (one,) = find_clearance_exemptions(beside(0.004), SAFE)
     assert find_close_pairs(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE) == []
     (other,) = find_clearance_exemptions(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE)
@@ -190,7 +190,7 @@ def test_a_drawer_that_stands_open_is_a_neighbour_of_what_it_was_built_beside() 
     )
 
 
-def test_what_is_in_the_hand_or_on_a_table_is_nobodys_neighbour() -> None:
+def test_held_and_resting_objects_have_no_exemptions() -> None:
     scene = load_scene("init_1")
     assert find_close_pairs(scene, 0.3) == []
     with pytest.warns(UserWarning, match="overlap by 10"):
@@ -206,7 +206,7 @@ def test_what_is_in_the_hand_or_on_a_table_is_nobodys_neighbour() -> None:
     )  # it may leave when it is lifted; that is not told by joints
 
 
-def test_holds_where_every_joint_is_within_its_range() -> None:
+def test_exemption_is_active_where_every_joint_is_in_range() -> None:
     one = ClearanceExemption("a.b", "c", 0.0, 0.01, {"a.x": (0.0, 1.0), "a.y": (-np.inf, 0.5)})
     states = np.array([[9.0, 0.5, 0.0], [9.0, 1.5, 0.0], [9.0, 1.0, 0.6], [9.0, 0.0, -7.0]])
     assert one.is_active(["q", "a.x", "a.y"], states).tolist() == [True, False, False, True]
@@ -224,7 +224,7 @@ def test_holds_where_every_joint_is_within_its_range() -> None:
         ([{"srdf": "home.srdf"}], -np.inf),
     ],
 )
-def test_what_a_scene_allows(tmp_path: Path, allow: list[Any], margin: float) -> None:
+def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: float) -> None:
     (tmp_path / "home.srdf").write_text(
         '<robot name="home"><disable_collisions link1="door.panel" link2="wall" reason="as built"/></robot>'
     )
@@ -252,7 +252,7 @@ def test_what_a_scene_allows(tmp_path: Path, allow: list[Any], margin: float) ->
         ([7], "allow[0]", ""),
     ],
 )
-def test_wrong_allowances_are_named(allow: list[Any], field: str, said: str) -> None:
+def test_errors_name_invalid_allowed_pairs(allow: list[Any], field: str, said: str) -> None:
     with pytest.raises(InputError) as caught:
         Scene.from_document({**in_wall(-0.03).document, "allow": allow})
     assert caught.value.field == field
@@ -283,7 +283,7 @@ def test_an_srdf_of_other_links_is_refused_by_line(tmp_path: Path) -> None:
         Scene.from_document({**in_wall(-0.03).document, "allow": ["home.srdf"]}, tmp_path)
 
 
-def test_plans_open_and_shut_what_stands_in_others(tmp_path: Path) -> None:
+def test_plans_open_and_close_overlapping_doors(tmp_path: Path) -> None:
     """Every success is judged by the oracle, which has its own idea of neighbours."""
     plan = vkc.plan(beside(0.004), [vkc.Actuate("drawer", {"slide": 0.3})])
     assert plan.success, plan.report()
@@ -298,7 +298,7 @@ def test_plans_open_and_shut_what_stands_in_others(tmp_path: Path) -> None:
         assert vkc.Plan.load(tmp_path / "both.npz").success
 
 
-def test_what_a_cup_stands_in_it_may_leave_but_not_enter() -> None:
+def test_cup_may_leave_but_not_enter_an_overlap() -> None:
     cup, table = {"name": "cup", "type": "cup", "position": [1.5, 0.0, 0.748]}, [0.8, 1.2, 0.05]
     document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}, "objects": [cup]}
     tables = [{"name": "table", "type": "box", "size": table, "position": [1.8, 0.0, 0.725]}]
@@ -313,7 +313,7 @@ def test_what_a_cup_stands_in_it_may_leave_but_not_enter() -> None:
     assert "cup.cup – table overlap by" in into.validation.notes[0]
 
 
-def test_nobody_is_let_through_what_was_left() -> None:
+def test_left_overlap_is_not_exempt_again() -> None:
     """A leaf that swings by 1.2 rad may not swing into a post that it was never near."""
     post = {"name": "post", "type": "box", "size": [0.08, 0.1, 0.5], "position": [3.2, -0.3, 0.25]}
     document = in_wall(-0.06).document
@@ -345,7 +345,7 @@ def test_a_leaf_whose_edge_swings_into_the_wall_is_proven_to() -> None:
     assert vkc.plan(enough, [vkc.Actuate("door", HINGE)]).success
 
 
-def test_a_robot_that_may_touch_starts_and_drives_in_what_it_may() -> None:
+def test_robot_may_overlap_allowed_obstacles() -> None:
     mat = {"name": "mat", "type": "box", "size": [1.2, 1.2, 0.2], "position": [0.0, 0.0, 0.1]}
     document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}, "obstacles": [mat]}
     refused = vkc.plan(Scene.from_document(document), [vkc.GoTo(2.0, 0.0)])
@@ -359,7 +359,7 @@ def test_a_robot_that_may_touch_starts_and_drives_in_what_it_may() -> None:
     assert plan.success, plan.report()
 
 
-def test_of_ten_thousand_obstacles_only_those_nearby_are_measured(
+def test_only_nearby_obstacles_are_measured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(0)
@@ -383,8 +383,8 @@ def test_of_ten_thousand_obstacles_only_those_nearby_are_measured(
     assert 1 <= len(asked) < 10
 
 
-def test_what_a_link_does_not_reach_is_never_near() -> None:
-    """Of all that stands in a home a refrigerator's door meets few things, and none but those that it reaches."""
+def test_unreached_links_are_never_near() -> None:
+    """In a home, a refrigerator's door is near those links only that it reaches."""
     home = load_scene("household")
     standing = neighbours.PlacedShapes(home, home.objects)
     label, values = "refrigerator.door", np.linspace(0.0, 2.0, 9)
@@ -439,8 +439,8 @@ def hinged_at_post(folder: Path, *, block: bool) -> Scene:
         return Scene.from_document(document, folder)
 
 
-def test_an_exemption_is_of_two_shapes_and_not_of_their_links(tmp_path: Path) -> None:
-    """The leaf may turn in the post in which it stands, and goes through no other shape of the same obstacle."""
+def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
+    """The leaf may turn in its post, but not through other shapes of the same obstacle."""
     for name in ("free", "blocked"):
         (tmp_path / name).mkdir()
     steps = [vkc.Actuate("door", {"hinge": 1.2})]
@@ -471,7 +471,7 @@ def test_an_exemption_is_of_two_shapes_and_not_of_their_links(tmp_path: Path) ->
     )
 
 
-def test_shapes_that_two_joints_move_overlap_no_deeper_than_either_alone_takes_them() -> None:
+def test_overlap_of_two_joints_is_bounded_by_each_alone() -> None:
     """A lever on a leaf, 5 mm inside a panel: what both joints do together is not exempt beyond what each does alone."""
     lever = (
         '<link name="lever">{}</link><joint name="turn" type="revolute"><parent link="leaf"/><child link="lever"/>'

@@ -1,4 +1,4 @@
-"""The rules of what may be close to what, one by one."""
+"""Tests each rule for shapes that may be close to each other."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def door(attachment: str = "handle", **fields: object) -> Scene:
     return with_object(scene, attachments={**given, attachment: changed})
 
 
-def test_who_takes_hold_of_what() -> None:
+def test_grasping_and_grasped_links() -> None:
     scene = door_scene()
     assert CONTACT_WINDOW == 1.0  # [s], as the pages say
     assert find_grasped_link(scene, HANDLE) == LEVER
@@ -62,7 +62,7 @@ def test_a_hand_keeps_the_attachments_clearance(clearance: float | None, expecte
     )
 
 
-def test_what_pushes_or_holds_through_another_needs_none_from_what_it_is_at() -> None:
+def test_pushing_or_indirect_hold_needs_no_clearance_from_its_link() -> None:
     options = Options()
     pushed = door(contact="push")
     assert compute_hand_clearance(pushed, HANDLE, LEVER, options) == 0.0
@@ -83,7 +83,7 @@ def test_what_pushes_or_holds_through_another_needs_none_from_what_it_is_at() ->
         ("handle_free", "push", True, False),
     ],
 )
-def test_who_moves_as_one(attachment: str, contact: str, firm: bool, as_one: bool) -> None:
+def test_rigid_grasps(attachment: str, contact: str, firm: bool, as_one: bool) -> None:
     scene = door(attachment, contact=contact, firm=firm)
     assert bool(scene.objects["door"].object.attachments[attachment].freedoms) == (
         attachment == "handle_free"
@@ -91,7 +91,7 @@ def test_who_moves_as_one(attachment: str, contact: str, firm: bool, as_one: boo
     assert is_rigid_grasp(scene, Hold("door", attachment)) == as_one
 
 
-def test_what_the_gripper_itself_holds() -> None:
+def test_hold_of_the_gripper_itself() -> None:
     stick = Hold("stick", "grip")
     assert find_gripper_hold([]) is None
     assert find_gripper_hold([THROUGH]) is None
@@ -99,7 +99,7 @@ def test_what_the_gripper_itself_holds() -> None:
     assert find_gripper_hold([stick, THROUGH]) is stick
 
 
-def test_only_a_push_brings_the_foremost_point() -> None:
+def test_hand_frame_of_a_push_is_the_foremost_point() -> None:
     robot = door_scene().robot
     grip = door_scene().objects["door"].object.attachments["handle"]
     assert compute_hand_frame(robot, grip) == pin.SE3.Identity()
@@ -108,7 +108,7 @@ def test_only_a_push_brings_the_foremost_point() -> None:
     assert front.translation[2] > 0.0
 
 
-def test_how_far_the_gripper_is_open(tmp_path: Path) -> None:
+def test_gripper_openings(tmp_path: Path) -> None:
     """For what is held, and at the start; what has no gripper rests."""
     scene = between_cheeks(write_gripper(tmp_path / "mine"), opening=0.04, start=0.03)
     hold = Hold("drawer", "grip")

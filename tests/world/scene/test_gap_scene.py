@@ -1,4 +1,4 @@
-"""The scene with a gap of 0.85 m between a pillar and a wall, and a table beyond it."""
+"""Tests the scene with a gap of 0.85 m between a pillar and a wall, and a table beyond it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def scene() -> Scene:
 
 
 def distance(first: str, second: str) -> float:
-    """Return coal's distance between two obstacles [m]; the objects as they are, with no function of the package between."""
+    """Return coal's distance between two obstacles [m], without functions of the package."""
     one, two = (
         next(shape for shape in scene().obstacles if shape.name == name) for name in (first, second)
     )
@@ -45,7 +45,7 @@ def test_the_gap_is_as_wide_as_the_scene_says() -> None:
     assert distance("pillar", "wall_south") == pytest.approx(GAP, abs=1e-6)
 
 
-def test_there_is_no_other_way() -> None:
+def test_gap_is_the_only_passage() -> None:
     for first, second in (("pillar", "sideboard"), ("sideboard", "wall_north")):
         assert abs(distance(first, second)) < 1e-6
     low, high, south, north = scene().arena
@@ -53,7 +53,7 @@ def test_there_is_no_other_way() -> None:
     assert {*scene().obstacle_names} == {"pillar", "sideboard", *PARTS, *WALLS}
 
 
-def test_the_robot_has_less_than_ten_centimetres_a_side() -> None:
+def test_robot_clearance_in_the_gap() -> None:
     robot = scene().robot
     data, shapes = robot.model.createData(), robot.collision.createData()
     home = np.concatenate([np.zeros(3), scene().start[3:]])

@@ -1,4 +1,4 @@
-"""Holds: what depends on what, and which descriptions make no sense."""
+"""Tests holds: their dependencies, and invalid descriptions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BALL = Hold("ball", "pull", STICK, "tip")
 FLY = Hold("fly", "leg", BALL, "ball")
 
 
-def test_the_tool_and_what_is_held_through_something() -> None:
+def test_grasping_frames_of_holds() -> None:
     assert make_holds({}, {}) == ()
     assert make_holds({"door": "handle", "drawer": "knob"}, {}) == (
         Hold("door", "handle"),
@@ -39,7 +39,7 @@ def test_the_tool_and_what_is_held_through_something() -> None:
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(["stick", "ball", "fly", "door"])))
-def test_each_follows_the_one_it_depends_on(order: tuple[str, ...]) -> None:
+def test_holds_are_ordered_by_dependency(order: tuple[str, ...]) -> None:
     attachments = {"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}
     found = make_holds(
         {name: attachments[name] for name in order}, {"fly": "ball.ball", "ball": "stick.tip"}
@@ -102,27 +102,27 @@ def test_a_hold_comes_after_the_one_it_depends_on() -> None:
         ({"ball": "fly.leg", "fly": "stick.tip", "stick": "ball.ball"}, "ball, fly, stick"),
     ],
 )
-def test_nothing_holds_itself_up(by: dict[str, str], got: str) -> None:
+def test_cyclic_holds_are_rejected(by: dict[str, str], got: str) -> None:
     with pytest.raises(InputError, match="in a cycle") as caught:
         make_holds({"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}, by)
     assert (caught.value.field, caught.value.got) == ("by", got)
 
 
 @pytest.mark.parametrize("frame", ["tip", "stick.", "stick", "", None, 3])
-def test_what_is_no_link_of_an_object(frame: object) -> None:
+def test_invalid_link_labels_are_rejected(frame: object) -> None:
     with pytest.raises(InputError, match="not a link of an object") as caught:
         make_holds({"stick": "grip", "ball": "pull"}, {"ball": frame})  # type: ignore[dict-item]
     assert caught.value.field == "by"
 
 
-def test_what_is_not_held_holds_nothing() -> None:
+def test_only_held_objects_can_hold() -> None:
     with pytest.raises(UnknownNameError) as caught:
         make_holds({"stick": "grip", "ball": "pull"}, {"ball": "stik.tip"})
     assert (caught.value.field, caught.value.nearest) == ("by", "stick")
 
 
 def described(path: Path, name: str, old: str, new: str) -> str:
-    """Write a copy of an object's description in which something is said otherwise; return its path."""
+    """Write a modified copy of an object's description; return its path."""
     source = Path(str(folder("scenes"))) / "objects"
     shutil.copy(source / f"{name}.urdf", path)
     text = (source / f"{name}.yaml").read_text()
@@ -131,7 +131,7 @@ def described(path: Path, name: str, old: str, new: str) -> str:
     return str(path / f"{name}.yaml")
 
 
-def test_a_handle_that_would_be_taken_from_inside_is_taken_from_the_other_side(
+def test_approach_from_inside_is_reversed(
     tmp_path: Path,
 ) -> None:
     right = drawer_scene()
@@ -167,7 +167,7 @@ def test_a_handle_that_would_be_taken_from_inside_is_taken_from_the_other_side(
     )
 
 
-def test_what_is_right_or_wrong_from_both_sides_stays() -> None:
+def test_approach_that_is_no_better_reversed_is_kept() -> None:
     for name in (
         "drawer",
         "door",
@@ -193,7 +193,7 @@ def test_what_is_right_or_wrong_from_both_sides_stays() -> None:
     assert Scene.from_document(around, drawer_scene().folder).objects["drawer"].reversed == ()
 
 
-def test_a_ball_on_the_floor_is_not_taken_from_below(tmp_path: Path) -> None:
+def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
     free = "\n    closing: [1, 0, 0]\n    joint: spherical\n    limits: [-1.5, 1.5]"
     said = described(
         tmp_path,
@@ -213,7 +213,7 @@ def test_a_ball_on_the_floor_is_not_taken_from_below(tmp_path: Path) -> None:
     assert high.objects["ball"].reversed == flat.objects["ball"].reversed == ()
 
 
-def test_a_stick_whose_frame_points_backwards_comes_from_the_other_side(tmp_path: Path) -> None:
+def test_approach_by_a_reversed_stick_is_reversed(tmp_path: Path) -> None:
     fixed = described(
         tmp_path,
         "ball",
@@ -253,7 +253,7 @@ def test_a_stick_whose_frame_points_backwards_comes_from_the_other_side(tmp_path
 
 
 @pytest.mark.parametrize("name", ["drawer", "door", "ball", "cup", "stick", "cabinet", "tray"])
-def test_from_the_other_side_and_back(name: str) -> None:
+def test_reversing_twice_restores_the_approach(name: str) -> None:
     placed = next(iter(drawer_scene().objects.values()))
     placed = vkc.PlacedObject(
         name, load_object(name), placed.placement, np.zeros(load_object(name).coordinates.size)

@@ -1,4 +1,4 @@
-"""The home of the third experiment and what can be moved in it, and the arena of the ten-step chore."""
+"""Tests the home of the third experiment with its objects, and the arena of the ten-step chore."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def moving_links(obj: ArticulatedObject) -> list[str]:
 
 
 # --- the objects
-# ------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", JOINTS)
@@ -115,7 +115,7 @@ def test_joints_have_their_limits_and_rates(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CARRIED)
-def test_what_is_carried_is_free_and_taken_firmly(name: str) -> None:
+def test_carried_objects_are_free_with_firm_grasps(name: str) -> None:
     obj = thing(name)
     assert obj.free
     assert not obj.coordinates.names
@@ -182,7 +182,7 @@ def test_object_turned_round_is_the_same_object(name: str) -> None:
 
 @pytest.mark.parametrize("name", JOINTS)
 def test_parts_do_not_overlap_while_they_move(name: str) -> None:
-    """Every joint over its range, the others at either end; the rack comes out only through the open door."""
+    """Every joint moves over its range, with the others at either end; the rack only with an open"""
     obj = thing(name)
     pairs = [pair for pair in combinations(obj.links, 2) if frozenset(pair) not in PINNED]
     ends = [np.linspace(0.0, upper, 11) for upper in obj.upper]
@@ -204,7 +204,7 @@ def test_parts_do_not_overlap_while_they_move(name: str) -> None:
                 )
 
 
-def test_carried_things_fit_the_hand_and_stand_on_their_origin() -> None:
+def test_carried_objects_fit_the_hand_and_rest_on_their_origin() -> None:
     for name in ("cup", "broom"):
         lowest = min(bounds([part])[0, 2] for part in parts(at_origin(name)))
         assert lowest == pytest.approx(0.0, abs=1e-12)
@@ -242,10 +242,10 @@ def test_refrigerator_and_cabinet_have_room_for_cup_and_ball() -> None:
 
 
 # --- the home
-# ---------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
-def test_home_is_as_large_and_full_as_the_papers() -> None:
+def test_home_size_and_furniture_match_the_paper() -> None:
     here = scene()
     assert (here.name, here.robot.name, here.robot.base) == ("household", "husky_ur5e", "omni")
     assert here.arena == (-4.0, 4.0, -4.0, 4.0)
@@ -273,7 +273,7 @@ def test_start_region_has_free_places_at_any_heading() -> None:
     assert np.ptp(bases[:, 2]) > 5.0
 
 
-def test_nothing_stands_in_anything_else() -> None:
+def test_no_shapes_overlap() -> None:
     """Furniture may touch walls and what stands on it; objects are clear of everything, things to carry by 1 mm."""
     here = scene()
     for name, placed in here.objects.items():
@@ -368,7 +368,7 @@ def test_furniture_is_as_its_colours_and_descriptions_say() -> None:
 
 
 # --- the robot in it
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def test_robot_fits_through_the_open_door_and_nowhere_else_into_the_bedroom() -> None:
@@ -430,7 +430,7 @@ REACHED = [
 
 
 @pytest.mark.parametrize(("name", "attachment", "moved"), REACHED)
-def test_the_arm_reaches_it_without_touching_anything(
+def test_arm_reaches_the_attachment_without_collisions(
     name: str, attachment: str, moved: bool
 ) -> None:
     here = scene()
@@ -473,7 +473,7 @@ def test_the_arm_reaches_it_without_touching_anything(
 
 
 # --- helpers
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def bounds(shapes: Iterable[tuple[coal.CollisionGeometry, pin.SE3]]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The scenes of the first experiment: a stick on a table, a cube under another; and how stick and ball are grasped."""
+"""Tests the scenes of the first experiment, with stick and cube, and grasps of stick and ball."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def crosses(start: np.ndarray, end: np.ndarray, box: np.ndarray) -> bool:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_tables_cube_and_stick_are_where_the_paper_has_them(name: str) -> None:
+def test_tables_cube_and_stick_match_the_paper(name: str) -> None:
     here = scene(name)
     assert here.name == name
     assert here.arena == (-5.0, 5.0, -5.0, 5.0)
@@ -83,7 +83,7 @@ def test_tables_cube_and_stick_are_where_the_paper_has_them(name: str) -> None:
     np.testing.assert_allclose(here.objects["stick"].placement.translation[:2], STICK)
 
 
-def test_the_scenes_differ_in_what_stands_in_the_way_alone() -> None:
+def test_scenes_differ_only_in_obstacles() -> None:
     first = scene("init_1")
     for name in SCENES[1:]:
         other = {
@@ -100,7 +100,7 @@ def test_the_scenes_differ_in_what_stands_in_the_way_alone() -> None:
         )
 
 
-def test_the_block_is_as_large_as_the_papers() -> None:
+def test_block_size_matches_the_paper() -> None:
     np.testing.assert_allclose(
         bounds(scene("init_3"), ("block",)), [[1.0, -3.5, 0.0], [3.0, -0.5, 2.1]], atol=1e-12
     )
@@ -121,7 +121,7 @@ def test_fifty_starts_can_be_drawn(name: str) -> None:
     )
 
 
-def test_the_straight_way_to_the_stick_leads_through_the_block() -> None:
+def test_straight_path_to_the_stick_crosses_the_block() -> None:
     block, region = bounds(scene("init_3"), ("block",))[:, :2], scene("init_3").start_region
     assert region is not None
     corners = itertools.product(region.x, region.y)
@@ -131,7 +131,7 @@ def test_the_straight_way_to_the_stick_leads_through_the_block() -> None:
     assert all(crosses(start[:2], STICK, block) for start in starts("init_3"))
 
 
-def test_nothing_is_in_the_way_of_the_first_scene() -> None:
+def test_first_scene_has_no_obstacles_on_the_path() -> None:
     here = scene("init_1")
     for name in set(here.obstacle_names) - set(TABLES):
         assert not any(
@@ -139,7 +139,7 @@ def test_nothing_is_in_the_way_of_the_first_scene() -> None:
         )
 
 
-def test_two_things_are_in_the_way_of_most_starts_of_the_second_scene() -> None:
+def test_second_scene_has_two_obstacles_on_most_paths() -> None:
     """Where the base's middle cannot pass, at any heading: half the robot's width round either thing."""
     around = np.array([[-1.0], [1.0]]) * HUSKY_WIDTH / 2
     first, second = (
@@ -203,7 +203,7 @@ def support(shape: pin.GeometryObject, direction: np.ndarray) -> float:
 
 
 # --- the grasps
-# ---------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 def hand(robot: Robot, tool: pin.SE3) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
@@ -308,7 +308,7 @@ def test_the_hand_fits_round_a_ball_on_the_floor(turn: tuple[float, float, float
     np.testing.assert_allclose(tool.actInv(LYING).translation, [0.0, 0.0, 0.01], atol=1e-12)
 
 
-def test_a_hand_never_takes_the_ball_from_below() -> None:
+def test_hand_never_grasps_the_ball_from_below() -> None:
     grip = load_object("ball").attachment("grip")
     for turn in itertools.product(np.linspace(-1.5, 1.5, 7), repeat=3):
         assert (grip.placement * grip.motion(turn)).rotation[2, 2] < 0.0

@@ -1,4 +1,4 @@
-"""Shapes of obstacles: where they are, how large, and what is drawn of them."""
+"""Tests the shapes of obstacles: placement, size and visual shapes."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_a_urdf_stands_with_its_joints_at_zero(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["urdf", "mesh"])
-def test_a_file_that_is_not_there(kind: str, tmp_path: Path) -> None:
+def test_missing_file_is_reported(kind: str, tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         described(tmp_path, type=kind, file="none.obj")
     assert caught.value.file == tmp_path / "none.obj"

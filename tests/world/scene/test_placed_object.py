@@ -1,4 +1,4 @@
-"""Objects where they stand, and with their joints moved."""
+"""Tests placed objects and their joint values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.scene.placed_object import make_world_shapes
 
 
-def test_standing_objects_are_where_their_joints_put_them(tmp_path: Path) -> None:
+def test_world_shapes_follow_the_joints(tmp_path: Path) -> None:
     placed = load(tmp_path, TINY).objects["front"]
     np.testing.assert_array_equal(placed.state, [0.3, 0.0])
     shapes = {s.name: s for s in make_world_shapes(placed)}

@@ -1,4 +1,4 @@
-"""Poses and points; what is no pose is in tests/world/task/test_steps.py, where steps take it."""
+"""Tests poses and points; for invalid ones see tests/world/task/test_steps.py."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vkc_pin.world.scene.poses import as_placement, as_target
 @pytest.mark.parametrize(
     "pose", [[2e4, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1e300, 0], np.diag([1.0, 1.0, 1.0, 1.0]) + 1e5]
 )
-def test_what_is_further_away_than_any_room(pose: Any) -> None:
+def test_distant_poses_are_rejected(pose: Any) -> None:
     for read in (as_placement, as_target):
         with pytest.raises(InputError, match="out of range") as caught:
             read(pose, name="where")

@@ -1,4 +1,4 @@
-"""Scenes: what is in them, changing them, and drawing starts."""
+"""Tests scenes: their contents, changed copies, and random starts."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_frame_fills_the_opening_without_a_gap_wider_than_a_finger(door: Sce
         assert abs(compute_clearance(list_placed_shapes([part]), list_placed_shapes(walls))) < 1e-3
 
 
-def test_with_methods_refuse_what_does_not_fit(door: Scene) -> None:
+def test_with_methods_reject_invalid_values(door: Scene) -> None:
     with pytest.raises(InputError, match="base: wrong number of values"):
         door.with_start(base=[0.0, 1.0])
     with pytest.raises(InputError, match="arm: wrong number of values"):
@@ -130,14 +130,14 @@ def test_a_fixed_base_may_stand_anywhere_in_the_arena(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scene.with_start(base=[0.1, 0.2, 0.3]).start[:3], [0.1, 0.2, 0.3])
 
 
-def test_start_clearance_sees_obstacles_and_objects(door: Scene) -> None:
+def test_start_clearance_includes_obstacles_and_objects(door: Scene) -> None:
     into_the_sofa = door.with_start(base=[-1.5, -1.5, 0.0])
     assert into_the_sofa.start_clearance() < -0.1
     into_the_door = door.with_start(base=[2.2, 0.0, 0.0])
     assert into_the_door.start_clearance() < -0.1
 
 
-def test_sampling_needs_a_region_with_room_in_it(tmp_path: Path) -> None:
+def test_sampling_needs_a_free_start_region(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     none = load(tmp_path, TINY.replace("start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n", ""))
     with pytest.raises(InputError, match="no start region"):
@@ -153,7 +153,7 @@ STICK = (
 )
 
 
-def test_what_is_free_and_held_is_in_the_hand(tmp_path: Path) -> None:
+def test_held_free_object_is_in_the_hand(tmp_path: Path) -> None:
     (tmp_path / "stick.urdf").write_text(STICK)
     attachment = "attachments: [{name: end, link: stick, position: [-0.2, 0, 0], approach: [1, 0, 0], closing: [0, 0, 1]}]"
     (tmp_path / "stick.yaml").write_text(f"urdf: stick.urdf\nfree: true\n{attachment}\n")

@@ -1,4 +1,4 @@
-"""A scene is described by what it is: after any changes, what its document describes is the same scene."""
+"""Tests that the document of a changed scene describes the same scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ lengths = st.floats(-2.0, 2.0)
 
 @cache
 def full() -> Scene:
-    """Return a scene with a stick, a ball, and a door that stands where its description says so by yaw."""
+    """Return a scene with a stick, a ball, and a door whose description gives its yaw."""
     scene = room(table(), objects=FREE)
     door = {"name": "door", "type": "door", "position": [3.0, 1.0, 0.0], "yaw": 0.7}
     return Scene.from_document(
@@ -86,7 +86,7 @@ def test_a_changed_scene_comes_back(scene: Scene) -> None:
     assert again.document == scene.document
 
 
-def test_what_was_not_moved_keeps_the_words_of_its_description() -> None:
+def test_unmoved_objects_keep_their_description() -> None:
     entries = {
         entry["name"]: entry
         for entry in full().with_start(base=[1.0, 0.0, 0.0]).document["objects"]

@@ -1,4 +1,4 @@
-"""Scenes from files, and what is wrong with them."""
+"""Tests scene files and their errors."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def test_the_document_rebuilds_the_scene(door: Scene) -> None:
         ("    radius: 0.1", "    radus: 0.1", 16, "obstacles[1].radus", "radius"),
     ],
 )
-def test_unknown_names_are_located_and_the_nearest_is_offered(
+def test_unknown_names_are_located_with_a_suggestion(
     tmp_path: Path, old: str, new: str, line: int, field: str, nearest: str
 ) -> None:
     assert old in TINY
@@ -469,7 +469,7 @@ def test_objects_that_a_scene_describes_itself(tmp_path: Path) -> None:
         ('<child link="leaf"/>', '<child link="leav"/>', 7, "hinge: child"),
     ],
 )
-def test_what_is_wrong_in_such_a_description_is_located(
+def test_errors_in_inline_descriptions_are_located(
     tmp_path: Path, old: str, new: str, line: int, field: str
 ) -> None:
     """In the scene's file, or in the text of the URDF in it."""

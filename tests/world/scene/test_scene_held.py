@@ -1,4 +1,4 @@
-"""Scenes in which something is held or put elsewhere: through documents and files and back, and what is wrong with them."""
+"""Tests scenes with held or moved objects, as documents and files, and their errors."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def assert_same(one: pin.SE3, other: pin.SE3) -> None:
 
 
 # --- elsewhere
-# --------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def assert_same(one: pin.SE3, other: pin.SE3) -> None:
         (0.0, 0.0, -np.pi),
     ],
 )
-def test_put_elsewhere(hall: Scene, rpy: tuple[float, float, float]) -> None:
+def test_object_at_another_placement(hall: Scene, rpy: tuple[float, float, float]) -> None:
     """Upright, lying and standing on its tip, where roll and yaw are one."""
     placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([1.0, -2.0, 0.8]))
     moved = hall.with_placement("cane", placement)
@@ -100,7 +100,7 @@ def test_the_scene_keeps_its_own_copy(hall: Scene) -> None:
     np.testing.assert_array_equal(moved.objects["cane"].placement.translation, [1.0, 0.0, 0.05])
 
 
-def test_what_is_fixed_can_be_put_elsewhere_too(hall: Scene) -> None:
+def test_fixed_object_at_another_placement(hall: Scene) -> None:
     moved = hall.with_placement(
         "front", pin.SE3(pin.utils.rotate("z", 1.0), np.array([4.0, 1.0, 0.0]))
     )
@@ -110,7 +110,7 @@ def test_what_is_fixed_can_be_put_elsewhere_too(hall: Scene) -> None:
     same(moved, again(moved))
 
 
-def test_what_is_held_is_where_it_is_held(hall: Scene) -> None:
+def test_held_object_is_placed_in_the_hand(hall: Scene) -> None:
     held = hall.with_held({"cane": "end"})
     moved = held.with_placement("cane", pin.SE3.Identity())
     assert_same(moved.objects["cane"].placement, held.objects["cane"].placement)
@@ -120,14 +120,14 @@ def test_what_is_held_is_where_it_is_held(hall: Scene) -> None:
     same(let_go, again(let_go))
 
 
-def test_there_is_no_such_object(hall: Scene) -> None:
+def test_unknown_object_is_rejected(hall: Scene) -> None:
     with pytest.raises(UnknownNameError) as caught:
         hall.with_placement("cana", pin.SE3.Identity())
     assert caught.value.nearest == "cane"
 
 
 # --- in the hand
-# ------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.05, -0.4), (-0.095, 1.2)])
@@ -171,7 +171,7 @@ def test_held_through_something(hall: Scene) -> None:
     assert [str(hold) for hold in held.holds] == ["cane.grip", "fruit.pull by cane.tip"]
 
 
-def test_holding_anew_forgets_how_it_was_held(hall: Scene) -> None:
+def test_new_holds_replace_old_ones(hall: Scene) -> None:
     held = hall.with_held(
         {"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"}, at={"cane": (0.05, 0.1)}
     )
@@ -181,7 +181,7 @@ def test_holding_anew_forgets_how_it_was_held(hall: Scene) -> None:
     same(other, again(other))
 
 
-def test_files_say_it_as_documents_do(tmp_path: Path, hall: Scene) -> None:
+def test_files_and_documents_agree(tmp_path: Path, hall: Scene) -> None:
     short = load(tmp_path, "{cane: end}")
     assert short.document["start"]["held"] == {"cane": {"attachment": "end"}}
     same(short, hall.with_held({"cane": "end"}))
@@ -221,7 +221,7 @@ def test_the_start_is_clear_of_what_is_carried_and_samples_carry_it(
 
 
 # --- what is wrong
-# ----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_the_start_is_clear_of_what_is_carried_and_samples_carry_it(
         ({"cane": "grip"}, {}, {"cana": (0.0, 0.0)}, "at", "cane"),
     ],
 )
-def test_names_that_do_not_exist(
+def test_unknown_names_are_rejected(
     hall: Scene,
     held: Mapping[str, str],
     by: Mapping[str, str],
@@ -272,7 +272,7 @@ def test_names_that_do_not_exist(
         ),
     ],
 )
-def test_holds_that_cannot_be(
+def test_impossible_holds_are_rejected(
     hall: Scene, held: Mapping[str, str], by: Mapping[str, str], at: Mapping[str, Any], match: str
 ) -> None:
     with pytest.raises(InputError, match=match):
@@ -348,7 +348,7 @@ def test_holds_that_cannot_be(
         ),
     ],
 )
-def test_files_with_holds_that_cannot_be(
+def test_files_with_impossible_holds_are_rejected(
     tmp_path: Path, held: str, error: type[InputError], field: str, details: str
 ) -> None:
     with pytest.raises(error) as caught:

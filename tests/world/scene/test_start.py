@@ -1,4 +1,4 @@
-"""Random starts, and where a robot may stand."""
+"""Tests random starts, and limits of the start."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vkc_pin.world.scene.scene_schema import RegionSchema
 
 
 @pytest.mark.parametrize("yaw", [None, (0.5, 0.7)])
-def test_draws_fill_the_region_and_nothing_else(yaw: tuple[float, float] | None) -> None:
+def test_samples_fill_the_region(yaw: tuple[float, float] | None) -> None:
     low, high = np.array([-1.0, 2.0, -np.pi]), np.array([3.0, 2.5, np.pi])
     if yaw is not None:
         low[2], high[2] = yaw
@@ -31,7 +31,7 @@ def test_draws_fill_the_region_and_nothing_else(yaw: tuple[float, float] | None)
     assert (np.abs(np.corrcoef(shares.T) - np.eye(3)) < 0.1).all()
 
 
-def test_the_same_numbers_give_the_same_starts() -> None:
+def test_samples_are_reproducible() -> None:
     region = RegionSchema(x=(0.0, 1.0), y=(0.0, 1.0))
     one, other = (next(region.sample_poses(np.random.default_rng(5))) for _ in range(2))
     np.testing.assert_array_equal(one, other)

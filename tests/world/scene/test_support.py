@@ -1,4 +1,4 @@
-"""What stands on what."""
+"""Tests which objects rest on which links."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_cup_on_a_plate_or_above_it(gap: float, stands: bool) -> None:
 
 
 @pytest.mark.parametrize("apart", [-1e-3, 0.0, 1e-3])
-def test_what_is_beside_bears_nothing(apart: float) -> None:
+def test_adjacent_shape_is_no_support(apart: float) -> None:
     assert on(plates(cups=1, wall=apart)) == {"plate.plate"}
 
 
@@ -53,7 +53,7 @@ def test_the_floor_and_two_tables() -> None:
     assert on(scene_of([cup(at=(0.1, 0.0, 0.0))])) == {"floor"}
 
 
-def test_what_stands_on_what_stands_on_what_moves() -> None:
+def test_stacked_objects_are_supported() -> None:
     scene = plates(cups=1)
     upper = cup("upper", at=(0.8, 0.06, TOP + 0.1))
     stacked = Scene.from_document(
@@ -74,7 +74,7 @@ def test_what_stands_on_what_stands_on_what_moves() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.1, 1.5, 3.0])
-def test_tilt_is_the_angle_of_the_vertical_whatever_the_heading(angle: float) -> None:
+def test_tilt_ignores_the_heading(angle: float) -> None:
     rng = np.random.default_rng(3)
     before = pin.SE3.Random()
     first, last = (pin.utils.rotate("z", rng.uniform()) for _ in range(2))
@@ -82,7 +82,7 @@ def test_tilt_is_the_angle_of_the_vertical_whatever_the_heading(angle: float) ->
     assert compute_tilt(before, leaning * before) == pytest.approx(angle, abs=1e-9)
 
 
-def test_how_far_it_is_lowered_is_more_than_rounding_and_less_than_a_shelf() -> None:
+def test_resting_distance_exceeds_rounding() -> None:
     assert 1e-3 < RESTING_DISTANCE < 0.02
     thin = [
         {"name": "sheet", "type": "box", "size": [0.3, 0.3, 0.002], "position": [0.0, 0.0, 0.499]}

@@ -1,4 +1,4 @@
-"""What is done together, and what cannot be done at its place."""
+"""Tests the grouping of steps into actions, and the check of steps before planning."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OPEN, SHUT = A("refrigerator", {"hinge": 1.57}), A("refrigerator", {"hinge": 0.0
 CUP = (G("cold_cup"), P("cold_cup", TABLE))
 
 
-def test_what_is_done_with_one_thing_is_one_action() -> None:
+def test_steps_with_one_object_form_one_action() -> None:
     steps = [
         G("refrigerator"),
         OPEN,
@@ -43,7 +43,7 @@ def test_what_is_done_with_one_thing_is_one_action() -> None:
     ]
 
 
-def test_no_step_is_lost() -> None:
+def test_grouping_keeps_all_steps() -> None:
     steps = [
         vkc.Release(),
         vkc.Release(),
@@ -59,8 +59,8 @@ def test_no_step_is_lost() -> None:
     assert len(actions) == 6  # a grasp of one thing is no part of what is done with another
 
 
-def test_what_is_foreseen_is_what_each_step_asks_for_where_it_stands() -> None:
-    """Steps are compiled one by one, each in the scene that the steps before leave: an open door, a cup on the table."""
+def test_steps_are_compiled_in_the_scene_that_the_previous_steps_leave() -> None:
+    """Each step is compiled in the scene that the steps before leave: open door, cup on the table."""
     scene, options = vkc.load_scene("household"), vkc.Options()
     steps = [OPEN, *CUP, SHUT]
     tasks = compile_each_step(scene, steps, options)
@@ -88,7 +88,7 @@ def test_what_is_foreseen_is_what_each_step_asks_for_where_it_stands() -> None:
         ([OPEN, G("no_cup")], "steps[1].object", "no object"),
     ],
 )
-def test_the_first_step_that_cannot_be_done_is_named(
+def test_error_names_the_first_infeasible_step(
     steps: list[vkc.Step], field: str, problem: str
 ) -> None:
     with pytest.raises(vkc.InputError, match=problem) as caught:
@@ -97,7 +97,7 @@ def test_the_first_step_that_cannot_be_done_is_named(
 
 
 @pytest.mark.parametrize("stands", [True, False])
-def test_a_free_object_is_taken_anew_where_it_stands_only(stands: bool) -> None:
+def test_free_object_is_regrasped_only_if_it_rests_on_a_support(stands: bool) -> None:
     """In the air, it would fall."""
     x, y, z = littered().with_held({"litter": "grip"}).objects["litter"].placement.translation
     table = {
@@ -117,8 +117,8 @@ def test_a_free_object_is_taken_anew_where_it_stands_only(stands: bool) -> None:
     assert not list(generate_alternatives(scene, task)), "only where phases may be more"
 
 
-def test_where_it_stands_is_known_if_nothing_has_moved_before() -> None:
-    """Else only the motion says where it was left, and it cannot be taken again in the same plan."""
+def test_released_object_can_be_regrasped_if_nothing_has_moved() -> None:
+    """Otherwise only the motion decides where it rests, and the plan cannot grasp it again."""
     scene = littered().with_held({"litter": "grip"})
     compile_task(scene, [vkc.Release("litter"), vkc.Place("litter", BIN)], vkc.Options())
     with pytest.raises(vkc.InputError, match="known only after planning"):

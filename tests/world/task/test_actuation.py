@@ -1,4 +1,4 @@
-"""Which way a hand can push, and what no push can do."""
+"""Tests which joints a hand can push, and in which direction."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STEP = 1e-6  # [rad] or [m]
 
 
 def moved(placed: PlacedObject, attachment: Attachment, joint: str, values: list[float]) -> float:
-    """Return how far the point of the link that is touched goes into the face when a joint does, by finite differences."""
+    """Return the advance of the contact into its face per unit of a joint, by finite differences."""
     touched = attachment.placement
     for freedom, value in zip(attachment.freedoms, values, strict=True):
         touched = touched * freedom.motion(value)
@@ -45,7 +45,7 @@ def moved(placed: PlacedObject, attachment: Attachment, joint: str, values: list
     st.lists(st.floats(0.0, 1.0), min_size=3, max_size=3),
     st.tuples(st.floats(-0.9, 1.9), st.floats(0.01, 0.29)),
 )
-def test_the_advance_is_that_of_finite_differences(
+def test_advance_matches_finite_differences(
     rpy: list[float], at: list[float], where: list[float], state: tuple[float, float]
 ) -> None:
     """Of a face of a tray that slides on an arm that swings: every point of the region is between the extremes, two are they."""
@@ -74,8 +74,11 @@ def test_the_advance_is_that_of_finite_differences(
         assert least - 1e-8 <= moved(arm, face, joint, inside) <= most + 1e-8
 
 
-def test_a_rim_is_looked_at_all_along() -> None:
-    """A wheel that is pushed along its axis, off the hinge: at one side of the rim the lever is longer than at the other."""
+def test_advance_covers_the_whole_rim() -> None:
+    """Advances of all points of a region lie between the extremes, which two points attain.
+
+    The face is on a tray that slides on a rotating arm.
+    """
     arm = full_scene().objects["cabinet"]
     around = Freedom(
         "_around", "revolute", np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, np.array([-0.1, 0.0, 0.0])
@@ -109,15 +112,13 @@ def test_a_door_is_pushed_shut_or_further_open(
     assert (reach.pushed, move.pushed, move.name) == ({}, {"door.hinge": way}, "move door.hinge")
 
 
-def test_a_goal_beyond_the_limit_is_the_limit() -> None:
+def test_push_goal_is_clipped_to_the_limit() -> None:
     """A door that is as far open as it goes is not pulled further."""
     (_, move) = compiled(at(1.57), {"hinge": 2.0}, "push_back").phases
     assert move.pushed == {"door.hinge": -1}
 
 
-def test_which_way_a_push_moves_a_joint_is_asked_where_the_steps_before_have_left_the_others() -> (
-    None
-):
+def test_push_direction_depends_on_the_state_after_previous_steps() -> None:
     """A face on a tray that slides on an arm: pulled out, it is on the other side of the axis about which the arm swings."""
     scene, slides = full_scene(), (0.0, 0.3)
     normal, along = (
@@ -163,7 +164,7 @@ def test_which_way_a_push_moves_a_joint_is_asked_where_the_steps_before_have_lef
         compile_task(there, steps[1:], Options())
 
 
-def test_a_hand_that_takes_hold_may_go_any_way() -> None:
+def test_grasp_has_no_push_directions() -> None:
     assert [phase.pushed for phase in compiled(at(0.0), {"hinge": 1.0}, "handle").phases] == [
         {},
         {},
@@ -174,9 +175,7 @@ def test_a_hand_that_takes_hold_may_go_any_way() -> None:
 @pytest.mark.parametrize(
     ("begin", "end", "face", "way"), [(-0.5, -1.0, "push", "up"), (0.5, 1.0, "push_back", "down")]
 )
-def test_what_would_have_to_be_pulled_is_refused(
-    begin: float, end: float, face: str, way: str
-) -> None:
+def test_push_cannot_pull(begin: float, end: float, face: str, way: str) -> None:
     said = f"pushing 'door' at '{face}' moves 'hinge' {way} only: a hand that pushes cannot pull"
     with pytest.raises(InputError, match=said) as caught:
         compiled(at(begin), {"hinge": end}, face)
@@ -190,7 +189,7 @@ def test_a_latched_door_cannot_be_pushed_open() -> None:
         compiled(at(0.0), {"hinge": 1.0}, "push")
 
 
-def test_a_drawer_is_not_pulled_out_at_its_front() -> None:
+def test_drawer_front_cannot_be_pulled() -> None:
     scene = vkc.load_scene("drawer")
     with pytest.raises(InputError, match="moves 'slide' down only"):
         compiled(scene, {"slide": 0.3}, "push", "drawer")
@@ -208,7 +207,7 @@ def test_a_drawer_is_not_pulled_out_at_its_front() -> None:
         ("arm", [0.0, 6e-4, 0.0], [1.0, 0.0, 0.0], "swing"),  # half a millimetre beside it
     ],
 )
-def test_a_face_whose_joint_does_not_yield_is_refused(
+def test_push_along_the_joint_axis_is_rejected(
     link: str, position: list[float], approach: list[float], joint: str
 ) -> None:
     z = np.array(approach)
@@ -227,7 +226,7 @@ def test_a_face_whose_joint_does_not_yield_is_refused(
     assert cabinet().attachments["grip"].contact == "grasp"
 
 
-def test_a_face_on_both_sides_of_the_hinge_is_refused() -> None:
+def test_face_on_both_sides_of_the_hinge_is_rejected() -> None:
     placed = at(-1.0).objects["door"]
     wide = (
         dataclasses.replace(placed.object.attachments["push"].freedoms[0], lower=-0.7),

@@ -1,4 +1,4 @@
-"""From steps to phases: what is held when, what moves, what must hold at the end of each."""
+"""Tests the compilation of steps to phases: holds, moving joints and goals."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def with_link_of(scene: Scene, owner: str, link: str) -> Scene:
     )
 
 
-def test_opening_a_door_is_reaching_turning_and_moving() -> None:
+def test_opening_a_door_has_three_phases() -> None:
     task = phases([OPEN])
     assert [phase.name for phase in task.phases] == [
         "reach door.handle",
@@ -93,7 +93,7 @@ def test_opening_a_door_is_reaching_turning_and_moving() -> None:
     assert all(phase.base is None and phase.frames == () for phase in task.phases)
 
 
-def test_a_knob_that_is_turned_already() -> None:
+def test_turned_knob_needs_no_turn_phase() -> None:
     task = phases([OPEN], door_scene().with_state("door", {"knob": 0.6}))
     assert [phase.name for phase in task.phases] == [
         "reach door.handle",
@@ -103,7 +103,7 @@ def test_a_knob_that_is_turned_already() -> None:
     assert task.phases[1].initial_values == {"door.hinge": 0.0, "door.knob": 0.6}
 
 
-def test_a_door_that_is_ajar() -> None:
+def test_open_door_needs_no_turn_phase() -> None:
     """Out of the latch's reach nothing needs turning; within it, it does."""
     task = phases([OPEN], door_scene().with_state("door", {"hinge": 0.3}))
     assert [phase.name for phase in task.phases] == ["reach door.handle", "move door.hinge"]
@@ -115,7 +115,7 @@ def test_a_door_that_is_ajar() -> None:
     ]
 
 
-def test_a_joint_that_is_where_it_should_be_needs_no_turned_knob() -> None:
+def test_joint_at_its_goal_does_not_release_the_latch() -> None:
     assert len(phases([Actuate("door", {"hinge": 0.0})]).phases) == 2
 
 
@@ -147,7 +147,7 @@ def test_hinge_and_knob_together() -> None:
     assert back.phases[3].initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
 
 
-def test_a_held_object_needs_no_reaching() -> None:
+def test_held_object_is_not_grasped_again() -> None:
     task = phases([OPEN], door_scene().with_held({"door": "handle"}))
     assert [phase.name for phase in task.phases] == ["turn door.knob", "move door.hinge, door.knob"]
     assert task.phases[0].held == task.holds == (HANDLE,)
@@ -155,7 +155,7 @@ def test_a_held_object_needs_no_reaching() -> None:
     assert task.state == SHUT
 
 
-def test_twice_the_same_object_is_grasped_once() -> None:
+def test_object_of_two_steps_is_grasped_once() -> None:
     task = phases([Grasp("door"), OPEN, Actuate("door", {"hinge": 0.5})])
     assert [phase.name for phase in task.phases][2:] == [
         "move door.hinge, door.knob",
@@ -164,7 +164,7 @@ def test_twice_the_same_object_is_grasped_once() -> None:
     assert task.phases[3].initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
 
 
-def test_the_task_of_the_first_steps_is_as_if_there_were_no_others() -> None:
+def test_truncated_task_equals_task_of_the_first_steps() -> None:
     back, drawer = Actuate("door", {"knob": 0.0}), Actuate("drawer", {"slide": 0.2})
     steps = [GoTo(0.3, 0.2), OPEN, back, drawer, Release()]
     whole = phases(steps, full_scene())
@@ -188,7 +188,7 @@ def test_grasp_only() -> None:
     assert task.holds == (Hold("door", "handle_free"),)
 
 
-def test_the_attachment_that_was_used_is_used_again() -> None:
+def test_previous_attachment_is_preferred() -> None:
     task = phases([Grasp("door", "handle_free"), GoTo(0.0, 0.0), OPEN])
     assert task.holds == (Hold("door", "handle_free"),)
     assert task.phases[2].grasps == (Hold("door", "handle_free"),)
@@ -205,7 +205,7 @@ def test_reach() -> None:
     assert phase.frames[0].frame == "forearm_link"
 
 
-def test_go_to_lets_go() -> None:
+def test_go_to_releases_fixed_objects() -> None:
     task = phases([OPEN, GoTo(1.0, 2.0, 0.3)])
     last = task.phases[-1]
     assert (last.name, last.held, last.released) == ("go to", (), (HANDLE,))
@@ -236,14 +236,14 @@ def test_one_object_after_another() -> None:
     assert task.phases[4].held == task.after == (drawer,)
 
 
-def test_joints_that_the_grasp_cannot_move_are_none_of_the_task() -> None:
+def test_task_has_only_joints_that_its_grasps_can_move() -> None:
     task = phases([Actuate("cabinet", {"slide": 0.2})], full_scene())
     assert task.state == {f"cabinet.{joint}": CABINET_STATE[joint] for joint in ("swing", "slide")}
     placed = full_scene().objects["cabinet"]
     assert find_path_joints(placed, placed.object.attachment()) == ["swing", "slide"]
 
 
-def test_a_goal_beyond_the_limits_ends_at_the_limit() -> None:
+def test_goal_beyond_a_limit_ends_at_the_limit() -> None:
     """It is compiled, so that planning can say by how much it fails; what follows starts from the limit."""
     task = phases([Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)])
     assert task.phases[2].values["door.hinge"] == 2.0
@@ -261,7 +261,7 @@ def test_a_goal_beyond_the_limits_ends_at_the_limit() -> None:
         (Reach([0.0] * 6, "tol"), "steps[1].frame", "tool"),
     ],
 )
-def test_names_that_do_not_exist(step: Step, field: str, nearest: str | None) -> None:
+def test_unknown_names_are_rejected(step: Step, field: str, nearest: str | None) -> None:
     with pytest.raises(UnknownNameError) as caught:
         phases([GoTo(0.0, 0.0), step])
     assert (caught.value.field, caught.value.nearest) == (field, nearest)
@@ -298,13 +298,13 @@ def test_nothing_to_do(steps: list[Step]) -> None:
     ("steps", "field"),
     [(OPEN, "steps"), (["open"], "steps[0]"), ([GoTo(0.0, 0.0), None], "steps[1]")],
 )
-def test_what_is_no_step(steps: Any, field: str) -> None:
+def test_invalid_steps_are_rejected(steps: Any, field: str) -> None:
     with pytest.raises(InputError) as caught:
         phases(steps)
     assert caught.value.field == field
 
 
-def test_what_is_left_open_is_the_first_attachment_that_moves_the_joints() -> None:
+def test_default_attachment_is_the_first_that_moves_the_joints() -> None:
     """The first of all moves only some of them."""
     placed = full_scene().objects["cabinet"]
     named = {
@@ -335,7 +335,7 @@ def test_what_is_left_open_is_the_first_attachment_that_moves_the_joints() -> No
     )
 
 
-def test_what_the_hand_has_is_taken_before_what_comes_first() -> None:
+def test_present_attachment_is_preferred() -> None:
     task = phases(
         [
             Actuate("door", {"hinge": 1.2}, "handle_free"),
@@ -348,7 +348,7 @@ def test_what_the_hand_has_is_taken_before_what_comes_first() -> None:
     assert task.holds == (Hold("door", "handle_free"),)
 
 
-def test_what_holds_a_latch_is_passed_over() -> None:
+def test_attachment_that_cannot_release_the_latch_is_skipped() -> None:
     """The plate moves the hinge, and no knob: while the latch is shut, it will not do."""
     scene = with_link(door_scene(), "plate", "panel")
     attachments = scene.objects["door"].object.attachments
@@ -362,7 +362,7 @@ def test_what_holds_a_latch_is_passed_over() -> None:
     )
 
 
-def test_one_object_held_here_and_then_there() -> None:
+def test_object_grasped_at_two_attachments_in_turn() -> None:
     """Each by its own joints, in one chain; by the same joint, it is told which has no place in one."""
     lid = with_link_of(full_scene(), "cabinet", "lid")
     task = phases([Actuate("cabinet", {"swing": 0.5}), Actuate("cabinet", {"lid_hinge": 0.2})], lid)
@@ -387,7 +387,7 @@ def test_one_object_held_here_and_then_there() -> None:
     assert find_shared_coordinate(door_scene(), both.holds) == "door.hinge"
 
 
-def test_what_the_start_holds_is_let_go_of_where_another_hold_moves_the_same() -> None:
+def test_unused_initial_hold_is_dropped_if_another_moves_the_same_joints() -> None:
     """With the joints that the new one does not move, which then are none of the task."""
     scene = (
         with_link(door_scene(), "plate", "panel")
@@ -412,7 +412,7 @@ def test_an_object_without_attachments() -> None:
         phases([Grasp("door")], dataclasses.replace(door_scene(), objects={"door": bare}))
 
 
-def test_phases_are_told_apart_by_what_happens_to_what() -> None:
+def test_phase_keys_differ_by_kind_and_subject() -> None:
     """However they are called."""
     assert [phase.key for phase in phases([OPEN, GoTo(0.0, 0.0)]).phases] == [
         ("grasp", ("door", "handle", "")),

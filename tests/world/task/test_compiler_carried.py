@@ -1,4 +1,4 @@
-"""From steps to phases where things are carried: what is in the hand when, what stands where, and what one hand cannot do."""
+"""Tests the compilation of steps in which objects are carried, placed or used as tools."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def held(task: Task) -> list[tuple[Hold, ...]]:
 
 
 # --- touching
-# ---------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
-def test_touching_with_a_stick_is_taking_it_and_carrying_it() -> None:
+def test_touch_with_a_stick_grasps_it_first() -> None:
     task = phases(Touch("stick.tip", POINT))
     reach, touch = task.phases
     assert names(task) == ["reach stick.grip", "touch with stick.tip"]
@@ -81,7 +81,7 @@ def test_touching_with_the_robot_itself() -> None:
     assert held(task) == [(), ()]
 
 
-def test_what_stands_where_before_and_after_it_is_taken() -> None:
+def test_resting_placements_before_and_after_a_grasp() -> None:
     task = phases(Touch("stick.tip", POINT))
     for phase, standing in zip(task.phases, [{"stick", "ball"}, {"ball"}], strict=True):
         assert set(phase.resting) == standing
@@ -92,7 +92,7 @@ def test_what_stands_where_before_and_after_it_is_taken() -> None:
     assert all(not phase.lowered and not phase.released_by for phase in task.phases)
 
 
-def test_a_stick_in_the_hand_is_used_at_once() -> None:
+def test_held_stick_touches_without_a_grasp() -> None:
     for attachment, hold in (("grip", GRIP), ("end", END)):
         task = phases(Touch("stick.tip", POINT), of=scene().with_held({"stick": attachment}))
         assert (names(task), held(task), task.holds) == (
@@ -112,7 +112,7 @@ def test_a_stick_in_the_hand_is_used_at_once() -> None:
 # -----------------------------------------------------------------------------------------
 
 
-def test_placing_is_taking_bringing_and_letting_go() -> None:
+def test_place_grasps_carries_and_releases() -> None:
     task = phases(Place("stick", POSE), GoTo(0.0, 0.0))
     assert names(task) == ["reach stick.grip", "place stick", "go to"]
     reach, place, leave = task.phases
@@ -132,7 +132,7 @@ def test_placing_is_taking_bringing_and_letting_go() -> None:
     assert reach.released == place.released == ()
 
 
-def test_placing_at_a_point_keeps_it_upright_and_leaves_open_where_exactly() -> None:
+def test_place_at_a_point_keeps_the_object_upright() -> None:
     lying = with_object(scene(), "stick", POSE)
     task = phases(Place("stick", (0.0, 1.0, 0.5)), GoTo(0.0, 0.0), of=lying)
     (goal,) = task.phases[1].frames
@@ -179,7 +179,7 @@ def test_releasing_what_is_held_at_the_start() -> None:
     assert moved.phases[1].released_by == {"stick": (GRIP, 0)}
 
 
-def test_what_cannot_be_released() -> None:
+def test_invalid_releases_are_rejected() -> None:
     with pytest.raises(InputError, match="hand is empty") as caught:
         phases(GoTo(0.0, 0.0), Release())
     assert caught.value.field == "steps[1]"
@@ -219,7 +219,7 @@ def test_a_ball_is_fetched_with_the_stick() -> None:
     assert task.after == ()
 
 
-def test_letting_go_of_the_stick_lets_go_of_the_ball_on_it() -> None:
+def test_releasing_the_stick_releases_the_ball_on_it() -> None:
     fetch = [Grasp("stick"), Grasp("ball", "pull", by="stick.tip")]
     for step in (Release(), Release("stick"), Place("stick", POSE)):
         task = phases(*fetch, step, GoTo(0.0, 0.0))
@@ -247,13 +247,13 @@ def test_held_through_something_at_the_start() -> None:
         ("ball.ball", "does not carry", InputError),
     ],
 )
-def test_what_nothing_can_be_held_through(by: str, match: str, error: type[InputError]) -> None:
+def test_invalid_holders_are_rejected(by: str, match: str, error: type[InputError]) -> None:
     with pytest.raises(error, match=match) as caught:
         phases(Grasp("stick"), Grasp("ball", by=by))
     assert caught.value.field == "steps[1].by"
 
 
-def test_only_what_is_carried_can_hold_something() -> None:
+def test_only_carried_objects_can_hold_others() -> None:
     with pytest.raises(InputError, match="does not carry") as caught:
         phases(Grasp("ball", by="stick.tip"))
     assert (caught.value.field, caught.value.got) == ("steps[0].by", "'stick.tip'")
@@ -266,7 +266,7 @@ def test_only_what_is_carried_can_hold_something() -> None:
 
 
 # --- one hand
-# ---------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -283,7 +283,7 @@ def test_only_what_is_carried_can_hold_something() -> None:
 @pytest.mark.parametrize(
     "first", [Grasp("stick"), Touch("stick.tip", POINT)], ids=["taken", "used"]
 )
-def test_a_hand_that_carries_something_takes_nothing_else(first: Step, second: Step) -> None:
+def test_hand_holds_one_object_only(first: Step, second: Step) -> None:
     with pytest.raises(InputError, match="one hand") as caught:
         phases(GoTo(0.0, 0.0), first, second)
     assert str(caught.value.field).startswith("steps[2]")
@@ -294,7 +294,7 @@ def test_a_hand_that_carries_something_takes_nothing_else(first: Step, second: S
     compile_task(scene(), [GoTo(0.0, 0.0), first, Release(), second], OPTIONS)
 
 
-def test_the_same_thing_is_not_taken_twice() -> None:
+def test_held_object_cannot_be_grasped_twice() -> None:
     assert names(phases(Grasp("stick"), Grasp("stick"), Touch("stick.tip", POINT))) == [
         "reach stick.grip",
         "touch with stick.tip",
@@ -304,7 +304,7 @@ def test_the_same_thing_is_not_taken_twice() -> None:
     assert caught.value.field == "steps[1]"
 
 
-def test_what_is_carried_comes_along_and_a_door_does_not() -> None:
+def test_free_objects_are_carried_along_and_doors_released() -> None:
     for step in (
         Reach(POSE),
         Reach(POSE, "forearm_link"),
@@ -327,10 +327,10 @@ def test_what_is_carried_comes_along_and_a_door_does_not() -> None:
 
 
 # --- again
-# ------------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
-def test_what_was_placed_can_be_taken_again() -> None:
+def test_placed_object_can_be_grasped_again() -> None:
     task = phases(Place("stick", POSE), GoTo(0.0, 0.0), Touch("stick.tip", POINT))
     assert names(task) == [
         "reach stick.grip",
@@ -349,7 +349,7 @@ def test_what_was_placed_can_be_taken_again() -> None:
     assert elsewhere.phases[2].released == (GRIP,)
 
 
-def test_the_attachment_that_was_used_is_used_again() -> None:
+def test_previous_attachment_is_preferred() -> None:
     task = phases(Place("stick", POSE, "end"), Touch("stick.tip", POINT))
     assert task.holds == (END,)
 
@@ -363,7 +363,7 @@ def test_the_attachment_that_was_used_is_used_again() -> None:
     ],
     ids=["taken and let go", "used and let go", "placed at a point"],
 )
-def test_what_stands_somewhere_cannot_be_taken_before_that_is_known(before: Sequence[Step]) -> None:
+def test_object_of_uncertain_placement_cannot_be_grasped(before: Sequence[Step]) -> None:
     for again in (Grasp("stick"), Touch("stick.tip", POSE), Place("stick", POSE)):
         with pytest.raises(InputError, match="known only after planning") as caught:
             phases(*before, again)
@@ -373,7 +373,7 @@ def test_what_stands_somewhere_cannot_be_taken_before_that_is_known(before: Sequ
 
 
 # --- what is wrong
-# ----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -387,7 +387,7 @@ def test_what_stands_somewhere_cannot_be_taken_before_that_is_known(before: Sequ
         (Grasp("stick", "gripp"), "steps[0].attachment", "grip"),
     ],
 )
-def test_names_that_do_not_exist(step: Step, field: str, nearest: str | None) -> None:
+def test_unknown_names_are_rejected(step: Step, field: str, nearest: str | None) -> None:
     with pytest.raises(UnknownNameError) as caught:
         phases(step)
     assert caught.value.field == field
@@ -403,7 +403,7 @@ def test_names_that_do_not_exist(step: Step, field: str, nearest: str | None) ->
         (Actuate("stick", {"tip_joint": 0.0}), "steps[0].joints"),
     ],
 )
-def test_what_stands_fixed_is_not_carried_and_what_is_free_not_driven(
+def test_fixed_objects_are_not_carried_and_free_objects_not_actuated(
     step: Step, field: str
 ) -> None:
     with pytest.raises(InputError) as caught:
@@ -411,7 +411,7 @@ def test_what_stands_fixed_is_not_carried_and_what_is_free_not_driven(
     assert caught.value.field == field
 
 
-def test_a_free_things_joints_are_not_driven() -> None:
+def test_joints_of_free_objects_are_not_actuated() -> None:
     free = full_scene().objects["cabinet"]
     loose = dataclasses.replace(free, object=dataclasses.replace(free.object, free=True))
     with pytest.raises(InputError, match="is a free object") as caught:
@@ -419,7 +419,7 @@ def test_a_free_things_joints_are_not_driven() -> None:
     assert caught.value.field == "steps[0].object"
 
 
-def test_every_phase_says_where_everything_is() -> None:
+def test_every_phase_has_all_placements() -> None:
     """A free object is either in the hand or stands somewhere, never both."""
     task = phases(
         Touch("stick.tip", POINT),
@@ -454,7 +454,7 @@ def test_a_door_is_not_held_through_a_stick() -> None:
     assert caught.value.field == "steps[1].by"
 
 
-def test_an_object_that_is_not_there_is_missed_by_its_name() -> None:
+def test_error_names_the_missing_object() -> None:
     with pytest.raises(InputError, match="stick") as caught:
         phases(Touch("stik.tip", POINT))
     assert caught.value.field == "steps[0].frame"

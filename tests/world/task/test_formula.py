@@ -24,7 +24,7 @@ def numbers(formula: Formula, count: int = 5) -> np.ndarray:
     return inputs
 
 
-def test_a_state_gives_what_it_says() -> None:
+def test_state_returns_the_named_quantities() -> None:
     s = state()
     parts = [
         s.rotation("cup.cup")[0, 1],
@@ -54,7 +54,7 @@ def test_a_state_gives_what_it_says() -> None:
     np.testing.assert_allclose(formula.evaluate(x), np.stack(expected, axis=1), atol=1e-12)
 
 
-def test_what_a_formula_depends_on() -> None:
+def test_formula_lists_its_inputs() -> None:
     s = state()
     assert not s.make_formula(s.position("tool")).uses_previous
     s = state()
@@ -84,7 +84,7 @@ def test_what_a_formula_depends_on() -> None:
         ),
     ],
 )
-def test_a_formula_computes_what_was_written(expression) -> None:  # type: ignore[no-untyped-def]
+def test_formula_evaluates_the_expression(expression) -> None:  # type: ignore[no-untyped-def]
     s = state()
     formula = s.make_formula(expression(s.coordinate("elbow_joint"), s.coordinate("door.hinge")))
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
@@ -94,7 +94,7 @@ def test_a_formula_computes_what_was_written(expression) -> None:  # type: ignor
     np.testing.assert_allclose(formula.evaluate(inputs), expected, atol=2 * ROUNDING)
 
 
-def test_formulas_are_equal_if_they_compute_the_same_way_and_survive_json() -> None:
+def test_equal_formulas_compare_equal_and_survive_json() -> None:
     def make(limit: float) -> Formula:
         s = state()
         return s.make_formula(ca.sumsqr(s.velocity("tool")) - limit)
@@ -110,7 +110,7 @@ def test_formulas_are_equal_if_they_compute_the_same_way_and_survive_json() -> N
     assert Formula(formula.frames, formula.coordinates, formula.rows, code) == formula
 
 
-def test_roots_have_slopes_at_zero() -> None:
+def test_square_roots_are_differentiable_at_zero() -> None:
     s = state()
     formula = s.make_formula(ca.norm_2(s.velocity("tool")))
     x = ca.SX.sym("x", 25)
@@ -125,7 +125,7 @@ def test_roots_have_slopes_at_zero() -> None:
     assert float(formula.function(moving)) == pytest.approx(0.5, abs=2e-8)
 
 
-def test_unknown_names_are_named_with_the_nearest() -> None:
+def test_error_suggests_the_nearest_name() -> None:
     for ask, kind, name, nearest in (
         (State.position, "frame", "tol", "tool"),
         (State.velocity, "frame", "cup.cap", "cup.cup"),

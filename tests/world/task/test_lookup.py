@@ -1,4 +1,4 @@
-"""What steps name, found in a scene, or refused with the names that there are."""
+"""Tests the search for names of steps in a scene, and the errors for unknown names."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_objects_attachments_links_and_frames() -> None:
     assert find_robot_frame(scene, "forearm_link", "frame") == "forearm_link"
 
 
-def test_what_there_is_not() -> None:
+def test_unknown_names_are_reported() -> None:
     scene = full_scene()
     cabinet = scene.objects["cabinet"]
     for call, nearest in (
@@ -48,7 +48,7 @@ def test_what_there_is_not() -> None:
         find_attachment(bare, None, "here")
 
 
-def test_the_joints_on_the_path_are_those_that_move_the_attachment() -> None:
+def test_path_joints_move_the_attachment() -> None:
     """By trying each of them, with Pinocchio."""
     for placed in full_scene().objects.values():
         model, base = placed.object.model, placed.object.coordinates.q(placed.state)
@@ -69,7 +69,7 @@ def test_the_joints_on_the_path_are_those_that_move_the_attachment() -> None:
     )
 
 
-def test_limits_of_joints_are_those_of_the_file() -> None:
+def test_joint_limits_match_the_file() -> None:
     cabinet = full_scene().objects["cabinet"]
     assert find_joint_limits(cabinet, "cabinet.swing") == (-1.0, 2.0)
     assert find_joint_limits(cabinet, "cabinet.slide") == (0.0, 0.3)

@@ -1,4 +1,4 @@
-"""Phases have names and keys; a task can be cut off after a step."""
+"""Tests names and keys of phases, and the truncation of tasks."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def told(task: Task) -> list[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("steps", [FURNITURE, CARRYING], ids=["furniture", "carrying"])
-def test_a_task_that_is_cut_off_is_that_of_the_first_steps(steps: list[Step]) -> None:
+def test_truncated_task_is_that_of_the_first_steps(steps: list[Step]) -> None:
     scene = scene_for(steps)
     whole = compile_task(scene, steps, SHORT)
     for count in range(1, len(steps) + 1):
@@ -74,7 +74,7 @@ def test_a_task_that_is_cut_off_is_that_of_the_first_steps(steps: list[Step]) ->
     assert told(whole.truncate(len(steps))) == told(whole)
 
 
-def test_phases_are_called_after_what_happens_in_them() -> None:
+def test_phase_names() -> None:
     names = [phase.name for phase in compile_task(scene_for(CARRYING), CARRYING, SHORT).phases]
     assert names == [
         "reach stick.grip",
@@ -91,14 +91,14 @@ def test_phases_are_called_after_what_happens_in_them() -> None:
     assert str(FrameGoal("tool", POSE)) == "tool"
 
 
-def test_the_same_happens_in_phases_of_one_key() -> None:
+def test_equal_keys_mean_equal_phases() -> None:
     """However long they take and whatever is held."""
     one, other = Phase("go", (), 3), Phase("go", (), 9, held=(Hold("cup", "side"),))
     assert one.key == other.key
     assert Phase("turn", ("door.knob",), 3).key != Phase("move", ("door.knob",), 3).key
 
 
-def test_stretches_say_what_is_in_the_hand() -> None:
+def test_summary_lists_held_objects() -> None:
     found = summarize_phases(compile_task(scene_for(CARRYING), CARRYING, SHORT))
     assert found[:4] == [
         ("reach stick.grip", ()),

@@ -1,4 +1,4 @@
-"""Steps: what they take, how they are kept, and what is wrong with them."""
+"""Tests the arguments of steps, their conversion to data, and their errors."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def spoiled(row: int, column: int, value: float) -> np.ndarray:
         (pin.SE3(np.eye(3), np.ones(3)).homogeneous.T, "last row"),
     ],
 )
-def test_what_is_no_pose(pose: Any, problem: str) -> None:
+def test_invalid_poses_are_rejected(pose: Any, problem: str) -> None:
     with pytest.raises(InputError, match=problem) as caught:
         Reach(pose)
     assert caught.value.field == "Reach.pose"
@@ -93,7 +93,7 @@ def test_what_is_no_pose(pose: Any, problem: str) -> None:
         ({"hinge": np.inf}, "Actuate.joints['hinge']"),
     ],
 )
-def test_what_cannot_be_actuated(joints: Any, field: str) -> None:
+def test_invalid_joints_are_rejected(joints: Any, field: str) -> None:
     with pytest.raises(InputError) as caught:
         Actuate("door", joints)
     assert caught.value.field == field
@@ -139,7 +139,7 @@ def test_targets_that_are_poses(pose: Any) -> None:
         (spoiled(0, 0, 0.5), "not a rotation"),
     ],
 )
-def test_what_is_neither_point_nor_pose(target: Any, problem: str) -> None:
+def test_invalid_targets_are_rejected(target: Any, problem: str) -> None:
     for make, field in (
         (lambda: Touch("stick.tip", target), "Touch.target"),
         (lambda: Place("stick", target), "Place.pose"),
@@ -163,13 +163,13 @@ def test_actuate_needs_joints() -> None:
 
 @pytest.mark.parametrize("field", ["x", "y", "yaw"])
 @pytest.mark.parametrize("value", ["there", np.nan, -np.inf, [1.0, 2.0], {}])
-def test_where_one_cannot_go(field: str, value: Any) -> None:
+def test_invalid_base_goals_are_rejected(field: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         GoTo(**{"x": 0.0, "y": 0.0, "yaw": 0.0, field: value})
     assert caught.value.field == f"GoTo.{field}"
 
 
-def test_only_the_heading_may_be_left_open() -> None:
+def test_only_the_heading_is_optional() -> None:
     assert GoTo(1.0, 2.0).yaw is None
     with pytest.raises(InputError, match=r"GoTo\.x"):
         GoTo(None, 2.0)  # type: ignore[arg-type]
@@ -234,7 +234,7 @@ def test_steps_of_earlier_plans() -> None:
         ({"step": "Release", "objects": "stick"}, "Release.objects", "object"),
     ],
 )
-def test_data_with_names_that_do_not_exist(
+def test_data_with_unknown_names_are_rejected(
     data: dict[str, Any], field: str, nearest: str | None
 ) -> None:
     with pytest.raises(UnknownNameError) as caught:
@@ -251,7 +251,7 @@ def test_data_with_names_that_do_not_exist(
         ({"step": "Place", "pose": [0.0, 0.0, 0.0]}, "Place.object"),
     ],
 )
-def test_data_that_lacks_something(data: dict[str, Any], field: str) -> None:
+def test_incomplete_data_are_rejected(data: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError) as caught:
         step_from_dict(data)
     assert caught.value.field == field

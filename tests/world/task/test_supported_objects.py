@@ -1,4 +1,4 @@
-"""What rides along in the phases of a task, and what is refused."""
+"""Tests which objects are supported by moving links in the phases of a task."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def rides(task: Task) -> list[list[tuple[str, str]]]:
     return [[(ride.object, ride.support) for ride in phase.supported] for phase in task.phases]
 
 
-def test_a_cup_rides_on_the_plate_and_stands_elsewhere_then() -> None:
+def test_cup_on_the_plate_moves_with_it() -> None:
     task = compiled(
         plates(cups=2), vkc.Actuate("plate", {"slide": 0.4}), vkc.Grasp("cup"), vkc.GoTo(0.0, 0.0)
     )
@@ -40,11 +40,11 @@ def test_a_cup_rides_on_the_plate_and_stands_elsewhere_then() -> None:
     assert [hold.object for hold in task.phases[3].held] == ["cup"]
 
 
-def test_what_hovers_or_stands_on_the_post_does_not() -> None:
+def test_object_above_the_plate_or_on_the_post_does_not_move() -> None:
     assert rides(compiled(plates(gap=0.05), vkc.Actuate("plate", {"slide": 0.4}))) == [[], []]
 
 
-def test_a_turntable_stays_level_and_a_flap_does_not() -> None:
+def test_tilting_support_is_rejected() -> None:
     assert rides(compiled(plates("turntable"), vkc.Actuate("plate", {"turn": 0.5})))[1] == [
         ("cup", "plate.plate")
     ]
@@ -59,7 +59,7 @@ def test_a_turntable_stays_level_and_a_flap_does_not() -> None:
     assert "0.50 rad" in str(caught.value)
 
 
-def test_what_stands_on_two_things_of_which_one_moves() -> None:
+def test_object_on_moving_and_fixed_links_is_rejected() -> None:
     scene = plates(cups=0)
     shelf = {
         "name": "shelf",
@@ -80,7 +80,7 @@ def test_what_stands_on_two_things_of_which_one_moves() -> None:
     assert rides(compiled(between, vkc.GoTo(0.0, 0.0))) == [[]]
 
 
-def test_a_cup_put_on_the_plate_rides_from_then_on() -> None:
+def test_cup_placed_on_the_plate_moves_with_it() -> None:
     scene = plates().with_placement("cup", pin.SE3(np.eye(3), np.array([0.0, 1.0, 0.0])))
     steps = vkc.Place("cup", [0.8, 0.05, TOP]), vkc.Actuate("plate", {"slide": 0.4})
     task = compiled(scene, *steps)
@@ -89,7 +89,7 @@ def test_a_cup_put_on_the_plate_rides_from_then_on() -> None:
     assert "cup" not in task.phases[-1].released_by
 
 
-def test_a_cup_rides_on_the_tray_in_the_hand() -> None:
+def test_cup_on_the_held_tray_moves_with_it() -> None:
     task = compiled(trays(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
     assert rides(task) == [[], [("cup", "tray.tray")], []]
     left = task.phases[2].resting["cup"].translation
@@ -98,12 +98,12 @@ def test_a_cup_rides_on_the_tray_in_the_hand() -> None:
     )
 
 
-def test_what_rides_cannot_be_taken() -> None:
+def test_supported_object_cannot_be_grasped() -> None:
     with pytest.raises(InputError, match="'cup' rests on an object that the robot carries"):
         compiled(trays(), vkc.Grasp("tray"), vkc.Grasp("cup", by="tray.tray"))
 
 
-def test_where_it_stands_after_a_ride_to_where_only_the_motion_knows() -> None:
+def test_supported_object_of_uncertain_placement_cannot_be_grasped() -> None:
     with pytest.raises(
         InputError, match="the placement of 'cup' at this step is known only after planning"
     ):

@@ -111,7 +111,7 @@ def test_when_terms_are_active() -> None:
         ({"holding": 3}, r"\.holding: not an object"),
     ],
 )
-def test_wrong_fields_are_named(fields: dict[str, Any], message: str) -> None:
+def test_errors_name_the_invalid_field(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
         tilt(**fields)
 
@@ -152,7 +152,9 @@ def own(s: vkc.State) -> Any:
         (lambda s: s.position("tool")[7], "it cannot be evaluated"),
     ],
 )
-def test_wrong_expressions_are_named(expression: Callable[[vkc.State], Any], message: str) -> None:
+def test_errors_name_the_invalid_expression(
+    expression: Callable[[vkc.State], Any], message: str
+) -> None:
     with pytest.raises(vkc.InputError, match=rf"(?s)^terms\['mine'\]\.expression: {message}"):
         trace_terms(hall(), [vkc.Constraint("mine", expression, lower=0.0)])
 
@@ -195,7 +197,7 @@ def test_lists_of_terms_are_checked() -> None:
         trace_terms(room(table()), [tilt(), tilt(lower=0.5)])
 
 
-def test_phases_that_there_are_not() -> None:
+def test_unknown_phases_are_rejected() -> None:
     phases = [("reach stick.grip", ()), ("place stick", ("stick",))]
     check_terms_active([tilt(), tilt(during="place stick"), tilt(holding="stick")], phases)
     with pytest.raises(vkc.UnknownNameError, match="there is no phase 'place stik'") as caught:
@@ -210,7 +212,7 @@ def test_phases_that_there_are_not() -> None:
 
 
 @pytest.mark.parametrize("function", [vkc.plan, vkc.build])
-def test_wrong_terms_are_found_before_anything_is_planned(function: Callable[..., Any]) -> None:
+def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -> None:
     steps = [vkc.Place("stick", (0.8, 0.5, 0.56)), vkc.GoTo(0.0, 0.0)]
     for terms, message in (
         (

@@ -81,7 +81,7 @@ def test_random_tasks_accept_room_settings() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_is_opened(kind: str, tmp_path: Path) -> None:
-    """From a start at random, in a room with other furniture; the plan keeps the object, and is read again elsewhere."""
+    """From a random start in a furnished room; the plan saves the object and is loaded elsewhere."""
     room, steps = vkc.random_task(11, objects=(f"random_{kind}",), clutter=0.3)
     plan = vkc.plan(room, steps)
     assert plan.success, plan.validation

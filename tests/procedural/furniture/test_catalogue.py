@@ -55,7 +55,7 @@ HAND = hand()
 @FEW
 @given(EACH, st.integers(0, 5000))
 def test_the_hand_fits_around_every_handle(kind: str, seed: int) -> None:
-    """Open fingers keep the clearances of a plan: 5 mm to the link that is taken, 20 mm to others."""
+    """Open fingers keep a plan's clearances: 5 mm to the grasped link, 20 mm to others."""
     own = placed(kind, seed)
     assert len(own.object.attachments) >= 2
     for attachment in own.object.attachments.values():

@@ -225,7 +225,7 @@ def test_error_if_parts_do_not_fit() -> None:
 
 
 def test_imported_objects_and_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Imported objects have their frame in their middle: the floor is free before their face, not from inside of them."""
+    """Imported objects have their frame in the middle: the floor is free in front of their face."""
     box = '<collision><origin xyz="{} 0 0.2"/><geometry><box size="{} 0.5 0.4"/></geometry></collision>'
     body, door = box.format(0.03, 0.64), box.format(-0.3, 0.02)
     ends = (

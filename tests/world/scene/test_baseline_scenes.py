@@ -304,7 +304,7 @@ def tool_frame(robot: Robot) -> pin.Frame:
 def room(
     name: str, placed: PlacedObject, robot: list[tuple[str, coal.CollisionGeometry, pin.SE3]]
 ) -> float:
-    """Smallest distance [m] between the robot and the world, without that of the fingers to what they hold."""
+    """Smallest distance between robot and world [m], except of fingers to the grasped object."""
     here = scene(name)
     labels = zip(here.obstacles, here.obstacle_labels, strict=True)
     world = list_placed_shapes([shape for shape, label in labels if label != FLOOR])
@@ -363,7 +363,7 @@ def test_the_arm_reaches_the_handle_without_touching_anything(name: str, moved: 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_hand_is_collision_free_along_the_whole_range(name: str) -> None:
-    """Hand and wrist at the handle are far from all but what they hold; the fingers keep grasp_clearance from that."""
+    """Hand and wrist are clear of other shapes; the fingers keep grasp_clearance."""
     robot, (_, goal) = scene(name).robot, GOALS[name]
     z = np.concatenate([np.zeros(3), robot.home])
     links = {*robot.touch_links, "wrist_3_link"}
@@ -381,7 +381,7 @@ def test_hand_is_collision_free_along_the_whole_range(name: str) -> None:
 
 
 def test_the_robot_fits_through_door_and_aisle() -> None:
-    """Its base, 0.67 wide, drives straight through the open door, and along the aisle with the drawer shut."""
+    """Its base, 0.67 m wide, drives straight through the open door and along the aisle."""
     for name, headings, path in (
         ("corridor_door", (0.0, np.pi), np.linspace([0.0, -0.1], [6.5, -0.1], 14)),
         ("aisle_drawer", (np.pi / 2, -np.pi / 2), np.linspace([2.875, -1.0], [2.875, 4.8], 14)),

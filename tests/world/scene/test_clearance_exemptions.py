@@ -328,7 +328,7 @@ def test_left_overlap_is_not_exempt_again() -> None:
 
 
 def test_a_leaf_whose_edge_swings_into_the_wall_is_proven_to() -> None:
-    """3 mm are too few for a leaf 40 mm thick that turns about its edge, and the scene can say that it does so all the same."""
+    """3 mm are too few for a leaf 40 mm thick that turns about its edge, unless the scene allows it."""
     scene = in_wall(-0.003)
     plan = vkc.plan(scene, [vkc.Actuate("door", HINGE)])
     assert plan.status == "infeasible"
@@ -413,7 +413,7 @@ def box(position: str, size: str) -> str:
 
 
 def hinged_at_post(folder: Path, *, block: bool) -> Scene:
-    """Return a room with a leaf that is 1 mm inside the post at its hinge; a block of the same obstacle may be in its way."""
+    """Return a room with a leaf 1 mm inside its post; the same obstacle may have a block."""
     post, blocking = box("0.02 0.049 1", "0.1 0.1 2"), box("0.3 -0.25 0.3", "0.2 0.2 0.6")
     wall = f'<robot name="w"><link name="w">{post}{blocking if block else ""}</link></robot>'
     (folder / "wall.urdf").write_text(wall, encoding="utf-8")
@@ -472,7 +472,7 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
 
 
 def test_overlap_of_two_joints_is_bounded_by_each_alone() -> None:
-    """A lever on a leaf, 5 mm inside a panel: what both joints do together is not exempt beyond what each does alone."""
+    """A lever on a leaf, 5 mm inside a panel: only overlaps by one joint alone are exempt."""
     lever = (
         '<link name="lever">{}</link><joint name="turn" type="revolute"><parent link="leaf"/><child link="lever"/>'
         '<origin xyz="0.055 -0.4 1"/><axis xyz="1 0 0"/><limit lower="0" upper="0.5" velocity="1" effort="1"/></joint></robot>'

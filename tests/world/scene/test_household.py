@@ -125,7 +125,7 @@ def test_carried_objects_are_free_with_firm_grasps(name: str) -> None:
 
 @pytest.mark.parametrize("name", ATTACHMENTS)
 def test_attachments_are_where_hands_can_be(name: str) -> None:
-    """The open fingers around each are clear of what they take, and the rest of the hand of everything in the object."""
+    """The open fingers are clear of the grasped link, and the rest of the hand of the object."""
     obj = thing(name)
     assert tuple(obj.attachments) == ATTACHMENTS[name]
     for attachment in obj.attachments.values():
@@ -182,7 +182,7 @@ def test_object_turned_round_is_the_same_object(name: str) -> None:
 
 @pytest.mark.parametrize("name", JOINTS)
 def test_parts_do_not_overlap_while_they_move(name: str) -> None:
-    """Every joint moves over its range, with the others at either end; the rack only with an open"""
+    """Every joint moves over its range; the rack only moves with its door open."""
     obj = thing(name)
     pairs = [pair for pair in combinations(obj.links, 2) if frozenset(pair) not in PINNED]
     ends = [np.linspace(0.0, upper, 11) for upper in obj.upper]
@@ -274,7 +274,7 @@ def test_start_region_has_free_places_at_any_heading() -> None:
 
 
 def test_no_shapes_overlap() -> None:
-    """Furniture may touch walls and what stands on it; objects are clear of everything, things to carry by 1 mm."""
+    """Furniture may touch walls and supported objects; free objects keep 1 mm, others more."""
     here = scene()
     for name, placed in here.objects.items():
         links = (
@@ -535,7 +535,7 @@ def moved_hand(tool: pin.SE3) -> Shapes:
 
 
 def turns(freedoms: Sequence[Freedom]) -> list[np.ndarray]:
-    """Some values of a grasp's freedoms: all zero, and the last, its turn, half and all the way to either side."""
+    """Values of a grasp's freedoms: all zero, and its turn half and all of the range."""
     rows = [np.zeros(len(freedoms))]
     if freedoms:
         ends = (

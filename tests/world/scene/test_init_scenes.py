@@ -50,7 +50,7 @@ def bounds(of: Scene, names: tuple[str, ...]) -> np.ndarray:
 
 
 def crosses(start: np.ndarray, end: np.ndarray, box: np.ndarray) -> bool:
-    """Whether the straight way on the floor from start to end meets a box, shape (2, 2): lowest and highest x, y."""
+    """Whether the straight floor path meets a box, shape (2, 2): lowest and highest x, y."""
     with np.errstate(divide="ignore", invalid="ignore"):
         at = np.sort((box - start) / (end - start), axis=0)
     return bool(max(0.0, *at[0]) <= min(1.0, *at[1]))
@@ -140,7 +140,7 @@ def test_first_scene_has_no_obstacles_on_the_path() -> None:
 
 
 def test_second_scene_has_two_obstacles_on_most_paths() -> None:
-    """Where the base's middle cannot pass, at any heading: half the robot's width round either thing."""
+    """The base's centre cannot pass within half the robot's width of either obstacle."""
     around = np.array([[-1.0], [1.0]]) * HUSKY_WIDTH / 2
     first, second = (
         bounds(scene("init_2"), (name,))[:, :2] + around for name in ("crate_1", "crate_2")
@@ -228,7 +228,7 @@ SLIDES = np.linspace(-0.095, 0.095, 5)
 
 @pytest.mark.parametrize(("turn", "table"), [(0.0, 0.04), (0.45, 0.02), (-0.45, 0.02)])
 def test_the_hand_fits_round_the_stick_along_the_whole_range(turn: float, table: float) -> None:
-    """On the table it stays clear of it by more than dist_safe, and of dowel and discs by more than grasp_clearance."""
+    """It keeps dist_safe from the table, and grasp_clearance from dowel and discs."""
     here = scene("init_1")
     placed = here.objects["stick"]
     grip = placed.object.attachments["grip"]

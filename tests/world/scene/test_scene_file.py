@@ -523,7 +523,7 @@ def test_the_packaged_scenes_all_load() -> None:
 
 
 def test_a_start_may_have_a_height(tmp_path: Path) -> None:
-    """The robot keeps it wherever it goes; the document has it, and two scenes of one robot may differ."""
+    """The height is constant and part of the document; scenes of one robot may differ."""
     low, high = (
         load(tmp_path, TINY),
         load(tmp_path, TINY.replace("arm: home", "arm: home\n  z: 0.4")),

@@ -60,7 +60,7 @@ def test_grouping_keeps_all_steps() -> None:
 
 
 def test_steps_are_compiled_in_the_scene_that_the_previous_steps_leave() -> None:
-    """Each step is compiled in the scene that the steps before leave: open door, cup on the table."""
+    """Each step is compiled in the scene that the steps before leave."""
     scene, options = vkc.load_scene("household"), vkc.Options()
     steps = [OPEN, *CUP, SHUT]
     tasks = compile_each_step(scene, steps, options)

@@ -25,7 +25,7 @@ STEP = 1e-6  # [rad] or [m]
 
 
 def moved(placed: PlacedObject, attachment: Attachment, joint: str, values: list[float]) -> float:
-    """Return the advance of the contact into its face per unit of a joint, by finite differences."""
+    """Return the advance of the contact into its face per unit of a joint, numerically."""
     touched = attachment.placement
     for freedom, value in zip(attachment.freedoms, values, strict=True):
         touched = touched * freedom.motion(value)
@@ -48,7 +48,10 @@ def moved(placed: PlacedObject, attachment: Attachment, joint: str, values: list
 def test_advance_matches_finite_differences(
     rpy: list[float], at: list[float], where: list[float], state: tuple[float, float]
 ) -> None:
-    """Of a face of a tray that slides on an arm that swings: every point of the region is between the extremes, two are they."""
+    """Advances of all points of a region lie between the extremes, which two points attain.
+
+    The face is on a tray that slides on a rotating arm.
+    """
     arm = full_scene().objects["cabinet"].with_state({"swing": state[0], "slide": state[1]})
     slides = [
         Freedom(f"_{k}", "prismatic", axis, -0.1, 0.2) for k, axis in enumerate(np.eye(3)[:2])
@@ -75,10 +78,7 @@ def test_advance_matches_finite_differences(
 
 
 def test_advance_covers_the_whole_rim() -> None:
-    """Advances of all points of a region lie between the extremes, which two points attain.
-
-    The face is on a tray that slides on a rotating arm.
-    """
+    """A wheel is pushed along its axis, off the hinge; the lever arm is longer at one side of the"""
     arm = full_scene().objects["cabinet"]
     around = Freedom(
         "_around", "revolute", np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, np.array([-0.1, 0.0, 0.0])
@@ -119,7 +119,7 @@ def test_push_goal_is_clipped_to_the_limit() -> None:
 
 
 def test_push_direction_depends_on_the_state_after_previous_steps() -> None:
-    """A face on a tray that slides on an arm: pulled out, it is on the other side of the axis about which the arm swings."""
+    """A face on a sliding tray: pulled out, it is on the other side of the arm's axis."""
     scene, slides = full_scene(), (0.0, 0.3)
     normal, along = (
         np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0),

@@ -54,7 +54,7 @@ def with_link(scene: Scene, name: str, link: str) -> Scene:
 
 
 def with_link_of(scene: Scene, owner: str, link: str) -> Scene:
-    """Return the scene with one more attachment of an object, named after its link and like the first."""
+    """Return the scene with one more attachment, named after its link and like the first."""
     placed = scene.objects[owner]
     return with_objects(
         scene,
@@ -127,7 +127,7 @@ def test_the_knob_alone() -> None:
 
 
 def test_hinge_and_knob_together() -> None:
-    """The latch is released first, and the knob goes where it was asked to once the door is open."""
+    """The latch is released first; the knob reaches its goal once the door is open."""
     far = phases([Actuate("door", {"hinge": 1.2, "knob": 0.7})])
     assert [phase.name for phase in far.phases] == [
         "reach door.handle",
@@ -244,7 +244,7 @@ def test_task_has_only_joints_that_its_grasps_can_move() -> None:
 
 
 def test_goal_beyond_a_limit_ends_at_the_limit() -> None:
-    """It is compiled, so that planning can say by how much it fails; what follows starts from the limit."""
+    """Planning then says by how much it fails; later steps start from the limit."""
     task = phases([Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)])
     assert task.phases[2].values["door.hinge"] == 2.0
     assert task.phases[3].initial_values["door.hinge"] == HINGE[1]
@@ -363,7 +363,7 @@ def test_attachment_that_cannot_release_the_latch_is_skipped() -> None:
 
 
 def test_object_grasped_at_two_attachments_in_turn() -> None:
-    """Each by its own joints, in one chain; by the same joint, it is told which has no place in one."""
+    """Holds of different joints share a chain; of the same joint they cannot."""
     lid = with_link_of(full_scene(), "cabinet", "lid")
     task = phases([Actuate("cabinet", {"swing": 0.5}), Actuate("cabinet", {"lid_hinge": 0.2})], lid)
     grip, other = Hold("cabinet", "grip"), Hold("cabinet", "lid")

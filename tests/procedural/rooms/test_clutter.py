@@ -76,9 +76,9 @@ def test_clutter_depends_on_the_seed() -> None:
 
 
 def test_too_much_clutter_is_rejected() -> None:
-    with pytest.raises(InputError, match="no place"):
+    with pytest.raises(InputError, match="no space"):
         add_clutter(home(), 5000)
-    with pytest.raises(InputError, match="no place"):
+    with pytest.raises(InputError, match="no space"):
         add_clutter(
             vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}), 1
         )

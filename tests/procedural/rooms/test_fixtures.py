@@ -65,5 +65,5 @@ def test_unknown_objects(kind: str, nearest: str) -> None:
 
 
 def test_free_objects_are_rejected() -> None:
-    with pytest.raises(vkc.InputError, match="carried, not opened"):
+    with pytest.raises(vkc.InputError, match="a free object cannot be a fixture"):
         make_fixture("cup")

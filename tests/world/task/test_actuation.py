@@ -78,7 +78,7 @@ def test_advance_matches_finite_differences(
 
 
 def test_advance_covers_the_whole_rim() -> None:
-    """A wheel is pushed along its axis, off the hinge; the lever arm is longer at one side of the"""
+    """The rim of a wheel beside the hinge has a longer lever arm at one side."""
     arm = full_scene().objects["cabinet"]
     around = Freedom(
         "_around", "revolute", np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, np.array([-0.1, 0.0, 0.0])

@@ -89,7 +89,7 @@ class RoomSettings:
             raise InputError(
                 "there is no table for it",
                 field="carried",
-                expected="at least one table",
+                expected="at least 1 table",
                 got=self.tables,
             )
 

@@ -166,7 +166,7 @@ def test_every_frame_and_shape_is_where_robot_and_object_have_it(grasps: dict[st
 
 @pytest.mark.parametrize("grasps", GRASPS, ids=IDS)
 def test_where_the_closure_holds_the_objects_are_those_of_the_world(grasps: dict[str, str]) -> None:
-    """The world is built without any inversion. Objects are put where a random configuration's closures hold."""
+    """Where the closures hold, objects equal those of a world without inversion."""
     scene, size = full_scene(), full_scene().robot.coordinates.size
     chain = consolidate(scene, grasps)
     for z in random_configurations(chain.lower, chain.upper, 4, np.random.default_rng(1)):
@@ -556,7 +556,7 @@ def test_every_hold_has_its_own_shapes_joints_and_names() -> None:
 
 
 def test_attachment_held_twice_is_rejected() -> None:
-    """Its freedom would have one name for two coordinates; without freedoms there is no ambiguity."""
+    """Its freedom would have one name for two coordinates; without freedoms that is allowed."""
     with pytest.raises(InputError, match="two coordinates share this name") as caught:
         consolidate(carried_scene(), [STICK, PULLED, Hold("ball", "pull")])
     assert str(caught.value.field).startswith("ball.pull_")

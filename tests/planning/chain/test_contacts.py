@@ -58,7 +58,7 @@ def waypoint_in(problem: TrajectoryProblem, phase: str) -> int:
 def pairs(
     problem: TrajectoryProblem, phase: int, *, waypoint: int | None = None
 ) -> dict[tuple[str, str], list[float]]:
-    """Return (link, link or obstacle) → margins of their pairs at a waypoint, or without reductions."""
+    """Return (link, link or obstacle) → margins of their pairs at a waypoint, or unreduced."""
     part = problem.contacts.phases[phase]
     every = np.arange(len(part.pairs))
     margins = (
@@ -332,7 +332,7 @@ def test_a_scene_in_which_nothing_can_collide_is_refused() -> None:
 
 
 # --- distances
-# ------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.ndarray:
@@ -500,7 +500,7 @@ def test_a_boundary_between_phases_belongs_to_the_earlier() -> None:
 
 
 # --- witness planes
-# -------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def stacked_placements(model: pin.Model, data: pin.Data, q: np.ndarray) -> np.ndarray:
@@ -516,7 +516,7 @@ def stacked_placements(model: pin.Model, data: pin.Data, q: np.ndarray) -> np.nd
 
 @pytest.mark.parametrize("phase", [0, 2])
 def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> None:
-    """Of each plane at a random configuration, against coal's distances around it, coordinate by coordinate.
+    """Compares each plane with coal's distances around a random configuration.
 
     A distance has one derivative only where its witness points are unique; elsewhere, and where it
     bends within the step, the two one-sided differences differ, and the plane's slope must lie
@@ -648,7 +648,7 @@ def test_pairing_stops_when_the_budget_is_exhausted() -> None:
 
 
 def side_by_side(*, out: float = 0.0) -> Scene:
-    """Return a room with two drawers, whose fronts are 15 mm apart; the second stands open by so much [m]."""
+    """Return a room with two drawers 15 mm apart, the second one opened by a distance [m]."""
     scene = load_scene("drawer")
     pair = [
         {"type": "drawer", "name": name, "position": [1.93, y, 0.0], "state": {"slide": slide}}

@@ -52,7 +52,7 @@ def fetching() -> TrajectoryProblem:
 def margins(
     problem: TrajectoryProblem, phase: int, *, at: str = ""
 ) -> dict[tuple[str, str], set[float]]:
-    """Return (link, link or obstacle) → margins of pairs, at "first" or "last" or without reductions."""
+    """Return (link, link or obstacle) → margins of pairs, "first" or "last", or unreduced."""
     part, every = (
         problem.contacts.phases[phase],
         np.arange(len(problem.contacts.phases[phase].pairs)),
@@ -200,7 +200,7 @@ def test_it_stands_where_the_motion_that_is_asked_about_leaves_it() -> None:
 
 
 def test_distances_to_what_was_left_are_those_of_a_scene_in_which_it_stands_there() -> None:
-    """As seen by a problem of the last phase alone, in a scene where everything is where the motion put it."""
+    """Compares with a problem of the last phase alone, in the scene that the motion leaves."""
     problem = fetching()
     z = random_configurations(
         problem.chain.lower,

@@ -42,7 +42,7 @@ def problem(scene: Scene, *steps: Step) -> TrajectoryProblem:
 
 
 def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarray]:
-    """Return links → the smallest margin of any of their pairs at every waypoint of a phase, its first included; eased ones.
+    """Return links → the smallest reduced margin of their pairs at each waypoint of a phase.
 
     Those of the hand are `test_contacts`' business.
     """
@@ -90,7 +90,7 @@ def test_what_is_lifted_may_be_close_to_what_it_lay_on_and_what_is_lowered_to_wh
 
 
 def test_the_margin_is_half_the_distance_of_that_shape() -> None:
-    """The discs lie lower than the dowel: they alone are close. A wall at the tip has its own distance, in its own place."""
+    """Only the discs are close, as they lie lower; a wall at the tip has its own distance."""
     wall = box("wall", [0.3, 0.02, 0.3], [0.8, 0.25 + 0.01 + 0.01, TOP + 0.1])
     p = problem(room(table(gap=GAP), wall), Place("stick", ASIDE))
     part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
@@ -185,7 +185,7 @@ def test_what_is_in_the_hand_at_the_start_may_leave_what_it_lies_on(
 
 
 def test_taken_again_it_stands_in_nothing() -> None:
-    """What it stood in at the start it may leave once; after that it was put down, and nothing is put down inside of things."""
+    """An object may leave an initial penetration once; later placements are collision-free."""
     p = problem(room(table(gap=-1e-3)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
     only_near(margins(p, 3)["stick.stick", "table"], 0.0, begin=True)
 
@@ -202,7 +202,7 @@ def test_what_rides_is_eased_from_what_is_beside_it_where_the_ride_begins_alone(
 def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_that_is_lifted() -> (
     None
 ):
-    """A cup on a tray, a centimetre in front of a wall; where the tray is put down there is none."""
+    """A cup on a tray is 1 cm in front of a wall; there is none where the tray is placed."""
     things = [
         {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
         cup(at=(0.82, 0.05, 0.72)),
@@ -218,7 +218,7 @@ def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_t
 
 
 def test_in_a_short_phase_both_ends_must_be_possible() -> None:
-    """It is lifted and lowered within a few waypoints, and lies on the table in the end, though above it at first."""
+    """The object is lifted and placed within a few waypoints and finally rests on the table."""
     options = dataclasses.replace(SHORT, reach_waypoints=NEAR)
     p = program_of(
         room(table(gap=GAP)), [Place("stick", lifted(STICK, [0.0, 0.5, -GAP]))], options=options
@@ -235,7 +235,7 @@ def test_margin_from_the_floor_is_reduced() -> None:
 
 
 def tip_at_a_wall(gap: float, *steps: Step) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return the problem of touching a point `gap` before a wall, and then what `steps` say; and the point."""
+    """Return the problem of touching a point `gap` before a wall and then `steps`; the point."""
     point = np.array([0.8, 0.7, 0.75])
     scene = room(box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))).with_held(
         {"stick": "grip"}
@@ -271,7 +271,7 @@ def test_reaching_a_pose_is_no_touch() -> None:
 
 
 def resting(steps: Sequence[Step]) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return a problem on the table and the configurations of a motion through it that lifts and lowers the stick."""
+    """Return a problem on the table and a motion that lifts and places the stick."""
     scene = room(table(gap=GAP))
     p = problem(scene, *steps)
     up, down = np.array(scene.start), reaching(tool_at(STICK), above(STICK))

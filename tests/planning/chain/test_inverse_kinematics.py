@@ -228,7 +228,7 @@ def test_half_a_turn_away_is_not_taken_for_there(axis: int) -> None:
 
 
 def tilt(placement: pin.SE3, target: pin.SE3) -> float:
-    """Return the angle between the world's vertical and where it is when the body stands as the target does [rad]."""
+    """Return the angle [rad] between the body's and the target's vertical."""
     vertical = target.rotation.T @ np.array([0.0, 0.0, 1.0])
     return float(np.arccos(np.clip((placement.rotation @ vertical)[2], -1.0, 1.0)))
 
@@ -323,7 +323,7 @@ def test_what_hangs_upside_down_is_turned_upright() -> None:
 
 
 def test_residuals_and_jacobians_with_a_shift(chain: VirtualKinematicChain) -> None:
-    """What is added to the frame's place is fixed in another joint's frame: a hand's approach, say."""
+    """The shift is fixed in another joint's frame, such as a hand's approach direction."""
     _, joint, local = solver_and_frame(chain)
     hand, vector = chain.robot.model.njoints - 1, (0.03, -0.05, 0.08)
     z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(10))

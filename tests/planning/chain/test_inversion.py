@@ -30,7 +30,8 @@ def trees(draw: st.DrawFn) -> tuple[str, int]:
         origin = f'<origin xyz="{xyz}" rpy="{rpy}"/>'
         shape = f"{origin}<geometry>{draw(st.sampled_from(SHAPES))}</geometry>"
         inertia = '<mass value="1.5"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
-        bodies = f"<inertial>{origin}{inertia}</inertial><collision>{shape}</collision><visual>{shape}</visual>"
+        shapes = f"<collision>{shape}</collision><visual>{shape}</visual>"
+        bodies = f"<inertial>{origin}{inertia}</inertial>{shapes}"
         parts.append(f'<link name="l{i}">{bodies}</link>')
     for i in range(1, number):
         xyz, rpy = (f"{draw(length)} {draw(length)} {draw(length)}" for _ in range(2))

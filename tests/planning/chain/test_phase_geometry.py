@@ -1,4 +1,4 @@
-"""Bounding volumes against coal's distances of all pairs: random shapes on joints that are anywhere."""
+"""Compares bounding volumes with coal's distances of random shapes on random joints."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def random_placement(rng: np.random.Generator, size: float) -> pin.SE3:
 
 
 def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9) -> PhaseGeometry:
-    """Return boxes, balls and cylinders, some on joints, the others in a room of 3 m, and two thirds of all pairs."""
+    """Return boxes, balls and cylinders on joints and in a 3 m room, and 2/3 of all pairs."""
     shapes = []
     for k in range(moving + standing):
         size = rng.uniform(0.02, 0.4, 3)
@@ -55,7 +55,7 @@ def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9
 
 
 def random_joints(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return placements of the universe and the joints, shapes (count, J + 1, 3, 3) and (count, J + 1, 3)."""
+    """Return universe and joint placements, shapes (count, J + 1, 3, 3) and (count, J + 1, 3)."""
     rotations = np.array(
         [[np.eye(3), *(pin.exp3(rng.normal(size=3)) for _ in range(JOINTS))] for _ in range(count)]
     )

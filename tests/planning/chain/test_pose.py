@@ -98,7 +98,7 @@ def test_it_grows_with_the_angle_up_to_half_a_turn() -> None:
     "axis", [*np.eye(3), *-np.eye(3), None], ids=["x", "y", "z", "-x", "-y", "-z", "random"]
 )
 def test_half_a_turn_is_no_solution(away: float, axis: np.ndarray | None) -> None:
-    """½ vee(E − Eᵀ) vanishes there: a planner built on it converged to a pose turned half round."""
+    """½ vee(E − Eᵀ) vanishes there; a planner using it converged to a half turn."""
     rng = np.random.default_rng(2)
     for sign in (-1.0, 1.0):
         about = random_axis(rng) if axis is None else axis
@@ -249,7 +249,7 @@ def outside(kind: str, placement: pin.SE3, target: pin.SE3) -> float:
 
 
 def tilted(target: pin.SE3, heading: float, tilt: float, about: float) -> pin.SE3:
-    """Return `target` turned about its own vertical by `heading`, then tilted by `tilt` about a level axis in the world."""
+    """Return `target` rotated about its vertical by `heading`, then tilted by `tilt`."""
     level = np.array([np.cos(about), np.sin(about), 0.0])
     turn = pin.exp3(tilt * level) @ pin.exp3(heading * np.array([0.0, 0.0, 1.0]))
     return pin.SE3(turn @ target.rotation, np.array(target.translation))

@@ -33,7 +33,8 @@ def composite() -> pin.JointModelComposite:
 def unbounded_unaligned() -> pin.JointModel:
     """Return a continuous joint about a slanted axis, as loaded from a URDF."""
     axis = f'<parent link="a"/><child link="b"/><axis xyz="{" ".join(map(str, AXIS))}"/>'
-    urdf = f'<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">{axis}</joint></robot>'
+    joint = f'<joint name="j" type="continuous">{axis}</joint>'
+    urdf = f'<robot name="r"><link name="a"/><link name="b"/>{joint}</robot>'
     return pin.buildModelFromXML(urdf).joints[1]
 
 
@@ -371,7 +372,8 @@ print(vkc_pin.planning.kinematics.joint_placements(model)(0.5)[0])
 
 
 def test_the_compiled_module_is_loaded_at_first_use() -> None:
-    code = "import sys, vkc_pin.planning.kinematics; print('vkc_pin.planning.kinematics._cpin' in sys.modules)"
+    name = "vkc_pin.planning.kinematics"
+    code = f"import sys, {name}; print('{name}._cpin' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )

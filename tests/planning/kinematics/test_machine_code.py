@@ -1,4 +1,4 @@
-"""Tests that compiled functions equal interpreted ones bit for bit, and the fallback if it fails."""
+"""Tests that compiled functions equal interpreted ones bit for bit, and the fallback."""
 
 from __future__ import annotations
 
@@ -239,7 +239,8 @@ BROKEN = {
     "writes nothing": "echo done; exit 0",
     "writes garbage": "echo garbage > functions.so",
     "computes something else": "sed -i 's/sin(/cos(/' functions.c; exec cc \"$@\"",
-    "rounds otherwise": "sed -i 's/4.2857142857142855e-01/4.2857142857142861e-01/' functions.c; exec cc \"$@\"",
+    "rounds otherwise": "sed -i 's/4.2857142857142855e-01/4.2857142857142861e-01/' functions.c; "
+    'exec cc "$@"',
     "lacks the function": "sed -i 's/int f(/int g(/' functions.c; exec cc \"$@\"",
     "kills": "kill -9 $PPID",
 }

@@ -169,7 +169,12 @@ def test_step_that_increases_any_violation_is_rejected(kind: str) -> None:
             loop.merit.compute_penalty(loop.found, clearance=True) - 2.0
         )  # as much as this kind is worth
         trial = Trial(
-            **{**fields, "objective": 0.0, "found": found, "predicted_penalty": predicted_penalty}
+            **{
+                **fields,
+                "objective": 0.0,
+                "infeasibility": found,
+                "predicted_penalty": predicted_penalty,
+            }
         )  # type: ignore[arg-type]
         assert loop.is_acceptable(trial, *loop.compute_penalties(trial)) == expected
 

@@ -89,7 +89,7 @@ def test_stationary_motion_costs_nothing() -> None:
 
 
 def test_motion_at_constant_speed_costs_its_length() -> None:
-    """4 m on a slant and 2 rad of a joint, in two phases of which one has nine times the waypoints."""
+    """4 m on a slant and 2 rad of a joint; one of two phases has nine times the waypoints."""
     for ends in ((4, 40), (36, 40)):
         path = np.zeros((41, 6))
         path[:, :2] = np.outer(

@@ -47,7 +47,7 @@ def two_grasps() -> TrajectoryProblem:
 
 
 def column(problem: TrajectoryProblem, name: str) -> np.ndarray:
-    """Return lower and upper bound of a coordinate at every waypoint after the start, shape (N, 2)."""
+    """Return the bounds of a coordinate at each waypoint after the start, shape (N, 2)."""
     index = problem.chain.index(name)
     return np.column_stack([problem.lower[:, index], problem.upper[:, index]])
 
@@ -63,7 +63,7 @@ def names_of(problem: TrajectoryProblem) -> list[str]:
 
 
 # --- bounds
-# ---------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_phases_follow_one_another(opened: TrajectoryProblem) -> None:
@@ -199,7 +199,7 @@ def test_clip_and_waypoints(opened: TrajectoryProblem) -> None:
 
 
 # --- poses
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_closure_holds_from_the_grasp_to_the_end_of_the_hold(opened: TrajectoryProblem) -> None:
@@ -260,7 +260,7 @@ def test_a_frame_of_the_robot_can_reach_too() -> None:
 
 
 def test_pose_error_and_drift(opened: TrajectoryProblem) -> None:
-    """The largest residual at the waypoints where a pose must hold; way and angle off half-way between those of a hold."""
+    """Pose error is the largest residual at goals; drift is measured between held waypoints."""
     z = random_path(opened)
     poses, model = opened.transcription.structure.poses, opened.chain.model
     data = opened.chain.model.createData()
@@ -314,7 +314,7 @@ def tool(problem: TrajectoryProblem, row: np.ndarray) -> pin.SE3:
     ids=["door", "socket with a standoff", "stick"],
 )
 def test_a_hand_comes_straight_to_what_it_grasps(step: Step, scene) -> None:  # type: ignore[no-untyped-def]
-    """Some waypoints before, the pose holds exactly where the tool is `approach` behind the grasp, wherever in it that is."""
+    """Before the grasp, the tool is `approach` behind the grasp pose, whatever its freedoms."""
     problem = program_of(scene(), [step], options=SHORT)
     number = next(k for k, name in enumerate(names_of(problem)) if name.startswith("approach "))
     pose, solver, target = (
@@ -348,7 +348,7 @@ def test_a_hand_comes_straight_to_what_it_grasps(step: Step, scene) -> None:  # 
 
 
 # --- what is carried
-# --------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 FETCH: list[Step] = [
     Grasp("ball", "pull", "stick.tip"),
@@ -458,7 +458,7 @@ def test_what_is_held_through_something_is_closed_by_its_holder(
 
 @pytest.fixture(scope="module")
 def carrying() -> TrajectoryProblem:
-    """A robot that rolls, a grasp that is clamped, own constraints of bounds and an equality, some with the time of a step."""
+    """Return a problem with a rolling base, a clamped grasp and user-defined constraints."""
     scene = dataclasses.replace(room(table()), robot=load_robot("husky_ur5e", base="differential"))
     terms = [
         Constraint(
@@ -484,7 +484,7 @@ def carrying() -> TrajectoryProblem:
 
 
 def test_excess_is_the_signed_bound_violation(carrying: TrajectoryProblem) -> None:
-    """With a sign: what must be taken away to bring them to the nearest bound; nothing where they are within."""
+    """The sign points away from the bound; values within bounds have no excess."""
     p, t = carrying, carrying.transcription
     dt = np.random.default_rng(1).uniform(0.1, 0.4, p.segments)
     for seed, scale in ((0, 1.0), (1, 0.1), (2, 5.0)):
@@ -591,11 +591,11 @@ def test_a_program_with_all_kinds_of_rows_is_feasible_where_it_is_set_up(
 
 
 # --- rates
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_rates_are_those_of_the_trajectory(two_grasps: TrajectoryProblem) -> None:
-    """As the trajectory is played, with the pauses in which a gripper closes; where a hand holds nothing, its choice is moot."""
+    """Rates include the pauses of the gripper; freedoms of open hands do not matter."""
     z, dt = random_path(two_grasps), SHORT.dt
     trajectory = make_trajectory(two_grasps, z, np.full(two_grasps.segments, dt))
     steps, changes = two_grasps.rates(z)
@@ -667,7 +667,7 @@ def runs(problem: TrajectoryProblem) -> list[slice]:
 
 
 def test_long_runs_get_more_time() -> None:
-    """Only where it is too long, and so much that the profile 3s² − 2s³ is within all rates; then less again."""
+    """Only runs that are too long get more time, enough for the profile 3s² − 2s³."""
     problem = program_of(
         full_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1)], options=SHORT
     )
@@ -741,7 +741,7 @@ def test_a_problem_does_not_change(opened: TrajectoryProblem) -> None:
 
 
 # --- the rest
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def test_contacts_are_those_of_each_waypoints_phase(opened: TrajectoryProblem) -> None:

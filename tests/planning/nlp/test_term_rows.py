@@ -129,7 +129,7 @@ def times(p: vkc.TrajectoryProblem) -> np.ndarray:
 
 
 class Numbers:
-    """What a term asks a State for, in numbers: of the plain models, and of grasps by their definition."""
+    """Numeric State: frames of the plain models, and grasps by their definition."""
 
     def __init__(
         self, p: vkc.TrajectoryProblem, path: np.ndarray, waypoint: int, dt: float
@@ -157,7 +157,7 @@ class Numbers:
         return pin.updateFramePlacement(robot.model, data, robot.model.getFrameId(frame)).copy()
 
     def _held(self, owner: str, t: int, hold: Any) -> pin.SE3:
-        """Return where the base link of something is that is held: holder · (link · A · J(v) · D)⁻¹."""
+        """Return the placement of a held base link: holder · (link · A · J(v) · D)⁻¹."""
         placed = self.p.scene.objects[owner]
         attachment = placed.object.attachments[hold.attachment]
         values = [self._value(f"{owner}.{name}", t) for name in attachment.coordinates]
@@ -413,7 +413,8 @@ def test_terms_without_a_derivative_are_rejected() -> None:
         for term in (vkc.Constraint("mine", expression, upper=0.2), vkc.Cost("mine", expression)):
             with pytest.raises(
                 vkc.InputError,
-                match=r"terms\['mine'\]\.expression: its value or derivative is not finite at the start",
+                match=r"terms\['mine'\]\.expression: "
+                "its value or derivative is not finite at the start",
             ):
                 program_of(
                     room(table()).with_held({"stick": "grip"}),

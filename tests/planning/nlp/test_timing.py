@@ -20,7 +20,7 @@ def test_runs_lie_between_rests() -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 30.0]))
 def test_the_profile_fits_into_the_time(seed: int, size: float) -> None:
-    """A motion along 3s² − 2s³ over each run, in the time it is given, respects both limits, by finite differences."""
+    """A motion along 3s² − 2s³ in each run keeps both limits, by finite differences."""
     rng = np.random.default_rng(seed)
     rests = sorted(rng.choice(np.arange(1, 12), 2, replace=False).tolist())
     runs, limits = split_at_stops(rests, 12), (rng.uniform(0.3, 3.0, 4), rng.uniform(0.3, 6.0, 4))

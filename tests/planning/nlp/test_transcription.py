@@ -150,7 +150,7 @@ class Point:
 
 
 def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:
-    """Return a point at which shares are between 0 and 1, and everything there is for them to remove is random."""
+    """Return a point with relaxation variables between 0 and 1, and random excess."""
     rng, t = np.random.default_rng(seed), p.transcription
     N, K = t.segments, t.slots
     axes = rng.normal(size=(N, len(p.pose_goals), 3))
@@ -174,7 +174,7 @@ def random_point(p: TrajectoryProblem, seed: int = 0) -> Point:
 
 
 def functions(p: TrajectoryProblem, *, rates: bool) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Return what Ipopt is given: (x, p) → f, ∇f; (x, p) → g, ∂g; (x, p, σ, λ) → the upper half of ∇²L."""
+    """Return Ipopt's functions: x, p → f, ∇f; x, p → g, ∂g; x, p, σ, λ → triu ∇²L."""
     solver = p.transcription.solver(rates=rates, options=QUIET).function
     return tuple(solver.get_function(name) for name in ("nlp_grad_f", "nlp_jac_g", "nlp_hess_l"))
 
@@ -204,7 +204,7 @@ def differences(function, x: np.ndarray, step: float = 1e-5) -> np.ndarray:  # t
 
 
 def clamped(p: TrajectoryProblem) -> list[tuple[int, int, int]]:
-    """Return column, first and last waypoint of what a hand keeps as it chose it; by the definition of a firm grasp."""
+    """Return column, first and last waypoint of the freedoms of firm grasps."""
     found = []
     for hold, names in p.chain.virtual.items():
         firm = p.scene.objects[hold.object].object.attachments[hold.attachment].firm
@@ -220,13 +220,13 @@ def clamped(p: TrajectoryProblem) -> list[tuple[int, int, int]]:
 
 
 def clamp_rows(p: TrajectoryProblem) -> np.ndarray:
-    """Return the last rows but for those of pushes: one for every coordinate that is clamped and every step of time."""
+    """Return the clamping rows: one for each clamped coordinate and step."""
     count = sum(last - first for _, first, last in clamped(p))
     return p.transcription.rows - len(p.transcription.pushed_rows) - count + np.arange(count)
 
 
 def stretches(p: TrajectoryProblem) -> list[np.ndarray]:
-    """Return the waypoints of each stretch between two rests: the start, every grasp and release, the end."""
+    """Return the waypoints of each run: from the start, grasps and releases, to the end."""
     neighbours = zip(p.ends[:-1], p.task.phases[:-1], p.task.phases[1:], strict=True)
     hands = [int(end) for end, a, b in neighbours if a.grasps or set(a.held) - set(b.held)]
     stops = [0, *hands, p.segments]
@@ -234,7 +234,7 @@ def stretches(p: TrajectoryProblem) -> list[np.ndarray]:
 
 
 # --- definitions
-# ----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -318,7 +318,7 @@ def test_there_are_goals_of_all_kinds() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_clamped_coordinates_keep_their_values(name: str) -> None:
-    """A row for every step of time from the way in to the end of the hold: the change of the coordinate in it."""
+    """There is one row per step from the approach to the end of the hold."""
     p = problem(name)
     point = random_point(p)
     path = p.waypoints(point.z)
@@ -331,7 +331,7 @@ def test_clamped_coordinates_keep_their_values(name: str) -> None:
 
 
 def test_pushed_coordinates_move_in_one_direction() -> None:
-    """A row for every step of the phase, the first from the start: how far the hinge goes in it, which is 0 at least."""
+    """There is one row per step of the phase: the hinge's displacement, at least 0."""
     p = problem("push")
     point, column, t = random_point(p), p.chain.index("door.hinge"), p.transcription
     path, phase = p.waypoints(point.z)[:, column], p.task.phases[0]
@@ -361,7 +361,7 @@ def test_pushed_coordinates_move_in_one_direction() -> None:
 
 
 def test_rows_of_a_base_on_wheels() -> None:
-    """How far it goes aside of the heading at the middle; of a car what a turn leaves of the way; what the wheels go."""
+    """Rows are lateral displacement, curvature limit of a car, and wheel travel."""
     for name in ("differential", "ackermann"):
         p = problem(name)
         point = random_point(p)
@@ -450,7 +450,7 @@ def test_every_row_has_one_meaning(name: str) -> None:
 
 
 # --- derivatives
-# ----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -541,7 +541,7 @@ def test_patterns_hold_everywhere(name: str) -> None:
 
 
 # --- relaxation
-# -----------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -593,7 +593,7 @@ def test_satisfied_poses_need_no_relaxation() -> None:
 
 
 # --- reuse
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------------
 
 
 def moved_door(scene: Scene) -> Scene:

@@ -43,7 +43,7 @@ def some_poses(chain: VirtualKinematicChain) -> tuple[PoseRow, ...]:
 
 
 class Numbers:
-    """Random values of all that the functions depend on, and what is computed from them by Pinocchio."""
+    """Random inputs of the functions, and results computed from them by Pinocchio."""
 
     def __init__(self, chain: VirtualKinematicChain, poses: tuple[PoseRow, ...], seed: int) -> None:
         self.chain, self.poses, rng = chain, poses, np.random.default_rng(seed)

@@ -38,7 +38,7 @@ def test_two_points_are_a_straight_line() -> None:
 
 
 def test_linear_constraints_of_waypoints_hold_along_the_path() -> None:
-    """It is linear in them: a combination of coordinates that is zero at all of them is zero all along."""
+    """The path is linear in the waypoints: zero combinations of coordinates stay zero."""
     given_points = points(5)
     given_points[:, 2] = 2.0 * given_points[:, 0] - given_points[:, 1]
     path = fit_path(given_points, np.ones(3), NOWHERE)

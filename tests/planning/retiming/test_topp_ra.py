@@ -19,7 +19,7 @@ def duration(places: np.ndarray, speeds: np.ndarray) -> float:
 
 @pytest.mark.parametrize(("length", "fastest", "strongest"), [(1.0, 10.0, 2.0), (3.0, 0.5, 1.0)])
 def test_duration_of_a_straight_path(length: float, fastest: float, strongest: float) -> None:
-    """Up with all there is and down again, with a stretch at full speed between them if it is long enough."""
+    """Full acceleration, a phase at full speed if the path is long enough, and braking."""
     path = fit_path(np.array([[0.0, 0.0], [length, 0.0]]), np.ones(2), FREE)
     places = np.linspace(0.0, length, 201)
     speeds = compute_speeds(

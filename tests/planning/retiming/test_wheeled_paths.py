@@ -64,7 +64,7 @@ def smooth_drive(count: int) -> np.ndarray:
 
 
 def test_between_waypoints_it_goes_where_the_base_would() -> None:
-    """Through every second of the waypoints, it passes the others closely; splines of x, y and yaw go there, but slip."""
+    """A path through every second waypoint passes the others closely; splines would slip."""
     fine, scale = smooth_drive(40), np.array([1.0, 1.0, 0.5, 0.3])
     ((path, own),) = fit_rolling_paths(fine[::2], scale, FAR, TANK)
     assert len(own) == 21
@@ -78,7 +78,7 @@ def test_between_waypoints_it_goes_where_the_base_would() -> None:
 
 
 def test_a_steered_base_stops_where_it_would_have_to_turn_too_tightly() -> None:
-    """From one smallest circle to that on the other side; from straight on to it, or between wider ones, it needs no stop."""
+    """It stops between opposite smallest circles, but not between straight or wider arcs."""
     scale = np.array([1.0, 1.0, 0.5, 0.3])
     for before, after, stops in ((-1.0, 1.0, 1), (np.inf, 1.0, 0), (-1.8, 1.8, 0)):
         points = arcs([(0.2, 0.2 / (1.001 * before))] * 5 + [(0.2, 0.2 / (1.001 * after))] * 5)
@@ -142,7 +142,7 @@ def test_points_between_waypoints_lie_on_arcs(base: str) -> None:
 
 
 def test_rounding_of_places_is_no_reason_to_stop() -> None:
-    """Millimetres along a wide circle, each place off by a micrometre, as a solver leaves them: one path, no turn too tight."""
+    """Waypoints on a wide circle with errors of a micrometre give one path, no tight turn."""
     radius, points = 0.8, arcs([(1.2e-3, 0.7 * 1.2e-3 / 0.8)] * 6)
     points[1:-1, :2] += 3e-7 * np.array(
         [[1.0, -1.0], [-1.0, 0.5], [0.7, 1.0], [-1.0, -1.0], [0.3, 1.0]]
@@ -158,7 +158,7 @@ def test_rounding_of_places_is_no_reason_to_stop() -> None:
 
 
 def test_on_its_smallest_circle_a_steered_base_needs_no_stop() -> None:
-    """Steps grow and shrink along it, as they do where a motion begins and ends; from straight on it may bend within a step."""
+    """Steps vary in length as at start and end; from a straight line it may bend in a step."""
     scale = np.array([1.0, 1.0, 0.5, 0.3])
     lengths = [0.02, 0.06, 0.1, 0.12, 0.12, 0.1, 0.05, 0.02]
     assert (

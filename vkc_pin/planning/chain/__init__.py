@@ -1,1 +1,1 @@
-"""The virtual kinematic chain: its kinematics, and what it can hit."""
+"""Builds the virtual kinematic chain, its kinematics and its collision model."""

@@ -262,7 +262,9 @@ class ContactModel:
         reach: float,
         allowed: float,
     ) -> Any:
-        """Return a checker of straight lines in the first coordinates, see `Clearances.make_line_checker`.
+        """Return a checker of straight lines in the first coordinates.
+
+        See `Clearances.make_line_checker`.
 
         Args:
             z: Configuration that gives all other coordinates, shape (n,).

@@ -1,1 +1,1 @@
-"""Equations 1 to 7 as one nonlinear program."""
+"""Formulates equations 1 to 7 as one nonlinear program."""

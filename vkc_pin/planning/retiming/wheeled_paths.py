@@ -188,7 +188,7 @@ class _StepFitter:
         self, poses: Floats, slopes: Floats, spans: Floats, distances: Floats, parts: int
     ) -> None:
         self.poses, self.spans, self.parts = poses, spans[:, None], parts
-        self.yaw, self.way = (
+        self.yaw_slopes, self.distance_slopes = (
             [column[:-1, None] * self.spans, column[1:, None] * self.spans] for column in slopes.T
         )
         self.distances = self._initial_distances = distances[:, None]
@@ -203,7 +203,7 @@ class _StepFitter:
     def compute_heading(self, s: Floats) -> tuple[Floats, Floats]:
         """Return the yaw and its derivative at s, shape (K,): shape (N, K) each."""
         before, change = self.poses[:-1, 2:], np.diff(self.poses[:, 2:], axis=0)
-        value, slope = _evaluate_hermite(s, change, *self.yaw)
+        value, slope = _evaluate_hermite(s, change, *self.yaw_slopes)
         return before + value + self.heading_bumps * _evaluate_bump(s)[
             0
         ], slope + self.heading_bumps * _evaluate_bump(s)[1]
@@ -211,7 +211,7 @@ class _StepFitter:
     def compute_distance(self, s: Floats) -> tuple[Floats, Floats]:
         """Return the distance driven in each step and its derivative at s, shape (N, K) each."""
         (value, slope), (bump, bump_slope) = (
-            _evaluate_hermite(s, self.distances, *self.way),
+            _evaluate_hermite(s, self.distances, *self.distance_slopes),
             _evaluate_bump(s),
         )
         return value + self.distance_bumps * bump, slope + self.distance_bumps * bump_slope
@@ -299,11 +299,12 @@ class _StepFitter:
             + travelled
             + gaps[:, None] * (3.0 - 2.0 * s) * s**2
         )
-        (yaw, yaw_rate), (way, speed) = self.compute_heading(s), self.compute_distance(s)
+        (yaw, yaw_rate), (distance, speed) = self.compute_heading(s), self.compute_distance(s)
         start_distance = np.concatenate([[[0.0]], np.cumsum(self.distances, axis=0)[:-1]])
         velocity = speed * np.exp(1j * yaw)
         values = [
-            _concatenate_steps(part) for part in (place.real, place.imag, yaw, start_distance + way)
+            _concatenate_steps(part)
+            for part in (place.real, place.imag, yaw, start_distance + distance)
         ]
         slopes = [
             _concatenate_steps(part / self.spans)

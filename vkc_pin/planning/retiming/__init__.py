@@ -1,1 +1,1 @@
-"""Timing of motions: a smooth path through waypoints, and how fast it can be gone along."""
+"""Retimes trajectories: a smooth path through waypoints, at the highest speed within limits."""

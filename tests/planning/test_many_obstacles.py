@@ -152,7 +152,7 @@ def check_contacts(
     which = np.array([number[tuple(pair)] for pair in contacts.pair.tolist()], int)
     every, same = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
     margins = np.array(
-        [part.margins_at(every, same, z, np.full(len(every), row)) for row in range(len(z))]
+        [part.get_margins(every, same, z, np.full(len(every), row)) for row in range(len(z))]
     )
     assert len(set(zip(contacts.waypoint.tolist(), which.tolist(), strict=True))) == len(which)
     np.testing.assert_allclose(
@@ -277,26 +277,26 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     z = samples.z[samples.waypoint_rows]
     distances = brute_force(table, z)
     moves = table._moves[table._phase][:, table.pairs].any(axis=2)
-    placed, count = table.solids.at(samples.world.coordinates.q(z)), len(table.pairs)
+    placed, count = table.solids.place(samples.world.coordinates.q(z)), len(table.pairs)
     at, pairs = np.repeat(np.arange(len(z)), count), np.tile(table.pairs, (len(z), 1))
-    bounds = placed.bounds(at, pairs).reshape(-1, count)
+    bounds = placed.compute_lower_bounds(at, pairs).reshape(-1, count)
     assert (bounds <= distances + COAL).all()
     assert (bounds[np.isfinite(bounds)] >= 0.0).all()
     for reach in (0.02, 0.5):
-        close = table.near(
+        close = table.find_close_pairs(
             placed,
             np.arange(len(z)),
             np.arange(len(z)),
-            np.zeros((len(z), len(table.group))),
+            np.zeros((len(z), len(table.groups))),
             reach,
         )
         assert set(map(tuple, np.argwhere((distances < reach - COAL) & moves).tolist())) <= set(
             zip(*map(np.ndarray.tolist, close), strict=True)
         )
     np.testing.assert_allclose(
-        placed.distances(at, pairs).reshape(-1, count), distances, rtol=0.0, atol=COAL
+        placed.compute_distances(at, pairs).reshape(-1, count), distances, rtol=0.0, atol=COAL
     )
-    nearest, least = placed.nearest(table.pairs)
+    nearest, least = placed.find_nearest(table.pairs)
     np.testing.assert_allclose(least, distances.min(axis=1), rtol=0.0, atol=COAL)
     np.testing.assert_allclose(
         distances[np.arange(len(z)), nearest], distances.min(axis=1), rtol=0.0, atol=COAL

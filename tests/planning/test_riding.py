@@ -34,7 +34,7 @@ def test_a_cup_on_a_plate_comes_along_and_is_taken_off() -> None:
             placement.translation, [0.8 - value, 0.05, TOP], rtol=0.0, atol=1e-9
         )
     np.testing.assert_allclose(where(plan)[-1].translation, [0.2, -1.0, 0.0], rtol=0.0, atol=1e-3)
-    rides = FreeObjects(plan.scene, plan.trajectory).rides
+    rides = FreeObjects(plan.scene, plan.trajectory).supports
     assert [riding for riding in rides if riding] == [{"cup": "plate.plate"}]
 
 

@@ -15,12 +15,12 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.closure import (
     RESOLUTION,
-    _grasp_levers,
-    _hand_levers,
+    _bound_position_acceleration,
+    _bound_rates,
+    _bound_rotation_acceleration,
+    _find_grasp_levers,
+    _find_hand_levers,
     _maximize,
-    _position_bound,
-    _rates,
-    _rotation_bound,
     find_drift,
 )
 from vkc_pin.validation.samples import Samples
@@ -86,7 +86,7 @@ def test_a_drift_between_two_samples_is_found(plan: Plan, by: float, right: bool
         _, hold = held_phase(samples)
         assert (
             one.amount + LIMITS[0]
-            <= samples.grasp_errors_at(hold.object, hold.attachment, moments)[:, 0].max()
+            <= samples.compute_grasp_errors_at(hold.object, hold.attachment, moments)[:, 0].max()
             + RESOLUTION
         )
 
@@ -97,8 +97,8 @@ def test_the_largest_drift_is_that_of_a_fine_grid(plan: Plan) -> None:
         phase, hold = held_phase(samples)
         drift = find_drift(samples, phase, hold, LIMITS)
         moments = np.linspace(*samples.trajectory.times[[phase.first, phase.last]], 40_001)
-        fine = samples.grasp_errors_at(hold.object, hold.attachment, moments).max(axis=0)
-        assert drift.found[0] == pytest.approx(fine[0], abs=2e-6)
+        fine = samples.compute_grasp_errors_at(hold.object, hold.attachment, moments).max(axis=0)
+        assert drift.measured[0] == pytest.approx(fine[0], abs=2e-6)
         assert np.all(fine <= np.maximum(drift.bound + RESOLUTION, 0.5 * np.array(LIMITS)))
 
 
@@ -118,21 +118,23 @@ def test_second_derivatives_stay_below_their_bounds(plan: Plan, seed: int, speed
         names, times, positions * speed, (span,), plan.trajectory.robot_size, curve
     )
     samples = Samples(plan.scene, trajectory)
-    chains = _hand_levers(samples, span, hold), _grasp_levers(samples, hold)
-    velocity, acceleration = _rates(trajectory, times[:1], times[1:])
+    chains = _find_hand_levers(samples, span, hold), _find_grasp_levers(samples, hold)
+    velocity, acceleration = _bound_rates(trajectory, times[:1], times[1:])
     h = 1e-3
     moments = np.linspace(0.01, 0.69, 60)
     values = [placements(samples, hold, moments + k * h) for k in (-1.0, 0.0, 1.0)]
     second = (values[0] - 2.0 * values[1] + values[2]) / h**2
-    position = sum(_position_bound(chain, velocity, acceleration)[0] for chain in chains)
+    position = sum(
+        _bound_position_acceleration(chain, velocity, acceleration)[0] for chain in chains
+    )
     assert np.linalg.norm(second[:, :3], axis=1).max() <= position * 1.001 + 1e-3
-    rotation = _rotation_bound([*chains[0], *chains[1]], velocity, acceleration)[0]
+    rotation = _bound_rotation_acceleration([*chains[0], *chains[1]], velocity, acceleration)[0]
     assert np.linalg.norm(second[:, 3:], axis=1).max() <= rotation * 1.001 + 1e-3
 
 
 def placements(samples: Samples, hold: vkc.Hold, times: Floats) -> Floats:
     """Return the offset of the tool from the handle and the axial vector of their relative rotation, shape (K, 6)."""
-    z = samples.world.compute_positions(samples.trajectory, times, samples.free)
+    z = samples.world.compute_positions(samples.trajectory, times, samples.free_objects)
     attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
     turns, origins = samples._frames(
         z, samples.scene.robot.tool_frame, f"{hold.object}.{attachment.link}"
@@ -166,12 +168,12 @@ def test_a_peak_between_samples_is_found_from_the_bound_of_its_curvature(
         bump = height * np.exp(-(((times - at) / width) ** 2))
         return np.column_stack([bump, 0.0 * bump])
 
-    def curvature(begin: Floats, end: Floats) -> Floats:
+    def bound_curvature(begin: Floats, end: Floats) -> Floats:
         return np.column_stack([np.full(len(begin), 2.0 * height / width**2), np.zeros(len(end))])
 
     times = np.array([0.0, 1.0])
-    drift = _maximize(times, evaluate(times), evaluate, curvature, np.array(LIMITS))
-    assert drift.found[0] == pytest.approx(height, abs=2 * RESOLUTION)
+    drift = _maximize(times, evaluate(times), evaluate, bound_curvature, np.array(LIMITS))
+    assert drift.measured[0] == pytest.approx(height, abs=2 * RESOLUTION)
     assert drift.bound[0] <= LIMITS[0]
     assert drift.times[0] == pytest.approx(at, abs=width * 0.1)
 
@@ -186,7 +188,7 @@ def test_an_error_that_is_not_proven_small_is_refused() -> None:
         lambda begin, end: np.full((len(begin), 2), np.inf),
         np.array(LIMITS),
     )
-    assert np.all(drift.found == 1e-4)
+    assert np.all(drift.measured == 1e-4)
     assert np.all(drift.bound > LIMITS)
 
 
@@ -204,5 +206,7 @@ def test_differential_bases_do_not_drift_where_a_held_phase_begins() -> None:
     for phase in plan.trajectory.phases:
         moments = np.linspace(*plan.trajectory.times[[phase.first, phase.last]], 4001)
         for hold in phase.holds:
-            errors = samples.grasp_errors_at(hold.object, hold.attachment, moments, hold.frame)
+            errors = samples.compute_grasp_errors_at(
+                hold.object, hold.attachment, moments, hold.frame
+            )
             assert np.all(errors.max(axis=0) <= LIMITS)

@@ -31,7 +31,7 @@ from helpers.riding import plates, slid
 from helpers.small_problems import door_scene
 
 from vkc_pin.options import Options
-from vkc_pin.validation.contact_windows import check_gripper, windows
+from vkc_pin.validation.contact_windows import check_gripper, find_contact_windows
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.validate import validate
@@ -53,18 +53,20 @@ def near(
     """Return the labels of pairs that may be close, and between which waypoints; by the way check what else is said of them."""
     samples = Samples(scene, motion)
     labels, found = samples.world.collision_labels, dict[tuple[str, str], list[tuple[int, int]]]()
-    for window in windows(
+    for window in find_contact_windows(
         samples, CollisionShapes(samples.world), steps, Options(dist_safe=dist_safe)
     ):
         named = {(labels[i], labels[j]) for i, j in window.pairs.tolist()}
         assert (np.diff(window.pairs, axis=1) > 0).all()
         for first, second in named:
             by_hand = first in HANDS
-            held = window.together and window.margin == 0.0
+            held = window.moves_together and window.margin == 0.0
             assert held or window.margin == (
-                -np.inf if window.together else min(0.005, dist_safe) if by_hand else 0.0
+                -np.inf if window.moves_together else min(0.005, dist_safe) if by_hand else 0.0
             )
-            assert window.contact == (0.0 if by_hand and not window.together else CONTACT_DEPTH)
+            assert window.contact == (
+                0.0 if by_hand and not window.moves_together else CONTACT_DEPTH
+            )
             at = found.setdefault((first, second), [])
             at += [(window.first, window.last)] * ((window.first, window.last) not in at)
     return {pair: sorted(at) for pair, at in found.items()}
@@ -125,9 +127,9 @@ def test_only_a_grasp_without_freedom_moves_as_one(attachment: str, rigid: bool)
     samples = Samples(
         scene, Trajectory(names, np.arange(2.0), rows, (PhaseSpan("hold", 0, 1, scene.holds),), 9)
     )
-    near, lever = windows(samples, CollisionShapes(samples.world), [], Options())
-    assert (near.together, near.margin, near.contact) == (False, 0.005, 0.0)
-    assert (lever.together, lever.margin, lever.contact) == (
+    near, lever = find_contact_windows(samples, CollisionShapes(samples.world), [], Options())
+    assert (near.moves_together, near.margin, near.contact) == (False, 0.005, 0.0)
+    assert (lever.moves_together, lever.margin, lever.contact) == (
         (True, 0.0, CONTACT_DEPTH) if rigid else (False, 0.005, CONTACT_DEPTH)
     )
 
@@ -249,7 +251,7 @@ def test_neighbours_at_the_waypoints_at_which_their_joints_have_them_so(
     samples = Samples(scene, motion)
     found = [
         window
-        for window in windows(samples, CollisionShapes(samples.world), [], Options())
+        for window in find_contact_windows(samples, CollisionShapes(samples.world), [], Options())
         if len(window.pairs)
     ]
     for window in found:
@@ -282,7 +284,7 @@ def test_what_stands_in_something_leaves_it_once_and_within_a_second() -> None:
     samples = Samples(scene, script.motion())
     inside = [
         window
-        for window in windows(samples, CollisionShapes(samples.world), [], Options())
+        for window in find_contact_windows(samples, CollisionShapes(samples.world), [], Options())
         if window.margin < 0.0
     ]
     assert inside

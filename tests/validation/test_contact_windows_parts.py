@@ -11,7 +11,7 @@ import pytest
 
 from vkc_pin.options import Options
 from vkc_pin.validation import contact_windows as touching
-from vkc_pin.validation.contact_windows import Window, _Windows, check_gripper, check_pushes
+from vkc_pin.validation.contact_windows import Window, _WindowFinder, check_gripper, check_pushes
 from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
 from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption
@@ -218,9 +218,9 @@ def pushed(
     samples: Any = SimpleNamespace(
         scene=SimpleNamespace(robot=SimpleNamespace(tool_frame="tool"), objects=objects),
         trajectory=SimpleNamespace(phases=[span(1, 2, DOOR)]),
-        rows=lambda phase: np.arange(10, 10 + len(hands)),
-        placements=placements,
-        waypoint=lambda row: row // 10,
+        get_rows=lambda phase: np.arange(10, 10 + len(hands)),
+        compute_placements=placements,
+        find_waypoint=lambda row: row // 10,
         times=0.5 * np.arange(30),
     )
     found = check_pushes(samples)
@@ -259,9 +259,9 @@ def test_what_it_had_gone_back_counts_from_the_furthest(monkeypatch: pytest.Monk
 # ---------------------------------------------------------------------------------------------------------
 
 
-def windows(times: list[float], moving: list[bool], dt: float = 0.25) -> Any:
+def find_contact_windows(times: list[float], moving: list[bool], dt: float = 0.25) -> Any:
     """Return windows of a motion that moves in some of its steps."""
-    made = object.__new__(_Windows)
+    made = object.__new__(_WindowFinder)
     made.options, made.steps = Options(dt=dt), np.array(moving)
     made.trajectory = SimpleNamespace(times=np.array(times), phases=[])  # type: ignore[assignment]
     return made
@@ -269,47 +269,67 @@ def windows(times: list[float], moving: list[bool], dt: float = 0.25) -> Any:
 
 def test_what_was_in_contact_may_be_close_for_a_second_or_as_many_steps() -> None:
     even = [0.25 * k for k in range(21)]
-    made = windows(even, [True] * 20)
-    assert [made._until(at) for at in (0, 1, 10, 15, 16, 17, 20)] == [4, 5, 14, 19, 20, 20, 20]
-    assert [made._since(at) for at in (20, 19, 10, 5, 4, 3, 0)] == [16, 15, 6, 1, 0, 0, 0]
-    slow = windows(
+    made = find_contact_windows(even, [True] * 20)
+    assert [made._find_easing_end(at) for at in (0, 1, 10, 15, 16, 17, 20)] == [
+        4,
+        5,
+        14,
+        19,
+        20,
+        20,
+        20,
+    ]
+    assert [made._find_easing_start(at) for at in (20, 19, 10, 5, 4, 3, 0)] == [
+        16,
+        15,
+        6,
+        1,
+        0,
+        0,
+        0,
+    ]
+    slow = find_contact_windows(
         [1.0 * k for k in range(21)], [True] * 20
     )  # steps that take longer: four of them
-    assert (slow._until(5), slow._since(15)) == (9, 11)
-    quick = windows([0.125 * k for k in range(21)], [True] * 20)  # or shorter: a second
-    assert (quick._until(5), quick._since(15)) == (13, 7)
+    assert (slow._find_easing_end(5), slow._find_easing_start(15)) == (9, 11)
+    quick = find_contact_windows(
+        [0.125 * k for k in range(21)], [True] * 20
+    )  # or shorter: a second
+    assert (quick._find_easing_end(5), quick._find_easing_start(15)) == (13, 7)
 
 
 def test_steps_in_which_nothing_moves_do_not_count() -> None:
     moving = [True, True, False, False, True, True, True, False, True, True]
-    made = windows([1.0 * k for k in range(11)], moving)
-    assert made._until(0) == 6  # of the steps up to 6, four move; the seventh would be one too many
-    assert made._until(1) == 8
-    assert made._since(10) == 5
-    assert made._since(9) == 2
+    made = find_contact_windows([1.0 * k for k in range(11)], moving)
+    assert (
+        made._find_easing_end(0) == 6
+    )  # of the steps up to 6, four move; the seventh would be one too many
+    assert made._find_easing_end(1) == 8
+    assert made._find_easing_start(10) == 5
+    assert made._find_easing_start(9) == 2
 
 
 def test_what_lasts_from_where_to_where() -> None:
-    made = windows([0.0], [])
+    made = find_contact_windows([0.0], [])
     made.trajectory.phases = [SimpleNamespace(first=3 * k) for k in range(4)]
-    runs = made._runs([{"a", "b"}, {"a"}, {"a", "c"}, {"c"}, {"b", "c"}])
+    runs = made._find_spans([{"a", "b"}, {"a"}, {"a", "c"}, {"c"}, {"b", "c"}])
     assert sorted(runs, key=str) == sorted(
         [("b", None, 0), ("a", None, 6), ("c", 3, None), ("b", 9, None)], key=str
     )
-    assert list(made._runs([{"a"}, {"a"}])) == [("a", None, None)]
-    assert list(made._runs([set(), set()])) == []
+    assert list(made._find_spans([{"a"}, {"a"}])) == [("a", None, None)]
+    assert list(made._find_spans([set(), set()])) == []
 
 
 def test_pairs_are_of_the_smaller_and_the_larger() -> None:
-    made = windows([0.0], [])
-    assert made._pairs([3, 1], [2]).tolist() == [[2, 3], [1, 2]]
-    assert made._pairs([], [2]).shape == made._pairs([1], []).shape == (0, 2)
+    made = find_contact_windows([0.0], [])
+    assert made._make_pairs([3, 1], [2]).tolist() == [[2, 3], [1, 2]]
+    assert made._make_pairs([], [2]).shape == made._make_pairs([1], []).shape == (0, 2)
     made.labels, made.solids = (
         np.array(["stick.tip", "base", "stick.grip", "stick.x"]),
-        SimpleNamespace(bodies=3),
+        SimpleNamespace(body_count=3),
     )
-    assert made._shapes("stick") == [0, 2]  # what stands beyond is an obstacle of that name
-    assert made._between({"stick.tip", "base"}, {"stick.grip"}).tolist() == [[0, 2], [1, 2]]
+    assert made._get_shapes("stick") == [0, 2]  # what stands beyond is an obstacle of that name
+    assert made._pair_links({"stick.tip", "base"}, {"stick.grip"}).tolist() == [[0, 2], [1, 2]]
 
 
 def test_a_window_is_no_window_of_what_moves_as_one_unless_that_is_said() -> None:
@@ -352,7 +372,7 @@ def test_what_is_allowed_where_it_is(
     holds: str, spans: list[tuple[int, int]], margin: float, contact: float, together: bool
 ) -> None:
     """Up to the last waypoint in a row at which it is."""
-    made = windows([0.0], [True] * 4)
+    made = find_contact_windows([0.0], [True] * 4)
     made.labels = made.keys = np.array(["drawer.tray", "side"])
     made.samples = SimpleNamespace(
         z=np.zeros((9, 2)),
@@ -360,10 +380,10 @@ def test_what_is_allowed_where_it_is(
         world=SimpleNamespace(coordinates=SimpleNamespace(names=())),
     )
     one: Any = Allowed([mark == "x" for mark in holds], margin)
-    found = list(made._allowed(one))
+    found = list(made._find_exemption_windows(one))
     assert [(window.first, window.last) for window in found] == spans
     for window in found:
         assert window.pairs.tolist() == [[0, 1]]
         assert window[3:] == (margin, contact, together, True)
     made.labels = np.array(["drawer.tray", "other"])
-    assert list(made._allowed(one)) == []
+    assert list(made._find_exemption_windows(one)) == []

@@ -13,10 +13,10 @@ from helpers.motions import whirl
 from helpers.small_problems import full_scene
 
 from vkc_pin.validation.distances import (
-    POINT,
+    POINT_RADIUS,
     CollisionShapes,
     PlacedShapes,
-    _free,
+    _bound_free_displacements,
     bound_displacements,
 )
 from vkc_pin.validation.samples import Samples
@@ -33,7 +33,7 @@ def test_boxes_are_those_around_the_corners_of_turned_boxes() -> None:
     mine = solids()
     world, rng = mine.world, np.random.default_rng(3)
     q = world.coordinates.q(rng.uniform(-1.0, 1.0, (2, world.coordinates.size)))
-    placed = mine.at(q)
+    placed = mine.place(q)
     assert len(placed) == 2
     lower, upper = placed.corners
     assert lower.shape == upper.shape == (2, len(world.shapes), 3)
@@ -56,7 +56,7 @@ def between(one: tuple[list[float], list[float]], other: tuple[list[float], list
     far = ([9.0] * 3, [9.5] * 3)
     corners = tuple(np.array([[far[side], far[side]], [one[side], other[side]]]) for side in (0, 1))
     placed.__dict__["corners"] = corners
-    found = placed.bounds(np.array([1, 1]), np.array([[0, 1], [1, 0]]))
+    found = placed.compute_lower_bounds(np.array([1, 1]), np.array([[0, 1], [1, 0]]))
     assert found[0] == found[1]
     return float(found[0])
 
@@ -83,9 +83,9 @@ def test_how_far_shapes_move_is_the_sum_over_their_joints() -> None:
     found = bound_displacements(mine, z)
     assert found.shape == (4, len(world.shapes))
     np.testing.assert_array_equal(found[0], 0.0)
-    np.testing.assert_array_equal(found[:, mine.bodies :], 0.0)
+    np.testing.assert_array_equal(found[:, mine.body_count :], 0.0)
     kinds = set()
-    for g, shape in enumerate(world.shapes[: mine.bodies]):
+    for g, shape in enumerate(world.shapes[: mine.body_count]):
         far = np.linalg.norm(mine.half[g]) + np.linalg.norm(shape.placement.act(mine.center[g]))
         joint, expected = shape.parentJoint, np.zeros(4)
         while joint:
@@ -123,7 +123,9 @@ def test_how_far_a_point_at_a_free_joint_moves(angle: float) -> None:
             [3.0, 4.0, 2.0, *(3.0 * turn)],
         ]
     )
-    np.testing.assert_allclose(_free(rows, 0.25), [5.0 + 0.25 * angle, 2.0], atol=1e-7)
+    np.testing.assert_allclose(
+        _bound_free_displacements(rows, 0.25), [5.0 + 0.25 * angle, 2.0], atol=1e-7
+    )
 
 
 def test_what_is_carried_moves_as_its_free_joint_does() -> None:
@@ -131,31 +133,33 @@ def test_what_is_carried_moves_as_its_free_joint_does() -> None:
     samples = Samples(scene, motion)
     mine, world = CollisionShapes(samples.world), samples.world
     found = bound_displacements(mine, samples.z)
-    for g, label in enumerate(world.collision_labels[: mine.bodies]):
+    for g, label in enumerate(world.collision_labels[: mine.body_count]):
         owner = label.partition(".")[0]
         if owner not in ("stick", "ball"):
             continue
         shape = world.shapes[g]
         far = np.linalg.norm(mine.half[g]) + np.linalg.norm(shape.placement.act(mine.center[g]))
         columns = world.get_placement_columns(owner)
-        expected = np.append(0.0, np.cumsum(_free(samples.z[:, columns], float(far))))
+        expected = np.append(
+            0.0, np.cumsum(_bound_free_displacements(samples.z[:, columns], float(far)))
+        )
         np.testing.assert_allclose(found[:, g], expected, atol=1e-6)
 
 
 def test_a_point_has_a_size() -> None:
     """A tenth of a millimetre: what is that much further away is still near, what is more is not."""
-    assert POINT == 1e-4  # [m]
+    assert POINT_RADIUS == 1e-4  # [m]
     mine = solids()
-    placed = mine.at(mine.world.coordinates.q(np.zeros((1, mine.world.coordinates.size))))
+    placed = mine.place(mine.world.coordinates.q(np.zeros((1, mine.world.coordinates.size))))
     wall = next(
         k
-        for k in range(mine.bodies, len(mine.world.shapes))
+        for k in range(mine.body_count, len(mine.world.shapes))
         if "wall" in mine.world.collision_labels[k]
     )
     lower, upper = (corners[0, wall] for corners in placed.corners)
     for axis in range(3):
         for edge, side in ((lower, -1.0), (upper, 1.0)):
-            for gap, near in ((0.5 * POINT, True), (1.5 * POINT, False)):
+            for gap, near in ((0.5 * POINT_RADIUS, True), (1.5 * POINT_RADIUS, False)):
                 point = (lower + upper) / 2
                 point[axis] = edge[axis] + side * (0.25 + gap)
-                assert (wall in placed.around(point, 0.25)) == near
+                assert (wall in placed.find_shapes_near(point, 0.25)) == near

@@ -86,7 +86,7 @@ def samples_of(*holds: Hold, phases: Sequence[Sequence[str]] = ()) -> Any:
 def test_what_steps_want_in_the_hand(
     holds: list[Hold], steps: list[Step], expected: list[str]
 ) -> None:
-    found = goals._in_hand(samples_of(*holds), steps)
+    found = goals._find_grasped_objects(samples_of(*holds), steps)
     assert [sorted(names) for names in found] == [sorted(names.split()) for names in expected]
 
 
@@ -106,7 +106,9 @@ def test_what_steps_want_in_the_hand(
 def test_what_should_be_in_the_hand_and_is_not(end: int, step: Step, missing: list[str]) -> None:
     """After `end` phases: in the one before, or in the one that follows."""
     samples = samples_of(STICK, phases=[["ball"], [], ["cup"], []])
-    found = goals._dropped(samples, [GO, step], [{"door"}, set(), {"stick", "ball", "cup"}], 1, end)
+    found = goals._find_missing_grasps(
+        samples, [GO, step], [{"door"}, set(), {"stick", "ball", "cup"}], 1, end
+    )
     assert [miss.subject for miss in found] == missing
     assert all((miss.amount, miss.unit) == (1.0, "holds") for miss in found)
 
@@ -126,12 +128,12 @@ def ordered(
     samples = samples_of(phases=[[]] * len(moved))
     monkeypatch.setattr(
         goals,
-        "_moved",
+        "_measure_joint_motion",
         lambda _, k: {name: (by, "m") for name, by in moved[k].items() if name != "ball"},
     )
     monkeypatch.setattr(
         goals,
-        "_carried",
+        "_measure_transport",
         lambda _, k, named: {n: (by, "m") for n, by in moved[k].items() if n == "ball"},
     )
     table = [[mark == "x" for mark in row] for row in holds]
@@ -237,8 +239,8 @@ def moving(**columns: list[float]) -> Any:
     units = {name: "m" if name.endswith("slide") else "rad" for name in names}
     return SimpleNamespace(
         trajectory=trajectory,
-        moved_by=lambda holds: driven if holds else set(),
-        unit=units.__getitem__,
+        find_driven_coordinates=lambda holds: driven if holds else set(),
+        get_unit=units.__getitem__,
     )
 
 
@@ -250,11 +252,14 @@ def test_what_the_hand_moves_in_a_phase_and_by_how_much() -> None:
         drawer__slide=[0.0, 0.0, 1.0, 1.0, 1.25],
         cup__lid=[0.0, 0.0, 1.0, 1.0, 1.0 + 0.9e-5],
     )
-    assert goals._moved(samples, 0) == {}
-    assert goals._moved(samples, 1) == {"door": (pytest.approx(0.4), "rad"), "drawer": (0.25, "m")}
+    assert goals._measure_joint_motion(samples, 0) == {}
+    assert goals._measure_joint_motion(samples, 1) == {
+        "door": (pytest.approx(0.4), "rad"),
+        "drawer": (0.25, "m"),
+    }
     assert goals.MOTION_TOLERANCE == 1e-5  # [m] or [rad]: less is no motion, as the pages say
     just = moving(cup__lid=[0.0, 0.0, 1.0, 1.0, 1.0 + 1.2e-5])
-    assert goals._moved(just, 1).keys() == {"cup"}
+    assert goals._measure_joint_motion(just, 1).keys() == {"cup"}
 
 
 def test_how_far_what_is_carried_goes() -> None:
@@ -271,10 +276,13 @@ def test_how_far_what_is_carried_goes() -> None:
     world = SimpleNamespace(get_placement_columns=lambda owner: [1, 2, 3, 4, 5, 6, 7])
     phases = [SimpleNamespace(held={"stick": "grip", "door": "handle"})]
     samples: Any = SimpleNamespace(
-        z=z, world=world, rows=lambda phase: np.arange(4), trajectory=SimpleNamespace(phases=phases)
+        z=z,
+        world=world,
+        get_rows=lambda phase: np.arange(4),
+        trajectory=SimpleNamespace(phases=phases),
     )
-    assert goals._carried(samples, 0, {"stick", "cup"}) == {"stick": (9.0, "m")}
-    assert goals._carried(samples, 0, {"cup"}) == {}
+    assert goals._measure_transport(samples, 0, {"stick", "cup"}) == {"stick": (9.0, "m")}
+    assert goals._measure_transport(samples, 0, {"cup"}) == {}
 
 
 # --- angles
@@ -288,10 +296,10 @@ def test_which_turns_count(tilt: float, heading: float, other: float) -> None:
     placed = pin.SE3(
         pin.utils.rotate("z", other) @ pin.utils.rotate("x", tilt) @ target.rotation, np.ones(3)
     )
-    assert goals._turn(placed, target, "all") == 0.0
-    assert goals._turn(placed, target, "heading") == pytest.approx(tilt, abs=1e-7)
+    assert goals._compute_angle_error(placed, target, "all") == 0.0
+    assert goals._compute_angle_error(placed, target, "heading") == pytest.approx(tilt, abs=1e-7)
     whole = pin.SE3(pin.utils.rotate("x", tilt) @ target.rotation, np.ones(3))
-    assert goals._turn(whole, target, "") == pytest.approx(tilt, abs=1e-6)
+    assert goals._compute_angle_error(whole, target, "") == pytest.approx(tilt, abs=1e-6)
 
 
 def test_of_several_attachments_the_one_that_is_nearest_in_its_worse_part() -> None:
@@ -309,14 +317,17 @@ def test_of_several_attachments_the_one_that_is_nearest_in_its_worse_part() -> N
     scene = SimpleNamespace(held={"stick": "near"}, objects={"stick": thing})
     phases = [SimpleNamespace(held={"cup": "rim"}), SimpleNamespace(held={"stick": "far"})]
     samples: Any = SimpleNamespace(
-        scene=scene, trajectory=SimpleNamespace(phases=phases), grasp_errors=grasp_errors
+        scene=scene, trajectory=SimpleNamespace(phases=phases), compute_grasp_errors=grasp_errors
     )
-    assert goals._grasp(samples, Grasp("stick"), 7) == ("far", (0.2, 0.1))
+    assert goals._find_closest_grasp(samples, Grasp("stick"), 7) == ("far", (0.2, 0.1))
     assert asked == [("stick", "near", [7], None), ("stick", "far", [7], None)]
-    assert goals._grasp(samples, Grasp("stick", "near", "cup.rim"), 7) == ("near", (0.02, 0.3))
+    assert goals._find_closest_grasp(samples, Grasp("stick", "near", "cup.rim"), 7) == (
+        "near",
+        (0.02, 0.3),
+    )
     assert asked[-1] == ("stick", "near", [7], "cup.rim")
     scene.held, phases[1].held = {}, {}
-    assert goals._grasp(samples, Grasp("stick"), 7) == ("unused", (0.0, 0.0))
+    assert goals._find_closest_grasp(samples, Grasp("stick"), 7) == ("unused", (0.0, 0.0))
 
 
 # --- all of it
@@ -333,20 +344,22 @@ def checked(
     steps: list[Any] = list(range(len(table)))
     held: list[list[list[bool]]] = []
 
-    def misses(_: Any, step: int, k: int, options: Any) -> list[goals.Miss]:
-        return [goals.Miss(f"x{i}", amount, "m", "") for i, amount in enumerate(table[step][k])]
+    def misses(_: Any, step: int, k: int, options: Any) -> list[goals.GoalError]:
+        return [
+            goals.GoalError(f"x{i}", amount, "m", "") for i, amount in enumerate(table[step][k])
+        ]
 
-    def fallen(_: Any, __: Any, hands: Any, number: int, k: int) -> list[goals.Miss]:
+    def fallen(_: Any, __: Any, hands: Any, number: int, k: int) -> list[goals.GoalError]:
         assert hands == "hands"
         return [
-            goals.Miss("stick", amount, "holds", "")
+            goals.GoalError("stick", amount, "holds", "")
             for at, amount in (dropped or {}).items()
             if at == (number, k)
         ]
 
-    monkeypatch.setattr(goals, "_in_hand", lambda *_: "hands")
-    monkeypatch.setattr(goals, "_misses", misses)
-    monkeypatch.setattr(goals, "_dropped", fallen)
+    monkeypatch.setattr(goals, "_find_grasped_objects", lambda *_: "hands")
+    monkeypatch.setattr(goals, "_compute_goal_errors", misses)
+    monkeypatch.setattr(goals, "_find_missing_grasps", fallen)
     monkeypatch.setattr(goals, "_check_order", lambda _, __, hands, holds: held.append(holds) or [])
     found = goals.check_goals(samples, steps, None)  # type: ignore[arg-type]
     return [

@@ -53,30 +53,32 @@ def test_some_may_be_closer_for_a_while(door: Scene) -> None:
     plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     every = np.arange(len(plain.pairs))
     first, second = plain.pairs[[3]], plain.pairs[[3, 70]]
-    near = [Window(first, 0, 1, 0.005, 1e-4, together=True), Window(second, 1, 3, 0.01, 0.0)]
+    near = [Window(first, 0, 1, 0.005, 1e-4, moves_together=True), Window(second, 1, 3, 0.01, 0.0)]
     table = PairTable(door, CollisionShapes(World(door)), motion, 0.02, windows=near)
     np.testing.assert_array_equal(table.pairs, plain.pairs)
     for waypoint, margins in enumerate(
         [{3: 0.005}, {3: 0.005, 70: 0.01}, {3: 0.01, 70: 0.01}, {3: 0.01, 70: 0.01}]
     ):
         at = np.full(len(every), waypoint)
-        found = table.margins_at(every, at)
+        found = table.get_margins(every, at)
         assert {int(k): float(found[k]) for k in np.flatnonzero(found != 0.02)} == margins
-        assert (plain.margins_at(every, at) == 0.02).all()
-        contact = table.contact_at(every, at, at)
+        assert (plain.get_margins(every, at) == 0.02).all()
+        contact = table.get_contact_overlaps(every, at, at)
         assert {int(k): float(contact[k]) for k in np.flatnonzero(contact)} == (
             {3: 1e-4} if waypoint < 2 else {}
         )
     for begin, as_one in ((0, [3]), (1, []), (2, [])):  # all the time between two waypoints
         at = np.full(len(every), begin)
-        np.testing.assert_array_equal(np.flatnonzero(table.together_at(every, at, at + 1)), as_one)
+        np.testing.assert_array_equal(
+            np.flatnonzero(table.find_moving_together(every, at, at + 1)), as_one
+        )
 
 
 def test_a_window_of_pairs_that_are_not_looked_at_is_nobody_elses(door: Scene) -> None:
     """Neighbouring links, or two walls: what is said of them must not end up with another pair."""
     motion = wander(door, 0, size=0.1)
     plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
-    known, count = {(min(pair), max(pair)) for pair in plain.pairs.tolist()}, len(plain.group)
+    known, count = {(min(pair), max(pair)) for pair in plain.pairs.tolist()}, len(plain.groups)
     absent = np.array(
         [(i, j) for i in range(count) for j in range(i + 1, count) if (i, j) not in known]
     )
@@ -86,11 +88,11 @@ def test_a_window_of_pairs_that_are_not_looked_at_is_nobody_elses(door: Scene) -
         CollisionShapes(World(door)),
         motion,
         0.02,
-        windows=[Window(absent, 0, 3, -1.0, 1.0, together=True)],
+        windows=[Window(absent, 0, 3, -1.0, 1.0, moves_together=True)],
     )
     every = np.arange(len(plain.pairs))
-    assert (table.margins_at(every, np.zeros_like(every)) == 0.02).all()
-    assert not table.contact_at(every, np.zeros_like(every), np.ones_like(every)).any()
+    assert (table.get_margins(every, np.zeros_like(every)) == 0.02).all()
+    assert not table.get_contact_overlaps(every, np.zeros_like(every), np.ones_like(every)).any()
 
 
 def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
@@ -161,8 +163,8 @@ def test_what_does_not_move_in_a_phase_is_not_looked_at_in_it() -> None:
         if {name.partition(".")[0] for name in pair_names(found, k)} == {"stick", "table"}
     ]
     assert lies
-    still = np.zeros((1, len(found.group)))
-    placed = solids.at(samples.world.coordinates.q(samples.z[samples.waypoint_rows]))
+    still = np.zeros((1, len(found.groups)))
+    placed = solids.place(samples.world.coordinates.q(samples.z[samples.waypoint_rows]))
     for waypoint in range(61):
         here = np.array([waypoint])
         _, pairs = found.near(placed, here, here, still, np.inf)
@@ -205,7 +207,7 @@ def test_links_of_the_robot_have_a_clearance_of_their_own(door: Scene) -> None:
     )
     motion = wander(scene, 0, size=0.1)
     table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02, 0.01)
-    margins = table.margins_at(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))
+    margins = table.get_margins(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))
     by_pair = {
         frozenset(pair): float(margin)
         for pair, margin in zip(table.pairs.tolist(), margins, strict=True)

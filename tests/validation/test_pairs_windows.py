@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.validation.contact_windows import Window
-from vkc_pin.validation.pairs import PairTable, _Windows
+from vkc_pin.validation.pairs import PairTable, _WindowIndex
 
 numbers = st.integers(0, 6)
 pairs = st.lists(st.tuples(numbers, numbers), min_size=1, max_size=8, unique=True)
@@ -22,7 +22,7 @@ def made(windows: list[Window], mine: np.ndarray) -> PairTable:
     """Return a table that knows nothing but its pairs, each of which keeps 0.02."""
     table = object.__new__(PairTable)
     table.pairs, table.margins = mine, np.full(len(mine), 0.02)
-    table._windows = _Windows(windows, mine)
+    table._windows = _WindowIndex(windows, mine)
     return table
 
 
@@ -65,11 +65,11 @@ def test_what_holds_for_a_pair_between_two_waypoints(
         return [getattr(windows[w], name) for r, w in expected if r == row]
 
     rows = range(len(asked))
-    assert table.contact_at(which, first, last).tolist() == [
+    assert table.get_contact_overlaps(which, first, last).tolist() == [
         max([0.0, *of(row, "contact")]) for row in rows
     ]
-    assert table.together_at(which, first, last).tolist() == [
-        any(of(row, "together")) for row in rows
+    assert table.find_moving_together(which, first, last).tolist() == [
+        any(of(row, "moves_together")) for row in rows
     ]
     here = [
         [
@@ -79,5 +79,5 @@ def test_what_holds_for_a_pair_between_two_waypoints(
         ]
         for p, t, _ in asked
     ]
-    assert table.margins_at(which, first).tolist() == [min([0.02, *margins]) for margins in here]
+    assert table.get_margins(which, first).tolist() == [min([0.02, *margins]) for margins in here]
     assert (table.margins == 0.02).all()  # they are left as they are

@@ -11,7 +11,7 @@ import pytest
 from helpers.drives import hall, moved, of_rows
 
 from vkc_pin.errors import InputError
-from vkc_pin.validation.report import SAME, Bound, Report, Violation
+from vkc_pin.validation.report import AGREEMENT_TOLERANCE, Bound, Report, Violation
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 WRONG = Violation(
@@ -101,12 +101,13 @@ def test_with_reasons_only_the_violations_are_others() -> None:
 
 
 @pytest.mark.parametrize(
-    ("off", "told"), [(0.9 * SAME, False), (1.5 * SAME, True), (math.nan, True)]
+    ("off", "told"),
+    [(0.9 * AGREEMENT_TOLERANCE, False), (1.5 * AGREEMENT_TOLERANCE, True), (math.nan, True)],
 )
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("field", ["clearance", "closure_error", "closure_angle"])
 def test_numbers_that_are_the_same_or_not(field: str, off: float, sign: float, told: bool) -> None:
-    assert SAME == 1e-5  # [m] or [rad], as the pages say
+    assert AGREEMENT_TOLERANCE == 1e-5  # [m] or [rad], as the pages say
     one = Report(clearance=0.5, closure_error=0.5, closure_angle=0.5)
     other = Report(
         **{"clearance": 0.5, "closure_error": 0.5, "closure_angle": 0.5, field: 0.5 + sign * off}

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vkc_pin.errors import InputError
-from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MOST, Samples
+from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MAX_SAMPLES, Samples
 from vkc_pin.world.scene.hold import Hold, make_holds
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
@@ -78,8 +78,8 @@ def test_a_motion_that_jumps_is_seen_at_its_waypoints(jump: float) -> None:
     positions = trajectory.positions.copy()
     positions[2:, 1] += jump
     samples = Samples(scene, dataclasses.replace(trajectory, positions=positions))
-    assert samples.needed == pytest.approx(jump / LENGTH_STEP, rel=1e-2)
-    assert samples.needed > MOST
+    assert samples.required_count == pytest.approx(jump / LENGTH_STEP, rel=1e-2)
+    assert samples.required_count > MAX_SAMPLES
     np.testing.assert_array_equal(samples.times, trajectory.times)
     np.testing.assert_array_equal(samples.waypoint_rows, np.arange(len(trajectory.times)))
 
@@ -111,13 +111,13 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
         samples.z[samples.waypoint_rows], samples.world.compute_positions(trajectory), atol=1e-9
     )
     assert (np.diff(samples.times) > 0).all()
-    assert [samples.waypoint(int(row)) for row in samples.waypoint_rows] == list(
+    assert [samples.find_waypoint(int(row)) for row in samples.waypoint_rows] == list(
         range(len(trajectory.times))
     )
     assert all(
-        samples.waypoint(int(row) - 1) == t for t, row in enumerate(samples.waypoint_rows[1:])
+        samples.find_waypoint(int(row) - 1) == t for t, row in enumerate(samples.waypoint_rows[1:])
     )
-    assert [samples.unit(name) == "m" for name in trajectory.names] == lengths.tolist()
+    assert [samples.get_unit(name) == "m" for name in trajectory.names] == lengths.tolist()
 
 
 @settings(max_examples=40, deadline=None)
@@ -167,9 +167,12 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
 
 def test_what_a_hand_moves() -> None:
     samples = Samples(full_scene(), motion(full_scene(), 0))
-    assert samples.moved_by(()) == set()
-    assert samples.moved_by(make_holds({"cabinet": "grip"})) == {"cabinet.swing", "cabinet.slide"}
-    assert samples.moved_by(make_holds({"door": "handle", "drawer": "handle"})) == {
+    assert samples.find_driven_coordinates(()) == set()
+    assert samples.find_driven_coordinates(make_holds({"cabinet": "grip"})) == {
+        "cabinet.swing",
+        "cabinet.slide",
+    }
+    assert samples.find_driven_coordinates(make_holds({"door": "handle", "drawer": "handle"})) == {
         "door.hinge",
         "door.knob",
         "drawer.slide",

@@ -65,7 +65,7 @@ def test_the_closest_pair_of_every_waypoint_is_told() -> None:
         PairTable(door, CollisionShapes(world), motion, 0.02),
         world.compute_positions(motion, motion.times),
     )
-    robots = np.array([group == "robot" for group in table.group])
+    robots = np.array([group == "robot" for group in table.groups])
     with_others = np.flatnonzero(
         robots[table.pairs].sum(axis=1) == 1
     )  # the robot is close to itself everywhere, as is the door

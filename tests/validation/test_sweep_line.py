@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.validation import sweep as module
-from vkc_pin.validation.sweep import RESOLUTION, Hit, _least, sweep
+from vkc_pin.validation.sweep import RESOLUTION, Hit, _find_group_minima, sweep
 
 
 class Line:
@@ -29,8 +29,12 @@ class Line:
     ) -> None:
         self.balls = balls
         self.pairs = np.array([(point, 2 + k) for k in range(len(balls)) for point in (0, 1)])
-        self.margins, self.group = np.full(len(self.pairs), margin), [""] * (2 + len(balls))
-        self.own, self.contact, self.together = margins or {}, contact or {}, together or set()
+        self.margins, self.groups = np.full(len(self.pairs), margin), [""] * (2 + len(balls))
+        self.own, self.contact, self.moves_together = (
+            margins or {},
+            contact or {},
+            together or set(),
+        )
         labels = ["one", "two", *(f"ball_{k}" for k in range(len(balls)))]
         self.world = SimpleNamespace(
             coordinates=SimpleNamespace(q=lambda z: z), collision_labels=labels
@@ -38,7 +42,7 @@ class Line:
         self.solids: Any = self
         self.asked: list[tuple[float, ...]] = []
 
-    def at(self, q: np.ndarray) -> Any:
+    def place(self, q: np.ndarray) -> Any:
         def distances(states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
             point, ball = pairs[:, 0], pairs[:, 1] - 2
             where = q[states, point]
@@ -50,16 +54,16 @@ class Line:
             __len__ = staticmethod(lambda: len(q))
 
         placed: Any = PlacedShapes()
-        placed.distances = distances
+        placed.compute_distances = distances
         return placed
 
-    def near(
+    def find_close_pairs(
         self, placed: Any, first: np.ndarray, last: np.ndarray, moved: np.ndarray, limit: float
     ) -> Any:
         k = np.repeat(np.arange(len(first)), len(self.pairs))
         return k, np.tile(np.arange(len(self.pairs)), len(first))
 
-    def margins_at(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def get_margins(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
         return np.array(
             [
                 self.own.get((int(p), int(t)), self.margins[p])
@@ -67,16 +71,20 @@ class Line:
             ]
         )
 
-    def contact_at(self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    def get_contact_overlaps(
+        self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray
+    ) -> np.ndarray:
         spans = zip(pairs.tolist(), first.tolist(), last.tolist(), strict=True)
         return np.array([self.contact.get(span, 0.0) for span in spans])
 
-    def exempt_at(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def find_exempt(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
         return np.zeros(len(pairs), bool)
 
-    def together_at(self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    def find_moving_together(
+        self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray
+    ) -> np.ndarray:
         spans = zip(pairs.tolist(), first.tolist(), last.tolist(), strict=True)
-        return np.array([span in self.together for span in spans], bool)
+        return np.array([span in self.moves_together for span in spans], bool)
 
 
 @pytest.fixture(autouse=True)
@@ -219,6 +227,6 @@ def test_at_a_waypoint_the_contact_is_that_of_the_waypoint_and_between_that_of_b
 def test_of_each_group_the_smallest_and_of_these_the_first() -> None:
     groups = np.array([3, 1, 3, 1, 0, 3])
     values = np.array([0.5, 0.2, 0.1, 0.2, 9.0, 0.1])
-    assert _least(groups, values).tolist() == [4, 1, 2]
-    assert _least(np.zeros(0, int), np.zeros(0)).tolist() == []
-    assert _least(np.array([1, 1]), np.array([1.0, 0.0])).tolist() == [1]
+    assert _find_group_minima(groups, values).tolist() == [4, 1, 2]
+    assert _find_group_minima(np.zeros(0, int), np.zeros(0)).tolist() == []
+    assert _find_group_minima(np.array([1, 1]), np.array([1.0, 0.0])).tolist() == [1]

@@ -12,7 +12,7 @@ from helpers.carrying import STICK, TOP, carried_over, room, table
 from helpers.drives import DT, hall, moved, of_rows, through
 
 import vkc_pin as vkc
-from vkc_pin.validation.terms import BETWEEN
+from vkc_pin.validation.terms import INTERMEDIATE_FACTOR
 
 START = hall().start
 
@@ -116,7 +116,7 @@ def test_between_waypoints(turn: float, wrong: bool) -> None:
     edge = away * np.cos(turn / 2)
     term = vkc.Constraint("behind", lambda s: s.position("tool")[0], upper=edge)
     out = away - edge
-    assert (out > BETWEEN * term.tolerance) == wrong
+    assert (out > INTERMEDIATE_FACTOR * term.tolerance) == wrong
     violations = found(scene, motion, term)
     assert len(violations) == wrong
     for violation in violations:
@@ -124,7 +124,14 @@ def test_between_waypoints(turn: float, wrong: bool) -> None:
         assert violation.waypoint == 1
         assert violation.time == pytest.approx(7.5, abs=0.1)
         assert "between waypoints" in violation.detail
-    assert len(found(scene, motion, dataclasses.replace(term, tolerance=out / BETWEEN * 0.9))) == 1
+    assert (
+        len(
+            found(
+                scene, motion, dataclasses.replace(term, tolerance=out / INTERMEDIATE_FACTOR * 0.9)
+            )
+        )
+        == 1
+    )
 
 
 def test_speeds_are_those_of_the_last_step() -> None:

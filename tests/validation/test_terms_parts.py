@@ -12,7 +12,7 @@ from helpers.drives import hall, moved, of_rows
 
 import vkc_pin as vkc
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.terms import BETWEEN, _inputs, _rows, check_terms
+from vkc_pin.validation.terms import INTERMEDIATE_FACTOR, _compute_inputs, _find_rows, check_terms
 from vkc_pin.world.task.formula import Formula
 from vkc_pin.world.task.terms import trace_terms
 
@@ -31,7 +31,7 @@ def looked_at(
     )
     samples: Any = SimpleNamespace(trajectory=trajectory, waypoint_rows=each * np.arange(len(way)))
     term: Any = SimpleNamespace(is_active=lambda name, held: name == "True")
-    at, between = _rows(samples, term)
+    at, between = _find_rows(samples, term)
     assert not (at % each).any()
     return (at // each).tolist(), between.tolist()
 
@@ -88,7 +88,7 @@ def test_formulas_are_given_frames_coordinates_and_the_last_steps(moving: bool) 
     formula = term.formula
     assert formula.uses_previous == moving
     asked = np.sort(np.append(samples.waypoint_rows[1:], samples.waypoint_rows[1:] - 1))
-    inputs = _inputs(samples, formula, asked)
+    inputs = _compute_inputs(samples, formula, asked)
     half = formula.state_size
     assert inputs.shape == (len(asked), 2 * half + 1)
     model, data = samples.world.model, samples.world.model.createData()
@@ -143,7 +143,7 @@ def test_by_how_much_and_on_which_side(
 
 def test_between_waypoints_ten_times_as_much_is_all_right() -> None:
     """A bump of the formula half-way of a step, 1e-3 times some number high."""
-    assert BETWEEN == 10.0
+    assert INTERMEDIATE_FACTOR == 10.0
     scene = hall()
     motion = of_rows(scene, np.array([moved(scene.start, x=x) for x in (0.0, 1.0, 2.0, 3.0)]))
     samples = Samples(scene, motion)

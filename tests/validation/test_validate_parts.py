@@ -19,7 +19,7 @@ from vkc_pin.validation.validate import (
     START_LIMIT_TOLERANCE,
     START_TOLERANCE,
     WAYPOINT_TOLERANCE,
-    _Check,
+    _Validator,
 )
 from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption
 from vkc_pin.world.scene.hold import Hold
@@ -35,16 +35,16 @@ def check(
     **fields: Any,
 ) -> Any:
     """Return a check of a motion of which only times are known, with `each` samples a step."""
-    made = object.__new__(_Check)
+    made = object.__new__(_Validator)
     edges = np.array(times)
     rows = each * np.arange(len(edges))
     samples = SimpleNamespace(
         times=np.interp(np.arange(rows[-1] + 1), rows, edges),
         waypoint_rows=rows,
-        waypoint=lambda row: int(np.searchsorted(rows, row, side="right")) - 1,
-        rows=lambda phase: np.arange(rows[phase.first], rows[phase.last] + 1),
-        unit=lambda name: "rad" if "turn" in name else "m",
-        virtual=set(),
+        find_waypoint=lambda row: int(np.searchsorted(rows, row, side="right")) - 1,
+        get_rows=lambda phase: np.arange(rows[phase.first], rows[phase.last] + 1),
+        get_unit=lambda name: "rad" if "turn" in name else "m",
+        grasp_freedoms=set(),
     )
     defaults: dict[str, Any] = {
         "samples": samples,
@@ -52,7 +52,7 @@ def check(
             times=edges, phases=phases or [PhaseSpan("p", 0, len(edges) - 1)]
         ),
         "options": Options(),
-        "found": [],
+        "violations": [],
         "exemptions": {},
         "steps": [],
     }
@@ -64,9 +64,9 @@ def check(
 def told(made: Any) -> list[tuple[Any, ...]]:
     rows = [
         (one.constraint, one.subject, one.waypoint, one.time, one.amount, one.unit)
-        for one in made.found
+        for one in made.violations
     ]
-    made.found.clear()
+    made.violations.clear()
     return rows
 
 
@@ -78,9 +78,9 @@ def test_tolerances_are_those_of_the_pages() -> None:
 def test_where_something_is_noted() -> None:
     """At a waypoint, or at a sample: then it is the waypoint before, and the sample's own time."""
     made = check()
-    made._add("limit", "x", 0.5, "m", "d")
-    made._add("limit", "x", 0.5, "m", "d", waypoint=2)
-    made._add("limit", "x", 0.5, "m", "d", row=3)
+    made._add_violation("limit", "x", 0.5, "m", "d")
+    made._add_violation("limit", "x", 0.5, "m", "d", waypoint=2)
+    made._add_violation("limit", "x", 0.5, "m", "d", row=3)
     assert told(made) == [("limit", "x", *at, 0.5, "m") for at in ((0, 0.0), (2, 2.0), (1, 1.5))]
 
 
@@ -100,7 +100,7 @@ def reported(
 ) -> Report:
     """Return the report of a check that finds these."""
     phases = [PhaseSpan(f"p{k}", k, k + 1) for k in range(3)]
-    made = check(phases=phases, found=list(found), terms=(), scene=None)
+    made = check(phases=phases, violations=list(found), terms=(), scene=None)
     for name in (
         "check_rates",
         "check_rolling",
@@ -110,15 +110,17 @@ def reported(
         "check_pushes",
     ):
         monkeypatch.setattr(module, name, lambda *_: [])
-    motors = SimpleNamespace(violations=list, facts=lambda jerk_time: {"torque": jerk_time})
-    monkeypatch.setattr(module, "Motors", lambda samples: motors)
-    made._start = made._limits = made._unheld = made._tips = made._latches = made._slides = lambda: (
-        None
+    motors = SimpleNamespace(
+        find_violations=list, summarize=lambda jerk_time: {"torque": jerk_time}
     )
-    made._closure, made._clearance = lambda: (0.25, 0.5), lambda: np.array(nearest)
-    made._within_reason = lambda: reason
+    monkeypatch.setattr(module, "MotorLoads", lambda samples: motors)
+    made._check_start = made._check_limits = made._check_undriven_joints = made._check_tilt = (
+        made._check_latches
+    ) = made._check_firm_grasps = lambda: None
+    made._check_closure, made._check_clearance = lambda: (0.25, 0.5), lambda: np.array(nearest)
+    made._check_sample_count = lambda: reason
     made.options = Options(jerk_time=0.125)
-    report: Report = made.report()
+    report: Report = made.make_report()
     return report
 
 
@@ -166,11 +168,11 @@ def test_what_is_longer_than_can_be_looked_at(
     needed: float, most: int, right: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At least its waypoints can; it is named where it jumps furthest."""
-    monkeypatch.setattr(module, "MOST", most)
+    monkeypatch.setattr(module, "MAX_SAMPLES", most)
     made = check()
-    made.samples.needed = needed
+    made.samples.required_count = needed
     made.trajectory.positions = np.array([[0.0, 0.0], [2.0, 2.0], [-3.0, 2.0], [-1.0, 4.0]])
-    assert made._within_reason() == right
+    assert made._check_sample_count() == right
     expected = ("sampling", "motion", 1, 1.0, needed - max(most, 4), "configurations")
     assert told(made) == ([] if right else [expected])
 
@@ -186,11 +188,11 @@ def limited(way: list[float], *, bulge: tuple[int, float] | None = None) -> list
     if bulge is not None:
         (high if bulge[1] > 0.0 else low)[bulge[0]] += bulge[1]
     made = check(times=np.arange(float(len(way))), _ranges=(low[:, None], high[:, None]))
-    made.samples.bounds = lambda name: (-1.0, 2.0, 0.0, 0.0)
+    made.samples.get_limits = lambda name: (-1.0, 2.0, 0.0, 0.0)
     made.trajectory.names, made.trajectory.positions = ("turn",), column[:, None]
     made.trajectory.column = lambda name: column
-    made._limits()
-    details = [one.detail for one in made.found]
+    made._check_limits()
+    details = [one.detail for one in made.violations]
     rows = [(*row[:4], pytest.approx(row[4]), row[5]) for row in told(made)]
     for row, detail in zip(rows, details, strict=True):
         value = (
@@ -261,8 +263,8 @@ def test_where_it_starts(off: float, told_of: bool) -> None:
         ("choice", "x", "turn"),
         np.array([[7.0, 1.0, 2.0 + off]]),
     )
-    made._start()
-    details = [one.detail for one in made.found]
+    made._check_start()
+    details = [one.detail for one in made.violations]
     rows = told(made)
     assert [row[:4] for row in rows] == [("start", "turn", 0, 0.0)] * told_of
     if told_of and off == off:
@@ -283,8 +285,8 @@ def stilled(
         (high if bulge[1] > 0.0 else low)[bulge[0]] += bulge[1]
     made = check(times=np.arange(float(len(way))), _ranges=(low[:, None], high[:, None]))
     made.trajectory.names, made.trajectory.column = ("turn",), lambda name: column
-    made._still(phase, "slide", "turn", "it moves by ", " there")
-    details = [one.detail for one in made.found]
+    made._check_stationary(phase, "slide", "turn", "it moves by ", " there")
+    details = [one.detail for one in made.violations]
     rows = told(made)
     assert details == [f"it moves by {row[4]:.4f} rad there" for row in rows]
     return [(*row[:4], pytest.approx(row[4]), row[5]) for row in rows]
@@ -311,11 +313,11 @@ def test_what_nobody_holds_and_what_a_hand_does_not_drive() -> None:
         ("base", "wrist", "door.hinge", "door.knob", "cup.lid", "door.choice"),
         2,
     )
-    made.samples.moved_by = lambda holds: {"door.hinge"} if holds else set()
-    made.samples.virtual = {"door.choice"}
+    made.samples.find_driven_coordinates = lambda holds: {"door.hinge"} if holds else set()
+    made.samples.grasp_freedoms = {"door.choice"}
     noted: list[tuple[Any, ...]] = []
-    made._still = lambda phase, *what: noted.append((phase.name, *what))
-    made._unheld()
+    made._check_stationary = lambda phase, *what: noted.append((phase.name, *what))
+    made._check_undriven_joints()
     nobody, driven = " while nobody holds {}", " while where it is held, nothing drives it"
     assert noted == [
         ("p", "unheld", "door.hinge", "moves by ", nobody.format("door")),
@@ -340,8 +342,8 @@ def test_only_a_hand_that_clamps_must_not_slide() -> None:
         scene=SimpleNamespace(objects=objects),
     )
     noted: list[tuple[Any, ...]] = []
-    made._still = lambda phase, *what: noted.append((phase.name, *what))
-    made._slides()
+    made._check_stationary = lambda phase, *what: noted.append((phase.name, *what))
+    made._check_firm_grasps()
     said = "the hand moves on 'stick' by ", " while it clamps it"
     assert noted == [("q", "slide", f"stick.{name}", *said) for name in clamps.coordinates]
 
@@ -350,12 +352,12 @@ def test_only_a_hand_that_clamps_must_not_slide() -> None:
 def test_what_something_stands_on_stays_level(angle: float, tips: bool) -> None:
     """As it was at the phase's begin, whichever way it turns about the vertical."""
     made = check(phases=[PhaseSpan("p", 0, 1), PhaseSpan("q", 1, 3)])
-    made.samples.free = SimpleNamespace(rides=[{}, {"cup": "tray.plate"}])
+    made.samples.free_objects = SimpleNamespace(supports=[{}, {"cup": "tray.plate"}])
     start = pin.utils.rotate("x", 0.3)
     little = pin.utils.rotate("z", 1.0) @ pin.utils.rotate("y", -0.2 * MAX_TILT) @ start
     turns = [start, little, pin.utils.rotate("y", angle) @ start, start, start]
     made.samples.placements = lambda rows, label: [pin.SE3(turn, np.zeros(3)) for turn in turns]
-    made._tips()
+    made._check_tilt()
     assert told(made) == (
         [("tips", "cup", 2, 2.0, pytest.approx(angle - MAX_TILT), "rad")] if tips else []
     )
@@ -385,11 +387,11 @@ def close(
     made.samples.world = SimpleNamespace(coordinates=SimpleNamespace(names=()), **shapes)
     made.samples.z = np.arange(7.0)[:, None]
     monkeypatch.setattr(module, "CollisionShapes", lambda world: None)
-    monkeypatch.setattr(module, "windows", lambda *_: [])
+    monkeypatch.setattr(module, "find_contact_windows", lambda *_: [])
     monkeypatch.setattr(module, "PairTable", lambda *_, **__: None)
     monkeypatch.setattr(module, "find_clearance_exemptions", lambda scene, safe: allowed)
     monkeypatch.setattr(module, "sweep", lambda table, z, waypoints: iter(hits))
-    nearest = made._clearance()
+    nearest = made._check_clearance()
     return nearest.tolist(), [(*row[:4], pytest.approx(row[4]), row[5]) for row in told(made)]
 
 

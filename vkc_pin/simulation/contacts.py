@@ -106,9 +106,9 @@ def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
     }
     excluded = np.array([(min(pair), max(pair)) in exempt for pair in pairs.tolist()], bool)
     named = [frozenset((labels[i], labels[j])) for i, j in pairs.tolist()]
-    placed = CollisionShapes(world).at(world.coordinates.q(world.start[None]))
-    near = np.flatnonzero(placed.bounds(np.zeros(len(pairs), int), pairs) < 0.0)
-    deep = near[placed.distances(np.zeros(len(near), int), pairs[near]) < -CONTACT_DEPTH]
+    placed = CollisionShapes(world).place(world.coordinates.q(world.start[None]))
+    near = np.flatnonzero(placed.compute_lower_bounds(np.zeros(len(pairs), int), pairs) < 0.0)
+    deep = near[placed.compute_distances(np.zeros(len(near), int), pairs[near]) < -CONTACT_DEPTH]
     overlapping = {named[k] for k in deep.tolist() if not excluded[k]}
     excluded[deep] = True
     never = {named[k] for k in np.flatnonzero(excluded).tolist()}
@@ -176,7 +176,7 @@ def find_unplanned_contacts(
     if not samples_by_pair:
         return ()
     world = World(scene)
-    placed = CollisionShapes(world).at(world.coordinates.q(world.compute_positions(trajectory)))
+    placed = CollisionShapes(world).place(world.coordinates.q(world.compute_positions(trajectory)))
     found = []
     for (first, second), samples in samples_by_pair.items():
         ones, others = (
@@ -186,7 +186,7 @@ def find_unplanned_contacts(
         together = np.zeros(0)
         if ones and others:
             pairs = np.array([(i, j) for i in ones for j in others])
-            _, distances = placed.nearest(np.sort(pairs, axis=1))
+            _, distances = placed.find_nearest(np.sort(pairs, axis=1))
             together = trajectory.times[distances < _TOUCHING]
         moments = np.array(samples)
         far = np.array(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.validation.samples import LENGTH_STEP, MOST, Samples
+from vkc_pin.validation.samples import LENGTH_STEP, MAX_SAMPLES, Samples
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
@@ -24,7 +24,7 @@ __all__ = ["Drift", "find_drift"]
 
 RESOLUTION = 1e-6
 """A maximum is found up to this [m] or [rad]."""
-PROVEN_SHARE = 0.5
+PROVEN_FRACTION = 0.5
 """Share of a limit below which errors are bounded, but their maximum is not searched for."""
 
 
@@ -39,7 +39,7 @@ class Drift(NamedTuple):
             does, shape (2,) [s].
     """
 
-    found: Floats
+    measured: Floats
     bound: Floats
     times: Floats
 
@@ -55,7 +55,7 @@ class _Lever(NamedTuple):
     column: int
     rate: float
     arm: float
-    turns: bool
+    is_revolute: bool
 
 
 def find_drift(
@@ -69,52 +69,57 @@ def find_drift(
         hold: What is held in it.
         limits: Of position [m] and angle [rad].
     """
-    rows = samples.rows(phase)
+    rows = samples.get_rows(phase)
     times = samples.times[rows]
-    errors = samples.grasp_errors(hold.object, hold.attachment, rows, hold.frame)
+    errors = samples.compute_grasp_errors(hold.object, hold.attachment, rows, hold.frame)
     if (
-        samples.scene.objects[hold.object].object.free or samples.truncated
+        samples.scene.objects[hold.object].object.free or samples.is_truncated
     ):  # it moves rigidly with the hand
         return Drift(errors.max(axis=0), errors.max(axis=0), times[errors.argmax(axis=0)])
-    hand, grasp = _hand_levers(samples, phase, hold), _grasp_levers(samples, hold)
+    hand, grasp = _find_hand_levers(samples, phase, hold), _find_grasp_levers(samples, hold)
 
-    def curvature(begin: Floats, end: Floats) -> Floats:
-        speed, acceleration = _rates(samples.trajectory, begin, end)
-        position = sum(_position_bound(chain, speed, acceleration) for chain in (hand, grasp))
-        return np.column_stack([position, _rotation_bound([*hand, *grasp], speed, acceleration)])
+    def bound_curvature(begin: Floats, end: Floats) -> Floats:
+        speed, acceleration = _bound_rates(samples.trajectory, begin, end)
+        position = sum(
+            _bound_position_acceleration(chain, speed, acceleration) for chain in (hand, grasp)
+        )
+        return np.column_stack(
+            [position, _bound_rotation_acceleration([*hand, *grasp], speed, acceleration)]
+        )
 
     def evaluate(moments: Floats) -> Floats:
-        return samples.grasp_errors_at(hold.object, hold.attachment, moments, hold.frame)
+        return samples.compute_grasp_errors_at(hold.object, hold.attachment, moments, hold.frame)
 
-    return _maximize(times, errors, evaluate, curvature, np.array(limits))
+    return _maximize(times, errors, evaluate, bound_curvature, np.array(limits))
 
 
 def _maximize(
     times: Floats,
     errors: Floats,
     evaluate: Callable[[Floats], Floats],
-    curvature: Callable[[Floats, Floats], Floats],
+    bound_curvature: Callable[[Floats, Floats], Floats],
     limits: Floats,
 ) -> Drift:
     """Return the maxima of errors over an interval by bisection (branch and bound).
 
     Args:
-        times: Moments that divide the interval, shape (K,) [s].
+        times: MotionSamples that divide the interval, shape (K,) [s].
         errors: Position and angle errors at these, shape (K, 2).
         evaluate: Returns the errors at increasing moments, shape (n,): shape (n, 2).
-        curvature: Returns bounds of the second derivatives of position and sine of the angle on
+        bound_curvature: Returns bounds of the second derivatives of position and sine of the angle on
             intervals, shape (n, 2).
         limits: Shape (2,).
     """
     begin, end, left, right = times[:-1], times[1:], errors[:-1], errors[1:]
     found, when = errors.max(axis=0), times[errors.argmax(axis=0)]
-    budget = MOST
+    budget = MAX_SAMPLES
     while True:
         bound = (
-            np.maximum(left, right) + curvature(begin, end) * ((end - begin) ** 2 / 8.0)[:, None]
+            np.maximum(left, right)
+            + bound_curvature(begin, end) * ((end - begin) ** 2 / 8.0)[:, None]
         )
         bound[:, 1] = np.arcsin(np.minimum(bound[:, 1], 1.0))
-        proven = np.maximum(found + RESOLUTION, PROVEN_SHARE * limits)
+        proven = np.maximum(found + RESOLUTION, PROVEN_FRACTION * limits)
         open_ = np.flatnonzero((bound > proven).any(axis=1) & (end - begin > 1e-12))
         if not len(open_) or (budget := budget - len(open_)) < 0:
             break
@@ -133,7 +138,7 @@ def _maximize(
     return Drift(found, np.where(unproven, bound.max(axis=0), found), when)
 
 
-def _rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
+def _bound_rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
     """Return bounds of the coordinates' |velocity| and |acceleration| on intervals without knots inside, shape (N, n) each."""
     span = (end - begin)[:, None]
     slope = (trajectory.at(end) - trajectory.at(begin)) / span
@@ -149,7 +154,9 @@ def _rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, 
     return speed, np.maximum(np.abs(at_begin), np.abs(at_end))
 
 
-def _position_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats) -> Floats:
+def _bound_position_acceleration(
+    chain: Iterable[_Lever], speed: Floats, acceleration: Floats
+) -> Floats:
     """Return a bound of the acceleration of a frame's origin, shape (N,) [m/s²].
 
     With joints counted from the world on, ∂²p/∂i∂j is at most the arm of the later joint of both,
@@ -163,13 +170,15 @@ def _position_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats
     total, turning = np.zeros(len(speed)), np.zeros(len(speed))
     for lever in chain:
         v, a = lever.rate * speed[:, lever.column], lever.rate * acceleration[:, lever.column]
-        own = v if lever.turns else 0.0
+        own = v if lever.is_revolute else 0.0
         total += lever.arm * (a + v * (2.0 * turning + own))
         turning += own
     return total
 
 
-def _rotation_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats) -> Floats:
+def _bound_rotation_acceleration(
+    chain: Iterable[_Lever], speed: Floats, acceleration: Floats
+) -> Floats:
     """Return a bound of the second derivative of the sine of the angle between two frames, as a vector along its axis.
 
     The axial vector of a rotation R with R̈ = ([ω̇] + [ω]²) R grows by at most |ω̇| + |ω|², with
@@ -183,13 +192,13 @@ def _rotation_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats
     """
     turning, change = np.zeros(len(speed)), np.zeros(len(speed))
     for lever in chain:
-        if lever.turns:
+        if lever.is_revolute:
             turning += lever.rate * speed[:, lever.column]
             change += lever.rate * acceleration[:, lever.column]
     return np.asarray(change + 1.5 * turning**2)
 
 
-def _hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]:
+def _find_hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]:
     """Return what moves the frame that holds an object, from the world on."""
     scene = samples.scene
     tip = compute_hand_frame(
@@ -202,7 +211,10 @@ def _hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]
     ):  # a link of a free object, rigidly with what holds that but for freedoms
         holder = through.frame or scene.robot.tool_frame
         ends = zip(
-            *(samples.placements(samples.rows(phase), name) for name in (frame, holder)),
+            *(
+                samples.compute_placements(samples.get_rows(phase), name)
+                for name in (frame, holder)
+            ),
             strict=True,
         )
         reach += max(
@@ -218,10 +230,10 @@ def _hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]
                 )
             )
         frame, through = through.frame, through.by
-    return [*_levers(samples, scene.robot.tool_frame, reach), *reversed(backwards)]
+    return [*_find_levers(samples, scene.robot.tool_frame, reach), *reversed(backwards)]
 
 
-def _grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
+def _find_grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
     """Return what moves the frame at which an object is held, from the world on."""
     attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
     reach, backwards = abs(attachment.standoff), list[_Lever]()
@@ -231,16 +243,16 @@ def _grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
         column = samples.trajectory.names.index(f"{hold.object}.{suffix}")
         if freedom.unit == "rad":
             through = float(np.linalg.norm(freedom.through))
-            backwards.append(_Lever(column, 1.0, reach + through, turns=True))
+            backwards.append(_Lever(column, 1.0, reach + through, is_revolute=True))
             reach += 2.0 * through
         else:
-            backwards.append(_Lever(column, 1.0, 1.0, turns=False))
+            backwards.append(_Lever(column, 1.0, 1.0, is_revolute=False))
             reach += float(np.abs(samples.trajectory.ranges()[1][:, column]).max())
     reach += float(np.linalg.norm(attachment.placement.translation))
-    return [*_levers(samples, f"{hold.object}.{attachment.link}", reach), *reversed(backwards)]
+    return [*_find_levers(samples, f"{hold.object}.{attachment.link}", reach), *reversed(backwards)]
 
 
-def _levers(samples: Samples, frame: str, reach: float) -> list[_Lever]:
+def _find_levers(samples: Samples, frame: str, reach: float) -> list[_Lever]:
     """Return the coordinates that move a point at most `reach` [m] from a frame's origin, from the world on."""
     world, names = samples.world, samples.trajectory.names
     model, body = world.model, world.model.frames[world.model.getFrameId(frame)]

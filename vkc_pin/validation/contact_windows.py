@@ -31,11 +31,11 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Grasp, Step, Touch
 
-__all__ = ["Window", "check_gripper", "check_pushes", "windows"]
+__all__ = ["Window", "check_gripper", "check_pushes", "find_contact_windows"]
 
-_DWELL = 1e-6  # [s] by which a rest may be too short
+_DWELL_TOLERANCE = 1e-6  # [s] by which a rest may be too short
 
-_STILL = 1e-9  # [m] or [rad]
+_MOTION_TOLERANCE = 1e-9  # [m] or [rad]
 _T = TypeVar("_T")
 
 
@@ -57,11 +57,11 @@ class Window(NamedTuple):
     last: int
     margin: float
     contact: float = CONTACT_DEPTH
-    together: bool = False
-    exempt: bool = False
+    moves_together: bool = False
+    is_exempt: bool = False
 
 
-def windows(
+def find_contact_windows(
     samples: Samples, solids: CollisionShapes, steps: Sequence[Step], options: Options
 ) -> list[Window]:
     """Return all pairs of a motion that may be close, and when.
@@ -72,7 +72,7 @@ def windows(
         steps: What was asked for.
         options: Clearances, and the time between waypoints that counts as one.
     """
-    return list(_Windows(samples, solids, options).of(steps))
+    return list(_WindowFinder(samples, solids, options).find(steps))
 
 
 def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
@@ -97,7 +97,7 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
             begin = at if opens else moved[k - 1] + 1 if k else 0  # fingers move from here on
             end = moved[k] if k < len(moved) else len(times) - 1
             rest = float(times[end] - times[begin])
-            if not rest >= options.grasp_time - _DWELL:
+            if not rest >= options.grasp_time - _DWELL_TOLERANCE:
                 detail = f"the robot stands still for {rest:.2f} s, {options.grasp_time:g} s are asked for"
                 subject, amount = (
                     ", ".join(sorted(map(str, changed))) or "gripper",
@@ -148,10 +148,10 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
             attachment = scene.objects[hold.object].object.attachments[hold.attachment]
             if attachment.contact != "push":
                 continue
-            rows = samples.rows(phase)
+            rows = samples.get_rows(phase)
             hands, links = (
-                samples.placements(rows, tool),
-                samples.placements(rows, f"{hold.object}.{attachment.link}"),
+                samples.compute_placements(rows, tool),
+                samples.compute_placements(rows, f"{hold.object}.{attachment.link}"),
             )
             foremost = compute_hand_frame(scene.robot, attachment) * attachment.offset.inverse()
             gone = [0.0]
@@ -163,7 +163,7 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
             worst = int(np.argmax(back))
             if not back[worst] <= CONTACT_DEPTH:
                 row, amount = int(rows[worst]), float(back[worst] - CONTACT_DEPTH)
-                at, time = samples.waypoint(row), float(samples.times[row])
+                at, time = samples.find_waypoint(row), float(samples.times[row])
                 detail = f"goes back by {1e3 * back[worst]:.2f} mm where the hand only pushes"
                 yield Violation(
                     "push",
@@ -176,35 +176,38 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
                 )
 
 
-class _Windows:
+class _WindowFinder:
     def __init__(self, samples: Samples, solids: CollisionShapes, options: Options) -> None:
         self.samples, self.solids, self.options = samples, solids, options
         self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
         self.labels, self.keys = np.array(world.collision_labels), world.collision_keys
         self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
         low, high = self.trajectory.ranges()
-        self.steps = (high - low).max(axis=1) > _STILL
+        self.steps = (high - low).max(axis=1) > _MOTION_TOLERANCE
         self.robots = len(self.scene.robot.collision.geometryObjects)
-        self.rides = samples.free.rides
+        self.supports = samples.free_objects.supports
 
-    def of(self, steps: Sequence[Step]) -> Iterator[Window]:
+    def find(self, steps: Sequence[Step]) -> Iterator[Window]:
         for one in find_clearance_exemptions(self.scene, self.options.dist_safe):
-            yield from self._allowed(one)
+            yield from self._find_exemption_windows(one)
         holds = [set(phase.holds) for phase in self.trajectory.phases]
-        for hold, first, last in self._runs([set(self.scene.holds), *holds]):
-            yield from self._hand(hold, first, last)
-        yield from self._grasps([step for step in steps if isinstance(step, Grasp)])
+        for hold, first, last in self._find_spans([set(self.scene.holds), *holds]):
+            yield from self._find_hold_windows(hold, first, last)
+        yield from self._find_grasp_windows([step for step in steps if isinstance(step, Grasp)])
         moved = set[str]()
         for owner, first, last in sorted(
-            self._runs(self._carried()), key=lambda run: -1 if run[1] is None else run[1]
+            self._find_spans(self._list_carried_objects()),
+            key=lambda run: -1 if run[1] is None else run[1],
         ):
-            yield from self._beside(
-                owner, first or 0, self._until(first or 0), new=owner not in moved
+            yield from self._find_carry_windows(
+                owner, first or 0, self._find_easing_end(first or 0), new=owner not in moved
             )
             for at in [last] if last is not None else []:
-                yield from self._beside(owner, at, self._since(at), begin=False)
+                yield from self._find_carry_windows(
+                    owner, at, self._find_easing_start(at), begin=False
+                )
             moved.add(owner)
-        for phase, riding in zip(self.trajectory.phases, self.rides, strict=True):
+        for phase, riding in zip(self.trajectory.phases, self.supports, strict=True):
             for owner, label in riding.items():
                 as_one = {other for other, on in riding.items() if on == label and other != owner}
                 mates = [
@@ -213,15 +216,15 @@ class _Windows:
                     if one == label or one.partition(".")[0] in as_one
                 ]
                 yield Window(
-                    self._pairs(self._shapes(owner), mates),
+                    self._make_pairs(self._get_shapes(owner), mates),
                     phase.first,
                     phase.last,
                     -np.inf,
-                    together=True,
+                    moves_together=True,
                 )
-        yield from self._touches([step for step in steps if isinstance(step, Touch)])
+        yield from self._find_touch_windows([step for step in steps if isinstance(step, Touch)])
 
-    def _allowed(self, one: ClearanceExemption) -> Iterator[Window]:
+    def _find_exemption_windows(self, one: ClearanceExemption) -> Iterator[Window]:
         """Yield when two links or shapes may be closer than others: always, or while joints are where that holds."""
         pairs = np.array(one.find_shape_pairs(self.labels.tolist(), self.keys), int).reshape(-1, 2)
         count = len(self.steps) + 1
@@ -233,22 +236,24 @@ class _Windows:
         ):
             if len(pairs):
                 yield Window(
-                    pairs, begin, min(end, count) - 1, one.margin, contact, together, exempt=True
+                    pairs, begin, min(end, count) - 1, one.margin, contact, together, is_exempt=True
                 )
 
-    def _hand(self, hold: Hold, first: int | None, last: int | None) -> Iterator[Window]:
+    def _find_hold_windows(
+        self, hold: Hold, first: int | None, last: int | None
+    ) -> Iterator[Window]:
         """Yield what a hold that lasts between two waypoints, or from the start or up to the end, means for what holds."""
         begin, end = 0 if first is None else first, len(self.steps) if last is None else last
         since, until = (
-            begin if first is None else self._since(begin),
-            end if last is None else self._until(end),
+            begin if first is None else self._find_easing_start(begin),
+            end if last is None else self._find_easing_end(end),
         )
-        yield from self._near(hold, since, until)
-        gripped = self._between(
+        yield from self._find_hand_windows(hold, since, until)
+        gripped = self._pair_links(
             find_touch_links(self.scene, hold), {find_grasped_link(self.scene, hold)}
         )
         if is_rigid_grasp(self.scene, hold):
-            yield Window(gripped, begin, end, 0.0, together=True)
+            yield Window(gripped, begin, end, 0.0, moves_together=True)
         else:
             yield Window(
                 gripped,
@@ -259,7 +264,7 @@ class _Windows:
                 ),
             )
 
-    def _near(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
+    def _find_hand_windows(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
         """Yield what links that take hold, or have it, keep from all of the object meanwhile."""
         by_clearance: dict[float, set[str]] = {}
         for link in (
@@ -270,14 +275,14 @@ class _Windows:
             ).add(link)
         for least, links in by_clearance.items():
             yield Window(
-                self._between(find_touch_links(self.scene, hold), links),
+                self._pair_links(find_touch_links(self.scene, hold), links),
                 first,
                 last,
                 least,
                 0.0 if least else CONTACT_DEPTH,
             )
 
-    def _grasps(self, steps: Sequence[Grasp]) -> Iterator[Window]:
+    def _find_grasp_windows(self, steps: Sequence[Grasp]) -> Iterator[Window]:
         """Yield what it means that the hand is at a grasp at the end of a phase, whether it holds on or not."""
         ends = np.array([phase.last for phase in self.trajectory.phases])
         for step in steps:
@@ -285,17 +290,19 @@ class _Windows:
             for name in (
                 [step.attachment] if step.attachment is not None else list(thing.attachments)
             ):
-                errors = self.samples.grasp_errors(
+                errors = self.samples.compute_grasp_errors(
                     step.object, name, self.samples.waypoint_rows[ends], step.by
                 )
                 for at in ends[
                     (errors <= (self.options.goal_position, self.options.goal_angle)).all(axis=1)
                 ].tolist():
-                    yield from self._near(
-                        self._grasped(step, name), self._since(at), self._until(at)
+                    yield from self._find_hand_windows(
+                        self._make_hold(step, name),
+                        self._find_easing_start(at),
+                        self._find_easing_end(at),
                     )
 
-    def _grasped(self, step: Grasp, attachment: str) -> Hold:
+    def _make_hold(self, step: Grasp, attachment: str) -> Hold:
         """Return the hold that a step brings about; how what it is held through is held itself does not matter here."""
         owner, _, link = (step.by or "").partition(".")
         through = (
@@ -303,7 +310,7 @@ class _Windows:
         )
         return Hold(step.object, attachment, through, link or None)
 
-    def _beside(
+    def _find_carry_windows(
         self, owner: str, at: int, other: int, *, begin: bool = True, new: bool = False
     ) -> Iterator[Window]:
         """Yield what a free object is next to where it begins or ends to be carried, at waypoint `at`.
@@ -311,13 +318,13 @@ class _Windows:
         Where it is lifted for the first time, or in the hand from the start (`new`), it may be as
         deep in something as it was.
         """
-        mine = self._shapes(owner)
-        pairs = self._pairs(
+        mine = self._get_shapes(owner)
+        pairs = self._make_pairs(
             mine, [k for k in range(self.robots, len(self.labels)) if k not in mine]
         )
-        placed, here = self.solids.at(self.q[[at]]), np.zeros(len(pairs), int)
-        pairs = pairs[placed.bounds(here, pairs) < self.options.dist_safe]
-        distances = placed.distances(here[: len(pairs)], pairs)
+        placed, here = self.solids.place(self.q[[at]]), np.zeros(len(pairs), int)
+        pairs = pairs[placed.compute_lower_bounds(here, pairs) < self.options.dist_safe]
+        distances = placed.compute_distances(here[: len(pairs)], pairs)
         first, last = (at, other) if begin else (other, at)
         yield Window(pairs[distances < self.options.dist_safe], first, last, 0.0)
         for k in np.flatnonzero(distances < -CONTACT_DEPTH).tolist() if new else ():
@@ -325,7 +332,7 @@ class _Windows:
                 pairs[[k]], first, last, float(distances[k]), CONTACT_DEPTH - float(distances[k])
             )
 
-    def _touches(self, steps: Sequence[Touch]) -> Iterator[Window]:
+    def _find_touch_windows(self, steps: Sequence[Touch]) -> Iterator[Window]:
         """Yield what is at the target of a touch, wherever a phase ends with that."""
         for step in steps:
             target = (
@@ -334,29 +341,39 @@ class _Windows:
                 else np.array(step.target)
             )
             ends = [phase.last for phase in self.trajectory.phases]
-            frames = self.samples.placements(self.samples.waypoint_rows[ends], step.frame)
-            owner, links = step.frame.partition(".")[0], _links_of(self.scene, step.frame)
+            frames = self.samples.compute_placements(self.samples.waypoint_rows[ends], step.frame)
+            owner, links = (
+                step.frame.partition(".")[0],
+                _find_touching_links(self.scene, step.frame),
+            )
             mine = [k for k, label in enumerate(self.labels) if label in links]
             for at, frame in zip(ends, frames, strict=True):
                 if np.linalg.norm(frame.translation - target) <= self.options.dist_safe:
-                    around = self.solids.at(self.q[[at]]).around(target, self.options.dist_safe)
+                    around = self.solids.place(self.q[[at]]).find_shapes_near(
+                        target, self.options.dist_safe
+                    )
                     close = [
                         k
                         for k in around
                         if k >= self.robots and self.labels[k].partition(".")[0] != owner
                     ]
-                    yield Window(self._pairs(mine, close), self._since(at), self._until(at), 0.0)
+                    yield Window(
+                        self._make_pairs(mine, close),
+                        self._find_easing_start(at),
+                        self._find_easing_end(at),
+                        0.0,
+                    )
 
-    def _carried(self) -> list[set[str]]:
+    def _list_carried_objects(self) -> list[set[str]]:
         """Return the free objects that are held or ride, at the start and in every phase."""
         free = {name for name, placed in self.scene.objects.items() if placed.object.free}
-        phases = zip(self.trajectory.phases, self.rides, strict=True)
+        phases = zip(self.trajectory.phases, self.supports, strict=True)
         return [
             free & self.scene.held.keys(),
             *(free & (phase.held.keys() | riding.keys()) for phase, riding in phases),
         ]
 
-    def _runs(
+    def _find_spans(
         self, phases: Sequence[Collection[_T]]
     ) -> Iterator[tuple[_T, int | None, int | None]]:
         """Yield what lasts, from and up to which waypoint: None is the start, where it has lasted already, and the end.
@@ -373,51 +390,51 @@ class _Windows:
                 begun.setdefault(item, at)
         yield from ((item, first, None) for item, first in begun.items())
 
-    def _between(self, ones: Collection[str], others: Collection[str]) -> Ints:
+    def _pair_links(self, ones: Collection[str], others: Collection[str]) -> Ints:
         """Return the pairs of shapes of some links with those of others, by their labels."""
-        return self._pairs(
+        return self._make_pairs(
             *(
                 [k for k, label in enumerate(self.labels) if label in links]
                 for links in (ones, others)
             )
         )
 
-    def _shapes(self, owner: str) -> list[int]:
+    def _get_shapes(self, owner: str) -> list[int]:
         return [
             k
             for k, label in enumerate(self.labels)
-            if label.partition(".")[0] == owner and k < self.solids.bodies
+            if label.partition(".")[0] == owner and k < self.solids.body_count
         ]
 
-    def _pairs(self, ones: Iterable[int], others: Collection[int]) -> Ints:
+    def _make_pairs(self, ones: Iterable[int], others: Collection[int]) -> Ints:
         return np.array([(min(i, j), max(i, j)) for i in ones for j in others], int).reshape(-1, 2)
 
-    def _until(self, at: int) -> int:
+    def _find_easing_end(self, at: int) -> int:
         """Return the last exempt waypoint after a contact at `at`: `CONTACT_WINDOW`, or as many moving steps."""
         times, moved, last = self.trajectory.times, 0, at
         while last < len(self.steps):
             moved += int(self.steps[last])
-            if times[last + 1] - times[at] > CONTACT_WINDOW + _STILL and moved > self.options.steps(
-                CONTACT_WINDOW
-            ):
+            if times[last + 1] - times[
+                at
+            ] > CONTACT_WINDOW + _MOTION_TOLERANCE and moved > self.options.steps(CONTACT_WINDOW):
                 break
             last += 1
         return last
 
-    def _since(self, at: int) -> int:
-        """Return the waypoint since which what comes into contact at one may be close; see `_until`."""
+    def _find_easing_start(self, at: int) -> int:
+        """Return the waypoint since which what comes into contact at one may be close; see `_find_easing_end`."""
         times, moved, first = self.trajectory.times, 0, at
         while first > 0:
             moved += int(self.steps[first - 1])
             if times[at] - times[
                 first - 1
-            ] > CONTACT_WINDOW + _STILL and moved > self.options.steps(CONTACT_WINDOW):
+            ] > CONTACT_WINDOW + _MOTION_TOLERANCE and moved > self.options.steps(CONTACT_WINDOW):
                 break
             first -= 1
         return first
 
 
-def _links_of(scene: Scene, frame: str) -> set[str]:
+def _find_touching_links(scene: Scene, frame: str) -> set[str]:
     """Return the labels of the links that a `Touch` brings somewhere: those that its frame is fixed to."""
     if frame.partition(".")[0] in scene.objects:
         return {frame}

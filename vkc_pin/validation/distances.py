@@ -22,7 +22,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["CollisionShapes", "PlacedShapes", "bound_displacements"]
 
-POINT = 1e-4  # [m], radius of a point
+POINT_RADIUS = 1e-4  # [m], radius of a point
 
 
 class CollisionShapes:
@@ -39,21 +39,21 @@ class CollisionShapes:
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.bodies = world, len(world.bodies.geometryObjects)
+        self.world, self.body_count = world, len(world.bodies.geometryObjects)
         boxes = [compute_bounding_box(shape) for shape in world.shapes]
         self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
-        obstacles = slice(self.bodies, None)
+        obstacles = slice(self.body_count, None)
         where = [shape.placement for shape in world.shapes[obstacles]]
-        self.asked = Shapes([shape.geometry for shape in world.shapes], where)
-        self.obstacle_corners = self.corners(flatten_placements(where), obstacles)
+        self.distance_queries = Shapes([shape.geometry for shape in world.shapes], where)
+        self.obstacle_corners = self.compute_corners(flatten_placements(where), obstacles)
         self._placements = ShapePlacements(world.model, world.bodies)
 
-    def at(self, q: Floats) -> PlacedShapes:
+    def place(self, q: Floats) -> PlacedShapes:
         """Return the shapes as they are placed at Pinocchio's configurations of the world, shape (W, nq)."""
         return PlacedShapes(self, self._placements.compute_placements(q))
 
-    def corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
+    def compute_corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
         """Return lower and upper corners of boxes along the world's axes around some shapes, shape (..., k, 3) each [m].
 
         Args:
@@ -80,7 +80,7 @@ class PlacedShapes:
     @cached_property
     def corners(self) -> tuple[Floats, Floats]:
         """Lower and upper corners of boxes along the world's axes around all shapes, shape (W, G, 3) each [m]."""
-        bodies = self._solids.corners(self._where, slice(self._solids.bodies))
+        bodies = self._solids.compute_corners(self._where, slice(self._solids.body_count))
         obstacles = (
             np.broadcast_to(part, (len(self._where), *part.shape))
             for part in self._solids.obstacle_corners
@@ -94,7 +94,7 @@ class PlacedShapes:
     def boxes(self) -> WorldBoxes:
         """The same boxes, to ask which of them come near each other."""
         return WorldBoxes(
-            *self._solids.corners(self._where, slice(self._solids.bodies)),
+            *self._solids.compute_corners(self._where, slice(self._solids.body_count)),
             *self._solids.obstacle_corners,
         )
 
@@ -102,7 +102,7 @@ class PlacedShapes:
         """Return W."""
         return len(self._where)
 
-    def bounds(self, states: Ints, pairs: Ints) -> Floats:
+    def compute_lower_bounds(self, states: Ints, pairs: Ints) -> Floats:
         """Return lower bounds of the distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m].
 
         They are -inf where the boxes overlap.
@@ -118,20 +118,20 @@ class PlacedShapes:
             gaps.max(axis=1) > 0.0, np.sqrt(np.einsum("ni,ni->n", outside, outside)), -np.inf
         )
 
-    def distances(self, states: Ints, pairs: Ints) -> Floats:
+    def compute_distances(self, states: Ints, pairs: Ints) -> Floats:
         """Return coal's signed distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m]."""
-        return self._solids.asked.compute_distances(self._where, states, pairs)
+        return self._solids.distance_queries.distances(self._where, states, pairs)
 
-    def nearest(self, pairs: Ints) -> tuple[Ints, Floats]:
+    def find_nearest(self, pairs: Ints) -> tuple[Ints, Floats]:
         """Return which of pairs, shape (n, 2), is nearest at each state, and its distance [m]: shape (W,) each.
 
         Only what may be nearest is asked of coal.
         """
         states, count = len(self._where), len(pairs)
         at, which = np.repeat(np.arange(states), count), np.tile(np.arange(count), states)
-        bounds = self.bounds(at, pairs[which])
+        bounds = self.compute_lower_bounds(at, pairs[which])
         order = np.lexsort((which, bounds, at))
-        chosen, found = self._solids.asked.find_closest_pairs(
+        chosen, found = self._solids.distance_queries.shortest(
             self._where,
             np.arange(states + 1) * count,
             pairs[which[order]],
@@ -144,17 +144,19 @@ class PlacedShapes:
         )
         return which[order[chosen]], found.distance
 
-    def around(self, point: Floats, reach: float) -> list[int]:
+    def find_shapes_near(self, point: Floats, reach: float) -> list[int]:
         """Return the shapes that are closer than `reach` [m] to a point, shape (3,) [m], at the first of the states.
 
         A point has a size here, 0.1 mm.
         """
         lower, upper = (corners[0] for corners in self.corners)
         near = np.flatnonzero(
-            ((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)
+            ((lower - point < reach + POINT_RADIUS) & (point - upper < reach + POINT_RADIUS)).all(
+                axis=1
+            )
         ).tolist()
         ball, here, shapes = (
-            coal.Sphere(POINT),
+            coal.Sphere(POINT_RADIUS),
             pin.SE3(np.eye(3), point),
             self._solids.world.shapes,
         )
@@ -165,7 +167,7 @@ class PlacedShapes:
         ]
 
     def _placement(self, shape: int) -> pin.SE3:
-        if shape >= self._solids.bodies:
+        if shape >= self._solids.body_count:
             return self._solids.world.shapes[shape].placement
         numbers = self._where[0, shape]
         return pin.SE3(numbers[:9].reshape(3, 3).T, numbers[9:])
@@ -190,7 +192,7 @@ def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
     for move in world.coordinates.moves:
         of_joint.setdefault(move.joint, []).append(move)
     found = np.zeros((len(samples), len(world.shapes)))
-    for g, shape in enumerate(world.shapes[: solids.bodies]):
+    for g, shape in enumerate(world.shapes[: solids.body_count]):
         reach = float(np.linalg.norm(solids.half[g])) + float(
             np.linalg.norm(shape.placement.act(solids.center[g]))
         )
@@ -199,7 +201,9 @@ def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
             moves = of_joint[joint]
             column, share, offset = moves[0].coordinate, abs(moves[0].factor), moves[0].offset
             if len(moves) == 7:  # the free joint of what can be carried
-                moved += _free(samples[:, [move.coordinate for move in moves]], reach)
+                moved += _bound_free_displacements(
+                    samples[:, [move.coordinate for move in moves]], reach
+                )
             elif len(moves) == 3:  # the planar base
                 moved += spans + steps[:, moves[2].coordinate] * reach
             elif moves[0].slides:
@@ -213,7 +217,7 @@ def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
     return found
 
 
-def _free(samples: Floats, reach: float) -> Floats:
+def _bound_free_displacements(samples: Floats, reach: float) -> Floats:
     """Return how far a point at `reach` [m] from a free joint moves from each sample to the next, shape (S − 1,) [m]."""
     turns = samples[:, 3:] / np.linalg.norm(samples[:, 3:], axis=1, keepdims=True)
     half = np.arccos(np.clip(np.abs(np.einsum("kc,kc->k", turns[1:], turns[:-1])), 0.0, 1.0))

@@ -20,7 +20,7 @@ __all__ = ["check_goals", "check_steps"]
 MOTION_TOLERANCE = 1e-5  # [m] or [rad]: less is no motion
 
 
-class Miss(NamedTuple):
+class GoalError(NamedTuple):
     """What of a step is not as it was asked for."""
 
     subject: str
@@ -81,10 +81,11 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
     """
     phases = samples.trajectory.phases
     ends = [0, *(phase.last for phase in phases)]  # a step may be done before anything begins
-    hands = _in_hand(samples, steps)
+    hands = _find_grasped_objects(samples, steps)
     misses = [
         [
-            _misses(samples, step, k, options) + _dropped(samples, steps, hands, number, k)
+            _compute_goal_errors(samples, step, k, options)
+            + _find_missing_grasps(samples, steps, hands, number, k)
             for k in range(len(ends))
         ]
         for number, step in enumerate(steps)
@@ -107,7 +108,7 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
     )
 
 
-def _in_hand(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
+def _find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
     """Return which free objects the steps want in the hand before the first and after each of them."""
     objects = samples.scene.objects
     held = {
@@ -140,9 +141,9 @@ def _in_hand(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
     return hands
 
 
-def _dropped(
+def _find_missing_grasps(
     samples: Samples, steps: Sequence[Step], hands: list[set[str]], number: int, end: int
-) -> list[Miss]:
+) -> list[GoalError]:
     """Return what should be in the hand when a step is done, after `end` phases, and is not."""
     phases = samples.trajectory.phases
     near = {owner for phase in phases[max(end - 1, 0) : end + 1] for owner in phase.held}
@@ -151,7 +152,7 @@ def _dropped(
     step = steps[number]
     if isinstance(step, Grasp) and end == len(phases):
         wanted.discard(step.object)  # taken hold of as the motion ends, and nothing more
-    return [Miss(name, 1.0, "holds", "is not in the hand") for name in sorted(wanted - near)]
+    return [GoalError(name, 1.0, "holds", "is not in the hand") for name in sorted(wanted - near)]
 
 
 def _check_order(
@@ -160,7 +161,10 @@ def _check_order(
     """Check that nothing moves before its step's turn; `holds[i][k]` says whether step i holds at the start of phase k."""
     phases = samples.trajectory.phases
     named = set().union(*hands, *({step.object} for step in steps if isinstance(step, Place)))
-    moved = [_moved(samples, k) | _carried(samples, k, named) for k in range(len(phases))]
+    moved = [
+        _measure_joint_motion(samples, k) | _measure_transport(samples, k, named)
+        for k in range(len(phases))
+    ]
     own = [
         hands[i] | hands[i + 1] | ({step.object} if isinstance(step, Actuate | Place) else set())
         for i, step in enumerate(steps)
@@ -179,7 +183,9 @@ def _check_order(
             amount, unit = moved[k][name]
             instead = f"when it is the turn of step {last + 1}, {type(steps[last]).__name__}"
             detail = f"moves by {amount:.4f} {unit} in '{phase.name}', {instead}"
-            return [_violation(samples, "order", phase.first, Miss(name, amount, unit, detail))]
+            return [
+                _violation(samples, "order", phase.first, GoalError(name, amount, unit, detail))
+            ]
         turns = left
     if len(steps) - 1 in turns:
         return []
@@ -187,12 +193,12 @@ def _check_order(
     detail = f"{type(steps[first]).__name__} is undone before the next step begins"
     return [
         _violation(
-            samples, "order", phases[-1].last, Miss(f"step {first + 1}", 1.0, "steps", detail)
+            samples, "order", phases[-1].last, GoalError(f"step {first + 1}", 1.0, "steps", detail)
         )
     ]
 
 
-def _violation(samples: Samples, constraint: str, waypoint: int, miss: Miss) -> Violation:
+def _violation(samples: Samples, constraint: str, waypoint: int, miss: GoalError) -> Violation:
     return Violation(
         constraint,
         waypoint=waypoint,
@@ -201,10 +207,12 @@ def _violation(samples: Samples, constraint: str, waypoint: int, miss: Miss) -> 
     )
 
 
-def _carried(samples: Samples, number: int, named: set[str]) -> dict[str, tuple[float, str]]:
+def _measure_transport(
+    samples: Samples, number: int, named: set[str]
+) -> dict[str, tuple[float, str]]:
     """Return those of some free objects that are in the hand in a phase, and how far they go."""
     phase, world = samples.trajectory.phases[number], samples.world
-    rows = samples.z[samples.rows(phase)]
+    rows = samples.z[samples.get_rows(phase)]
     carried = {}
     for owner in phase.held:
         if owner in named:
@@ -213,22 +221,24 @@ def _carried(samples: Samples, number: int, named: set[str]) -> dict[str, tuple[
     return carried
 
 
-def _moved(samples: Samples, number: int) -> dict[str, tuple[float, str]]:
+def _measure_joint_motion(samples: Samples, number: int) -> dict[str, tuple[float, str]]:
     """Return the objects that are moved by the hand in a phase, and how far; what moves by itself is "unheld"."""
     phase = samples.trajectory.phases[number]
     moved: dict[str, tuple[float, str]] = {}
-    driven = samples.moved_by(phase.holds)
+    driven = samples.find_driven_coordinates(phase.holds)
     for column, name in enumerate(samples.trajectory.names):
         if name not in driven:
             continue
         owner = name.partition(".")[0]
         values = samples.trajectory.positions[phase.first : phase.last + 1, column]
         if (spread := float(np.ptp(values))) > MOTION_TOLERANCE:
-            moved[owner] = max(moved.get(owner, (0.0, "")), (spread, samples.unit(name)))
+            moved[owner] = max(moved.get(owner, (0.0, "")), (spread, samples.get_unit(name)))
     return moved
 
 
-def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Miss]:
+def _compute_goal_errors(
+    samples: Samples, step: Step, end: int, options: Options
+) -> list[GoalError]:
     """Return what of a step's goal does not hold after `end` phases."""
     phases = samples.trajectory.phases
     row, misses = int(samples.waypoint_rows[phases[end - 1].last if end else 0]), []
@@ -237,20 +247,20 @@ def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Mi
 
     def expect(subject: str, error: float, unit: str, detail: str) -> None:
         if not error <= tolerance[unit]:
-            misses.append(Miss(subject, error - tolerance[unit], unit, detail))
+            misses.append(GoalError(subject, error - tolerance[unit], unit, detail))
 
     if isinstance(step, Actuate):
         for joint, goal in step.joints.items():
             name = f"{step.object}.{joint}"
             value, unit = (
                 float(samples.z[row, samples.world.coordinates.index(name)]),
-                samples.unit(name),
+                samples.get_unit(name),
             )
             expect(
                 name, abs(value - goal), unit, f"{value:.4f} {unit} instead of {goal:.4f} {unit}"
             )
     elif isinstance(step, Grasp):
-        name, (distance, turn) = _grasp(samples, step, row)
+        name, (distance, turn) = _find_closest_grasp(samples, step, row)
         expect(
             f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp"
         )
@@ -261,16 +271,16 @@ def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Mi
             f"the tool is turned {turn:.4f} rad from the grasp",
         )
     elif isinstance(step, Reach | Touch | Place):
-        frame, target, free = _target(samples, step)
-        placement = samples.placements([row], frame)[0]
+        frame, target, free = _get_target(samples, step)
+        placement = samples.compute_placements([row], frame)[0]
         distance = float(np.linalg.norm(placement.translation - target.translation))
         expect(frame, distance, "m", f"{distance:.4f} m from where it should be")
-        turn = _turn(placement, target, free)
+        turn = _compute_angle_error(placement, target, free)
         expect(frame, turn, "rad", f"turned {turn:.4f} rad from how it should be")
     if isinstance(step, Place | Release):
         for name in [step.object] if step.object is not None else list(held):
             if name in held:
-                misses.append(Miss(name, 1.0, "holds", "is held still"))
+                misses.append(GoalError(name, 1.0, "holds", "is held still"))
     if isinstance(step, GoTo):
         x, y, yaw = samples.z[row, :3]
         distance = float(np.hypot(x - step.x, y - step.y))
@@ -281,7 +291,7 @@ def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Mi
     return misses
 
 
-def _target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3, str]:
+def _get_target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3, str]:
     """Return the frame that a step brings somewhere, where, and which orientation is left free: "", "heading" or "all"."""
     if isinstance(step, Reach):
         return step.frame or samples.scene.robot.tool_frame, step.pose, ""
@@ -300,7 +310,7 @@ def _target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3
     return frame, pin.SE3(stands, np.array(goal)), "heading"
 
 
-def _turn(placement: pin.SE3, target: pin.SE3, free: str) -> float:
+def _compute_angle_error(placement: pin.SE3, target: pin.SE3, free: str) -> float:
     """Return the angle [rad] between two placements in what is not free."""
     if free == "all":
         return 0.0
@@ -310,7 +320,7 @@ def _turn(placement: pin.SE3, target: pin.SE3, free: str) -> float:
     return float(np.linalg.norm(pin.log3(target.rotation.T @ placement.rotation)))
 
 
-def _grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
+def _find_closest_grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
     """Return the attachment that a step asks for and how far the tool is from it, [m] and [rad].
 
     Without a name it is the one that is used, if there is one: held at the start or in some phase.
@@ -323,7 +333,8 @@ def _grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, f
     )
     names = names or [samples.scene.objects[step.object].object.attachment().name]
     errors = {
-        name: samples.grasp_errors(step.object, name, np.array([row]), step.by)[0] for name in names
+        name: samples.compute_grasp_errors(step.object, name, np.array([row]), step.by)[0]
+        for name in names
     }
     name = min(errors, key=lambda key: float(errors[key].max()))
     return name, (float(errors[name][0]), float(errors[name][1]))

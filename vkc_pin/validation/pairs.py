@@ -17,7 +17,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["PairTable"]
 
-_STILL = 1e-9  # [m] or [rad]
+_MOTION_TOLERANCE = 1e-9  # [m] or [rad]
 
 
 class PairTable:
@@ -56,24 +56,27 @@ class PairTable:
             [phase.last for phase in trajectory.phases],
         )
         self._moves = np.array(
-            [self._moved(samples.z[samples.rows(phase)]) for phase in trajectory.phases]
+            [
+                self._find_moving_shapes(samples.z[samples.get_rows(phase)])
+                for phase in trajectory.phases
+            ]
         )
         self._phase = np.searchsorted(lasts, np.arange(len(trajectory.times)))  # the earlier of two
-        labels, bodies = world.collision_labels, range(solids.bodies)
+        labels, bodies = world.collision_labels, range(solids.body_count)
         owners = [label.partition(".")[0] if "." in label else "" for label in labels]
         robots = len(scene.robot.collision.geometryObjects)
-        self.group = [
+        self.groups = [
             "robot" if i < robots else name if name in scene.objects else ""
             for i, name in enumerate(owners)
         ]
         self._robot_pairs = {
             frozenset(pair): own for pair, own in scene.robot.own_margins(own_margin).items()
         }
-        self._moving_once: Bools = np.asarray(self._moves.any(axis=0))
+        self._ever_moves: Bools = np.asarray(self._moves.any(axis=0))
         own = np.array(
-            [(i, j) for j in bodies for i in range(j) if self._counts(i, j)], int
+            [(i, j) for j in bodies for i in range(j) if self._can_collide(i, j)], int
         ).reshape(-1, 2)
-        self.pairs = np.concatenate([own, self._with_obstacles()])
+        self.pairs = np.concatenate([own, self._pair_with_obstacles()])
         if not len(self.pairs):
             raise InputError(
                 "no pair of geometries can collide", field="scene", expected="collision geometry"
@@ -82,12 +85,12 @@ class PairTable:
         self.margins[: len(own)] = [
             self._robot_pairs.get(frozenset(pair), dist_safe) for pair in own.tolist()
         ]
-        self._windows = _Windows(windows, self.pairs)
+        self._windows = _WindowIndex(windows, self.pairs)
 
-    def _moved(self, rows: Floats) -> Bools:
+    def _find_moving_shapes(self, rows: Floats) -> Bools:
         """Return whether each shape moves while the world goes through some configurations, shape (K, n): shape (G,)."""
         world = self.world
-        moved = world.coordinates.find_moved_joints(np.ptp(rows, axis=0) > _STILL)
+        moved = world.coordinates.moved(np.ptp(rows, axis=0) > _MOTION_TOLERANCE)
         for joint in range(1, len(moved)):
             moved[joint] |= moved[world.model.parents[joint]]
         robots = len(self.scene.robot.collision.geometryObjects)
@@ -95,36 +98,36 @@ class PairTable:
             [i < robots or moved[shape.parentJoint] for i, shape in enumerate(world.shapes)]
         )
 
-    def margins_at(self, pairs: Ints, waypoints: Ints) -> Floats:
+    def get_margins(self, pairs: Ints, waypoints: Ints) -> Floats:
         """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]; -inf: none."""
         margins, (k, which) = self.margins[pairs], self._windows.at(pairs, waypoints, waypoints)
         np.minimum.at(margins, k, self._windows.margin[which])
         return margins
 
-    def contact_at(self, pairs: Ints, first: Ints, last: Ints) -> Floats:
+    def get_contact_overlaps(self, pairs: Ints, first: Ints, last: Ints) -> Floats:
         """Return the overlap that counts as contact between waypoints `first` and `last`, all of shape (n,), shape (n,) [m]."""
         overlap, (k, which) = np.zeros(len(pairs)), self._windows.at(pairs, first, last)
         np.maximum.at(overlap, k, self._windows.contact[which])
         return overlap
 
-    def exempt_at(self, pairs: Ints, waypoints: Ints) -> Bools:
+    def find_exempt(self, pairs: Ints, waypoints: Ints) -> Bools:
         """Return whether the scene exempts pairs from their clearances at waypoints, both of shape (n,), shape (n,)."""
         exempt, (k, which) = (
             np.zeros(len(pairs), bool),
             self._windows.at(pairs, waypoints, waypoints),
         )
-        exempt[k[self._windows.exempt[which]]] = True
+        exempt[k[self._windows.is_exempt[which]]] = True
         return exempt
 
-    def together_at(self, pairs: Ints, first: Ints, last: Ints) -> Bools:
+    def find_moving_together(self, pairs: Ints, first: Ints, last: Ints) -> Bools:
         """Return whether pairs move as one between waypoints `first` and `last`, all of shape (n,), shape (n,)."""
         as_one, (k, which) = np.zeros(len(pairs), bool), self._windows.at(pairs, first, last)
-        as_one[k[self._windows.together[which]]] = True
+        as_one[k[self._windows.moves_together[which]]] = True
         return as_one
 
-    def _counts(self, i: int, j: int) -> bool:
+    def _can_collide(self, i: int, j: int) -> bool:
         """Return whether two bodies i < j (robot first, then objects) can collide at all."""
-        a, b = self.group[i], self.group[j]
+        a, b = self.groups[i], self.groups[j]
         if a == "robot" and b == "robot":
             return frozenset((i, j)) in self._robot_pairs
         if a == "robot":
@@ -132,21 +135,21 @@ class PairTable:
         if a == b:  # an object with itself
             links = frozenset(self.world.collision_labels[k].partition(".")[2] for k in (i, j))
             return links in self.scene.objects[a].object.own_pairs
-        return bool(self._moving_once[i] or self._moving_once[j])
+        return bool(self._ever_moves[i] or self._ever_moves[j])
 
-    def _with_obstacles(self) -> Ints:
+    def _pair_with_obstacles(self) -> Ints:
         """Return the pairs of what moves with the obstacles, shape (n, 2), by obstacle."""
-        bodies, labels = range(self.solids.bodies), self.world.collision_labels
+        bodies, labels = range(self.solids.body_count), self.world.collision_labels
         joints = [self.world.shapes[i].parentJoint for i in bodies]
-        moving = [i for i in bodies if self._moving_once[i]]
+        moving = [i for i in bodies if self._ever_moves[i]]
         # Wheels stand on the floor, objects hang as their makers hung them.
         free = {name for name, placed in self.scene.objects.items() if placed.object.free}
         above = [
             i
             for i in moving
-            if self.group[i] in free or (self.group[i] == "robot" and joints[i] > 1)
+            if self.groups[i] in free or (self.groups[i] == "robot" and joints[i] > 1)
         ]
-        obstacles = range(self.solids.bodies, len(labels))
+        obstacles = range(self.solids.body_count, len(labels))
         found = [np.zeros((0, 2), int)]
         for floor, ones in ((False, moving), (True, above)):
             others = [j for j in obstacles if (labels[j] == FLOOR) == floor]
@@ -157,7 +160,7 @@ class PairTable:
             )
         return np.concatenate(found).astype(int)
 
-    def near(
+    def find_close_pairs(
         self, placed: PlacedShapes, first: Ints, last: Ints, moved: Floats, limit: float
     ) -> tuple[Ints, Ints]:
         """Return (k, pair) of all pairs but those that boxes prove to stay `limit` [m] apart in a stretch k.
@@ -183,7 +186,7 @@ class PairTable:
         )
 
 
-class _Windows:
+class _WindowIndex:
     """When which pairs may be close, to be asked for many of them at once.
 
     Attributes:
@@ -209,8 +212,9 @@ class _Windows:
         self.margin, self.contact = (
             np.array([getattr(w, name) for w in windows], float) for name in ("margin", "contact")
         )
-        self.together, self.exempt = (
-            np.array([getattr(w, name) for w in windows], bool) for name in ("together", "exempt")
+        self.moves_together, self.is_exempt = (
+            np.array([getattr(w, name) for w in windows], bool)
+            for name in ("moves_together", "is_exempt")
         )
 
     def at(self, pairs: Ints, first: Ints, last: Ints) -> tuple[Ints, Ints]:

@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Bound", "CheckedMotion", "Exemption", "Report", "Violation"]
 
-SAME = 1e-5  # [m] or [rad] that two checks of the same motion may differ by, on two machines, say
-TOLD = 4  # bounds that the text names
-LISTED = 12  # violations that the text names; `violations` has them all
+AGREEMENT_TOLERANCE = (
+    1e-5  # [m] or [rad] that two checks of the same motion may differ by, on two machines, say
+)
+MAX_BOUNDS = 4  # bounds that the text names
+MAX_VIOLATIONS = 12  # violations that the text names; `violations` has them all
 
 
 @dataclass(frozen=True)
@@ -142,10 +144,10 @@ class Report:
             return [head + "every constraint holds"]
         return [
             head + f"{len(self.violations)} constraint(s) violated",
-            *(f"  - {v}" for v in self.violations[:LISTED]),
+            *(f"  - {v}" for v in self.violations[:MAX_VIOLATIONS]),
             *(
-                [f"  ... and {len(self.violations) - LISTED} more"]
-                if len(self.violations) > LISTED
+                [f"  ... and {len(self.violations) - MAX_VIOLATIONS} more"]
+                if len(self.violations) > MAX_VIOLATIONS
                 else []
             ),
             *(f"  because {note}" for note in self.notes),
@@ -161,7 +163,7 @@ class Report:
 
     def timing(self) -> list[str]:
         """Return what bounds the duration and what the motors do, as lines of text."""
-        told = ", ".join(map(str, self.bounds[:TOLD]))
+        told = ", ".join(map(str, self.bounds[:MAX_BOUNDS]))
         return [
             *([f"bounded by  {told}"] if told else []),
             *(
@@ -201,7 +203,7 @@ class Report:
             )
         for name, unit in (("clearance", "m"), ("closure_error", "m"), ("closure_angle", "rad")):
             there, here = getattr(claimed, name), getattr(self, name)
-            if there != here and not abs(there - here) <= SAME:
+            if there != here and not abs(there - here) <= AGREEMENT_TOLERANCE:
                 lines.append(f"{name} {there:.6g} {unit} instead of {here:.6g} {unit}")
         return lines
 
@@ -223,32 +225,32 @@ class Report:
             "closure_angle",
         ):  # infinite where nothing can collide
             if name in fields:
-                fields[name] = _real(fields[name], name)
+                fields[name] = _parse_real(fields[name], name)
         nearest: tuple[Any, ...] = items(
             fields.get("clearances", ()), "clearances", "a list of distances"
         )
         fields["clearances"] = tuple(
-            _real(one, f"clearances[{k}]") for k, one in enumerate(nearest)
+            _parse_real(one, f"clearances[{k}]") for k, one in enumerate(nearest)
         )
         fields["states"] = whole(fields.get("states", 0), "states", low=0)
         listed: tuple[Any, ...] = items(
             fields.get("violations"), "violations", "a list of violations"
         )
         fields["violations"] = tuple(
-            _violation(one, f"violations[{k}]") for k, one in enumerate(listed)
+            _parse_violation(one, f"violations[{k}]") for k, one in enumerate(listed)
         )
         notes: tuple[Any, ...] = items(fields.get("notes"), "notes", "a list of texts")
         fields["notes"] = tuple(text(note, f"notes[{k}]") for k, note in enumerate(notes))
         fields["torque"] = number(fields.get("torque", 0.0), "torque", low=0.0)
         bounds: tuple[Any, ...] = items(fields.get("bounds", ()), "bounds", "a list of bounds")
-        fields["bounds"] = tuple(_bound(one, f"bounds[{k}]") for k, one in enumerate(bounds))
+        fields["bounds"] = tuple(_parse_bound(one, f"bounds[{k}]") for k, one in enumerate(bounds))
         remarks: tuple[Any, ...] = items(fields.get("remarks", ()), "remarks", "a list of texts")
         fields["remarks"] = tuple(text(remark, f"remarks[{k}]") for k, remark in enumerate(remarks))
         exempt: tuple[Any, ...] = items(
             fields.get("exemptions", ()), "exemptions", "a list of exemptions"
         )
         fields["exemptions"] = tuple(
-            _exemption(one, f"exemptions[{k}]") for k, one in enumerate(exempt)
+            _parse_exemption(one, f"exemptions[{k}]") for k, one in enumerate(exempt)
         )
         try:
             return cls(**fields)
@@ -258,18 +260,18 @@ class Report:
             ) from None
 
 
-def _real(value: Any, field: str) -> float:
+def _parse_real(value: Any, field: str) -> float:
     """Return a number, which may be infinite. Raises `InputError` if it is none."""
     return value if isinstance(value, float) else number(value, field)
 
 
-def _violation(data: Any, field: str) -> Violation:
+def _parse_violation(data: Any, field: str) -> Violation:
     """Return the violation that plain data describe. Raises `InputError` if something is missing or of another kind."""
     given = mapping(data, field)
     for name in ("constraint", "subject", "unit", "detail"):
         given[name] = text(given.get(name), f"{field}.{name}")
     for name in ("time", "amount"):
-        given[name] = _real(given.get(name), f"{field}.{name}")
+        given[name] = _parse_real(given.get(name), f"{field}.{name}")
     given["waypoint"] = whole(given.get("waypoint"), f"{field}.waypoint", low=0)
     try:
         return Violation(**given)
@@ -279,7 +281,7 @@ def _violation(data: Any, field: str) -> Violation:
         ) from None
 
 
-def _exemption(data: Any, field: str) -> Exemption:
+def _parse_exemption(data: Any, field: str) -> Exemption:
     """Return the exemption that plain data describe. Raises `InputError` if something is missing or of another kind."""
     given = mapping(data, field)
     for name in ("subject", "reason"):
@@ -293,7 +295,7 @@ def _exemption(data: Any, field: str) -> Exemption:
         ) from None
 
 
-def _bound(data: Any, field: str) -> Bound:
+def _parse_bound(data: Any, field: str) -> Bound:
     """Return the bound that plain data describe. Raises `InputError` if something is missing or of another kind."""
     given = mapping(data, field)
     for name in ("subject", "kind"):

@@ -18,7 +18,7 @@ __all__ = ["check_rolling"]
 STEP_TOLERANCE = 1e-4  # [m] aside, or too short for its turn, from one waypoint to the next
 SLIP_TOLERANCE = 1e-3  # [m/s] aside, or too slow for its turn, along a curve
 WHEEL_TOLERANCE = 1e-3  # excess over the limit, relative to it
-_LOOKS = 16  # moments on each cubic of a curve
+_SAMPLES_PER_CUBIC = 16  # moments on each cubic of a curve
 
 
 def check_rolling(samples: Samples) -> Iterator[Violation]:
@@ -35,9 +35,9 @@ def check_rolling(samples: Samples) -> Iterator[Violation]:
     unit, per, usual = (
         ("m/s", "", SLIP_TOLERANCE) if smooth else ("m", " in a step", STEP_TOLERANCE)
     )
-    moments, along, aside, turn = _along(motion) if smooth else _steps(motion)
+    moments, along, aside, turn = _sample_velocities(motion) if smooth else _compute_steps(motion)
     spans = np.ones(len(moments)) if smooth else np.diff(motion.times)
-    for kind, excess, tolerance, text in _excesses(robot, along, aside, turn, spans):
+    for kind, excess, tolerance, text in _compute_excesses(robot, along, aside, turn, spans):
         worst = int(np.argmax(excess))
         amount, time = float(excess[worst]), float(moments[worst])
         if not amount <= (usual if tolerance is None else tolerance):
@@ -58,7 +58,7 @@ def check_rolling(samples: Samples) -> Iterator[Violation]:
             )
 
 
-def _excesses(
+def _compute_excesses(
     robot: Robot, along: Floats, aside: Floats, turn: Floats, spans: Floats
 ) -> Iterator[tuple[str, Floats, float | None, str]]:
     """Yield, for each constraint, by how much it is exceeded, how much is all right if not the usual, and what is said of it.
@@ -85,20 +85,26 @@ def _excesses(
         yield "wheels", fast, WHEEL_TOLERANCE * rim, f"has a wheel that is {{}} over {rim:.3f} m/s"
 
 
-def _steps(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
+def _compute_steps(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
     """Return when the steps from waypoint to waypoint begin, how far the base goes along and aside [m], and turns [rad]."""
     poses = motion.positions[:, :3]
-    return motion.times[:-1], *_seen(np.diff(poses, axis=0), (poses[1:, 2] + poses[:-1, 2]) / 2)
+    return motion.times[:-1], *_transform_to_base_frame(
+        np.diff(poses, axis=0), (poses[1:, 2] + poses[:-1, 2]) / 2
+    )
 
 
-def _along(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
+def _sample_velocities(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
     """Return moments of a curve, how fast the base goes along and aside then [m/s], and turns [rad/s]."""
     assert motion.curve is not None
-    moments = sample_intervals(motion.curve.times, np.arange(_LOOKS) / _LOOKS, last=True)
-    return moments, *_seen(motion.curve.velocity(moments)[:, :3], motion.curve.at(moments)[:, 2])
+    moments = sample_intervals(
+        motion.curve.times, np.arange(_SAMPLES_PER_CUBIC) / _SAMPLES_PER_CUBIC, last=True
+    )
+    return moments, *_transform_to_base_frame(
+        motion.curve.velocity(moments)[:, :3], motion.curve.at(moments)[:, 2]
+    )
 
 
-def _seen(change: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
+def _transform_to_base_frame(change: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
     """Return changes of (x, y, yaw), shape (K, 3), as a base with these headings sees them: along, aside, and its turn."""
     dx, dy, turn = change.T
     return (

@@ -20,13 +20,15 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["ANGLE_STEP", "LENGTH_STEP", "MOST", "Samples"]
+__all__ = ["ANGLE_STEP", "LENGTH_STEP", "MAX_SAMPLES", "Samples"]
 
 LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # [m], [rad] between two configurations that are looked at
-BEND = 0.1  # share of these by which a curve leaves the straight line between the two, at most
-MOST = 100_000
+CHORD_DEVIATION = (
+    0.1  # share of these by which a curve leaves the straight line between the two, at most
+)
+MAX_SAMPLES = 100_000
 """Configurations that are looked at, but for the waypoints: of half a kilometre of the base, or 160 turns of a joint."""
-_LARGEST = 1e12  # [m] or [rad] of a coordinate
+_MAX_COORDINATE = 1e12  # [m] or [rad] of a coordinate
 
 
 class Samples:
@@ -44,7 +46,7 @@ class Samples:
         waypoint_rows: Which of these are the waypoints, shape (T,).
         z: Minimal coordinates of the world, shape (S, n).
         virtual: Coordinate → the freedom of a grasp that it is.
-        needed: How many configurations would have to be looked at; more than `MOST`: only the
+        needed: How many configurations would have to be looked at; more than `MAX_SAMPLES`: only the
             waypoints are.
         truncated: Whether it is sampled at its waypoints or knots alone, since it is too long.
 
@@ -58,22 +60,22 @@ class Samples:
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
         self.scene, self.trajectory = scene, trajectory
         self.world = World(scene)
-        self.virtual: dict[str, Freedom] = {
+        self.grasp_freedoms: dict[str, Freedom] = {
             f"{owner}.{name}": freedom
             for owner, placed in scene.objects.items()
             for attachment in placed.object.attachments.values()
             for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
         }
         self._check_names()
-        self._check_size()
-        self.times, self.waypoint_rows = self._sample()
-        self.free = FreeObjects(scene, trajectory)
-        self.z = self.world.compute_positions(trajectory, self.times, self.free)
+        self._check_magnitudes()
+        self.times, self.waypoint_rows = self._choose_times()
+        self.free_objects = FreeObjects(scene, trajectory)
+        self.z = self.world.compute_positions(trajectory, self.times, self.free_objects)
 
-    def _check_size(self) -> None:
-        far = np.argwhere(np.abs(self.trajectory.positions) > _LARGEST)
+    def _check_magnitudes(self) -> None:
+        far = np.argwhere(np.abs(self.trajectory.positions) > _MAX_COORDINATE)
         if len(far):
-            where, expected = far[0].tolist(), f"numbers up to {_LARGEST:g}"
+            where, expected = far[0].tolist(), f"numbers up to {_MAX_COORDINATE:g}"
             got = self.trajectory.positions[tuple(where)]
             raise InputError(
                 "out of range", field=f"trajectory.positions{where}", expected=expected, got=got
@@ -88,7 +90,7 @@ class Samples:
                 expected=robot,
                 got=names[: len(robot)],
             )
-        known = [*self.world.coordinates.names, *self.virtual]
+        known = [*self.world.coordinates.names, *self.grasp_freedoms]
         for name in names:
             if name not in known:
                 raise UnknownNameError("coordinate", name, known, field="trajectory.names")
@@ -146,7 +148,7 @@ class Samples:
         if link not in item.links:
             raise UnknownNameError(f"link of '{owner}'", link, item.links, field=field)
 
-    def _sample(self) -> tuple[Floats, Ints]:
+    def _choose_times(self) -> tuple[Floats, Ints]:
         """Return the times to look at, and where among them the waypoints are."""
         curve, edges = self.trajectory.curve, self.trajectory.times
         if curve is None:
@@ -165,18 +167,18 @@ class Samples:
         )
         units = np.array(
             [
-                known.get(n, LENGTH_STEP if self.unit(n) == "m" else ANGLE_STEP)
+                known.get(n, LENGTH_STEP if self.get_unit(n) == "m" else ANGLE_STEP)
                 for n in self.trajectory.names
             ]
         )
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
-        bent = np.sqrt((bends / (BEND * units)).max(axis=1))
+        bent = np.sqrt((bends / (CHORD_DEVIATION * units)).max(axis=1))
         counts = np.maximum(
             1, np.ceil(np.maximum.reduce([planar, (steps / units).max(axis=1), bent]) - 1e-9)
         )
-        self.needed = float(counts.sum())
-        self.truncated = self.needed > max(MOST, len(counts))
-        counts = np.ones(len(counts), int) if self.truncated else counts.astype(int)
+        self.required_count = float(counts.sum())
+        self.is_truncated = self.required_count > max(MAX_SAMPLES, len(counts))
+        counts = np.ones(len(counts), int) if self.is_truncated else counts.astype(int)
         times = [
             np.linspace(a, b, n, endpoint=False)
             for (a, b), n in zip(itertools.pairwise(edges), counts, strict=True)
@@ -186,13 +188,13 @@ class Samples:
             np.searchsorted(edges, self.trajectory.times)
         ]
 
-    def unit(self, name: str) -> str:
+    def get_unit(self, name: str) -> str:
         """Return a coordinate's unit, "m" or "rad"."""
-        if name in self.virtual:
-            return self.virtual[name].unit
+        if name in self.grasp_freedoms:
+            return self.grasp_freedoms[name].unit
         return self.world.coordinates.units[self.world.coordinates.index(name)]
 
-    def bounds(self, name: str) -> tuple[float, float, float, float]:
+    def get_limits(self, name: str) -> tuple[float, float, float, float]:
         """Return lower, upper, velocity and acceleration limit of a coordinate of the trajectory."""
         robot = self.scene.robot
         if name in robot.coordinates.names:
@@ -206,8 +208,8 @@ class Samples:
                     min(upper, self.scene.arena[2 * i + 1]),
                 )
             return lower, upper, float(robot.velocity[i]), float(robot.acceleration[i])
-        if name in self.virtual:
-            return self.virtual[name].lower, self.virtual[name].upper, np.inf, np.inf
+        if name in self.grasp_freedoms:
+            return self.grasp_freedoms[name].lower, self.grasp_freedoms[name].upper, np.inf, np.inf
         owner, _, joint = name.partition(".")
         item = self.scene.objects[owner].object
         i = item.coordinates.index(joint)
@@ -218,15 +220,15 @@ class Samples:
             float(item.acceleration[i]),
         )
 
-    def waypoint(self, row: int) -> int:
+    def find_waypoint(self, row: int) -> int:
         """Return the waypoint of a sample, between two the earlier."""
         return int(np.searchsorted(self.waypoint_rows, row, side="right")) - 1
 
-    def rows(self, phase: PhaseSpan) -> Ints:
+    def get_rows(self, phase: PhaseSpan) -> Ints:
         """Return the samples of a phase, both ends among them."""
         return np.arange(self.waypoint_rows[phase.first], self.waypoint_rows[phase.last] + 1)
 
-    def moved_by(self, holds: Iterable[Hold]) -> set[str]:
+    def find_driven_coordinates(self, holds: Iterable[Hold]) -> set[str]:
         """Return the coordinates of objects that a hand that holds them can move: those between base and attachment."""
         model, names = self.world.model, set()
         for hold in holds:
@@ -237,14 +239,14 @@ class Samples:
                 joint = model.parents[joint]
         return names
 
-    def placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
+    def compute_placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
         """Return the placements of a frame in the world at some samples."""
-        turns, origins = self._frames(self.z[np.asarray(rows)], frame)
+        turns, origins = self._compute_frames(self.z[np.asarray(rows)], frame)
         return [
             pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)
         ]
 
-    def _frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
+    def _compute_frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
         """Return rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames in the world.
 
         Args:
@@ -267,7 +269,9 @@ class Samples:
                 turns[k, f], origins[k, f] = placed.rotation, placed.translation
         return turns, origins
 
-    def grasp_errors(self, owner: str, name: str, rows: Ints, by: str | None = None) -> Floats:
+    def compute_grasp_errors(
+        self, owner: str, name: str, rows: Ints, by: str | None = None
+    ) -> Floats:
         """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad].
 
         Args:
@@ -276,21 +280,21 @@ class Samples:
             rows: Which samples, shape (K,).
             by: The frame that takes the tool's place, "<object>.<link>".
         """
-        return self._grasp_errors(owner, name, self.times[rows], self.z[rows], by)
+        return self._compute_grasp_errors(owner, name, self.times[rows], self.z[rows], by)
 
-    def grasp_errors_at(
+    def compute_grasp_errors_at(
         self, owner: str, name: str, times: Floats, by: str | None = None
     ) -> Floats:
         """Return the same at any moments, increasing, shape (K,) [s]."""
-        z = self.world.compute_positions(self.trajectory, times, self.free)
-        return self._grasp_errors(owner, name, times, z, by)
+        z = self.world.compute_positions(self.trajectory, times, self.free_objects)
+        return self._compute_grasp_errors(owner, name, times, z, by)
 
-    def _grasp_errors(
+    def _compute_grasp_errors(
         self, owner: str, name: str, times: Floats, z: Floats, by: str | None
     ) -> Floats:
         attachment = self.scene.objects[owner].object.attachments[name]
         hand = compute_hand_frame(self.scene.robot, attachment)
-        turns, origins = self._frames(
+        turns, origins = self._compute_frames(
             z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}"
         )
         positions, own = (
@@ -312,10 +316,10 @@ class Samples:
         aimed = origins[:, 1] + np.einsum("kij,kj->ki", turns[:, 1], origin[which])
         off = origins[:, 0] + turns[:, 0] @ hand.translation - aimed
         rotation = np.swapaxes(turns[:, 1] @ turn[which], 1, 2) @ turns[:, 0] @ hand.rotation
-        return np.column_stack([np.linalg.norm(off, axis=1), _angles(rotation)])
+        return np.column_stack([np.linalg.norm(off, axis=1), _compute_angles(rotation)])
 
 
-def _angles(rotations: Floats) -> Floats:
+def _compute_angles(rotations: Floats) -> Floats:
     """Return by how much rotations turn, shape (K, 3, 3) → (K,) [rad]; as exact near none as near half a turn."""
     skew = rotations - np.swapaxes(rotations, 1, 2)
     sine = 0.5 * np.linalg.norm(skew[:, [2, 0, 1], [1, 2, 0]], axis=1)

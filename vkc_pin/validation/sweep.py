@@ -21,14 +21,14 @@ __all__ = ["Hit", "sweep"]
 RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
 # [m] of relative motion between two samples that changes nothing, as of what stands where it was
 # put
-STILL = 1e-6
+MIN_MOTION = 1e-6
 
 
 class Hit(NamedTuple):
     """A pair's distance [m] at one state: at sample `row`, or between it and the next.
 
     `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact
-    [m]. `usual` is the clearance that the pair would have to keep were it not exempt, and 0 where
+    [m]. `exempt_clearance` is the clearance that the pair would have to keep were it not exempt, and 0 where
     it is not; `shapes` are its numbers in the world.
     """
 
@@ -39,7 +39,7 @@ class Hit(NamedTuple):
     margin: float
     contact: float
     at_waypoint: bool
-    usual: float = 0.0
+    exempt_clearance: float = 0.0
     shapes: tuple[int, int] = (-1, -1)
 
 
@@ -51,7 +51,7 @@ def sweep(table: PairTable, z: Floats, waypoints: Ints) -> Iterator[Hit]:
         z: Sampled configurations of its world, shape (S, n), evenly spaced between waypoints.
         waypoints: Rows of `z` that are waypoints, shape (T,).
     """
-    return _Sweep(table).along(z, waypoints)
+    return _Sweep(table).find_hits(z, waypoints)
 
 
 class _Sweep:
@@ -59,36 +59,40 @@ class _Sweep:
         self._table, self._solids = table, table.solids
         self._waypoints = np.zeros(0, int)
 
-    def along(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
-        placed = self._solids.at(self._solids.world.coordinates.q(z[waypoints]))
-        at, pairs, distances = self._nearest(placed)
-        self._waypoints, margins = waypoints, self._table.margins_at(pairs, at)
+    def find_hits(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
+        placed = self._solids.place(self._solids.world.coordinates.q(z[waypoints]))
+        at, pairs, distances = self._find_nearest(placed)
+        self._waypoints, margins = waypoints, self._table.get_margins(pairs, at)
         apart = np.flatnonzero(margins > -np.inf)  # what moves as one is as close as it was
-        closest = apart[_least(at[apart], distances[apart])]
-        exempt = self._table.exempt_at(pairs, at) & (distances < self._table.margins[pairs])
+        closest = apart[_find_group_minima(at[apart], distances[apart])]
+        exempt = self._table.find_exempt(pairs, at) & (distances < self._table.margins[pairs])
         chosen = np.union1d(
             closest, np.flatnonzero((distances < np.maximum(margins, 0.0)) | exempt)
         )
-        yield from self._hits(
+        yield from self._make_hits(
             waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True
         )
         smallest = max(
             RESOLUTION, float(distances[closest].min(initial=np.inf))
         )  # what cannot come closer than that changes nothing
         moved = bound_displacements(self._solids, z)
-        stretch, pairs = self._active(placed, np.diff(moved[waypoints], axis=0), smallest)
-        ends = placed.distances(
+        stretch, pairs = self._find_active_pairs(
+            placed, np.diff(moved[waypoints], axis=0), smallest
+        )
+        ends = placed.compute_distances(
             np.concatenate([stretch, stretch + 1]), np.tile(self._table.pairs[pairs], (2, 1))
         )
         before, after = np.split(ends, 2)
-        yield from self._between(
+        yield from self._search_intervals(
             z,
-            Stretches(waypoints[stretch], waypoints[stretch + 1], pairs, before, after),
+            Intervals(waypoints[stretch], waypoints[stretch + 1], pairs, before, after),
             moved,
             smallest,
         )
 
-    def _between(self, z: Floats, todo: Stretches, moved: Floats, smallest: float) -> Iterator[Hit]:
+    def _search_intervals(
+        self, z: Floats, todo: Intervals, moved: Floats, smallest: float
+    ) -> Iterator[Hit]:
         """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
 
         d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it
@@ -103,22 +107,22 @@ class _Sweep:
             smallest: [m].
         """
         while len(todo.pair):
-            motion = self._motion(todo, moved)
+            motion = self._bound_motion(todo, moved)
             todo = todo.select(
                 (todo.before + todo.after - motion < 2 * smallest)
-                & ((motion > STILL) | (todo.before < 0))
+                & ((motion > MIN_MOTION) | (todo.before < 0))
             )
             next_to = todo.high - todo.low == 1
-            yield from self._slipping(z, todo.select(next_to), moved)
+            yield from self._find_tunnelling(z, todo.select(next_to), moved)
             todo = todo.select(~next_to)
             middle = (todo.low + todo.high) // 2
             rows, at = np.unique(middle, return_inverse=True)
-            distances = self._solids.at(self._solids.world.coordinates.q(z[rows])).distances(
-                at, self._table.pairs[todo.pair]
-            )
-            told = np.union1d(_least(at, distances), np.flatnonzero(distances < 0))
-            yield from self._hits(middle[told], todo.pair[told], distances[told])
-            todo = Stretches(
+            distances = self._solids.place(
+                self._solids.world.coordinates.q(z[rows])
+            ).compute_distances(at, self._table.pairs[todo.pair])
+            told = np.union1d(_find_group_minima(at, distances), np.flatnonzero(distances < 0))
+            yield from self._make_hits(middle[told], todo.pair[told], distances[told])
+            todo = Intervals(
                 np.append(todo.low, middle),
                 np.append(middle, todo.high),
                 np.tile(todo.pair, 2),
@@ -126,27 +130,27 @@ class _Sweep:
                 np.append(distances, todo.after),
             )
 
-    def _motion(self, todo: Stretches, moved: Floats) -> Floats:
+    def _bound_motion(self, todo: Intervals, moved: Floats) -> Floats:
         """Return how far any two points of pairs can move relative to each other in stretches, shape (n,) [m]."""
         first, second = self._table.pairs[todo.pair].T
         return (moved[todo.high, first] - moved[todo.low, first]) + (
             moved[todo.high, second] - moved[todo.low, second]
         )
 
-    def _slipping(self, z: Floats, todo: Stretches, moved: Floats) -> Iterator[Hit]:
+    def _find_tunnelling(self, z: Floats, todo: Intervals, moved: Floats) -> Iterator[Hit]:
         """Yield what overlaps between a sample and the next, at both of which it is free: nothing deeper than 1 mm can hide.
 
         Args:
             z: Sampled configurations of the world, shape (S, n).
-            todo: Stretches from one sample to the next.
+            todo: Intervals from one sample to the next.
             moved: See `bound_displacements`.
         """
-        first, motion = self._stretch(todo.low), self._motion(todo, moved)
-        overlap = self._table.contact_at(todo.pair, first, first + 1)
+        first, motion = self._find_interval(todo.low), self._bound_motion(todo, moved)
+        overlap = self._table.get_contact_overlaps(todo.pair, first, first + 1)
         free = (np.minimum(todo.before, todo.after) >= -overlap) & (
             todo.before + todo.after < motion
         )
-        free &= ~self._table.together_at(todo.pair, first, first + 1)
+        free &= ~self._table.find_moving_together(todo.pair, first, first + 1)
         for c in np.flatnonzero(free).tolist():
             row, k = todo.low[c], todo.pair[c]
             stack = [(0.0, 1.0, todo.before[c], todo.after[c])]
@@ -155,31 +159,31 @@ class _Sweep:
                 if (width := (high - low) * motion[c]) <= 2 * RESOLUTION or before + after >= width:
                     continue
                 middle = (low + high) / 2
-                state = self._solids.at(
+                state = self._solids.place(
                     self._solids.world.coordinates.q(
                         (1 - middle) * z[[row]] + middle * z[[row + 1]]
                     )
                 )
-                found = state.distances(np.zeros(1, int), self._table.pairs[[k]])
-                yield from self._hits(np.array([row]), np.array([k]), found)
+                found = state.compute_distances(np.zeros(1, int), self._table.pairs[[k]])
+                yield from self._make_hits(np.array([row]), np.array([k]), found)
                 between = float(found[0])
                 if between < -overlap[c]:
                     break
                 stack += [(low, middle, before, between), (middle, high, between, after)]
 
-    def _nearest(self, placed: PlacedShapes) -> tuple[Ints, Ints, Floats]:
+    def _find_nearest(self, placed: PlacedShapes) -> tuple[Ints, Ints, Floats]:
         """Return (state, pair), the closest and all that fall short of their margins among them, and their distances [m]."""
         found, todo = list[tuple[Ints, Ints, Floats]](), np.arange(len(placed))
         reach = max(self._table.margins.max(), RESOLUTION)
         while len(todo):
-            at, pairs = self._table.near(
-                placed, todo, todo, np.zeros((len(todo), len(self._table.group))), reach
+            at, pairs = self._table.find_close_pairs(
+                placed, todo, todo, np.zeros((len(todo), len(self._table.groups))), reach
             )
             states = todo[at]
-            distances = placed.distances(states, self._table.pairs[pairs])
+            distances = placed.compute_distances(states, self._table.pairs[pairs])
             least, apart = (
                 np.full(len(placed), np.inf),
-                self._table.margins_at(pairs, states) > -np.inf,
+                self._table.get_margins(pairs, states) > -np.inf,
             )
             np.minimum.at(least, states[apart], distances[apart])
             done = ~(least > reach)  # all others are further apart
@@ -190,10 +194,12 @@ class _Sweep:
         order = np.lexsort((pairs, states))
         return states[order], pairs[order], distances[order]
 
-    def _active(self, placed: PlacedShapes, moved: Floats, smallest: float) -> tuple[Ints, Ints]:
+    def _find_active_pairs(
+        self, placed: PlacedShapes, moved: Floats, smallest: float
+    ) -> tuple[Ints, Ints]:
         """Return (t, pair) of all but those that boxes prove to stay `smallest` apart between waypoints t and t + 1 [m].
 
-        Where d(s) of `_between` is less, one of both distances is less than `smallest` and half the
+        Where d(s) of `_search_intervals` is less, one of both distances is less than `smallest` and half the
         relative motion.
 
         Args:
@@ -202,24 +208,26 @@ class _Sweep:
                 [m].
             smallest: [m].
         """
-        return self._table.near(
+        return self._table.find_close_pairs(
             placed, np.arange(len(moved)), np.arange(1, len(moved) + 1), moved, smallest
         )
 
-    def _stretch(self, rows: Ints) -> Ints:
+    def _find_interval(self, rows: Ints) -> Ints:
         """Return the waypoints from which the stretches begin in which samples are, shape (n,)."""
         return np.searchsorted(self._waypoints, rows, side="right") - 1
 
-    def _hits(
+    def _make_hits(
         self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoint: bool = False
     ) -> Iterator[Hit]:
         """Yield the distances of pairs at samples, or between these and the next, all of shape (n,)."""
-        at = self._stretch(rows)
-        margins = self._table.margins_at(pairs, at)
-        contacts = self._table.contact_at(pairs, at, at if at_waypoint else at + 1)
+        at = self._find_interval(rows)
+        margins = self._table.get_margins(pairs, at)
+        contacts = self._table.get_contact_overlaps(pairs, at, at if at_waypoint else at + 1)
         labels = self._solids.world.collision_labels
-        usual = np.where(self._table.exempt_at(pairs, at), self._table.margins[pairs], 0.0)
-        columns = (rows, self._table.pairs[pairs], distances, margins, contacts, usual)
+        exempt_clearance = np.where(
+            self._table.find_exempt(pairs, at), self._table.margins[pairs], 0.0
+        )
+        columns = (rows, self._table.pairs[pairs], distances, margins, contacts, exempt_clearance)
         for row, (i, j), distance, margin, contact, clearance in zip(
             *(c.tolist() for c in columns), strict=True
         ):
@@ -228,7 +236,7 @@ class _Sweep:
             )
 
 
-class Stretches(NamedTuple):
+class Intervals(NamedTuple):
     """Pairs between two samples, `low` and `high`, and their distances at these, `before` and `after` [m]; shape (n,) each."""
 
     low: Ints
@@ -237,9 +245,9 @@ class Stretches(NamedTuple):
     before: Floats
     after: Floats
 
-    def select(self, which: Bools) -> Stretches:
+    def select(self, which: Bools) -> Intervals:
         """Return those of them."""
-        return Stretches(
+        return Intervals(
             self.low[which],
             self.high[which],
             self.pair[which],
@@ -248,7 +256,7 @@ class Stretches(NamedTuple):
         )
 
 
-def _least(groups: Ints, values: Floats) -> Ints:
+def _find_group_minima(groups: Ints, values: Floats) -> Ints:
     """Return where the smallest value of each group is, the first of them."""
     order = np.lexsort((values, groups))
     return order[np.flatnonzero(np.diff(groups[order], prepend=-1))]

@@ -16,7 +16,7 @@ from vkc_pin.world.task.terms import Constraint, Term
 
 __all__ = ["check_terms"]
 
-BETWEEN = 10.0  # times the tolerance at a waypoint
+INTERMEDIATE_FACTOR = 10.0  # times the tolerance at a waypoint
 
 
 def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
@@ -32,15 +32,18 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
     """
     found = []
     for term in (term for term in terms if isinstance(term, Constraint)):
-        at, between = _rows(samples, term)
+        at, between = _find_rows(samples, term)
         rows = np.sort(np.concatenate([at, between]))
         if not len(rows):
             continue
-        values = term.formula.evaluate(_inputs(samples, term.formula, rows))
+        values = term.formula.evaluate(_compute_inputs(samples, term.formula, rows))
         lower, upper = term.compute_bounds(term.formula.rows)
         excess = np.maximum(lower - values, values - upper)
         excess[np.isnan(excess)] = np.inf
-        for which, tolerance in ((at, term.tolerance), (between, BETWEEN * term.tolerance)):
+        for which, tolerance in (
+            (at, term.tolerance),
+            (between, INTERMEDIATE_FACTOR * term.tolerance),
+        ):
             mine = np.flatnonzero(np.isin(rows, which))
             if not len(mine):
                 continue
@@ -59,7 +62,7 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
             name = f"entry {entry}: " if len(lower) > 1 else ""
             where = " between waypoints" if which is between else ""
             detail = f"{name}{value:.6g} is {side} by {amount:.3g}{where}"
-            waypoint, time = samples.waypoint(row), float(samples.times[row])
+            waypoint, time = samples.find_waypoint(row), float(samples.times[row])
             found.append(
                 Violation(
                     "term",
@@ -74,7 +77,7 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
     return found
 
 
-def _rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
+def _find_rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
     """Return the samples at which a constraint must hold: those that are waypoints, and those between two of them."""
     trajectory = samples.trajectory
     asked = np.zeros(len(trajectory.times), bool)
@@ -97,13 +100,13 @@ def _rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
     return at, np.concatenate([np.zeros(0, int), *inner])
 
 
-def _inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
+def _compute_inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
     """Return the inputs of a formula at some samples, shape (S, 2·half + 1)."""
     ends = np.searchsorted(
         samples.waypoint_rows, rows
     )  # the waypoint in which the segment of a sample ends
     dt = np.diff(samples.trajectory.times, prepend=samples.trajectory.times[0] - 1.0)[ends]
-    now = before = _half(samples, formula, samples.z[rows])
+    now = before = _compute_state_inputs(samples, formula, samples.z[rows])
     if formula.uses_previous:
         times = samples.times[rows] - dt
         order = np.argsort(times, kind="stable")
@@ -111,11 +114,11 @@ def _inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
         earlier[order] = samples.world.compute_positions(
             samples.trajectory, np.maximum(times[order], samples.trajectory.times[0])
         )
-        before = _half(samples, formula, earlier)
+        before = _compute_state_inputs(samples, formula, earlier)
     return np.column_stack([now, before, dt])
 
 
-def _half(samples: Samples, formula: Formula, z: Floats) -> Floats:
+def _compute_state_inputs(samples: Samples, formula: Formula, z: Floats) -> Floats:
     """Return placements of a formula's frames and its coordinates at configurations of the world, shape (S, half)."""
     model, coordinates = samples.world.model, samples.world.coordinates
     data = model.createData()

@@ -15,15 +15,15 @@ from vkc_pin.options import Options
 from vkc_pin.utils.arguments import instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.closure import find_drift
-from vkc_pin.validation.contact_windows import check_gripper, check_pushes, windows
+from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find_contact_windows
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.dynamics.rates import check_rates
-from vkc_pin.validation.dynamics.torques import Motors
+from vkc_pin.validation.dynamics.torques import MotorLoads
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.report import Exemption, Report, Violation
 from vkc_pin.validation.rolling import check_rolling
-from vkc_pin.validation.samples import MOST, Samples
+from vkc_pin.validation.samples import MAX_SAMPLES, Samples
 from vkc_pin.validation.sweep import Hit, sweep
 from vkc_pin.validation.terms import check_terms
 from vkc_pin.world.scene.clearance_exemptions import (
@@ -79,7 +79,7 @@ def validate(
             names what is not there.
     """
     options = Options() if options is None else instance(options, Options, "options")
-    return _Check(*check_arguments(scene, steps, trajectory, terms), options).report()
+    return _Validator(*check_arguments(scene, steps, trajectory, terms), options).make_report()
 
 
 def check_arguments(
@@ -94,49 +94,55 @@ def check_arguments(
     return samples, asked, trace_terms(scene, terms)
 
 
-class _Check:
+class _Validator:
     def __init__(
         self, samples: Samples, steps: Sequence[Step], terms: Sequence[Term], options: Options
     ) -> None:
         self.samples, self.steps, self.options, self.terms = samples, steps, options, terms
         self.scene, self.trajectory = samples.scene, samples.trajectory
-        self.found: list[Violation] = []
+        self.violations: list[Violation] = []
         self.exemptions: dict[tuple[str, str], Exemption] = {}
         self._ranges = samples.trajectory.ranges()
 
-    def report(self) -> Report:
+    def make_report(self) -> Report:
         """Run every check."""
-        for check in (self._start, self._limits, self._unheld, self._tips, self._latches):
+        for check in (
+            self._check_start,
+            self._check_limits,
+            self._check_undriven_joints,
+            self._check_tilt,
+            self._check_latches,
+        ):
             check()
-        self.found += check_rates(self.samples, self.options)
-        self.found += check_rolling(self.samples)
-        self.found += check_goals(self.samples, self.steps, self.options)
-        self.found += check_terms(self.samples, self.terms)
-        motors = Motors(self.samples)
-        self.found += [
+        self.violations += check_rates(self.samples, self.options)
+        self.violations += check_rolling(self.samples)
+        self.violations += check_goals(self.samples, self.steps, self.options)
+        self.violations += check_terms(self.samples, self.terms)
+        motors = MotorLoads(self.samples)
+        self.violations += [
             *check_gripper(self.samples, self.options),
             *check_pushes(self.samples),
-            *motors.violations(),
+            *motors.find_violations(),
         ]
-        error, angle = self._closure()
-        self._slides()
+        error, angle = self._check_closure()
+        self._check_firm_grasps()
         nearest = (
-            self._clearance()
-            if self._within_reason()
+            self._check_clearance()
+            if self._check_sample_count()
             else np.full(len(self.trajectory.phases), np.inf)
         )
         worst: dict[tuple[str, str, str], Violation] = {}
-        for violation in self.found:
+        for violation in self.violations:
             key = (violation.constraint, violation.subject, violation.unit)
             if key not in worst or worst[key].amount < violation.amount:
                 worst[key] = violation
-        for violation in self.found:  # what overlaps is also too close
+        for violation in self.violations:  # what overlaps is also too close
             if violation.constraint == "penetration":
                 worst.pop(("clearance", violation.subject, violation.unit), None)
         ordered = tuple(
             sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit))
         )
-        close, facts = tuple(nearest.tolist()), motors.facts(self.options.jerk_time)
+        close, facts = tuple(nearest.tolist()), motors.summarize(self.options.jerk_time)
         return Report(
             ordered,
             min(close),
@@ -148,7 +154,7 @@ class _Check:
             **facts,
         )
 
-    def _add(
+    def _add_violation(
         self,
         constraint: str,
         subject: str,
@@ -161,10 +167,10 @@ class _Check:
         time: float | None = None,
     ) -> None:
         """Note a violation at a waypoint, or at a sample if `row` names one, or at a time [s] after the waypoint."""
-        at = waypoint if row is None else self.samples.waypoint(row)
+        at = waypoint if row is None else self.samples.find_waypoint(row)
         if time is None:
             time = self.trajectory.times[at] if row is None else self.samples.times[row]
-        self.found.append(
+        self.violations.append(
             Violation(
                 constraint,
                 subject,
@@ -176,24 +182,26 @@ class _Check:
             )
         )
 
-    def _within_reason(self) -> bool:
+    def _check_sample_count(self) -> bool:
         """The motion is no longer than can be looked at; otherwise nothing is said of collisions."""
-        needed, most = self.samples.needed, max(MOST, len(self.trajectory.times))
+        needed, most = self.samples.required_count, max(MAX_SAMPLES, len(self.trajectory.times))
         if needed > most:
             detail = f"{needed:.3g} configurations would have to be looked at, more than {most}: collisions were not looked for"
             step = int(np.argmax(np.abs(np.diff(self.trajectory.positions, axis=0)).max(axis=1)))
-            self._add("sampling", "motion", needed - most, "configurations", detail, waypoint=step)
+            self._add_violation(
+                "sampling", "motion", needed - most, "configurations", detail, waypoint=step
+            )
         return needed <= most
 
-    def _start(self) -> None:
+    def _check_start(self) -> None:
         """The motion begins where the robot and the objects are."""
         known = dict(
             zip(self.samples.world.coordinates.names, self.samples.world.start, strict=True)
         )
         for name, value in zip(self.trajectory.names, self.trajectory.positions[0], strict=True):
-            right, unit = known.get(name, value), self.samples.unit(name)
+            right, unit = known.get(name, value), self.samples.get_unit(name)
             if not abs(value - right) <= START_TOLERANCE:
-                self._add(
+                self._add_violation(
                     "start",
                     name,
                     abs(value - right),
@@ -201,7 +209,7 @@ class _Check:
                     f"{value:.6g} {unit} instead of {right:.6g} {unit}",
                 )
 
-    def _limits(self) -> None:
+    def _check_limits(self) -> None:
         """Every coordinate stays within its limits (eq. 4)."""
         ranges = zip(
             self.trajectory.names,
@@ -210,7 +218,7 @@ class _Check:
             strict=True,
         )
         for name, start, low, high in ranges:
-            lower, upper, _, _ = self.samples.bounds(name)
+            lower, upper, _, _ = self.samples.get_limits(name)
             most = max(lower - start, start - upper)
             excess = np.maximum(lower - low, high - upper)
             excess[0] -= (
@@ -219,7 +227,7 @@ class _Check:
             worst = int(np.argmax(excess))
             if not excess[worst] <= LIMIT_TOLERANCE:
                 unit, value = (
-                    self.samples.unit(name),
+                    self.samples.get_unit(name),
                     float(max(low[worst], high[worst], key=lambda v: max(lower - v, v - upper))),
                 )
                 out, ends = (
@@ -227,7 +235,7 @@ class _Check:
                     self.trajectory.column(name)[worst : worst + 2],
                 )
                 detail = f"{value:.4f} {unit} is outside {lower:.4f} to {upper:.4f} {unit} by {out:.4f} {unit}"
-                self._add(
+                self._add_violation(
                     "limit",
                     name,
                     out,
@@ -236,26 +244,32 @@ class _Check:
                     waypoint=worst + int(np.argmin(np.abs(ends - value))),
                 )
 
-    def _tips(self) -> None:
+    def _check_tilt(self) -> None:
         """What something stands on stays level while it moves."""
-        for phase, riding in zip(self.trajectory.phases, self.samples.free.rides, strict=True):
-            rows = self.samples.rows(phase)
+        for phase, riding in zip(
+            self.trajectory.phases, self.samples.free_objects.supports, strict=True
+        ):
+            rows = self.samples.get_rows(phase)
             for owner, label in riding.items():
-                links = self.samples.placements(rows, label)
+                links = self.samples.compute_placements(rows, label)
                 angles = np.array([compute_tilt(links[0], link) for link in links])
                 worst = int(np.argmax(angles))
                 if not angles[worst] <= MAX_TILT:
                     detail = f"'{label}', on which it stands, tilts by {angles[worst]:.2f} rad, more than {MAX_TILT:g} rad"
-                    self._add(
+                    self._add_violation(
                         "tips", owner, angles[worst] - MAX_TILT, "rad", detail, row=int(rows[worst])
                     )
 
-    def _unheld(self) -> None:
+    def _check_undriven_joints(self) -> None:
         """What no hand moves does not move."""
         for phase in self.trajectory.phases:
-            driven = self.samples.moved_by(phase.holds)
+            driven = self.samples.find_driven_coordinates(phase.holds)
             for i, name in enumerate(self.trajectory.names):
-                if i < self.trajectory.robot_size or name in driven or name in self.samples.virtual:
+                if (
+                    i < self.trajectory.robot_size
+                    or name in driven
+                    or name in self.samples.grasp_freedoms
+                ):
                     continue
                 owner = name.partition(".")[0]
                 why = (
@@ -263,9 +277,9 @@ class _Check:
                     if owner in phase.held
                     else f"nobody holds {owner}"
                 )
-                self._still(phase, "unheld", name, "moves by ", f" while {why}")
+                self._check_stationary(phase, "unheld", name, "moves by ", f" while {why}")
 
-    def _latches(self) -> None:
+    def _check_latches(self) -> None:
         """A latched joint leaves where it is held only while the joint that releases it is far enough.
 
         Between two samples both are linear in time, so the shortfall is largest where the joint
@@ -298,19 +312,21 @@ class _Check:
                         f"leaves {latch.held_at:g} while {latch.released_by} is at {lowest[row]:.3f}, "
                         f"{short[row]:.3f} short of {latch.threshold:g}"
                     )
-                    self._add(
-                        "latch", name, short[row], self.samples.unit(release), detail, row=row
+                    self._add_violation(
+                        "latch", name, short[row], self.samples.get_unit(release), detail, row=row
                     )
 
-    def _closure(self) -> tuple[float, float]:
+    def _check_closure(self) -> tuple[float, float]:
         """The hand stays where it holds an object (eq. 2); return the largest drift, [m] and [rad]."""
         largest, limits = np.zeros(2), (self.options.closure_position, self.options.closure_angle)
         for phase in self.trajectory.phases:
             for hold in phase.holds:
                 drift = find_drift(self.samples, phase, hold, limits)
-                largest = np.maximum(largest, drift.found)
+                largest = np.maximum(largest, drift.measured)
                 subject = f"{hold.object}.{hold.attachment}"
-                rows = zip(drift.found, drift.bound, drift.times, limits, ("m", "rad"), strict=True)
+                rows = zip(
+                    drift.measured, drift.bound, drift.times, limits, ("m", "rad"), strict=True
+                )
                 for found, bound, time, limit, unit in rows:
                     if not bound <= limit:
                         amount = found if found > limit else bound
@@ -319,7 +335,7 @@ class _Check:
                             int(np.searchsorted(self.trajectory.times, time, side="right")) - 1,
                             phase.last,
                         )
-                        self._add(
+                        self._add_violation(
                             "closure",
                             subject,
                             amount - limit,
@@ -330,24 +346,28 @@ class _Check:
                         )
         return float(largest[0]), float(largest[1])
 
-    def _slides(self) -> None:
+    def _check_firm_grasps(self) -> None:
         """A hand that clamps does not slide or turn on what it holds."""
         for phase in self.trajectory.phases:
             for owner, attachment in phase.held.items():
                 grasp = self.scene.objects[owner].object.attachments[attachment]
                 for name in grasp.coordinates if grasp.firm else ():
                     detail = f"the hand moves on '{owner}' by "
-                    self._still(phase, "slide", f"{owner}.{name}", detail, " while it clamps it")
+                    self._check_stationary(
+                        phase, "slide", f"{owner}.{name}", detail, " while it clamps it"
+                    )
 
-    def _still(self, phase: PhaseSpan, kind: str, name: str, before: str, after: str) -> None:
+    def _check_stationary(
+        self, phase: PhaseSpan, kind: str, name: str, before: str, after: str
+    ) -> None:
         """A coordinate does not change in a phase; what is said of it goes around by how much."""
         column, begin = self.trajectory.names.index(name), self.trajectory.column(name)[phase.first]
         low, high = (side[phase.first : phase.last, column] for side in self._ranges)
-        moved, unit = np.maximum(high - begin, begin - low), self.samples.unit(name)
+        moved, unit = np.maximum(high - begin, begin - low), self.samples.get_unit(name)
         worst = int(np.argmax(moved))
         if not moved[worst] <= MOTION_TOLERANCE:
             at = phase.first + worst + 1
-            self._add(
+            self._add_violation(
                 kind,
                 name,
                 moved[worst],
@@ -356,7 +376,7 @@ class _Check:
                 waypoint=at,
             )
 
-    def _clearance(self) -> Floats:
+    def _check_clearance(self) -> Floats:
         """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return each phase's smallest distance [m].
 
         What moves as one does not count. The start is where the robot is: it may be close to
@@ -367,12 +387,12 @@ class _Check:
             CollisionShapes(self.samples.world),
             [phase.last for phase in self.trajectory.phases],
         )
-        near = windows(samples, solids, self.steps, self.options)
+        near = find_contact_windows(samples, solids, self.steps, self.options)
         safe, own = self.options.dist_safe, self.options.self_distance
         pairs = PairTable(
             self.scene, solids, self.trajectory, safe, own, windows=near, samples=samples
         )
-        nearest, exempt = np.full(len(lasts), np.inf), self._exempt_pairs()
+        nearest, exempt = np.full(len(lasts), np.inf), self._find_exempt_pairs()
         names = samples.world.coordinates.names
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
             state = samples.z[[hit.row]]
@@ -389,7 +409,7 @@ class _Check:
             overlap = max(hit.contact, CONTACT_DEPTH + tolerated if tolerated > 0.0 else 0.0)
             if hit.margin > -np.inf and not tolerated > 0.0:
                 np.minimum.at(
-                    nearest, np.searchsorted(lasts, samples.waypoint(hit.row)), hit.distance
+                    nearest, np.searchsorted(lasts, samples.find_waypoint(hit.row)), hit.distance
                 )
             subject, millimetres = f"{hit.first} – {hit.second}", 1e3 * abs(hit.distance)
             short = (
@@ -398,7 +418,7 @@ class _Check:
                 - hit.distance
             )
             if hit.distance < -overlap:
-                self._add(
+                self._add_violation(
                     "penetration",
                     subject,
                     -hit.distance,
@@ -410,14 +430,16 @@ class _Check:
                 detail = (
                     f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
                 )
-                self._add("clearance", subject, short, "m", detail, row=hit.row)
+                self._add_violation("clearance", subject, short, "m", detail, row=hit.row)
             elif hit.distance < -CONTACT_DEPTH or (
-                hit.at_waypoint and hit.row > 0 and hit.distance < hit.usual - WAYPOINT_TOLERANCE
+                hit.at_waypoint
+                and hit.row > 0
+                and hit.distance < hit.exempt_clearance - WAYPOINT_TOLERANCE
             ):
-                self._note_exemption(hit, exempt.get(hit.shapes, ()))
+                self._record_exemption(hit, exempt.get(hit.shapes, ()))
         return nearest
 
-    def _exempt_pairs(self) -> dict[tuple[int, int], list[ClearanceExemption]]:
+    def _find_exempt_pairs(self) -> dict[tuple[int, int], list[ClearanceExemption]]:
         """Return the pairs of shapes that the scene exempts from clearance, each with its allowances."""
         world, found = self.samples.world, dict[tuple[int, int], list[ClearanceExemption]]()
         for one in find_clearance_exemptions(self.scene, self.options.dist_safe):
@@ -425,7 +447,7 @@ class _Check:
                 found.setdefault(pair, []).append(one)
         return found
 
-    def _note_exemption(self, hit: Hit, allowed: Sequence[ClearanceExemption]) -> None:
+    def _record_exemption(self, hit: Hit, allowed: Sequence[ClearanceExemption]) -> None:
         """Note that a pair came closer than others may, at its closest."""
         known = self.exemptions.get((hit.first, hit.second))
         if known is not None and known.distance <= hit.distance:

@@ -90,7 +90,14 @@ class Sun(g.Object):
         matrix = np.eye(4)
         matrix[:3, 3] = self.position
         size = self.reach + float(np.linalg.norm(self.position[:2])) * 0.1
-        box = {"left": -size, "right": size, "top": size, "bottom": -size, "near": 1.0, "far": 60.0}
+        box = {
+            "left": -size,
+            "right": size,
+            "top": size,
+            "bottom": -size,
+            "near": 1.0,
+            "far": 60.0,
+        }
         shadow = {"bias": -0.0004, "normalBias": 0.02, "radius": 2.5, "mapSize": [2048, 2048]}
         camera = {"uuid": f"{self.uuid}-camera", "type": "OrthographicCamera", "zoom": 1.0, **box}
         light = {"uuid": self.uuid, "type": "DirectionalLight", "color": 0xFFFFFF, "intensity": 0.5}

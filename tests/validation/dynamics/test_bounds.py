@@ -9,7 +9,7 @@ import pytest
 from helpers.executions import door_plan, drawer_plan
 
 import vkc_pin as vkc
-from vkc_pin.validation.dynamics.bounds import bounds
+from vkc_pin.validation.dynamics.bounds import find_limiting_constraints
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.dynamics.torques import sample_curve
 
@@ -35,7 +35,7 @@ def test_bounds_share_the_duration_and_limits_are_reached_where_they_say(made: o
                 "acceleration": (motion.acceleration, 3),
             }[bound.kind]
             values = np.abs(read(times)[:, motion.names.index(bound.subject)])
-            assert values.max() > 0.9 * samples.bounds(bound.subject)[place]
+            assert values.max() > 0.9 * samples.get_limits(bound.subject)[place]
 
 
 def test_torques_count_as_any_other_limit() -> None:
@@ -45,7 +45,7 @@ def test_torques_count_as_any_other_limit() -> None:
     moments = sample_curve(curve)
     torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
     torques[moments.pieces < len(curve.times) // 2, 4] = 1.5
-    (first, *_) = bounds(samples, moments, torques, 0.0)
+    (first, *_) = find_limiting_constraints(samples, moments, torques, 0.0)
     assert (first.subject, first.kind) == ("shoulder_lift_joint", "torque")
     assert first.begin == 0.0
 
@@ -62,7 +62,9 @@ def test_of_several_stretches_the_longest_is_named() -> None:
         for begin, end in parts:
             torques[(moments.pieces >= begin) & (moments.pieces < end), 4] = 50.0
         first = next(
-            bound for bound in bounds(samples, moments, torques, 0.0) if bound.kind == "torque"
+            bound
+            for bound in find_limiting_constraints(samples, moments, torques, 0.0)
+            if bound.kind == "torque"
         )
         lengths = {(a, b): curve.times[b] - curve.times[a] for a, b in parts}
         assert max(lengths, key=lambda part: lengths[part]) == long, (
@@ -86,7 +88,8 @@ def test_what_bounds_a_two_hundredth_of_the_duration_is_told_of() -> None:
         torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
         torques[moments.pieces == piece, 4] = 50.0
         assert (
-            "torque" in {bound.kind for bound in bounds(samples, moments, torques, 0.0)}
+            "torque"
+            in {bound.kind for bound in find_limiting_constraints(samples, moments, torques, 0.0)}
         ) == told
 
 
@@ -94,7 +97,7 @@ def test_without_a_curve_nothing_is_said() -> None:
     plan = drawer_plan()
     bare = dataclasses.replace(plan.trajectory, curve=None)
     assert (
-        bounds(
+        find_limiting_constraints(
             Samples(plan.scene, bare), sample_curve(plan.trajectory.curve), np.zeros((0, 0)), 0.0
         )
         == ()

@@ -10,14 +10,14 @@ import pytest
 
 from vkc_pin.options import Options
 from vkc_pin.validation.dynamics import torques as torques_module
-from vkc_pin.validation.dynamics.bounds import bounds
+from vkc_pin.validation.dynamics.bounds import find_limiting_constraints
 from vkc_pin.validation.dynamics.rates import (
     ACCEPTED_RATE_TOLERANCE,
     JUMP_TOLERANCE,
     REST_TOLERANCE,
     check_rates,
 )
-from vkc_pin.validation.dynamics.torques import TORQUE_TOLERANCE, Motors
+from vkc_pin.validation.dynamics.torques import TORQUE_TOLERANCE, MotorLoads
 
 TIMES = np.array([0.0, 1.0, 3.0, 4.0])
 KNOTS = np.array([0.0, 0.5, 1.0, 3.0, 4.0])
@@ -77,7 +77,7 @@ def told(
         accelerations=lambda: acceleration,
     )
     samples: Any = SimpleNamespace(
-        trajectory=motion, bounds=lambda name: (0.0, 0.0, *limits), unit=lambda name: "rad"
+        trajectory=motion, get_limits=lambda name: (0.0, 0.0, *limits), get_unit=lambda name: "rad"
     )
     rows = list(check_rates(samples, Options(jerk_time=jerk_time)))
     assert {one.subject for one in rows} <= {"joint"}
@@ -184,10 +184,10 @@ def bounding(
     )
     samples: Any = SimpleNamespace(
         trajectory=SimpleNamespace(curve=curve, names=("one", "two")),
-        bounds=lambda name: (0.0, 0.0, 2.0, 4.0),
+        get_limits=lambda name: (0.0, 0.0, 2.0, 4.0),
     )
     moments: Any = SimpleNamespace(pieces=np.array([0, 1, 2, 3, 0, 1, 2, 3]))
-    found = bounds(samples, moments, torques, jerk_time)
+    found = find_limiting_constraints(samples, moments, torques, jerk_time)
     return [(one.subject, one.kind, one.share, one.begin, one.end) for one in found]
 
 
@@ -245,7 +245,7 @@ def motors(
     smooth: bool = True,
 ) -> Any:
     """Return motors that have these torques at four moments; a tenth of that at rest."""
-    made = object.__new__(Motors)
+    made = object.__new__(MotorLoads)
     numbers = np.array(torques, float)
     made.trajectory = SimpleNamespace(  # type: ignore[assignment]
         names=("slide", "turn"),
@@ -253,7 +253,7 @@ def motors(
         robot_size=2,
         curve=SimpleNamespace(times=KNOTS) if smooth else None,
     )
-    made.samples = SimpleNamespace(unit=lambda name: "m" if name == "slide" else "rad")  # type: ignore[assignment]
+    made.samples = SimpleNamespace(get_unit=lambda name: "m" if name == "slide" else "rad")  # type: ignore[assignment]
     made.moments = SimpleNamespace(  # type: ignore[assignment, misc]
         times=np.array([0.0, 0.6, 2.0, 3.5]),
         pieces=np.array([0, 1, 2, 3]),
@@ -286,41 +286,43 @@ def test_the_worst_of_each_joint_is_named() -> None:
     assert made.waypoints.tolist() == [0, 0, 1, 2]
     rows = [
         (one.constraint, one.subject, one.waypoint, one.time, one.amount, one.unit)
-        for one in made.violations()
+        for one in made.find_violations()
     ]
     assert rows == [("torque", "slide", 0, 0.6, 5.0, "N"), ("torque", "turn", 2, 3.5, 280.0, "N·m")]
-    details = [one.detail for one in made.violations()]
+    details = [one.detail for one in made.find_violations()]
     assert details == [
         "15 N are more than the 10 N of its motor, 1.5 N if it were slow",
         "300 N·m are more than the 20 N·m of its motor, 30 N·m however slow it is",
     ]
-    assert made.shares.max() == 15.0
+    assert made.torque_ratios.max() == 15.0
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(1.0049, False), (1.0051, True)])
 def test_half_a_hundredth_more_is_all_right(share: float, wrong: bool) -> None:
     assert (
-        bool(motors([[0.0, 0.0], [0.0, 0.0], [-10.0 * share, 0.0], [0.0, 0.0]]).violations())
+        bool(motors([[0.0, 0.0], [0.0, 0.0], [-10.0 * share, 0.0], [0.0, 0.0]]).find_violations())
         == wrong
     )
 
 
 def test_what_nobody_knows_is_no_share() -> None:
     made = motors([[99.0, 99.0]] * 4, known=False, massless_objects=("stick", "cup"))
-    assert made.shares.tolist() == [[0.0, 0.0]] * 4
-    assert made.violations() == []
+    assert made.torque_ratios.tolist() == [[0.0, 0.0]] * 4
+    assert made.find_violations() == []
 
 
 def test_what_is_said_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        torques_module, "bounds", lambda samples, moments, shares, jerk_time: ("bounds", jerk_time)
+        torques_module,
+        "find_limiting_constraints",
+        lambda samples, moments, shares, jerk_time: ("bounds", jerk_time),
     )
-    assert motors([[1.0, 2.0], [-5.0, 2.0], [3.0, 2.0], [1.0, 2.0]]).facts() == {
+    assert motors([[1.0, 2.0], [-5.0, 2.0], [3.0, 2.0], [1.0, 2.0]]).summarize() == {
         "torque": 0.5,
         "bounds": ("bounds", 0.0),
         "remarks": (),
     }
-    found = motors([[9.0, 9.0]] * 4, known=False, massless_objects=("stick", "cup")).facts(0.25)
+    found = motors([[9.0, 9.0]] * 4, known=False, massless_objects=("stick", "cup")).summarize(0.25)
     assert found == {
         "torque": 0.0,
         "bounds": ("bounds", 0.25),
@@ -333,7 +335,7 @@ def test_what_is_said_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_without_a_curve_every_waypoint_is_a_moment() -> None:
     """Its velocity is the mean of the steps around it; before the first and after the last it rests."""
-    made = object.__new__(Motors)
+    made = object.__new__(MotorLoads)
     rows = np.arange(8.0).reshape(4, 2)
     made.trajectory = SimpleNamespace(  # type: ignore[assignment]
         curve=None,

@@ -14,7 +14,7 @@ from oracle.judge import judge
 
 import vkc_pin as vkc
 from vkc_pin.planning.retiming.retime import retime_trajectory
-from vkc_pin.validation.dynamics.torques import TORQUE_TOLERANCE, Motors
+from vkc_pin.validation.dynamics.torques import TORQUE_TOLERANCE, MotorLoads
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.validate import validate
@@ -78,11 +78,11 @@ def test_a_light_door_changes_nothing() -> None:
 
 def test_a_payload_that_is_too_heavy_to_hold_is_found_while_nothing_moves() -> None:
     heavy = changed(vkc.load_scene("init_1"), "stick", mass=60.0).with_held({"stick": "grip"})
-    found = Motors(Samples(heavy, still(heavy))).violations()
+    found = MotorLoads(Samples(heavy, still(heavy))).find_violations()
     assert {violation.constraint for violation in found} == {"torque"}
     assert "shoulder_lift_joint" in {violation.subject for violation in found}
     assert all("however slow it is" in violation.detail for violation in found)
-    assert Motors(Samples(holding(), still(holding()))).violations() == []
+    assert MotorLoads(Samples(holding(), still(holding()))).find_violations() == []
 
 
 def test_without_masses_torques_are_not_looked_at_and_that_is_said_once() -> None:
@@ -101,16 +101,16 @@ def test_without_masses_torques_are_not_looked_at_and_that_is_said_once() -> Non
 
 def test_what_is_carried_without_a_mass_is_named() -> None:
     scene = changed(vkc.load_scene("init_1"), "stick", mass=0.0).with_held({"stick": "grip"})
-    (remark,) = Motors(Samples(scene, still(scene))).facts()["remarks"]
+    (remark,) = MotorLoads(Samples(scene, still(scene))).summarize()["remarks"]
     assert remark == "carried as if it weighed nothing, as no mass is stated: stick"
-    assert Motors(Samples(holding(), still(holding()))).facts()["remarks"] == ()
+    assert MotorLoads(Samples(holding(), still(holding()))).summarize()["remarks"] == ()
 
 
 def test_jerk_bounds_nothing_unless_it_is_limited() -> None:
     plan = door_plan()
-    motors = Motors(Samples(plan.scene, plan.trajectory))
-    assert "jerk" not in {bound.kind for bound in motors.facts()["bounds"]}
-    assert "jerk" in {bound.kind for bound in motors.facts(1.0)["bounds"]}
+    motors = MotorLoads(Samples(plan.scene, plan.trajectory))
+    assert "jerk" not in {bound.kind for bound in motors.summarize()["bounds"]}
+    assert "jerk" in {bound.kind for bound in motors.summarize(1.0)["bounds"]}
 
 
 def test_reports_tell_of_torques_and_plans_keep_that(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ class Transcription:
         rows: Number of constraint rows without the rate rows.
         slot_rows: Rows of the witness planes, shape (N, K).
         pose_rows: For each pose, waypoint → its rows; see `pose.build_pose_rows`.
-        base_rows: Rolling rows of a wheeled base, see `StepRows`, shape (N·rows per step,); empty
+        base_rows: RollingLimits rows of a wheeled base, see `StepRows`, shape (N·rows per step,); empty
             for other bases.
         term_rows: For each user-defined term, waypoint → its rows; empty for costs. These are the
             last rows.

@@ -9,16 +9,16 @@ import numpy as np
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Bound
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.trajectory.dynamics.torques import Moments
+from vkc_pin.world.trajectory.dynamics.torques import MotionSamples
 
-__all__ = ["bounds"]
+__all__ = ["find_limiting_constraints"]
 
-_STILL = 1e-9  # of a limit
-_LEAST = 5e-3  # of the duration: less is not told of
+_MOTION_TOLERANCE = 1e-9  # of a limit
+_MIN_SHARE = 5e-3  # of the duration: less is not told of
 
 
-def bounds(
-    samples: Samples, moments: Moments, torques: Floats, jerk_time: float
+def find_limiting_constraints(
+    samples: Samples, moments: MotionSamples, torques: Floats, jerk_time: float
 ) -> tuple[Bound, ...]:
     """Return what bounds a motion and for how long, the longest first; nothing without a curve.
 
@@ -31,7 +31,7 @@ def bounds(
     curve, names = samples.trajectory.curve, samples.trajectory.names
     if curve is None:
         return ()
-    limits = np.array([samples.bounds(name)[2:] for name in names]).T
+    limits = np.array([samples.get_limits(name)[2:] for name in names]).T
     shares = [rates / limit for rates, limit in zip(curve.compute_max_rates(), limits, strict=True)]
     shares.append(jerk_time * curve.compute_jerks()[0] / limits[1])
     shares.append(np.zeros((len(curve.times) - 1, torques.shape[1])))
@@ -39,7 +39,7 @@ def bounds(
     every = np.hstack(shares)
     labels = [(name, kind) for kind in ("velocity", "acceleration", "jerk") for name in names]
     labels += [(name, "torque") for name in names[: torques.shape[1]]]
-    moving = (np.hstack(shares[:2]) > _STILL).any(axis=1)
+    moving = (np.hstack(shares[:2]) > _MOTION_TOLERANCE).any(axis=1)
     nearest = np.where(moving, every.argmax(axis=1), len(labels))
     spans, found = np.diff(curve.times), list[Bound]()
     edges = np.concatenate([[0], np.flatnonzero(np.diff(nearest)) + 1, [len(nearest)]])
@@ -54,5 +54,7 @@ def bounds(
         share = float(spans[nearest == number].sum() / spans.sum())
         found.append(Bound(name, kind, share=share, begin=float(begin), end=float(end)))
     return tuple(
-        sorted((bound for bound in found if bound.share >= _LEAST), key=lambda bound: -bound.share)
+        sorted(
+            (bound for bound in found if bound.share >= _MIN_SHARE), key=lambda bound: -bound.share
+        )
     )

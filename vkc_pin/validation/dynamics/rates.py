@@ -43,7 +43,7 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
         )
         jerks = curve.compute_jerks() if options.jerk_time > 0.0 else None
     for i, name in enumerate(motion.names):
-        _, _, fastest, strongest = samples.bounds(name)
+        _, _, fastest, strongest = samples.get_limits(name)
         looks = [
             ("velocity", velocities[:, i], fastest, "s", moments),
             ("acceleration", accelerations[:, i], strongest, "s²", moments),
@@ -54,7 +54,7 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
             looks.append(
                 ("jerk", jerks[1][:, i], JUMP_TOLERANCE * strongest, "s² at once", moments)
             )
-        unit = samples.unit(name)
+        unit = samples.get_unit(name)
         for kind, values, limit, per, when in looks:
             worst = int(np.argmax(np.abs(values)))
             value = abs(float(values[worst]))

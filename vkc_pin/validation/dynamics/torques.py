@@ -8,33 +8,33 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.validation.dynamics.bounds import bounds
+from vkc_pin.validation.dynamics.bounds import find_limiting_constraints
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.trajectory.dynamics.torques import Moments, Torques, sample_curve
+from vkc_pin.world.trajectory.dynamics.torques import MotionSamples, Torques, sample_curve
 
-__all__ = ["TORQUE_TOLERANCE", "Motors"]
+__all__ = ["TORQUE_TOLERANCE", "MotorLoads"]
 
 # excess over a limit, relative to it: torques are looked at at three moments of every cubic
 TORQUE_TOLERANCE = 5e-3
 
 
-class Motors:
+class MotorLoads:
     """The motors along a motion: looked at at the ends and in the middle of every cubic, without a curve at every waypoint."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples, self.trajectory = samples, samples.trajectory
-        self._torques = Torques(samples.scene, samples.trajectory, samples.free)
+        self._torques = Torques(samples.scene, samples.trajectory, samples.free_objects)
 
     @cached_property
-    def moments(self) -> Moments:
+    def moments(self) -> MotionSamples:
         """When it is looked at, and how it moves then."""
         trajectory, curve = self.trajectory, self.trajectory.curve
         if curve is not None:
             return sample_curve(curve)
         speeds = np.pad(trajectory.velocities(), ((1, 1), (0, 0)))
         pieces = np.minimum(np.arange(len(trajectory.times)), len(trajectory.times) - 2)
-        return Moments(
+        return MotionSamples(
             trajectory.times,
             pieces,
             trajectory.positions,
@@ -54,16 +54,16 @@ class Motors:
     @cached_property
     def torques(self) -> Floats:
         """Torques of the robot's coordinates at every moment, shape (K, robot's) [N·m], [N]."""
-        return self._at(np.arange(len(self.moments.times)))
+        return self._compute_torques(np.arange(len(self.moments.times)))
 
     @cached_property
-    def shares(self) -> Floats:
+    def torque_ratios(self) -> Floats:
         """The same without sign, as shares of what the motors have, shape (K, robot's); 0 where that is not known."""
         if not self._torques.torque_limits.is_known:
             return np.zeros((len(self.moments.times), self.trajectory.robot_size))
         return np.asarray(np.abs(self.torques) / self._torques.torque_limits.limits)
 
-    def _at(self, rows: Ints, speed: float = 1.0) -> Floats:
+    def _compute_torques(self, rows: Ints, speed: float = 1.0) -> Floats:
         now, phases = self.moments, self._torques.phases_of(self.waypoints[rows])
         return self._torques.at(
             phases,
@@ -72,18 +72,18 @@ class Motors:
             speed**2 * now.accelerations[rows],
         )
 
-    def violations(self) -> list[Violation]:
+    def find_violations(self) -> list[Violation]:
         """Return what is too heavy or too fast, the worst of each joint."""
         found = list[Violation]()
-        for k in np.flatnonzero(self.shares.max(axis=0) > 1.0 + TORQUE_TOLERANCE).tolist():
-            row = int(np.argmax(self.shares[:, k]))
+        for k in np.flatnonzero(self.torque_ratios.max(axis=0) > 1.0 + TORQUE_TOLERANCE).tolist():
+            row = int(np.argmax(self.torque_ratios[:, k]))
             name, limit, torque = (
                 self.trajectory.names[k],
                 float(self._torques.torque_limits.limits[k]),
                 abs(self.torques[row, k]),
             )
-            unit = "N" if self.samples.unit(name) == "m" else "N·m"
-            rest = abs(float(self._at(np.array([row]), 1e-2)[0, k]))
+            unit = "N" if self.samples.get_unit(name) == "m" else "N·m"
+            rest = abs(float(self._compute_torques(np.array([row]), 1e-2)[0, k]))
             why = (
                 f"{rest:.4g} {unit} however slow it is"
                 if rest > limit
@@ -102,16 +102,16 @@ class Motors:
             )
         return found
 
-    def facts(self, jerk_time: float = 0.0) -> dict[str, Any]:
+    def summarize(self, jerk_time: float = 0.0) -> dict[str, Any]:
         """Return what a report says of it; `jerk_time` is that of `Options`."""
         notes = [f"torques not checked: {note}" for note in self._torques.torque_limits.notes]
         if self._torques.massless_objects:
             notes.append(
                 f"carried as if it weighed nothing, as no mass is stated: {', '.join(self._torques.massless_objects)}"
             )
-        found = bounds(self.samples, self.moments, self.shares, jerk_time)
+        found = find_limiting_constraints(self.samples, self.moments, self.torque_ratios, jerk_time)
         return {
-            "torque": float(self.shares.max(initial=0.0)),
+            "torque": float(self.torque_ratios.max(initial=0.0)),
             "bounds": found,
             "remarks": tuple(notes),
         }

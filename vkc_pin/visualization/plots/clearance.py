@@ -80,11 +80,11 @@ def compute_clearance_curves(
         if ((kinds == kind) & asked).any()
     }
     placed, curves = (
-        table.solids.at(world.coordinates.q(world.compute_positions(trajectory, moments))),
+        table.solids.place(world.coordinates.q(world.compute_positions(trajectory, moments))),
         [],
     )
     for kind, pairs in groups.items():
-        which, distances = placed.nearest(pairs)
+        which, distances = placed.find_nearest(pairs)
         names = tuple(
             (world.collision_labels[i], world.collision_labels[j]) for i, j in pairs[which]
         )
@@ -102,7 +102,7 @@ _KINDS = (
 
 
 def _kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> str:
-    first, second = (table.group[int(i)] for i in pair)
+    first, second = (table.groups[int(i)] for i in pair)
     one, other = (table.world.collision_labels[int(i)] for i in pair)
     if first == "robot" and (one, other) in gripped:
         return _KINDS[4]

@@ -73,7 +73,7 @@ class FreeObjects:
         return self.trajectory.ranges()
 
     @cached_property
-    def rides(self) -> list[dict[str, str]]:
+    def supports(self) -> list[dict[str, str]]:
         """For every phase, free object → "<object>.<link>" of what rides in it."""
         return [rides for _, rides in self._begins]
 

@@ -18,7 +18,7 @@ from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 
-__all__ = ["Moments", "Torques", "sample_curve", "transform_to_base_axes"]
+__all__ = ["MotionSamples", "Torques", "sample_curve", "transform_to_base_axes"]
 
 _SHARES = np.array(
     [0.0, 0.5, 1.0]
@@ -26,7 +26,7 @@ _SHARES = np.array(
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class MotionSamples:
     """A motion at K moments.
 
     Attributes:
@@ -43,7 +43,7 @@ class Moments:
     accelerations: Floats
 
 
-def sample_curve(curve: Curve) -> Moments:
+def sample_curve(curve: Curve) -> MotionSamples:
     """Return the ends and the middle of every cubic of a curve, with its own accelerations at its ends."""
     spans, count = np.diff(curve.times), len(curve.times) - 1
     times = sample_intervals(curve.times, _SHARES)
@@ -52,7 +52,7 @@ def sample_curve(curve: Curve) -> Moments:
         curve.acceleration(curve.times[:-1] + 0.5 * spans),
     )
     accelerations = begin[:, None] + 2.0 * _SHARES[None, :, None] * (middle - begin)[:, None]
-    return Moments(
+    return MotionSamples(
         times,
         np.repeat(np.arange(count), len(_SHARES)),
         curve.at(times),
@@ -130,7 +130,7 @@ class Torques:
     @cached_property
     def massless_objects(self) -> tuple[str, ...]:
         """What is carried in some phase though nobody says what it weighs."""
-        phases = zip(self.trajectory.phases, self._free.rides, strict=True)
+        phases = zip(self.trajectory.phases, self._free.supports, strict=True)
         carried = dict.fromkeys(name for phase, rides in phases for name in (*phase.held, *rides))
         things = {name: self.scene.objects[name].object for name in carried}
         return tuple(name for name, thing in things.items() if thing.free and not thing.mass > 0.0)
@@ -188,7 +188,7 @@ class Torques:
         """Add what is carried in a phase to the hand, and what rides on objects that stand fixed to those."""
         phase, rides, objects = (
             self.trajectory.phases[number],
-            self._free.rides[number],
+            self._free.supports[number],
             self.scene.objects,
         )
         middle = self.trajectory.times[[phase.first, phase.last]].mean(keepdims=True)

@@ -74,7 +74,7 @@ def test_a_motion_is_judged_with_the_fingers_where_it_has_them(robot: Path, plan
     report = validate(plan.scene, PULL, with_openings(motion, 0.05, 0.05, 0.05), plan.options)
     (opening,) = [one for one in report.violations if one.constraint == "opening"]
     assert opening.amount == pytest.approx(0.01)
-    assert "50.0 mm open, 40.0 mm are asked for" in opening.detail
+    assert "50.0 mm open, 40.0 mm are required" in opening.detail
     assert opening.waypoint == 0
 
 

@@ -382,7 +382,7 @@ def test_never_let_go_of() -> None:
         ).violations  # that it comes so near is for putting down alone
         assert (low.constraint, low.subject) == ("clearance", "stick.stick – table")
         assert (held.constraint, held.subject) == ("goal", "stick")
-        assert "held still" in held.detail
+        assert "still grasped" in held.detail
     assert (
         only(judged(hall(), [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.5)], motion)).constraint
         == "clearance"
@@ -434,7 +434,7 @@ def test_left_behind() -> None:
     assert judged(hall(), [vkc.Grasp("stick"), vkc.Release(), goto], motion).ok
     found = only(judged(hall(), [vkc.Grasp("stick"), goto], motion))
     assert (found.constraint, found.subject) == ("goal", "stick")
-    assert "not in the hand" in found.detail
+    assert "not grasped" in found.detail
 
 
 def test_taken_hold_of_as_the_motion_ends() -> None:

@@ -89,7 +89,7 @@ def test_how_long_the_robot_stands_where_it_takes_something(way: list[float], re
         "s",
     )
     assert one.amount == pytest.approx(2.0 - rest)
-    assert one.detail == f"the robot stands still for {rest:.2f} s, 2 s are asked for"
+    assert one.detail == f"the robot rests for {rest:.2f} s, 2 s are required"
 
 
 @pytest.mark.parametrize(("late", "told"), [(0.9e-6, False), (1.5e-6, True)])

@@ -71,10 +71,10 @@ def test_lines_of_what_bounds_a_motion() -> None:
     assert Report().timing() == []
     assert FULL.timing() == [
         "bounded by  base_x velocity 62 % (1.0 to 2.5 s), rest 25 % (0.0 to 1.0 s)",
-        "torques     50 % of what the motors have, at most",
+        "torques     at most 50 % of the motors' limits",
         "unknown     no masses",
     ]
-    assert Report(torque=0.5).timing() == ["torques     50 % of what the motors have, at most"]
+    assert Report(torque=0.5).timing() == ["torques     at most 50 % of the motors' limits"]
     assert FULL.measures() == {"clearance": -0.01, "closure_error": 0.001, "torque": 0.5}
 
 

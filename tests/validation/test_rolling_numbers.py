@@ -88,7 +88,7 @@ def test_a_turn_takes_a_way() -> None:
     assert one.amount == pytest.approx(1.0)
     assert (
         one.detail
-        == "the base drives 1000.00 mm in a step less than its turn takes at a radius of 2 m"
+        == "the base drives 1000.00 mm in a step less than its turn requires at a radius of 2 m"
     )
     assert found(rows) == []
     rows[2:, 0], rows[2:, 1] = 2.0 * np.sin(0.5), 2.0 * (1.0 - np.cos(0.5))

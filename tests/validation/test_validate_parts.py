@@ -318,7 +318,7 @@ def test_what_nobody_holds_and_what_a_hand_does_not_drive() -> None:
     noted: list[tuple[Any, ...]] = []
     made._check_stationary = lambda phase, *what: noted.append((phase.name, *what))
     made._check_undriven_joints()
-    nobody, driven = " while nobody holds {}", " while where it is held, nothing drives it"
+    nobody, driven = " while {} is not grasped", " while no hold drives it"
     assert noted == [
         ("p", "unheld", "door.hinge", "moves by ", nobody.format("door")),
         ("p", "unheld", "door.knob", "moves by ", nobody.format("door")),
@@ -356,7 +356,9 @@ def test_what_something_stands_on_stays_level(angle: float, tips: bool) -> None:
     start = pin.utils.rotate("x", 0.3)
     little = pin.utils.rotate("z", 1.0) @ pin.utils.rotate("y", -0.2 * MAX_TILT) @ start
     turns = [start, little, pin.utils.rotate("y", angle) @ start, start, start]
-    made.samples.placements = lambda rows, label: [pin.SE3(turn, np.zeros(3)) for turn in turns]
+    made.samples.compute_placements = lambda rows, label: [
+        pin.SE3(turn, np.zeros(3)) for turn in turns
+    ]
     made._check_tilt()
     assert told(made) == (
         [("tips", "cup", 2, 2.0, pytest.approx(angle - MAX_TILT), "rad")] if tips else []

@@ -1,9 +1,9 @@
-"""Bounds the drift of grasps along a motion, at every moment and not at samples alone.
+"""Bounds the drift of grasps continuously along a motion.
 
-A position error e(t) between two moments t₀ and t₁ differs from its linear interpolation by at most
+A position error e(t) between times t₀ and t₁ differs from its linear interpolation by at most
 (t₁ − t₀)²/8 · max |ë|. A bound of |ë| follows from the coordinates' velocities and accelerations,
-which are polynomials, and from the lever arms of the joints. Where that does not prove that the
-error is small enough, the interval is bisected.
+which are polynomials, and from the lever arms of the joints. Where this bound does not prove that
+the error is small enough, the interval is bisected.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 __all__ = ["Drift", "find_drift"]
 
 RESOLUTION = 1e-6
-"""A maximum is found up to this [m] or [rad]."""
+"""Accuracy of a maximum [m] or [rad]."""
 PROVEN_FRACTION = 0.5
-"""Share of a limit below which errors are bounded, but their maximum is not searched for."""
+"""Fraction of a limit below which errors are only bounded, and not maximized."""
 
 
 class Drift(NamedTuple):
     """The largest error of a grasp in a phase.
 
     Attributes:
-        found: Largest position [m] and angle [rad] that was evaluated, shape (2,).
-        bound: `found` where every error is proven to be within the limit, up to `RESOLUTION`; else
-            the bound that is proven, shape (2,).
-        times: When the largest were evaluated or, where only the bound exceeds the limit, when that
-            does, shape (2,) [s].
+        measured: Largest evaluated position error [m] and angle [rad], shape (2,).
+        bound: `measured` where every error is proven to be within the limit, up to `RESOLUTION`;
+            otherwise the proven bound, shape (2,).
+        times: Times of the largest evaluated errors or, where only the bound exceeds the limit, of
+            the largest bound, shape (2,) [s].
     """
 
     measured: Floats
@@ -45,11 +45,13 @@ class Drift(NamedTuple):
 
 
 class _Lever(NamedTuple):
-    """How a coordinate of the trajectory moves a frame.
+    """The effect of a trajectory coordinate on a frame.
 
-    `column` is its place in the trajectory, `rate` what its joint moves per unit of it, `arm` the
-    distance [m] of the frame's origin from the joint's axis, or 1 for a joint that slides, and
-    `turns` says whether the joint turns the frame.
+    Attributes:
+        column: Column of the coordinate in the trajectory.
+        rate: Joint motion per unit of the coordinate.
+        arm: Largest distance of the frame's origin from the joint axis [m]; 1 for prismatic joints.
+        is_revolute: Whether the joint rotates the frame.
     """
 
     column: int
@@ -61,13 +63,13 @@ class _Lever(NamedTuple):
 def find_drift(
     samples: Samples, phase: PhaseSpan, hold: Hold, limits: tuple[float, float]
 ) -> Drift:
-    """Return how far a grasp of a phase drifts.
+    """Find the largest drift of a grasp in a phase.
 
     Args:
-        samples: The motion.
-        phase: The phase.
-        hold: What is held in it.
-        limits: Of position [m] and angle [rad].
+        samples: Sampled motion.
+        phase: Phase of the motion.
+        hold: Grasp to check.
+        limits: Limits of position error [m] and angle [rad].
     """
     rows = samples.get_rows(phase)
     times = samples.times[rows]
@@ -100,15 +102,15 @@ def _maximize(
     bound_curvature: Callable[[Floats, Floats], Floats],
     limits: Floats,
 ) -> Drift:
-    """Return the maxima of errors over an interval by bisection (branch and bound).
+    """Maximize errors over an interval by bisection (branch and bound).
 
     Args:
-        times: MotionSamples that divide the interval, shape (K,) [s].
-        errors: Position and angle errors at these, shape (K, 2).
-        evaluate: Returns the errors at increasing moments, shape (n,): shape (n, 2).
-        bound_curvature: Returns bounds of the second derivatives of position and sine of the angle on
+        times: Times that divide the interval, shape (K,) [s].
+        errors: Position and angle errors at these times, shape (K, 2).
+        evaluate: Function of increasing times, shape (n,), that returns errors, shape (n, 2).
+        bound_curvature: Function that bounds second derivatives of position and angle sine on
             intervals, shape (n, 2).
-        limits: Shape (2,).
+        limits: Limits of the errors, shape (2,).
     """
     begin, end, left, right = times[:-1], times[1:], errors[:-1], errors[1:]
     found, when = errors.max(axis=0), times[errors.argmax(axis=0)]
@@ -139,7 +141,7 @@ def _maximize(
 
 
 def _bound_rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
-    """Return bounds of the coordinates' |velocity| and |acceleration| on intervals without knots inside, shape (N, n) each."""
+    """Bound |velocity| and |acceleration| on N intervals between knots, shape (N, n) each."""
     span = (end - begin)[:, None]
     slope = (trajectory.at(end) - trajectory.at(begin)) / span
     if trajectory.curve is None:
@@ -157,15 +159,15 @@ def _bound_rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Fl
 def _bound_position_acceleration(
     chain: Iterable[_Lever], speed: Floats, acceleration: Floats
 ) -> Floats:
-    """Return a bound of the acceleration of a frame's origin, shape (N,) [m/s²].
+    """Bound the acceleration of a frame's origin, shape (N,) [m/s²].
 
-    With joints counted from the world on, ∂²p/∂i∂j is at most the arm of the later joint of both,
-    and 0 where the earlier slides.
+    With joints numbered from the world on, |∂²p/∂i∂j| is at most the arm of the later joint, and 0
+    if the earlier joint is prismatic.
 
     Args:
-        chain: What moves it, from the world on.
-        speed: Of the coordinates, shape (N, n).
-        acceleration: The same.
+        chain: Levers of the frame, from the world on.
+        speed: Bounds of the coordinates' |velocity|, shape (N, n).
+        acceleration: Bounds of the coordinates' |acceleration|, shape (N, n).
     """
     total, turning = np.zeros(len(speed)), np.zeros(len(speed))
     for lever in chain:
@@ -179,16 +181,15 @@ def _bound_position_acceleration(
 def _bound_rotation_acceleration(
     chain: Iterable[_Lever], speed: Floats, acceleration: Floats
 ) -> Floats:
-    """Return a bound of the second derivative of the sine of the angle between two frames, as a vector along its axis.
+    """Bound the second derivative of the sine of the angle between two frames, shape (N,).
 
-    The axial vector of a rotation R with R̈ = ([ω̇] + [ω]²) R grows by at most |ω̇| + |ω|², with
-    |ω| ≤ Σ|v| and
-    |ω̇| ≤ Σ|a| + ½ (Σ|v|)².
+    The sine is the norm of the axial vector of the rotation R. With R̈ = ([ω̇] + [ω]²) R, the second
+    derivative of that vector is at most |ω̇| + |ω|², where |ω| ≤ Σ|v| and |ω̇| ≤ Σ|a| + ½ (Σ|v|)².
 
     Args:
-        chain: What moves either frame.
-        speed: Of the coordinates, shape (N, n).
-        acceleration: The same.
+        chain: Levers of both frames.
+        speed: Bounds of the coordinates' |velocity|, shape (N, n).
+        acceleration: Bounds of the coordinates' |acceleration|, shape (N, n).
     """
     turning, change = np.zeros(len(speed)), np.zeros(len(speed))
     for lever in chain:
@@ -199,16 +200,15 @@ def _bound_rotation_acceleration(
 
 
 def _find_hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]:
-    """Return what moves the frame that holds an object, from the world on."""
+    """Return the levers of the grasping frame, from the world on."""
     scene = samples.scene
     tip = compute_hand_frame(
         scene.robot, scene.objects[hold.object].object.attachments[hold.attachment]
     )
     reach, backwards = float(np.linalg.norm(tip.translation)), list[_Lever]()
     frame, through = hold.frame, hold.by
-    while (
-        frame is not None and through is not None
-    ):  # a link of a free object, rigidly with what holds that but for freedoms
+    # A link of a grasped object moves rigidly with the holder, except for the grasp's freedoms.
+    while frame is not None and through is not None:
         holder = through.frame or scene.robot.tool_frame
         ends = zip(
             *(
@@ -234,7 +234,7 @@ def _find_hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_L
 
 
 def _find_grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
-    """Return what moves the frame at which an object is held, from the world on."""
+    """Return the levers of the attachment's frame, from the world on."""
     attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
     reach, backwards = abs(attachment.standoff), list[_Lever]()
     for suffix, freedom in reversed(
@@ -253,7 +253,7 @@ def _find_grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
 
 
 def _find_levers(samples: Samples, frame: str, reach: float) -> list[_Lever]:
-    """Return the coordinates that move a point at most `reach` [m] from a frame's origin, from the world on."""
+    """Return the levers of a point within `reach` [m] of a frame's origin, from the world on."""
     world, names = samples.world, samples.trajectory.names
     model, body = world.model, world.model.frames[world.model.getFrameId(frame)]
     reach += float(np.linalg.norm(body.placement.translation))

@@ -1,4 +1,4 @@
-"""Finds in a trajectory which pairs may be close and when, by the rules of `world.scene.contact_rules`."""
+"""Finds the pairs that may be close along a motion, and when, and checks gripper and pushes."""
 
 from __future__ import annotations
 
@@ -33,23 +33,22 @@ from vkc_pin.world.task.steps import Grasp, Step, Touch
 
 __all__ = ["Window", "check_gripper", "check_pushes", "find_contact_windows"]
 
-_DWELL_TOLERANCE = 1e-6  # [s] by which a rest may be too short
+_DWELL_TOLERANCE = 1e-6  # accepted shortfall of a rest [s]
 
 _MOTION_TOLERANCE = 1e-9  # [m] or [rad]
 _T = TypeVar("_T")
 
 
 class Window(NamedTuple):
-    """Pairs that may be closer than others for a while.
+    """An interval in which pairs may be closer than the usual clearance.
 
     Attributes:
-        pairs: Of indices of the world's shapes, the smaller first, shape (k, 2).
-        first, last: Between which waypoints.
-        margin: What they must keep at these [m]; -inf: their distance says nothing.
+        pairs: Pairs of indices of the world's shapes, the smaller index first, shape (k, 2).
+        first, last: First and last waypoint of the interval.
+        margin: Required clearance [m]; -inf if the distance is not checked.
         contact: Overlap that counts as contact [m].
-        together: Whether they move as one, so that they need not be looked at between samples.
-        exempt: Whether the scene exempts them, as neighbours or as it says, rather than what the
-            hand does.
+        moves_together: Whether the pairs move rigidly together and need no checks between samples.
+        is_exempt: Whether the scene exempts the pairs, rather than an action of the hand.
     """
 
     pairs: Ints
@@ -64,22 +63,21 @@ class Window(NamedTuple):
 def find_contact_windows(
     samples: Samples, solids: CollisionShapes, steps: Sequence[Step], options: Options
 ) -> list[Window]:
-    """Return all pairs of a motion that may be close, and when.
+    """Find all pairs of a motion that may be close, and when, by the scene's contact rules.
 
     Args:
-        samples: The motion.
-        solids: The shapes of its world.
-        steps: What was asked for.
-        options: Clearances, and the time between waypoints that counts as one.
+        samples: Sampled motion.
+        solids: Collision shapes of its world.
+        steps: Steps of the task.
+        options: Clearances and time step.
     """
     return list(_WindowFinder(samples, solids, options).find(steps))
 
 
 def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
-    """Yield where the robot does not stand still while its gripper closes or opens, and where that is not open as it should be.
+    """Yield rests that are too short for the gripper, and wrong gripper openings.
 
-    On the way to what it grasps next, and while it holds it, it is as far open as the attachment
-    says.
+    Before and during a grasp the gripper must have the opening of the attachment.
     """
     scene, trajectory, gripper = samples.scene, samples.trajectory, samples.scene.robot.gripper
     times, (low, high), before = trajectory.times, trajectory.ranges(), set(scene.holds)
@@ -94,11 +92,11 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
             )  # between one waypoint and the next
             moved = np.flatnonzero(moves)
             k = int(np.searchsorted(moved, at))
-            begin = at if opens else moved[k - 1] + 1 if k else 0  # fingers move from here on
+            begin = at if opens else moved[k - 1] + 1 if k else 0  # fingers start to move here
             end = moved[k] if k < len(moved) else len(times) - 1
             rest = float(times[end] - times[begin])
             if not rest >= options.grasp_time - _DWELL_TOLERANCE:
-                detail = f"the robot stands still for {rest:.2f} s, {options.grasp_time:g} s are asked for"
+                detail = f"the robot rests for {rest:.2f} s, {options.grasp_time:g} s are required"
                 subject, amount = (
                     ", ".join(sorted(map(str, changed))) or "gripper",
                     options.grasp_time - rest,
@@ -122,7 +120,7 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
             )
             if not abs(wide - right) <= WIDTH_TOLERANCE:
                 detail = (
-                    f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are asked for"
+                    f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are required"
                 )
                 time, amount = float(times[at]), abs(wide - right)
                 yield Violation(
@@ -137,10 +135,9 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
 
 
 def check_pushes(samples: Samples) -> Iterator[Violation]:
-    """Yield where a hand that pushes goes back with what it pushes, which would stay where it is.
+    """Yield pushes in which the pushed link follows the hand backwards, which it could not do.
 
-    What counts is where the hand is, and how the link moves there: the link's point at the contact
-    goes into the face, or stays.
+    The link's point at the contact must move into the face or rest.
     """
     scene, tool = samples.scene, samples.scene.robot.tool_frame
     for phase in samples.trajectory.phases:
@@ -154,12 +151,14 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
                 samples.compute_placements(rows, f"{hold.object}.{attachment.link}"),
             )
             foremost = compute_hand_frame(scene.robot, attachment) * attachment.offset.inverse()
-            gone = [0.0]
+            travel = [0.0]
             for hand, link, after in zip(hands, links, links[1:], strict=False):
                 contact = (hand * foremost).translation
                 into = (link * attachment.placement).rotation[:, 2]
-                gone.append(gone[-1] + float(into @ (after.act(link.actInv(contact)) - contact)))
-            back = np.maximum.accumulate(gone) - gone
+                travel.append(
+                    travel[-1] + float(into @ (after.act(link.actInv(contact)) - contact))
+                )
+            back = np.maximum.accumulate(travel) - travel
             worst = int(np.argmax(back))
             if not back[worst] <= CONTACT_DEPTH:
                 row, amount = int(rows[worst]), float(back[worst] - CONTACT_DEPTH)
@@ -225,7 +224,7 @@ class _WindowFinder:
         yield from self._find_touch_windows([step for step in steps if isinstance(step, Touch)])
 
     def _find_exemption_windows(self, one: ClearanceExemption) -> Iterator[Window]:
-        """Yield when two links or shapes may be closer than others: always, or while joints are where that holds."""
+        """Yield windows of a clearance exemption: always, or while its joint ranges hold."""
         pairs = np.array(one.find_shape_pairs(self.labels.tolist(), self.keys), int).reshape(-1, 2)
         count = len(self.steps) + 1
         rows = self.samples.z[self.samples.waypoint_rows]
@@ -242,7 +241,7 @@ class _WindowFinder:
     def _find_hold_windows(
         self, hold: Hold, first: int | None, last: int | None
     ) -> Iterator[Window]:
-        """Yield what a hold that lasts between two waypoints, or from the start or up to the end, means for what holds."""
+        """Yield windows of a hold from waypoint `first` to `last` (None: start, end)."""
         begin, end = 0 if first is None else first, len(self.steps) if last is None else last
         since, until = (
             begin if first is None else self._find_easing_start(begin),
@@ -265,7 +264,7 @@ class _WindowFinder:
             )
 
     def _find_hand_windows(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
-        """Yield what links that take hold, or have it, keep from all of the object meanwhile."""
+        """Yield windows of the grasping links with all links of the object."""
         by_clearance: dict[float, set[str]] = {}
         for link in (
             label for label in self.labels.tolist() if label.startswith(f"{hold.object}.")
@@ -283,7 +282,7 @@ class _WindowFinder:
             )
 
     def _find_grasp_windows(self, steps: Sequence[Grasp]) -> Iterator[Window]:
-        """Yield what it means that the hand is at a grasp at the end of a phase, whether it holds on or not."""
+        """Yield windows around phase ends at which the hand is at a grasp, held or not."""
         ends = np.array([phase.last for phase in self.trajectory.phases])
         for step in steps:
             thing = self.scene.objects[step.object].object
@@ -303,7 +302,7 @@ class _WindowFinder:
                     )
 
     def _make_hold(self, step: Grasp, attachment: str) -> Hold:
-        """Return the hold that a step brings about; how what it is held through is held itself does not matter here."""
+        """Make the hold that a step establishes; holds of the object in between are ignored."""
         owner, _, link = (step.by or "").partition(".")
         through = (
             Hold(owner, self.scene.objects[owner].object.attachment().name) if step.by else None
@@ -313,10 +312,17 @@ class _WindowFinder:
     def _find_carry_windows(
         self, owner: str, at: int, other: int, *, begin: bool = True, new: bool = False
     ) -> Iterator[Window]:
-        """Yield what a free object is next to where it begins or ends to be carried, at waypoint `at`.
+        """Yield windows of a free object with its neighbours where carrying begins or ends.
 
-        Where it is lifted for the first time, or in the hand from the start (`new`), it may be as
-        deep in something as it was.
+        Where it is lifted for the first time, or grasped at the start (`new`), it may penetrate its
+        neighbours as deep as it did before.
+
+        Args:
+            owner: Name of the object.
+            at: Waypoint at which carrying begins or ends.
+            other: Other end of the window.
+            begin: Whether carrying begins at `at`.
+            new: Whether the object has not moved before.
         """
         mine = self._get_shapes(owner)
         pairs = self._make_pairs(
@@ -333,7 +339,7 @@ class _WindowFinder:
             )
 
     def _find_touch_windows(self, steps: Sequence[Touch]) -> Iterator[Window]:
-        """Yield what is at the target of a touch, wherever a phase ends with that."""
+        """Yield windows around touches with the shapes at their targets."""
         for step in steps:
             target = (
                 step.target.translation
@@ -365,7 +371,7 @@ class _WindowFinder:
                     )
 
     def _list_carried_objects(self) -> list[set[str]]:
-        """Return the free objects that are held or ride, at the start and in every phase."""
+        """Return the grasped or supported free objects at the start and in every phase."""
         free = {name for name, placed in self.scene.objects.items() if placed.object.free}
         phases = zip(self.trajectory.phases, self.supports, strict=True)
         return [
@@ -376,10 +382,12 @@ class _WindowFinder:
     def _find_spans(
         self, phases: Sequence[Collection[_T]]
     ) -> Iterator[tuple[_T, int | None, int | None]]:
-        """Yield what lasts, from and up to which waypoint: None is the start, where it has lasted already, and the end.
+        """Yield items with the first and last waypoint of their presence.
+
+        None stands for the start, for items present there, and for the end.
 
         Args:
-            phases: What there is at the start, and in every phase.
+            phases: Items that are present at the start, and in every phase.
         """
         spans, begun = self.trajectory.phases, dict[_T, int | None]()
         for number, now in enumerate(phases):
@@ -391,7 +399,7 @@ class _WindowFinder:
         yield from ((item, first, None) for item, first in begun.items())
 
     def _pair_links(self, ones: Collection[str], others: Collection[str]) -> Ints:
-        """Return the pairs of shapes of some links with those of others, by their labels."""
+        """Return the pairs of shapes of two sets of links, given by labels."""
         return self._make_pairs(
             *(
                 [k for k, label in enumerate(self.labels) if label in links]
@@ -410,7 +418,7 @@ class _WindowFinder:
         return np.array([(min(i, j), max(i, j)) for i in ones for j in others], int).reshape(-1, 2)
 
     def _find_easing_end(self, at: int) -> int:
-        """Return the last exempt waypoint after a contact at `at`: `CONTACT_WINDOW`, or as many moving steps."""
+        """Return the last exempt waypoint after a contact at `at`; see `CONTACT_WINDOW`."""
         times, moved, last = self.trajectory.times, 0, at
         while last < len(self.steps):
             moved += int(self.steps[last])
@@ -422,7 +430,7 @@ class _WindowFinder:
         return last
 
     def _find_easing_start(self, at: int) -> int:
-        """Return the waypoint since which what comes into contact at one may be close; see `_find_easing_end`."""
+        """Return the first waypoint at which a pair in contact at `at` may be close."""
         times, moved, first = self.trajectory.times, 0, at
         while first > 0:
             moved += int(self.steps[first - 1])
@@ -435,7 +443,7 @@ class _WindowFinder:
 
 
 def _find_touching_links(scene: Scene, frame: str) -> set[str]:
-    """Return the labels of the links that a `Touch` brings somewhere: those that its frame is fixed to."""
+    """Return the labels of the links to which the frame of a `Touch` is fixed."""
     if frame.partition(".")[0] in scene.objects:
         return {frame}
     robot = scene.robot

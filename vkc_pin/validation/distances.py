@@ -1,7 +1,7 @@
-"""How far a world's shapes are from each other at configurations, and how far they move along a motion, at most.
+"""Computes distances of a world's shapes, and bounds their displacements along a motion.
 
-There are lower bounds of distances from boxes, and coal's own. Nothing of it is the planner's, so
-that what its culling overlooked would be found here.
+Lower bounds of distances come from bounding boxes, exact distances from coal. Nothing is shared
+with the planner's culling, so that its errors would be found here.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["CollisionShapes", "PlacedShapes", "bound_displacements"]
 
-POINT_RADIUS = 1e-4  # [m], radius of a point
+POINT_RADIUS = 1e-4  # radius of the sphere that stands for a point [m]
 
 
 class CollisionShapes:
@@ -30,12 +30,12 @@ class CollisionShapes:
 
     Attributes:
         world: The world, with G shapes.
-        bodies: How many of these, the first, belong to the robot or an object; the others are
+        body_count: Number of leading shapes that belong to the robot or an object; the others are
             obstacles.
-        center, half: Of a box around each in its own frame, centre and half extents, shape (G, 3)
-            [m].
-        obstacle_corners: See `corners`.
-        asked: The shapes, to ask coal for distances.
+        center, half: Centres and half extents of the bounding boxes in the shapes' own frames,
+            shape (G, 3) [m].
+        obstacle_corners: Corners of the obstacles' boxes; see `compute_corners`.
+        distance_queries: The shapes, prepared for coal's distance queries.
     """
 
     def __init__(self, world: World) -> None:
@@ -50,14 +50,14 @@ class CollisionShapes:
         self._placements = ShapePlacements(world.model, world.bodies)
 
     def place(self, q: Floats) -> PlacedShapes:
-        """Return the shapes as they are placed at Pinocchio's configurations of the world, shape (W, nq)."""
-        return PlacedShapes(self, self._placements.compute_placements(q))
+        """Place the shapes at Pinocchio's configurations of the world, shape (W, nq)."""
+        return PlacedShapes(self, self._placements.at(q))
 
     def compute_corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
-        """Return lower and upper corners of boxes along the world's axes around some shapes, shape (..., k, 3) each [m].
+        """Compute lower and upper corners of axis-aligned boxes, shape (..., k, 3) each [m].
 
         Args:
-            where: Placements of these shapes in the world, shape (..., k, 12).
+            where: Placements of the shapes in the world, shape (..., k, 12).
             which: The shapes.
         """
         rotation = where[..., :9].reshape(*where.shape[:-1], 3, 3).swapaxes(-1, -2)
@@ -71,7 +71,7 @@ class PlacedShapes:
 
     Args:
         solids: The shapes.
-        where: Where those of robot and objects are in the world, shape (W, M, 12).
+        where: Placements of the robot's and objects' shapes in the world, shape (W, M, 12).
     """
 
     def __init__(self, solids: CollisionShapes, where: Floats) -> None:
@@ -79,7 +79,7 @@ class PlacedShapes:
 
     @cached_property
     def corners(self) -> tuple[Floats, Floats]:
-        """Lower and upper corners of boxes along the world's axes around all shapes, shape (W, G, 3) each [m]."""
+        """Lower and upper corners of all axis-aligned boxes, shape (W, G, 3) each [m]."""
         bodies = self._solids.compute_corners(self._where, slice(self._solids.body_count))
         obstacles = (
             np.broadcast_to(part, (len(self._where), *part.shape))
@@ -92,7 +92,7 @@ class PlacedShapes:
 
     @cached_property
     def boxes(self) -> WorldBoxes:
-        """The same boxes, to ask which of them come near each other."""
+        """The axis-aligned boxes, prepared for proximity queries."""
         return WorldBoxes(
             *self._solids.compute_corners(self._where, slice(self._solids.body_count)),
             *self._solids.obstacle_corners,
@@ -103,9 +103,14 @@ class PlacedShapes:
         return len(self._where)
 
     def compute_lower_bounds(self, states: Ints, pairs: Ints) -> Floats:
-        """Return lower bounds of the distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m].
+        """Compute lower bounds of distances; -inf where the boxes overlap.
 
-        They are -inf where the boxes overlap.
+        Args:
+            states: State of each query, shape (n,).
+            pairs: Pair of shapes of each query, shape (n, 2).
+
+        Returns:
+            Lower bounds, shape (n,) [m].
         """
         lower, upper = self.corners
         first, second = pairs.T
@@ -119,13 +124,13 @@ class PlacedShapes:
         )
 
     def compute_distances(self, states: Ints, pairs: Ints) -> Floats:
-        """Return coal's signed distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m]."""
+        """Compute signed distances [m] of pairs, shape (n, 2), at states, shape (n,)."""
         return self._solids.distance_queries.distances(self._where, states, pairs)
 
     def find_nearest(self, pairs: Ints) -> tuple[Ints, Floats]:
-        """Return which of pairs, shape (n, 2), is nearest at each state, and its distance [m]: shape (W,) each.
+        """Find the nearest of pairs, shape (n, 2), at each state, and its distance [m]: (W,) each.
 
-        Only what may be nearest is asked of coal.
+        Only pairs that could be the nearest are passed to coal.
         """
         states, count = len(self._where), len(pairs)
         at, which = np.repeat(np.arange(states), count), np.tile(np.arange(count), states)
@@ -145,9 +150,9 @@ class PlacedShapes:
         return which[order[chosen]], found.distance
 
     def find_shapes_near(self, point: Floats, reach: float) -> list[int]:
-        """Return the shapes that are closer than `reach` [m] to a point, shape (3,) [m], at the first of the states.
+        """Return the shapes closer than `reach` [m] to a point, shape (3,) [m], at the first state.
 
-        A point has a size here, 0.1 mm.
+        The point is a sphere with a radius of 0.1 mm.
         """
         lower, upper = (corners[0] for corners in self.corners)
         near = np.flatnonzero(
@@ -174,15 +179,15 @@ class PlacedShapes:
 
 
 def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
-    """Return how far any point of each shape can have moved since the first sample, shape (S, G) [m].
+    """Bound the displacement of any point of each shape since the first sample, shape (S, G) [m].
 
-    A joint's rotation moves a point by at most the angle times its distance from the axis, and that
-    is at most the sum of the offsets of all joints between, and of the shape itself; a prismatic
-    joint adds its travel.
+    A revolute joint moves a point by at most its rotation times the point's distance from the axis.
+    That distance is at most the sum of the offsets of the shape and of all joints between. A
+    prismatic joint adds its travel.
 
     Args:
-        solids: The shapes, G of them.
-        samples: Configurations of their world, one after the other, shape (S, n).
+        solids: The G shapes.
+        samples: Successive configurations of their world, shape (S, n).
     """
     world = solids.world
     model, steps = world.model, np.abs(np.diff(samples, axis=0))
@@ -200,7 +205,7 @@ def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
         while joint:
             moves = of_joint[joint]
             column, share, offset = moves[0].coordinate, abs(moves[0].factor), moves[0].offset
-            if len(moves) == 7:  # the free joint of what can be carried
+            if len(moves) == 7:  # the free joint of a free object
                 moved += _bound_free_displacements(
                     samples[:, [move.coordinate for move in moves]], reach
                 )
@@ -218,7 +223,7 @@ def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
 
 
 def _bound_free_displacements(samples: Floats, reach: float) -> Floats:
-    """Return how far a point at `reach` [m] from a free joint moves from each sample to the next, shape (S − 1,) [m]."""
+    """Bound the motion of points within `reach` [m] of a free joint between samples [m]."""
     turns = samples[:, 3:] / np.linalg.norm(samples[:, 3:], axis=1, keepdims=True)
     half = np.arccos(np.clip(np.abs(np.einsum("kc,kc->k", turns[1:], turns[:-1])), 0.0, 1.0))
     return np.asarray(np.linalg.norm(np.diff(samples[:, :3], axis=0), axis=1) + 2.0 * half * reach)

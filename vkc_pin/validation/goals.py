@@ -1,4 +1,4 @@
-"""Whether a motion brings about what was asked for, step by step and in that order."""
+"""Checks that a motion reaches the goals of its steps in their order."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release
 
 __all__ = ["check_goals", "check_steps"]
 
-MOTION_TOLERANCE = 1e-5  # [m] or [rad]: less is no motion
+MOTION_TOLERANCE = 1e-5  # smaller displacements do not count as motion [m] or [rad]
 
 
 class GoalError(NamedTuple):
-    """What of a step is not as it was asked for."""
+    """An unmet part of a step's goal."""
 
     subject: str
     amount: float
@@ -30,7 +30,7 @@ class GoalError(NamedTuple):
 
 
 def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
-    """Check that the steps name what there is.
+    """Check that objects, joints, attachments and frames named by steps exist.
 
     Raises:
         UnknownNameError: An object, joint, attachment or frame does not exist.
@@ -72,15 +72,15 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
 
 
 def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> list[Violation]:
-    """Check that every step is done, in their order: "goal" and "order".
+    """Check that the steps are carried out in their order: constraints "goal" and "order".
 
-    There must be a phase for each step at whose end the step's goal holds, with everything in the
-    hand that the steps have put there, the last step's at the end of the motion; and in the phases
-    that lead from one to the next, no object may move but the one that the step actuates, and no
-    free object of a step be carried when it is not to be in the hand.
+    For each step there must be a phase at whose end the goal of the step holds and everything that
+    the steps have grasped so far is still grasped; for the last step it is the last phase. Between
+    the phases of two steps no object may move except the one that the step actuates, and free
+    objects named by steps may be carried only while they should be grasped.
     """
     phases = samples.trajectory.phases
-    ends = [0, *(phase.last for phase in phases)]  # a step may be done before anything begins
+    ends = [0, *(phase.last for phase in phases)]  # a goal may hold at the start
     hands = _find_grasped_objects(samples, steps)
     misses = [
         [
@@ -109,7 +109,7 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
 
 
 def _find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
-    """Return which free objects the steps want in the hand before the first and after each of them."""
+    """Return the free objects that must be grasped before the first and after each step."""
     objects = samples.scene.objects
     held = {
         hold.object: hold.frame or ""
@@ -131,12 +131,13 @@ def _find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[s
         ):
             held.setdefault(owner, (step.by or "") if isinstance(step, Grasp) else "")
         if isinstance(step, Place | Release):
-            gone = set(held) if owner is None else {owner}
+            released = set(held) if owner is None else {owner}
             while (
-                more := {name for name, by in held.items() if by.partition(".")[0] in gone} - gone
+                more := {name for name, by in held.items() if by.partition(".")[0] in released}
+                - released
             ):
-                gone |= more
-            held = {name: by for name, by in held.items() if name not in gone}
+                released |= more
+            held = {name: by for name, by in held.items() if name not in released}
         hands.append(set(held))
     return hands
 
@@ -144,21 +145,21 @@ def _find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[s
 def _find_missing_grasps(
     samples: Samples, steps: Sequence[Step], hands: list[set[str]], number: int, end: int
 ) -> list[GoalError]:
-    """Return what should be in the hand when a step is done, after `end` phases, and is not."""
+    """Return the objects that are not grasped after `end` phases although the step needs them."""
     phases = samples.trajectory.phases
     near = {owner for phase in phases[max(end - 1, 0) : end + 1] for owner in phase.held}
     near |= set() if end else set(samples.scene.held)
     wanted = set(hands[number + 1])
     step = steps[number]
     if isinstance(step, Grasp) and end == len(phases):
-        wanted.discard(step.object)  # taken hold of as the motion ends, and nothing more
-    return [GoalError(name, 1.0, "holds", "is not in the hand") for name in sorted(wanted - near)]
+        wanted.discard(step.object)  # no phase follows the grasp
+    return [GoalError(name, 1.0, "holds", "is not grasped") for name in sorted(wanted - near)]
 
 
 def _check_order(
     samples: Samples, steps: Sequence[Step], hands: list[set[str]], holds: list[list[bool]]
 ) -> list[Violation]:
-    """Check that nothing moves before its step's turn; `holds[i][k]` says whether step i holds at the start of phase k."""
+    """Check the order of object motions; `holds[i][k]`: step i holds when phase k begins."""
     phases = samples.trajectory.phases
     named = set().union(*hands, *({step.object} for step in steps if isinstance(step, Place)))
     moved = [
@@ -169,7 +170,7 @@ def _check_order(
         hands[i] | hands[i + 1] | ({step.object} if isinstance(step, Actuate | Place) else set())
         for i, step in enumerate(steps)
     ]
-    turns = {0}  # which step may be the one that is being done
+    turns = {0}  # steps that may be in progress
     for k in range(len(phases) + 1):
         for turn in range(len(steps) - 1):
             if turn in turns and holds[turn][k]:
@@ -210,7 +211,7 @@ def _violation(samples: Samples, constraint: str, waypoint: int, miss: GoalError
 def _measure_transport(
     samples: Samples, number: int, named: set[str]
 ) -> dict[str, tuple[float, str]]:
-    """Return those of some free objects that are in the hand in a phase, and how far they go."""
+    """Return the named objects that are grasped in a phase, with their path lengths."""
     phase, world = samples.trajectory.phases[number], samples.world
     rows = samples.z[samples.get_rows(phase)]
     carried = {}
@@ -222,7 +223,7 @@ def _measure_transport(
 
 
 def _measure_joint_motion(samples: Samples, number: int) -> dict[str, tuple[float, str]]:
-    """Return the objects that are moved by the hand in a phase, and how far; what moves by itself is "unheld"."""
+    """Return the objects whose joints a hand moves in a phase, with the largest joint motion."""
     phase = samples.trajectory.phases[number]
     moved: dict[str, tuple[float, str]] = {}
     driven = samples.find_driven_coordinates(phase.holds)
@@ -239,10 +240,10 @@ def _measure_joint_motion(samples: Samples, number: int) -> dict[str, tuple[floa
 def _compute_goal_errors(
     samples: Samples, step: Step, end: int, options: Options
 ) -> list[GoalError]:
-    """Return what of a step's goal does not hold after `end` phases."""
+    """Return the unmet parts of a step's goal after `end` phases."""
     phases = samples.trajectory.phases
     row, misses = int(samples.waypoint_rows[phases[end - 1].last if end else 0]), []
-    held = phases[min(end, len(phases) - 1)].held  # from then on
+    held = phases[min(end, len(phases) - 1)].held  # grasps of the next phase
     tolerance = {"m": options.goal_position, "rad": options.goal_angle}
 
     def expect(subject: str, error: float, unit: str, detail: str) -> None:
@@ -274,25 +275,25 @@ def _compute_goal_errors(
         frame, target, free = _get_target(samples, step)
         placement = samples.compute_placements([row], frame)[0]
         distance = float(np.linalg.norm(placement.translation - target.translation))
-        expect(frame, distance, "m", f"{distance:.4f} m from where it should be")
+        expect(frame, distance, "m", f"{distance:.4f} m from its target")
         turn = _compute_angle_error(placement, target, free)
-        expect(frame, turn, "rad", f"turned {turn:.4f} rad from how it should be")
+        expect(frame, turn, "rad", f"turned {turn:.4f} rad from its target orientation")
     if isinstance(step, Place | Release):
         for name in [step.object] if step.object is not None else list(held):
             if name in held:
-                misses.append(GoalError(name, 1.0, "holds", "is held still"))
+                misses.append(GoalError(name, 1.0, "holds", "is still grasped"))
     if isinstance(step, GoTo):
         x, y, yaw = samples.z[row, :3]
         distance = float(np.hypot(x - step.x, y - step.y))
-        expect("base", distance, "m", f"{distance:.4f} m from the place to go to")
+        expect("base", distance, "m", f"{distance:.4f} m from its target")
         if step.yaw is not None:
             turn = float(abs(wrap_angle(yaw - step.yaw)))
-            expect("base heading", turn, "rad", f"turned {turn:.4f} rad from the heading asked for")
+            expect("base heading", turn, "rad", f"turned {turn:.4f} rad from its target heading")
     return misses
 
 
 def _get_target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3, str]:
-    """Return the frame that a step brings somewhere, where, and which orientation is left free: "", "heading" or "all"."""
+    """Return a step's frame, its target and its free orientation: "", "heading" or "all"."""
     if isinstance(step, Reach):
         return step.frame or samples.scene.robot.tool_frame, step.pose, ""
     goal = step.target if isinstance(step, Touch) else step.pose
@@ -311,19 +312,19 @@ def _get_target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin
 
 
 def _compute_angle_error(placement: pin.SE3, target: pin.SE3, free: str) -> float:
-    """Return the angle [rad] between two placements in what is not free."""
+    """Compute the angle [rad] between two placements, ignoring the free part."""
     if free == "all":
         return 0.0
-    if free == "heading":  # the angle between the two verticals, seen from the body
+    if free == "heading":  # the angle between the two vertical axes in the body frame
         one, other = placement.rotation[2], target.rotation[2]
         return float(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
     return float(np.linalg.norm(pin.log3(target.rotation.T @ placement.rotation)))
 
 
 def _find_closest_grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
-    """Return the attachment that a step asks for and how far the tool is from it, [m] and [rad].
+    """Return a grasp step's attachment and the tool's distance [m] and angle [rad] from it.
 
-    Without a name it is the one that is used, if there is one: held at the start or in some phase.
+    If the step names no attachment, it is the nearest one that is used at the start or in a phase.
     """
     used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
     names = (

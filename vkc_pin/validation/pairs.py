@@ -1,4 +1,4 @@
-"""Every pair that could collide along a motion, what is asked of each, and which may be close."""
+"""Lists the pairs of shapes that could collide along a motion, with their required clearances."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class PairTable:
 
     Attributes:
         pairs: Indices of `world.shapes`, shape (P, 2).
-        solids: The shapes, to ask for distances.
-        margins: Clearance to keep at the waypoints, of each pair, shape (P,) [m].
+        solids: Collision shapes of the scene.
+        margins: Required clearance of each pair at the waypoints, shape (P,) [m].
 
     Args:
-        scene: Where it happens.
+        scene: Scene of the motion.
         solids: The shapes of the scene as one plain tree.
         trajectory: The motion.
-        dist_safe: Clearance to keep at the waypoints [m].
-        self_distance: The same between links of the robot that can [m]; `dist_safe` if left out.
-        windows: Which pairs may be closer than that, and when.
-        samples: The motion's samples, if somebody has them already.
+        dist_safe: Required clearance at the waypoints [m].
+        self_distance: Required clearance between links of the robot [m]. Default: `dist_safe`.
+        windows: Pairs that may be closer, with their intervals.
+        samples: Samples of the motion, if they exist already.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class PairTable:
         self._windows = _WindowIndex(windows, self.pairs)
 
     def _find_moving_shapes(self, rows: Floats) -> Bools:
-        """Return whether each shape moves while the world goes through some configurations, shape (K, n): shape (G,)."""
+        """Return which shapes move in a sequence of configurations, shape (K, n): shape (G,)."""
         world = self.world
         moved = world.coordinates.moved(np.ptp(rows, axis=0) > _MOTION_TOLERANCE)
         for joint in range(1, len(moved)):
@@ -99,19 +99,19 @@ class PairTable:
         )
 
     def get_margins(self, pairs: Ints, waypoints: Ints) -> Floats:
-        """Return the clearances that pairs must keep at waypoints, both of shape (n,), shape (n,) [m]; -inf: none."""
+        """Return the required clearances of pairs at waypoints, shape (n,) each [m]; -inf: none."""
         margins, (k, which) = self.margins[pairs], self._windows.at(pairs, waypoints, waypoints)
         np.minimum.at(margins, k, self._windows.margin[which])
         return margins
 
     def get_contact_overlaps(self, pairs: Ints, first: Ints, last: Ints) -> Floats:
-        """Return the overlap that counts as contact between waypoints `first` and `last`, all of shape (n,), shape (n,) [m]."""
+        """Return the overlaps that count as contact from `first` to `last`, shape (n,) each [m]."""
         overlap, (k, which) = np.zeros(len(pairs)), self._windows.at(pairs, first, last)
         np.maximum.at(overlap, k, self._windows.contact[which])
         return overlap
 
     def find_exempt(self, pairs: Ints, waypoints: Ints) -> Bools:
-        """Return whether the scene exempts pairs from their clearances at waypoints, both of shape (n,), shape (n,)."""
+        """Return which pairs the scene exempts from clearance at waypoints, shape (n,) each."""
         exempt, (k, which) = (
             np.zeros(len(pairs), bool),
             self._windows.at(pairs, waypoints, waypoints),
@@ -120,29 +120,29 @@ class PairTable:
         return exempt
 
     def find_moving_together(self, pairs: Ints, first: Ints, last: Ints) -> Bools:
-        """Return whether pairs move as one between waypoints `first` and `last`, all of shape (n,), shape (n,)."""
+        """Return which pairs move rigidly together from `first` to `last`, shape (n,) each."""
         as_one, (k, which) = np.zeros(len(pairs), bool), self._windows.at(pairs, first, last)
         as_one[k[self._windows.moves_together[which]]] = True
         return as_one
 
     def _can_collide(self, i: int, j: int) -> bool:
-        """Return whether two bodies i < j (robot first, then objects) can collide at all."""
+        """Return whether bodies i < j (robot first, then objects) can collide."""
         a, b = self.groups[i], self.groups[j]
         if a == "robot" and b == "robot":
             return frozenset((i, j)) in self._robot_pairs
         if a == "robot":
             return True
-        if a == b:  # an object with itself
+        if a == b:  # self-collision of an object
             links = frozenset(self.world.collision_labels[k].partition(".")[2] for k in (i, j))
             return links in self.scene.objects[a].object.own_pairs
         return bool(self._ever_moves[i] or self._ever_moves[j])
 
     def _pair_with_obstacles(self) -> Ints:
-        """Return the pairs of what moves with the obstacles, shape (n, 2), by obstacle."""
+        """Return the pairs of moving bodies with obstacles, shape (n, 2), by obstacle."""
         bodies, labels = range(self.solids.body_count), self.world.collision_labels
         joints = [self.world.shapes[i].parentJoint for i in bodies]
         moving = [i for i in bodies if self._ever_moves[i]]
-        # Wheels stand on the floor, objects hang as their makers hung them.
+        # Wheels touch the floor, and mounted objects may.
         free = {name for name, placed in self.scene.objects.items() if placed.object.free}
         above = [
             i
@@ -163,17 +163,20 @@ class PairTable:
     def find_close_pairs(
         self, placed: PlacedShapes, first: Ints, last: Ints, moved: Floats, limit: float
     ) -> tuple[Ints, Ints]:
-        """Return (k, pair) of all pairs but those that boxes prove to stay `limit` [m] apart in a stretch k.
+        """Find the pairs that may come closer than `limit` in intervals between waypoints.
 
-        Neither are those among them of which nothing moves then: what stands where it stood is as
-        close as it was.
+        Pairs whose boxes prove a larger distance are left out, and so are pairs of shapes that do
+        not move in the interval.
 
         Args:
-            placed: The world at the waypoints.
-            first: Waypoints at which stretches begin, shape (K,).
-            last: Waypoints at which they end, shape (K,).
-            moved: How far any point of each geometry moves in a stretch, shape (K, G) [m].
-            limit: [m].
+            placed: Shapes at the waypoints.
+            first: First waypoints of the intervals, shape (K,).
+            last: Last waypoints of the intervals, shape (K,).
+            moved: Largest displacement of each shape in each interval, shape (K, G) [m].
+            limit: Distance limit [m].
+
+        Returns:
+            Intervals and pairs, shape (n,) each.
         """
         return placed.boxes.find_close_pairs(
             first,
@@ -187,16 +190,17 @@ class PairTable:
 
 
 class _WindowIndex:
-    """When which pairs may be close, to be asked for many of them at once.
+    """An index of windows for vectorized queries.
 
     Attributes:
-        margin, contact, together, exempt: What holds in each window, see `Window`; shape (K,).
+        margin, contact, moves_together, is_exempt: Properties of each window, shape (K,); see
+            `Window`.
     """
 
     def __init__(self, windows: Sequence[Window], pairs: Ints) -> None:
         most = max((int(window.pairs.max()) for window in windows if len(window.pairs)), default=0)
         base = np.array([max(most, int(pairs.max())) + 1, 1])
-        numbers, rows = pairs @ base, [np.zeros((0, 2), int)]  # of each pair another number
+        numbers, rows = pairs @ base, [np.zeros((0, 2), int)]  # a unique number for each pair
         order = np.argsort(numbers)
         for w, window in enumerate(windows):
             wanted = window.pairs @ base
@@ -218,7 +222,7 @@ class _WindowIndex:
         )
 
     def at(self, pairs: Ints, first: Ints, last: Ints) -> tuple[Ints, Ints]:
-        """Return (k, window) for each of some pairs and the windows that hold all the time from waypoint `first` to `last`."""
+        """Return (k, window) for all windows of pair k that cover waypoints `first` to `last`."""
         some = np.flatnonzero(self._count[pairs])
         count = self._count[pairs[some]]
         k, place = (

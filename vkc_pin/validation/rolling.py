@@ -1,4 +1,4 @@
-"""Whether a base on wheels moves as wheels do: along, not aside, turning no tighter than it steers, and none too fast."""
+"""Checks that a wheeled base does not slip, turn too tightly or turn its wheels too fast."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["check_rolling"]
 
-STEP_TOLERANCE = 1e-4  # [m] aside, or too short for its turn, from one waypoint to the next
-SLIP_TOLERANCE = 1e-3  # [m/s] aside, or too slow for its turn, along a curve
-WHEEL_TOLERANCE = 1e-3  # excess over the limit, relative to it
-_SAMPLES_PER_CUBIC = 16  # moments on each cubic of a curve
+STEP_TOLERANCE = 1e-4  # lateral motion, or shortfall for the turn, between waypoints [m]
+SLIP_TOLERANCE = 1e-3  # lateral velocity, or shortfall for the turn, along a curve [m/s]
+WHEEL_TOLERANCE = 1e-3  # relative excess over the limit
+_SAMPLES_PER_CUBIC = 16
 
 
 def check_rolling(samples: Samples) -> Iterator[Violation]:
-    """Yield how a base on wheels slips, turns tighter than it can, and turns its wheels too fast, each where it does so most.
+    """Yield the worst violations of slip, turning radius and wheel speed of a wheeled base.
 
-    Along a curve its velocity tells, at moments close to each other on every cubic. Where there is
-    none, nothing is said of how the base gets from one waypoint to the next, and the arc that leads
-    there is what counts: its chord points where the base heads half-way.
+    Along a curve the velocity is checked at 16 times per cubic. Without a curve the motion between
+    waypoints is undefined; the base is assumed to follow the arc between them, whose chord is
+    parallel to the mean heading.
     """
     robot, motion = samples.scene.robot, samples.trajectory
     if robot.base not in ("differential", "ackermann"):
@@ -41,7 +41,7 @@ def check_rolling(samples: Samples) -> Iterator[Violation]:
         worst = int(np.argmax(excess))
         amount, time = float(excess[worst]), float(moments[worst])
         if not amount <= (usual if tolerance is None else tolerance):
-            said, of = (
+            text_amount, text_unit = (
                 (f"{1e3 * amount:.2f} m{unit}{per}", unit)
                 if tolerance is None
                 else (f"{amount:.3f} m/s", "m/s")
@@ -53,22 +53,22 @@ def check_rolling(samples: Samples) -> Iterator[Violation]:
                 waypoint=at,
                 time=time,
                 amount=amount,
-                unit=of,
-                detail=f"the base {text.format(said)}",
+                unit=text_unit,
+                detail=f"the base {text.format(text_amount)}",
             )
 
 
 def _compute_excesses(
     robot: Robot, along: Floats, aside: Floats, turn: Floats, spans: Floats
 ) -> Iterator[tuple[str, Floats, float | None, str]]:
-    """Yield, for each constraint, by how much it is exceeded, how much is all right if not the usual, and what is said of it.
+    """Yield constraint, excess, tolerance (None: the default) and text for each constraint.
 
     Args:
-        robot: Whose base it is.
-        along: How far it goes along, or how fast, shape (K,).
-        aside: The same, aside.
-        turn: How far it turns, or how fast.
-        spans: In what time, shape (K,) [s].
+        robot: Robot with the base.
+        along: Longitudinal displacement [m] or velocity [m/s], shape (K,).
+        aside: Lateral displacement or velocity, shape (K,).
+        turn: Rotation [rad] or angular velocity [rad/s], shape (K,).
+        spans: Durations of displacements, or 1 for velocities, shape (K,) [s].
     """
     yield "slip", np.abs(aside), None, "slips sideways by {}"
     if robot.base == "ackermann":
@@ -77,7 +77,7 @@ def _compute_excesses(
             "turning",
             short,
             None,
-            f"drives {{}} less than its turn takes at a radius of {robot.turning_radius:g} m",
+            f"drives {{}} less than its turn requires at a radius of {robot.turning_radius:g} m",
         )
     if robot.wheels is not None:
         rim = robot.wheels.rim_speed
@@ -86,7 +86,7 @@ def _compute_excesses(
 
 
 def _compute_steps(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return when the steps from waypoint to waypoint begin, how far the base goes along and aside [m], and turns [rad]."""
+    """Return begin [s], longitudinal and lateral motion [m] and turn [rad] of every segment."""
     poses = motion.positions[:, :3]
     return motion.times[:-1], *_transform_to_base_frame(
         np.diff(poses, axis=0), (poses[1:, 2] + poses[:-1, 2]) / 2
@@ -94,7 +94,7 @@ def _compute_steps(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def _sample_velocities(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return moments of a curve, how fast the base goes along and aside then [m/s], and turns [rad/s]."""
+    """Return times on a curve and longitudinal, lateral [m/s] and angular velocity [rad/s]."""
     assert motion.curve is not None
     moments = sample_intervals(
         motion.curve.times, np.arange(_SAMPLES_PER_CUBIC) / _SAMPLES_PER_CUBIC, last=True
@@ -105,7 +105,7 @@ def _sample_velocities(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floa
 
 
 def _transform_to_base_frame(change: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return changes of (x, y, yaw), shape (K, 3), as a base with these headings sees them: along, aside, and its turn."""
+    """Transform changes of (x, y, yaw), shape (K, 3), to the base frame: along, aside, turn."""
     dx, dy, turn = change.T
     return (
         np.cos(heading) * dx + np.sin(heading) * dy,

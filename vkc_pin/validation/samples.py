@@ -1,4 +1,4 @@
-"""A motion as `validation` looks at it: sampled densely, on the plain tree of robot and objects."""
+"""Samples a motion densely on the plain kinematic tree of robot and objects."""
 
 from __future__ import annotations
 
@@ -22,39 +22,36 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["ANGLE_STEP", "LENGTH_STEP", "MAX_SAMPLES", "Samples"]
 
-LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # [m], [rad] between two configurations that are looked at
-CHORD_DEVIATION = (
-    0.1  # share of these by which a curve leaves the straight line between the two, at most
-)
+LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # largest step between two samples [m], [rad]
+CHORD_DEVIATION = 0.1  # largest deviation of a curve from its chord, as a fraction of the step
 MAX_SAMPLES = 100_000
-"""Configurations that are looked at, but for the waypoints: of half a kilometre of the base, or 160 turns of a joint."""
-_MAX_COORDINATE = 1e12  # [m] or [rad] of a coordinate
+"""Most samples of a motion: half a kilometre of the base, or 160 turns of a joint."""
+_MAX_COORDINATE = 1e12  # [m] or [rad]
 
 
 class Samples:
-    """A motion in a scene, sampled at least every 5 mm of the base and of every sliding joint and every 0.01 rad of the rest.
+    """A motion in a scene, sampled at most 5 mm and 0.01 rad apart.
 
-    Between two samples a curve leaves the straight line by at most a tenth of that.
-    One that is longer than makes sense, as where it jumps, is sampled at its waypoints alone.
+    The steps hold for the base and prismatic joints, and for revolute joints, respectively. Between
+    two samples a curve deviates from its chord by at most a tenth of a step. A motion that would
+    need more than `MAX_SAMPLES` samples is sampled at its waypoints or knots only.
 
     Attributes:
-        scene, trajectory: What it was made of.
+        scene, trajectory: Scene and motion.
         world: The scene as one plain tree.
-        free: Its free objects along the motion.
-        times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints, or knots
-            of the curve.
-        waypoint_rows: Which of these are the waypoints, shape (T,).
+        free_objects: Free objects along the motion.
+        times: Sample times, shape (S,) [s]; evenly spaced between waypoints, or knots of the curve.
+        waypoint_rows: Rows of `times` that are the waypoints, shape (T,).
         z: Minimal coordinates of the world, shape (S, n).
-        virtual: Coordinate → the freedom of a grasp that it is.
-        needed: How many configurations would have to be looked at; more than `MAX_SAMPLES`: only the
-            waypoints are.
-        truncated: Whether it is sampled at its waypoints or knots alone, since it is too long.
+        grasp_freedoms: Coordinate name → freedom of a grasp.
+        required_count: Number of samples required by the steps above.
+        is_truncated: Whether only the waypoints or knots are sampled.
 
     Raises:
         UnknownNameError: The trajectory names a coordinate, object or attachment that the scene
             does not have.
-        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom,
-            or one is beyond all measure.
+        InputError: The trajectory lacks coordinates of the robot or of a grasp with freedoms, or a
+            coordinate is out of range.
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
@@ -149,12 +146,12 @@ class Samples:
             raise UnknownNameError(f"link of '{owner}'", link, item.links, field=field)
 
     def _choose_times(self) -> tuple[Floats, Ints]:
-        """Return the times to look at, and where among them the waypoints are."""
+        """Return the sample times [s] and the rows of the waypoints."""
         curve, edges = self.trajectory.curve, self.trajectory.times
         if curve is None:
             steps = np.abs(np.diff(self.trajectory.positions, axis=0))
             bends = np.zeros_like(steps)
-        else:  # as far as it would go at the largest speed on each cubic, and leave its chord at the largest acceleration
+        else:  # bounds of the travel and of the chord deviation from the largest rates per cubic
             edges, spans = curve.times, np.diff(curve.times)[:, None]
             speeds, accelerations = curve.compute_max_rates()
             steps, bends = speeds * spans, accelerations * spans**2 / 8.0
@@ -189,18 +186,18 @@ class Samples:
         ]
 
     def get_unit(self, name: str) -> str:
-        """Return a coordinate's unit, "m" or "rad"."""
+        """Return the unit of a coordinate, "m" or "rad"."""
         if name in self.grasp_freedoms:
             return self.grasp_freedoms[name].unit
         return self.world.coordinates.units[self.world.coordinates.index(name)]
 
     def get_limits(self, name: str) -> tuple[float, float, float, float]:
-        """Return lower, upper, velocity and acceleration limit of a coordinate of the trajectory."""
+        """Return the lower, upper, velocity and acceleration limit of a trajectory coordinate."""
         robot = self.scene.robot
         if name in robot.coordinates.names:
             i = robot.coordinates.index(name)
             lower, upper = float(robot.lower[i]), float(robot.upper[i])
-            if i < 3 and robot.base == "fixed":  # wherever it stands
+            if i < 3 and robot.base == "fixed":
                 lower = upper = float(self.scene.start[i])
             if i < 2:
                 lower, upper = (
@@ -221,15 +218,15 @@ class Samples:
         )
 
     def find_waypoint(self, row: int) -> int:
-        """Return the waypoint of a sample, between two the earlier."""
+        """Return the last waypoint at or before a sample."""
         return int(np.searchsorted(self.waypoint_rows, row, side="right")) - 1
 
     def get_rows(self, phase: PhaseSpan) -> Ints:
-        """Return the samples of a phase, both ends among them."""
+        """Return the rows of a phase's samples, including both ends."""
         return np.arange(self.waypoint_rows[phase.first], self.waypoint_rows[phase.last] + 1)
 
     def find_driven_coordinates(self, holds: Iterable[Hold]) -> set[str]:
-        """Return the coordinates of objects that a hand that holds them can move: those between base and attachment."""
+        """Return the object coordinates that holds drive: the joints from base to attachment."""
         model, names = self.world.model, set()
         for hold in holds:
             link = self.scene.objects[hold.object].object.attachments[hold.attachment].link
@@ -240,18 +237,21 @@ class Samples:
         return names
 
     def compute_placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
-        """Return the placements of a frame in the world at some samples."""
+        """Return the placements of a frame in the world at the given samples."""
         turns, origins = self._compute_frames(self.z[np.asarray(rows)], frame)
         return [
             pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)
         ]
 
     def _compute_frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
-        """Return rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames in the world.
+        """Compute rotations and origins of F frames in the world.
 
         Args:
             z: Minimal coordinates of the world, shape (K, n).
-            *names: The frames.
+            *names: Names of the frames.
+
+        Returns:
+            Rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m].
         """
         model, data = self.world.model, self.world.model.createData()
         configurations, frames = (
@@ -272,20 +272,20 @@ class Samples:
     def compute_grasp_errors(
         self, owner: str, name: str, rows: Ints, by: str | None = None
     ) -> Floats:
-        """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad].
+        """Compute the errors of a grasp at samples, shape (K, 2): position [m] and angle [rad].
 
         Args:
-            owner: The object.
-            name: Of one of its attachments.
-            rows: Which samples, shape (K,).
-            by: The frame that takes the tool's place, "<object>.<link>".
+            owner: Name of the grasped object.
+            name: Name of the attachment.
+            rows: Rows of the samples, shape (K,).
+            by: Frame that grasps instead of the tool, "<object>.<link>".
         """
         return self._compute_grasp_errors(owner, name, self.times[rows], self.z[rows], by)
 
     def compute_grasp_errors_at(
         self, owner: str, name: str, times: Floats, by: str | None = None
     ) -> Floats:
-        """Return the same at any moments, increasing, shape (K,) [s]."""
+        """Compute the errors of a grasp at increasing times, shape (K,) [s]."""
         z = self.world.compute_positions(self.trajectory, times, self.free_objects)
         return self._compute_grasp_errors(owner, name, times, z, by)
 
@@ -305,9 +305,8 @@ class Samples:
         for column, coordinate in enumerate(own):
             if coordinate in self.trajectory.names:
                 values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
-        known, which = np.unique(
-            values, axis=0, return_inverse=True
-        )  # most grasps stay as they are
+        # The freedoms of most grasps are constant.
+        known, which = np.unique(values, axis=0, return_inverse=True)
         held = [attachment.tool(row) for row in known]
         turn, origin = (
             np.array([getattr(part, side) for part in held]) for side in ("rotation", "translation")
@@ -320,7 +319,7 @@ class Samples:
 
 
 def _compute_angles(rotations: Floats) -> Floats:
-    """Return by how much rotations turn, shape (K, 3, 3) → (K,) [rad]; as exact near none as near half a turn."""
+    """Compute rotation angles, shape (K, 3, 3) → (K,) [rad]; accurate near 0 and near π."""
     skew = rotations - np.swapaxes(rotations, 1, 2)
     sine = 0.5 * np.linalg.norm(skew[:, [2, 0, 1], [1, 2, 0]], axis=1)
     return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0))

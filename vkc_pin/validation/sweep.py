@@ -1,8 +1,8 @@
-"""Looks along a motion for pairs that come close: at waypoints, and wherever between them two could.
+"""Finds close pairs along a motion, at waypoints and continuously between them.
 
-A pair is left out of a stretch between two waypoints only where it cannot come close: the distance
-of two bodies changes by at most what their relative motion is long. All stretches are looked at
-together, all their halves next, and so on.
+The distance of two bodies changes by at most the length of their relative motion. An interval
+between two waypoints is skipped for a pair only if this bound proves that it cannot come close.
+All remaining intervals are evaluated at once, then all their halves, and so on.
 """
 
 from __future__ import annotations
@@ -18,18 +18,22 @@ from vkc_pin.validation.pairs import PairTable
 
 __all__ = ["Hit", "sweep"]
 
-RESOLUTION = 1e-3  # [m] of penetration that may stay unseen between two samples
-# [m] of relative motion between two samples that changes nothing, as of what stands where it was
-# put
-MIN_MOTION = 1e-6
+RESOLUTION = 1e-3  # largest penetration that may be missed between two samples [m]
+MIN_MOTION = 1e-6  # smaller relative motions between two samples are ignored [m]
 
 
 class Hit(NamedTuple):
-    """A pair's distance [m] at one state: at sample `row`, or between it and the next.
+    """The distance of a pair at sample `row`, or between it and the next sample.
 
-    `margin` is the clearance asked for at waypoints, `contact` the overlap that counts as contact
-    [m]. `exempt_clearance` is the clearance that the pair would have to keep were it not exempt, and 0 where
-    it is not; `shapes` are its numbers in the world.
+    Attributes:
+        row: Row of the sample.
+        first, second: Labels of the two links or obstacles.
+        distance: Signed distance [m].
+        margin: Required clearance at waypoints [m].
+        contact: Overlap that counts as contact [m].
+        at_waypoint: Whether the sample is a waypoint.
+        exempt_clearance: Clearance from which the pair is exempt [m]; 0 if it is not exempt.
+        shapes: Indices of the two shapes in the world.
     """
 
     row: int
@@ -44,10 +48,10 @@ class Hit(NamedTuple):
 
 
 def sweep(table: PairTable, z: Floats, waypoints: Ints) -> Iterator[Hit]:
-    """Yield what is close along a motion, and at least the closest pair of every waypoint: these first.
+    """Yield close pairs along a motion: at first those at waypoints, at least one at each.
 
     Args:
-        table: The pairs.
+        table: Pairs of shapes.
         z: Sampled configurations of its world, shape (S, n), evenly spaced between waypoints.
         waypoints: Rows of `z` that are waypoints, shape (T,).
     """
@@ -63,7 +67,7 @@ class _Sweep:
         placed = self._solids.place(self._solids.world.coordinates.q(z[waypoints]))
         at, pairs, distances = self._find_nearest(placed)
         self._waypoints, margins = waypoints, self._table.get_margins(pairs, at)
-        apart = np.flatnonzero(margins > -np.inf)  # what moves as one is as close as it was
+        apart = np.flatnonzero(margins > -np.inf)  # pairs that do not move together
         closest = apart[_find_group_minima(at[apart], distances[apart])]
         exempt = self._table.find_exempt(pairs, at) & (distances < self._table.margins[pairs])
         chosen = np.union1d(
@@ -72,9 +76,8 @@ class _Sweep:
         yield from self._make_hits(
             waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True
         )
-        smallest = max(
-            RESOLUTION, float(distances[closest].min(initial=np.inf))
-        )  # what cannot come closer than that changes nothing
+        # Pairs that stay further apart do not affect the report.
+        smallest = max(RESOLUTION, float(distances[closest].min(initial=np.inf)))
         moved = bound_displacements(self._solids, z)
         stretch, pairs = self._find_active_pairs(
             placed, np.diff(moved[waypoints], axis=0), smallest
@@ -93,18 +96,17 @@ class _Sweep:
     def _search_intervals(
         self, z: Floats, todo: Intervals, moved: Floats, smallest: float
     ) -> Iterator[Hit]:
-        """Yield what comes closer than `smallest` at samples between two others, halves of which are left out where nothing can.
+        """Bisect intervals and yield pairs that come closer than `smallest` inside of them.
 
-        d(s) ≥ (d_t + d_{t+1} − relative motion) / 2 for every state in between. Without motion it
-        is what it is at both ends; an overlap is looked at all the same, to be told of wherever it
-        is.
+        Every state s in between satisfies d(s) ≥ (d_t + d_{t+1} − relative motion) / 2, so that
+        intervals with a larger bound are dropped. Without relative motion the distance is constant;
+        only overlaps are followed then, to report all of their samples.
 
         Args:
             z: Sampled configurations of the world, shape (S, n).
-            todo: Where to look, of all stretches at once; those of the same samples are next to
-                each other.
-            moved: See `bound_displacements`.
-            smallest: [m].
+            todo: Intervals of all pairs, grouped by samples.
+            moved: Displacements; see `bound_displacements`.
+            smallest: Distance of interest [m].
         """
         while len(todo.pair):
             motion = self._bound_motion(todo, moved)
@@ -131,19 +133,21 @@ class _Sweep:
             )
 
     def _bound_motion(self, todo: Intervals, moved: Floats) -> Floats:
-        """Return how far any two points of pairs can move relative to each other in stretches, shape (n,) [m]."""
+        """Bound the relative motion of pairs in intervals, shape (n,) [m]."""
         first, second = self._table.pairs[todo.pair].T
         return (moved[todo.high, first] - moved[todo.low, first]) + (
             moved[todo.high, second] - moved[todo.low, second]
         )
 
     def _find_tunnelling(self, z: Floats, todo: Intervals, moved: Floats) -> Iterator[Hit]:
-        """Yield what overlaps between a sample and the next, at both of which it is free: nothing deeper than 1 mm can hide.
+        """Yield pairs that overlap between two adjacent samples, but at neither of them.
+
+        Penetrations deeper than `RESOLUTION` are never missed.
 
         Args:
             z: Sampled configurations of the world, shape (S, n).
-            todo: Intervals from one sample to the next.
-            moved: See `bound_displacements`.
+            todo: Intervals between adjacent samples.
+            moved: Displacements; see `bound_displacements`.
         """
         first, motion = self._find_interval(todo.low), self._bound_motion(todo, moved)
         overlap = self._table.get_contact_overlaps(todo.pair, first, first + 1)
@@ -172,7 +176,7 @@ class _Sweep:
                 stack += [(low, middle, before, between), (middle, high, between, after)]
 
     def _find_nearest(self, placed: PlacedShapes) -> tuple[Ints, Ints, Floats]:
-        """Return (state, pair), the closest and all that fall short of their margins among them, and their distances [m]."""
+        """Return states, pairs and distances [m] of the closest pairs and all below their margins."""
         found, todo = list[tuple[Ints, Ints, Floats]](), np.arange(len(placed))
         reach = max(self._table.margins.max(), RESOLUTION)
         while len(todo):
@@ -186,7 +190,7 @@ class _Sweep:
                 self._table.get_margins(pairs, states) > -np.inf,
             )
             np.minimum.at(least, states[apart], distances[apart])
-            done = ~(least > reach)  # all others are further apart
+            done = ~(least > reach)  # all other pairs are further apart
             kept = done[states]
             found.append((states[kept], pairs[kept], distances[kept]))
             todo, reach = todo[~done[todo]], 2.0 * reach
@@ -197,29 +201,28 @@ class _Sweep:
     def _find_active_pairs(
         self, placed: PlacedShapes, moved: Floats, smallest: float
     ) -> tuple[Ints, Ints]:
-        """Return (t, pair) of all but those that boxes prove to stay `smallest` apart between waypoints t and t + 1 [m].
+        """Find segments and pairs that may come closer than `smallest` between two waypoints.
 
-        Where d(s) of `_search_intervals` is less, one of both distances is less than `smallest` and half the
-        relative motion.
+        By the bound of `_search_intervals`, the distance at one of both ends is then less than
+        `smallest` plus half the relative motion.
 
         Args:
-            placed: The world at the T waypoints.
-            moved: How far any point of each geometry moves from each to the next, shape (T − 1, G)
-                [m].
-            smallest: [m].
+            placed: Shapes at the T waypoints.
+            moved: Largest displacement of each shape between waypoints, shape (T − 1, G) [m].
+            smallest: Distance of interest [m].
         """
         return self._table.find_close_pairs(
             placed, np.arange(len(moved)), np.arange(1, len(moved) + 1), moved, smallest
         )
 
     def _find_interval(self, rows: Ints) -> Ints:
-        """Return the waypoints from which the stretches begin in which samples are, shape (n,)."""
+        """Return the last waypoint at or before each sample, shape (n,)."""
         return np.searchsorted(self._waypoints, rows, side="right") - 1
 
     def _make_hits(
         self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoint: bool = False
     ) -> Iterator[Hit]:
-        """Yield the distances of pairs at samples, or between these and the next, all of shape (n,)."""
+        """Yield hits for distances of pairs at or after samples, all of shape (n,)."""
         at = self._find_interval(rows)
         margins = self._table.get_margins(pairs, at)
         contacts = self._table.get_contact_overlaps(pairs, at, at if at_waypoint else at + 1)
@@ -237,7 +240,7 @@ class _Sweep:
 
 
 class Intervals(NamedTuple):
-    """Pairs between two samples, `low` and `high`, and their distances at these, `before` and `after` [m]; shape (n,) each."""
+    """Pairs in intervals: samples `low`, `high`, distances `before`, `after` [m]; shape (n,) each."""
 
     low: Ints
     high: Ints
@@ -246,7 +249,7 @@ class Intervals(NamedTuple):
     after: Floats
 
     def select(self, which: Bools) -> Intervals:
-        """Return those of them."""
+        """Return a subset of the intervals."""
         return Intervals(
             self.low[which],
             self.high[which],
@@ -257,6 +260,6 @@ class Intervals(NamedTuple):
 
 
 def _find_group_minima(groups: Ints, values: Floats) -> Ints:
-    """Return where the smallest value of each group is, the first of them."""
+    """Return the index of the first smallest value of each group."""
     order = np.lexsort((values, groups))
     return order[np.flatnonzero(np.diff(groups[order], prepend=-1))]

@@ -1,4 +1,4 @@
-"""Whether a motion keeps the user's own constraints: their expressions on numbers of the plain world model."""
+"""Checks the user's constraints numerically on the plain world model."""
 
 from __future__ import annotations
 
@@ -16,19 +16,17 @@ from vkc_pin.world.task.terms import Constraint, Term
 
 __all__ = ["check_terms"]
 
-INTERMEDIATE_FACTOR = 10.0  # times the tolerance at a waypoint
+INTERMEDIATE_FACTOR = 10.0  # tolerance between waypoints over that at waypoints
 
 
 def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
-    """Return the worst violation of each constraint among `terms`, at a waypoint and between two.
+    """Return the worst violation of each constraint among `terms`, at and between waypoints.
 
-    A constraint holds at the waypoints of its phases after their first, which is where the phase
-    before, or the start, has brought everything; while the robot still stands there for its
-    gripper, nothing is asked. Between two such waypoints the coordinates are linear in time and
-    expressions of frames are not. The program knows nothing of that, and what they are off by is of
-    second order in the step, so ten times the tolerance is allowed there. What is said of
-    velocities is said of the last step's time: between waypoints, of a time as long as the present
-    step, so that nothing jumps at a waypoint.
+    A constraint must hold at all waypoints of its phases except the first, which belongs to the
+    previous phase or the start, and except while the robot waits for its gripper. The NLP enforces
+    constraints at waypoints only. Between them expressions of frames deviate by terms of second
+    order in the step, so ten times the tolerance is accepted. Velocities are differences over the
+    duration of the current segment, so that they are continuous at waypoints.
     """
     found = []
     for term in (term for term in terms if isinstance(term, Constraint)):
@@ -78,7 +76,7 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
 
 
 def _find_rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
-    """Return the samples at which a constraint must hold: those that are waypoints, and those between two of them."""
+    """Return the samples at which a constraint must hold: at waypoints, and between them."""
     trajectory = samples.trajectory
     asked = np.zeros(len(trajectory.times), bool)
     for phase in trajectory.phases:
@@ -101,7 +99,7 @@ def _find_rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
 
 
 def _compute_inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
-    """Return the inputs of a formula at some samples, shape (S, 2·half + 1)."""
+    """Compute the inputs of a formula at samples, shape (S, 2·half + 1)."""
     ends = np.searchsorted(
         samples.waypoint_rows, rows
     )  # the waypoint in which the segment of a sample ends
@@ -119,7 +117,7 @@ def _compute_inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
 
 
 def _compute_state_inputs(samples: Samples, formula: Formula, z: Floats) -> Floats:
-    """Return placements of a formula's frames and its coordinates at configurations of the world, shape (S, half)."""
+    """Compute a formula's frame placements and coordinates at configurations, shape (S, half)."""
     model, coordinates = samples.world.model, samples.world.coordinates
     data = model.createData()
     frames = [model.getFrameId(name) for name in formula.frames]

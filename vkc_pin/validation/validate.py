@@ -1,8 +1,8 @@
-"""The independent check of a motion, continuous in time.
+"""Validates a motion independently of the planner, continuously in time.
 
-It knows nothing of the optimiser: numeric Pinocchio on the plain tree of robot and objects side by
-side (`world`), coal on every pair that could come close, at most 5 mm and 0.01 rad apart there,
-closer where something could slip through.
+It shares no code with the optimizer. Kinematics are computed numerically by Pinocchio on a plain
+tree of robot and objects (`world`). coal measures every pair that could come close, at samples at
+most 5 mm and 0.01 rad apart, and at finer ones where a collision could hide between two samples.
 """
 
 from __future__ import annotations
@@ -40,13 +40,11 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["check_arguments", "validate"]
 
-START_TOLERANCE = 1e-9  # [m] or [rad]
-LIMIT_TOLERANCE = 1e-5  # [m] or [rad]
-START_LIMIT_TOLERANCE = (
-    1e-2  # [m] or [rad]: a start slightly outside its limits is where the robot is
-)
+START_TOLERANCE = 1e-9  # difference from the scene's start [m] or [rad]
+LIMIT_TOLERANCE = 1e-5  # excess over a position limit [m] or [rad]
+START_LIMIT_TOLERANCE = 1e-2  # accepted excess at the start, where the robot already is [m], [rad]
 LATCH_TOLERANCE = 1e-4
-WAYPOINT_TOLERANCE = 1e-3  # [m] that clearance at a waypoint may fall short of dist_safe
+WAYPOINT_TOLERANCE = 1e-3  # accepted shortfall of dist_safe at a waypoint [m]
 
 
 def validate(
@@ -56,27 +54,26 @@ def validate(
     options: Options | None = None,
     terms: Sequence[Term] = (),
 ) -> Report:
-    """Check a motion against everything that was asked of it.
+    """Check a motion against its scene, steps and user terms.
 
     Args:
-        scene: Where it happens; its start is where the motion must start.
-        steps: What it must bring about, in this order.
-        trajectory: The motion, along its curve, or linear between waypoints.
-        options: Tolerances and dist_safe; `Options()` if left out.
-        terms: The user's own constraints; costs are nothing to check.
+        scene: Scene of the motion. The motion must begin at the scene's start.
+        steps: Steps that the motion must carry out, in this order.
+        trajectory: Motion, along its curve or linear between waypoints.
+        options: Tolerances and dist_safe. Default: `Options()`.
+        terms: User terms. Constraints are checked, costs are ignored.
 
     Returns:
-        Every violated constraint: start, limits, velocity, acceleration, jerk, torque, bases that
-            slip,
-        turn tighter than they can or whose wheels turn too fast, closure, latches,
-        rests in which the gripper closes or opens, how far it is open, joints of objects that
-        nobody holds, what tips on what it stands on, hands that slide on what they clamp, pushes
-        that would pull, goals and their order, clearance at waypoints and penetration anywhere, and
-        own constraints; or that it is longer than can be looked at.
+        Report of all violated constraints: start; limits of position, velocity, acceleration, jerk
+        and torque; slip, turning radius and wheel speed of the base; grasp closure; latches; rests
+        for the gripper and its opening; undriven joints of objects; tilt of supporting links;
+        sliding of firm grasps; pushes that would have to pull; goals and their order; clearance at
+        waypoints; penetration anywhere; user constraints. A motion too long to be sampled is
+        reported as such.
 
     Raises:
-        InputError: The trajectory is none of this scene's robot and objects, or a step or term
-            names what is not there.
+        InputError: The trajectory does not belong to the scene's robot and objects.
+        UnknownNameError: A step or term names something that does not exist.
     """
     options = Options() if options is None else instance(options, Options, "options")
     return _Validator(*check_arguments(scene, steps, trajectory, terms), options).make_report()
@@ -85,7 +82,7 @@ def validate(
 def check_arguments(
     scene: Scene, steps: Sequence[Step], trajectory: Trajectory, terms: Sequence[Term] = ()
 ) -> tuple[Samples, tuple[Step, ...], tuple[Term, ...]]:
-    """Return what `validate` checks, for its arguments; raise what it raises. That takes a few milliseconds."""
+    """Check the arguments of `validate` and prepare them; raises what `validate` raises."""
     samples, asked = (
         Samples(instance(scene, Scene, "scene"), instance(trajectory, Trajectory, "trajectory")),
         as_steps(steps),
@@ -105,7 +102,7 @@ class _Validator:
         self._ranges = samples.trajectory.ranges()
 
     def make_report(self) -> Report:
-        """Run every check."""
+        """Run all checks and return the report."""
         for check in (
             self._check_start,
             self._check_limits,
@@ -136,7 +133,7 @@ class _Validator:
             key = (violation.constraint, violation.subject, violation.unit)
             if key not in worst or worst[key].amount < violation.amount:
                 worst[key] = violation
-        for violation in self.violations:  # what overlaps is also too close
+        for violation in self.violations:  # a penetration implies a clearance violation
             if violation.constraint == "penetration":
                 worst.pop(("clearance", violation.subject, violation.unit), None)
         ordered = tuple(
@@ -166,7 +163,7 @@ class _Validator:
         row: int | None = None,
         time: float | None = None,
     ) -> None:
-        """Note a violation at a waypoint, or at a sample if `row` names one, or at a time [s] after the waypoint."""
+        """Add a violation at a waypoint, at sample `row`, or at a time [s] after the waypoint."""
         at = waypoint if row is None else self.samples.find_waypoint(row)
         if time is None:
             time = self.trajectory.times[at] if row is None else self.samples.times[row]
@@ -183,10 +180,10 @@ class _Validator:
         )
 
     def _check_sample_count(self) -> bool:
-        """The motion is no longer than can be looked at; otherwise nothing is said of collisions."""
+        """Return whether the motion is short enough to be checked for collisions."""
         needed, most = self.samples.required_count, max(MAX_SAMPLES, len(self.trajectory.times))
         if needed > most:
-            detail = f"{needed:.3g} configurations would have to be looked at, more than {most}: collisions were not looked for"
+            detail = f"{needed:.3g} samples are required, more than {most}: collisions not checked"
             step = int(np.argmax(np.abs(np.diff(self.trajectory.positions, axis=0)).max(axis=1)))
             self._add_violation(
                 "sampling", "motion", needed - most, "configurations", detail, waypoint=step
@@ -194,7 +191,7 @@ class _Validator:
         return needed <= most
 
     def _check_start(self) -> None:
-        """The motion begins where the robot and the objects are."""
+        """Check that the motion begins at the scene's start."""
         known = dict(
             zip(self.samples.world.coordinates.names, self.samples.world.start, strict=True)
         )
@@ -210,7 +207,7 @@ class _Validator:
                 )
 
     def _check_limits(self) -> None:
-        """Every coordinate stays within its limits (eq. 4)."""
+        """Check that every coordinate stays within its limits (eq. 4)."""
         ranges = zip(
             self.trajectory.names,
             self.trajectory.positions[0],
@@ -234,7 +231,8 @@ class _Validator:
                     max(lower - value, value - upper),
                     self.trajectory.column(name)[worst : worst + 2],
                 )
-                detail = f"{value:.4f} {unit} is outside {lower:.4f} to {upper:.4f} {unit} by {out:.4f} {unit}"
+                limits = f"{lower:.4f} to {upper:.4f} {unit}"
+                detail = f"{value:.4f} {unit} is outside {limits} by {out:.4f} {unit}"
                 self._add_violation(
                     "limit",
                     name,
@@ -245,7 +243,7 @@ class _Validator:
                 )
 
     def _check_tilt(self) -> None:
-        """What something stands on stays level while it moves."""
+        """Check that moving links that support an object stay level."""
         for phase, riding in zip(
             self.trajectory.phases, self.samples.free_objects.supports, strict=True
         ):
@@ -255,13 +253,14 @@ class _Validator:
                 angles = np.array([compute_tilt(links[0], link) for link in links])
                 worst = int(np.argmax(angles))
                 if not angles[worst] <= MAX_TILT:
-                    detail = f"'{label}', on which it stands, tilts by {angles[worst]:.2f} rad, more than {MAX_TILT:g} rad"
+                    angle = f"{angles[worst]:.2f} rad, more than {MAX_TILT:g} rad"
+                    detail = f"its support '{label}' tilts by {angle}"
                     self._add_violation(
                         "tips", owner, angles[worst] - MAX_TILT, "rad", detail, row=int(rows[worst])
                     )
 
     def _check_undriven_joints(self) -> None:
-        """What no hand moves does not move."""
+        """Check that joints that no hand drives do not move."""
         for phase in self.trajectory.phases:
             driven = self.samples.find_driven_coordinates(phase.holds)
             for i, name in enumerate(self.trajectory.names):
@@ -272,18 +271,14 @@ class _Validator:
                 ):
                     continue
                 owner = name.partition(".")[0]
-                why = (
-                    "where it is held, nothing drives it"
-                    if owner in phase.held
-                    else f"nobody holds {owner}"
-                )
+                why = "no hold drives it" if owner in phase.held else f"{owner} is not grasped"
                 self._check_stationary(phase, "unheld", name, "moves by ", f" while {why}")
 
     def _check_latches(self) -> None:
-        """A latched joint leaves where it is held only while the joint that releases it is far enough.
+        """Check that a latched joint leaves its latched position only while its latch is released.
 
-        Between two samples both are linear in time, so the shortfall is largest where the joint
-        starts to leave or where the latch's reach ends.
+        Between two samples both joints are linear in time. The shortfall of the releasing joint is
+        therefore largest where the latched joint starts to move or leaves the latch's range.
         """
         z, names = self.samples.z, self.samples.world.coordinates
         for owner, placed in self.scene.objects.items():
@@ -317,7 +312,7 @@ class _Validator:
                     )
 
     def _check_closure(self) -> tuple[float, float]:
-        """The hand stays where it holds an object (eq. 2); return the largest drift, [m] and [rad]."""
+        """Check grasp closure (eq. 2) and return the largest drift, [m] and [rad]."""
         largest, limits = np.zeros(2), (self.options.closure_position, self.options.closure_angle)
         for phase in self.trajectory.phases:
             for hold in phase.holds:
@@ -330,7 +325,8 @@ class _Validator:
                 for found, bound, time, limit, unit in rows:
                     if not bound <= limit:
                         amount = found if found > limit else bound
-                        detail = f"the grasp drifts by {1e3 * amount:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
+                        excess = f"{1e3 * amount:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
+                        detail = f"the grasp drifts by {excess}"
                         at = min(
                             int(np.searchsorted(self.trajectory.times, time, side="right")) - 1,
                             phase.last,
@@ -347,7 +343,7 @@ class _Validator:
         return float(largest[0]), float(largest[1])
 
     def _check_firm_grasps(self) -> None:
-        """A hand that clamps does not slide or turn on what it holds."""
+        """Check that a firm grasp neither slides nor turns."""
         for phase in self.trajectory.phases:
             for owner, attachment in phase.held.items():
                 grasp = self.scene.objects[owner].object.attachments[attachment]
@@ -360,7 +356,7 @@ class _Validator:
     def _check_stationary(
         self, phase: PhaseSpan, kind: str, name: str, before: str, after: str
     ) -> None:
-        """A coordinate does not change in a phase; what is said of it goes around by how much."""
+        """Check that a coordinate is constant in a phase; detail: `before`, amount, `after`."""
         column, begin = self.trajectory.names.index(name), self.trajectory.column(name)[phase.first]
         low, high = (side[phase.first : phase.last, column] for side in self._ranges)
         moved, unit = np.maximum(high - begin, begin - low), self.samples.get_unit(name)
@@ -377,10 +373,13 @@ class _Validator:
             )
 
     def _check_clearance(self) -> Floats:
-        """Nothing comes too close at a waypoint (eqs. 6 and 7) or penetrates anywhere; return each phase's smallest distance [m].
+        """Check clearance at waypoints (eqs. 6 and 7) and penetration anywhere.
 
-        What moves as one does not count. The start is where the robot is: it may be close to
-        something, but not inside.
+        Pairs that move together are ignored. At the start the clearance may be violated, since the
+        robot is already there, but nothing may penetrate.
+
+        Returns:
+            Smallest distance of each phase [m].
         """
         samples, solids, lasts = (
             self.samples,
@@ -396,8 +395,7 @@ class _Validator:
         names = samples.world.coordinates.names
         for hit in sweep(pairs, samples.z, samples.waypoint_rows):
             state = samples.z[[hit.row]]
-            # Also on the way to the waypoint at which the exemption ends, or from that at which it
-            # begins.
+            # The exemption also covers the segment before it ends and the one after it begins.
             tolerated = max(
                 (
                     -one.margin
@@ -428,7 +426,7 @@ class _Validator:
                 )
             elif hit.at_waypoint and hit.row > 0 and short > 0.0:
                 detail = (
-                    f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are asked for"
+                    f"are only {millimetres:.1f} mm apart, {1e3 * hit.margin:.0f} mm are required"
                 )
                 self._add_violation("clearance", subject, short, "m", detail, row=hit.row)
             elif hit.distance < -CONTACT_DEPTH or (
@@ -440,7 +438,7 @@ class _Validator:
         return nearest
 
     def _find_exempt_pairs(self) -> dict[tuple[int, int], list[ClearanceExemption]]:
-        """Return the pairs of shapes that the scene exempts from clearance, each with its allowances."""
+        """Return the pairs of shapes that the scene exempts from clearance, with the reasons."""
         world, found = self.samples.world, dict[tuple[int, int], list[ClearanceExemption]]()
         for one in find_clearance_exemptions(self.scene, self.options.dist_safe):
             for pair in one.find_shape_pairs(world.collision_labels, world.collision_keys):
@@ -448,14 +446,15 @@ class _Validator:
         return found
 
     def _record_exemption(self, hit: Hit, allowed: Sequence[ClearanceExemption]) -> None:
-        """Note that a pair came closer than others may, at its closest."""
+        """Record the smallest distance of a pair that used its exemption."""
         known = self.exemptions.get((hit.first, hit.second))
         if known is not None and known.distance <= hit.distance:
             return
-        reason = "as deep as the object stood at first"
+        reason = "no deeper than the object at the start"
         if allowed:
             one = allowed[0]
-            stood = f"{abs(1e3 * one.distance):.1f} mm {'apart' if one.distance >= 0.0 else 'inside each other'}"
+            side = "apart" if one.distance >= 0.0 else "inside each other"
+            stood = f"{abs(1e3 * one.distance):.1f} mm {side}"
             reason = (
                 "the scene allows it" if one.shapes is None else f"{one} stand {stood} as built"
             )

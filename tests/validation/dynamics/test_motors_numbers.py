@@ -291,8 +291,8 @@ def test_the_worst_of_each_joint_is_named() -> None:
     assert rows == [("torque", "slide", 0, 0.6, 5.0, "N"), ("torque", "turn", 2, 3.5, 280.0, "N·m")]
     details = [one.detail for one in made.find_violations()]
     assert details == [
-        "15 N are more than the 10 N of its motor, 1.5 N if it were slow",
-        "300 N·m are more than the 20 N·m of its motor, 30 N·m however slow it is",
+        "15 N exceeds the motor's 10 N, 1.5 N at rest",
+        "300 N·m exceeds the motor's 20 N·m, 30 N·m even at rest",
     ]
     assert made.torque_ratios.max() == 15.0
 
@@ -328,7 +328,7 @@ def test_what_is_said_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
         "bounds": ("bounds", 0.25),
         "remarks": (
             "torques not checked: nothing is stated",
-            "carried as if it weighed nothing, as no mass is stated: stick, cup",
+            "carried as massless, since no mass is given: stick, cup",
         ),
     }
 

@@ -37,8 +37,8 @@ def test_a_door_that_is_too_heavy_is_named_by_joint_torque_and_time(tmp_path: Pa
     assert worst.unit == "N·m"
     assert worst.amount == pytest.approx(150.0 * (report.torque - 1.0))
     assert 6.0 < worst.time <= plan.trajectory.times[-1], "where the spring pulls most"
-    assert "are more than the 150 N·m of its motor" in worst.detail
-    assert "however slow it is" in worst.detail
+    assert "exceeds the motor's 150 N·m" in worst.detail
+    assert "even at rest" in worst.detail
     planted = dataclasses.replace(plan, scene=closer(**HEAVY), validation=report, status="rejected")
     verdict = judge(planted.save(tmp_path / "heavy.npz"))
     assert verdict.agrees
@@ -52,7 +52,7 @@ def test_a_door_that_damps_is_too_fast_until_it_is_timed_for_it() -> None:
     fast = said(scene)
     assert fast.violations
     assert all(
-        violation.constraint == "torque" and "if it were slow" in violation.detail
+        violation.constraint == "torque" and "N·m at rest" in violation.detail
         for violation in fast.violations
     )
     slower = retime_trajectory(scene, plan.trajectory)
@@ -81,7 +81,7 @@ def test_a_payload_that_is_too_heavy_to_hold_is_found_while_nothing_moves() -> N
     found = MotorLoads(Samples(heavy, still(heavy))).find_violations()
     assert {violation.constraint for violation in found} == {"torque"}
     assert "shoulder_lift_joint" in {violation.subject for violation in found}
-    assert all("however slow it is" in violation.detail for violation in found)
+    assert all("even at rest" in violation.detail for violation in found)
     assert MotorLoads(Samples(holding(), still(holding()))).find_violations() == []
 
 
@@ -102,7 +102,7 @@ def test_without_masses_torques_are_not_looked_at_and_that_is_said_once() -> Non
 def test_what_is_carried_without_a_mass_is_named() -> None:
     scene = changed(vkc.load_scene("init_1"), "stick", mass=0.0).with_held({"stick": "grip"})
     (remark,) = MotorLoads(Samples(scene, still(scene))).summarize()["remarks"]
-    assert remark == "carried as if it weighed nothing, as no mass is stated: stick"
+    assert remark == "carried as massless, since no mass is given: stick"
     assert MotorLoads(Samples(holding(), still(holding()))).summarize()["remarks"] == ()
 
 
@@ -117,7 +117,7 @@ def test_reports_tell_of_torques_and_plans_keep_that(tmp_path: Path) -> None:
     plan = door_plan()
     assert plan.metrics["torque"] == plan.validation.torque > 0.0
     assert (
-        f"torques     {100.0 * plan.validation.torque:.0f} % of what the motors have"
+        f"torques     at most {100.0 * plan.validation.torque:.0f} % of the motors' limits"
         in plan.report()
     )
     assert f"bounded by  {plan.validation.bounds[0]}" in plan.report()

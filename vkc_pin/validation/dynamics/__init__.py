@@ -1,1 +1,1 @@
-"""What the motors have to do along a motion, and what keeps it from being faster."""
+"""Checks rates and motor torques along a motion, and finds the limits that bound its speed."""

@@ -1,4 +1,4 @@
-"""What keeps a motion from being faster: for every moment, the limit that it is nearest to."""
+"""Finds the limits that bound the speed of a motion, from the nearest limit of each cubic."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from vkc_pin.world.trajectory.dynamics.torques import MotionSamples
 
 __all__ = ["find_limiting_constraints"]
 
-_MOTION_TOLERANCE = 1e-9  # of a limit
-_MIN_SHARE = 5e-3  # of the duration: less is not told of
+_MOTION_TOLERANCE = 1e-9  # relative to a limit
+_MIN_SHARE = 5e-3  # smaller shares of the duration are not reported
 
 
 def find_limiting_constraints(
     samples: Samples, moments: MotionSamples, torques: Floats, jerk_time: float
 ) -> tuple[Bound, ...]:
-    """Return what bounds a motion and for how long, the longest first; nothing without a curve.
+    """Find the limits that bound the speed of a motion, by decreasing share of the duration.
 
     Args:
-        samples: The motion.
-        moments: When torques are known.
-        torques: As shares of their limits, shape (K, robot's).
+        samples: Sampled motion. Without a curve the result is empty.
+        moments: Motion at K times.
+        torques: Torques at these times relative to their limits, shape (K, robot coordinates).
         jerk_time: See `Options.jerk_time`.
     """
     curve, names = samples.trajectory.curve, samples.trajectory.names

@@ -1,4 +1,4 @@
-"""Whether coordinates change no faster than they may: velocities, accelerations and jerks."""
+"""Checks velocities, accelerations and jerks of a motion against their limits."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from vkc_pin.validation.samples import Samples
 
 __all__ = ["check_rates"]
 
-ACCEPTED_RATE_TOLERANCE = 1e-3  # excess over a limit, relative to it
+ACCEPTED_RATE_TOLERANCE = 1e-3  # relative excess over a limit
 REST_TOLERANCE = 1e-6  # [m/s] or [rad/s]
-JUMP_TOLERANCE = 1e-3  # of an acceleration, relative to its limit
+JUMP_TOLERANCE = 1e-3  # jump of an acceleration, relative to its limit
 
 
 def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
-    """Yield what exceeds limits on velocities and accelerations (eq. 5), and on jerks if there are some, each where it does most.
+    """Yield the worst violations of velocity and acceleration limits (eq. 5) and of jerk limits.
 
-    A curve begins and ends at rest. Its accelerations are looked at at the ends of its cubics,
-    where they are strongest, and its jerks, which are the same all along each; where there are
-    limits of jerk, accelerations do not jump from one to the next. Of a motion without a curve,
-    whose velocities jump, nothing is said of jerks.
+    A curve must begin and end at rest. Accelerations are evaluated at the ends of its cubics, where
+    they are largest. The jerk of each cubic is constant; with jerk limits, accelerations must not
+    jump between cubics. Jerks of a motion without a curve are not checked, as its velocities jump.
     """
     motion, curve = samples.trajectory, samples.trajectory.curve
     jerks: tuple[Floats, Floats] | None = None

@@ -1,4 +1,4 @@
-"""Torques of the arm along a motion, compared with what its motors have, and what bounds its duration."""
+"""Compares the torques of the arm along a motion with the limits of its motors."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from vkc_pin.world.trajectory.dynamics.torques import MotionSamples, Torques, sa
 
 __all__ = ["TORQUE_TOLERANCE", "MotorLoads"]
 
-# excess over a limit, relative to it: torques are looked at at three moments of every cubic
+# Relative excess over a limit. Torques are evaluated only at three times of every cubic.
 TORQUE_TOLERANCE = 5e-3
 
 
 class MotorLoads:
-    """The motors along a motion: looked at at the ends and in the middle of every cubic, without a curve at every waypoint."""
+    """Motor torques at the ends and middle of every cubic, or at waypoints if there is no curve."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples, self.trajectory = samples, samples.trajectory
@@ -28,7 +28,7 @@ class MotorLoads:
 
     @cached_property
     def moments(self) -> MotionSamples:
-        """When it is looked at, and how it moves then."""
+        """Times of the evaluation and the motion at these times."""
         trajectory, curve = self.trajectory, self.trajectory.curve
         if curve is not None:
             return sample_curve(curve)
@@ -44,7 +44,7 @@ class MotorLoads:
 
     @cached_property
     def waypoints(self) -> Ints:
-        """After which waypoint each moment is."""
+        """Last waypoint at or before each time."""
         edges = (
             self.trajectory.times if self.trajectory.curve is None else self.trajectory.curve.times
         )
@@ -53,13 +53,13 @@ class MotorLoads:
 
     @cached_property
     def torques(self) -> Floats:
-        """Torques of the robot's coordinates at every moment, shape (K, robot's) [N·m], [N]."""
+        """Torques at every time, shape (K, robot coordinates) [N·m], [N]."""
         return self._compute_torques(np.arange(len(self.moments.times)))
 
     @cached_property
     def torque_ratios(self) -> Floats:
-        """The same without sign, as shares of what the motors have, shape (K, robot's); 0 where that is not known."""
-        if not self._torques.torque_limits.is_known:
+        """|Torques| relative to their limits, shape (K, robot coordinates); 0 if unknown."""
+        if not self._torques.torque_limits.known:
             return np.zeros((len(self.moments.times), self.trajectory.robot_size))
         return np.asarray(np.abs(self.torques) / self._torques.torque_limits.limits)
 
@@ -73,7 +73,7 @@ class MotorLoads:
         )
 
     def find_violations(self) -> list[Violation]:
-        """Return what is too heavy or too fast, the worst of each joint."""
+        """Return the worst violation of each joint's torque limit."""
         found = list[Violation]()
         for k in np.flatnonzero(self.torque_ratios.max(axis=0) > 1.0 + TORQUE_TOLERANCE).tolist():
             row = int(np.argmax(self.torque_ratios[:, k]))
@@ -85,9 +85,7 @@ class MotorLoads:
             unit = "N" if self.samples.get_unit(name) == "m" else "N·m"
             rest = abs(float(self._compute_torques(np.array([row]), 1e-2)[0, k]))
             why = (
-                f"{rest:.4g} {unit} however slow it is"
-                if rest > limit
-                else f"{rest:.4g} {unit} if it were slow"
+                f"{rest:.4g} {unit} even at rest" if rest > limit else f"{rest:.4g} {unit} at rest"
             )
             found.append(
                 Violation(
@@ -97,21 +95,22 @@ class MotorLoads:
                     time=float(self.moments.times[row]),
                     amount=float(torque - limit),
                     unit=unit,
-                    detail=f"{torque:.4g} {unit} are more than the {limit:.4g} {unit} of its motor, {why}",
+                    detail=f"{torque:.4g} {unit} exceeds the motor's {limit:.4g} {unit}, {why}",
                 )
             )
         return found
 
     def summarize(self, jerk_time: float = 0.0) -> dict[str, Any]:
-        """Return what a report says of it; `jerk_time` is that of `Options`."""
-        notes = [f"torques not checked: {note}" for note in self._torques.torque_limits.notes]
+        """Return the fields of the report; `jerk_time` is that of `Options`."""
+        remarks = [f"torques not checked: {note}" for note in self._torques.torque_limits.notes]
         if self._torques.massless_objects:
-            notes.append(
-                f"carried as if it weighed nothing, as no mass is stated: {', '.join(self._torques.massless_objects)}"
+            remarks.append(
+                "carried as massless, since no mass is given: "
+                f"{', '.join(self._torques.massless_objects)}"
             )
         found = find_limiting_constraints(self.samples, self.moments, self.torque_ratios, jerk_time)
         return {
             "torque": float(self.torque_ratios.max(initial=0.0)),
             "bounds": found,
-            "remarks": tuple(notes),
+            "remarks": tuple(remarks),
         }

@@ -136,7 +136,7 @@ def placements(samples: Samples, hold: vkc.Hold, times: Floats) -> Floats:
     """Return the offset of the tool from the handle and the axial vector of their relative rotation, shape (K, 6)."""
     z = samples.world.compute_positions(samples.trajectory, times, samples.free_objects)
     attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
-    turns, origins = samples._frames(
+    turns, origins = samples._compute_frames(
         z, samples.scene.robot.tool_frame, f"{hold.object}.{attachment.link}"
     )
     own = [

@@ -167,14 +167,14 @@ def test_what_does_not_move_in_a_phase_is_not_looked_at_in_it() -> None:
     placed = solids.place(samples.world.coordinates.q(samples.z[samples.waypoint_rows]))
     for waypoint in range(61):
         here = np.array([waypoint])
-        _, pairs = found.near(placed, here, here, still, np.inf)
+        _, pairs = found.find_close_pairs(placed, here, here, still, np.inf)
         assert (
             set(lies) <= set(pairs.tolist())
             if 20 < waypoint <= 40
             else set(lies).isdisjoint(pairs.tolist())
         )
         if waypoint < 60:  # and on the way to the next
-            _, pairs = found.near(placed, here, here + 1, still, np.inf)
+            _, pairs = found.find_close_pairs(placed, here, here + 1, still, np.inf)
             assert (
                 set(lies) <= set(pairs.tolist())
                 if 20 <= waypoint < 40

@@ -378,8 +378,8 @@ def cull_nothing(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(Clearances, "find_closest_pairs", all_of_them)
     patch.setattr(Clearances, "find_first_violation", one_by_one)
-    patch.setattr(PlacedShapes, "bounds", nowhere)
-    patch.setattr(PairTable, "near", all_of)
+    patch.setattr(PlacedShapes, "compute_lower_bounds", nowhere)
+    patch.setattr(PairTable, "find_close_pairs", all_of)
     patch.setattr(
         MovingShapes, "_find_close_pairs", lambda body, along: np.arange(len(body.moving))
     )

@@ -51,7 +51,7 @@ class CollisionShapes:
 
     def place(self, q: Floats) -> PlacedShapes:
         """Place the shapes at Pinocchio's configurations of the world, shape (W, nq)."""
-        return PlacedShapes(self, self._placements.at(q))
+        return PlacedShapes(self, self._placements.compute_placements(q))
 
     def compute_corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
         """Compute lower and upper corners of axis-aligned boxes, shape (..., k, 3) each [m].
@@ -125,7 +125,7 @@ class PlacedShapes:
 
     def compute_distances(self, states: Ints, pairs: Ints) -> Floats:
         """Compute signed distances [m] of pairs, shape (n, 2), at states, shape (n,)."""
-        return self._solids.distance_queries.distances(self._where, states, pairs)
+        return self._solids.distance_queries.compute_distances(self._where, states, pairs)
 
     def find_nearest(self, pairs: Ints) -> tuple[Ints, Floats]:
         """Find the nearest of pairs, shape (n, 2), at each state, and its distance [m]: (W,) each.
@@ -136,7 +136,7 @@ class PlacedShapes:
         at, which = np.repeat(np.arange(states), count), np.tile(np.arange(count), states)
         bounds = self.compute_lower_bounds(at, pairs[which])
         order = np.lexsort((which, bounds, at))
-        chosen, found = self._solids.distance_queries.shortest(
+        chosen, found = self._solids.distance_queries.find_closest_pairs(
             self._where,
             np.arange(states + 1) * count,
             pairs[which[order]],

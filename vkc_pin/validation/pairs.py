@@ -90,7 +90,7 @@ class PairTable:
     def _find_moving_shapes(self, rows: Floats) -> Bools:
         """Return which shapes move in a sequence of configurations, shape (K, n): shape (G,)."""
         world = self.world
-        moved = world.coordinates.moved(np.ptp(rows, axis=0) > _MOTION_TOLERANCE)
+        moved = world.coordinates.find_moved_joints(np.ptp(rows, axis=0) > _MOTION_TOLERANCE)
         for joint in range(1, len(moved)):
             moved[joint] |= moved[world.model.parents[joint]]
         robots = len(self.scene.robot.collision.geometryObjects)

@@ -1,4 +1,4 @@
-"""Where to look at a scene from: a camera that sees the motion, not the furniture in front of it."""
+"""Chooses a viewpoint from which obstacles hide as little of a motion as possible."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["FIELD_OF_VIEW", "choose_viewpoint"]
 
 FIELD_OF_VIEW = 40.0
 """Vertical opening angle of the camera [degrees]."""
-_ASPECT = 1.5  # width over height that the picture is framed for; narrower windows step back
+_ASPECT = 1.5  # assumed width over height of the picture
 _ELEVATION = np.radians(38.0)
 _AZIMUTHS = np.radians(
     np.arange(-90.0, 270.0, 15.0)
@@ -22,12 +22,12 @@ _AZIMUTHS = np.radians(
 def choose_viewpoint(
     points: Floats, boxes: Sequence[tuple[Floats, Floats, float]]
 ) -> tuple[Floats, Floats]:
-    """Return the point that a camera looks at and is orbited around, and where it stands, shape (3,) each [m], in the world.
+    """Choose the target and position of a camera in the world, shape (3,) each [m].
 
     Args:
-        points: Where the motion is, shape (n, 3) [m]; all of them get into the picture.
-        boxes: What may hide it: lower corner, upper corner, shape (3,) each [m], and opacity from 0
-            to 1.
+        points: Points of the motion, shape (n, 3) [m]. All of them will be in the picture.
+        boxes: Boxes that may hide them: lower and upper corner, shape (3,) each [m], and opacity
+            from 0 to 1.
     """
     lower, upper = points.min(axis=0), points.max(axis=0)
     target = (lower + upper) / 2.0
@@ -74,7 +74,7 @@ def _direction(azimuth: float) -> Floats:
 
 
 def _crosses(points: Floats, direction: Floats, lower: Floats, upper: Floats) -> Bools:
-    """Return for every point, shape (3, n), whether its ray along `direction` meets the box."""
+    """Return which points, shape (3, n), have rays along `direction` that meet the box."""
     enter, leave = np.full(points.shape[1], -np.inf), np.full(points.shape[1], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
         for values, slope, low, high in zip(

@@ -1,4 +1,4 @@
-"""The few three.js elements that meshcat-python lacks: meshes with normals, ghosts and a sun that casts shadows."""
+"""Defines three.js elements that meshcat-python lacks: normals, ghosts, and shadows."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Triangles(g.TriangularMeshGeometry):
         self.normals = solid.normals
 
     def lower(self, object_data: dict[str, Any]) -> dict[str, Any]:
-        """Return it as three.js' own JSON."""
+        """Return three.js JSON."""
         data: dict[str, Any] = super().lower(object_data)
         data["data"]["attributes"]["normal"] = g.pack_numpy_array(self.normals.T)
         return data
 
 
 class Ghost(g.Object):
-    """A translucent body that does not show its inside: drawn into the depth buffer first, and then where it is in front."""
+    """A translucent body without visible back faces: it is drawn into the depth buffer first."""
 
     def __init__(self, solid: Solid, colour: Sequence[float]) -> None:
         flat = g.MeshLambertMaterial(
@@ -43,7 +43,7 @@ class Ghost(g.Object):
         self.depth = g.MeshBasicMaterial(transparent=True, side=2, colorWrite=False)
 
     def lower(self) -> dict[str, Any]:
-        """Return it as three.js' own JSON."""
+        """Return three.js JSON."""
         data: dict[str, Any] = {
             "metadata": {"version": 4.5, "type": "Object"},
             "geometries": [],
@@ -65,11 +65,11 @@ class Ghost(g.Object):
 
 
 class Sun(g.Object):
-    """A far light that casts shadows over a room.
+    """A distant light that casts shadows over a room.
 
     Args:
-        centre: The room's, shape (3,) [m].
-        reach: Its radius [m].
+        centre: Centre of the room, shape (3,) [m].
+        reach: Radius of the room [m].
         camera: From the camera's target to the camera, shape (3,): the light comes from the left of
             there, and from above.
     """
@@ -86,7 +86,7 @@ class Sun(g.Object):
         self.reach = reach + 2.0
 
     def lower(self) -> dict[str, Any]:
-        """Return it as three.js' own JSON."""
+        """Return three.js JSON."""
         matrix = np.eye(4)
         matrix[:3, 3] = self.position
         size = self.reach + float(np.linalg.norm(self.position[:2])) * 0.1
@@ -114,13 +114,13 @@ class Sun(g.Object):
 
 
 class Unshadow:
-    """A command: what is drawn at `path` casts no shadow. meshcat's own SetProperty turns names into lower case."""
+    """A command that disables the shadow at `path`; meshcat's SetProperty lowers the case of names."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def lower(self) -> dict[str, Any]:
-        """Return it as it is sent."""
+        """Return the command as it is sent."""
         where = self.path.append("<object>").lower()
         return {"type": "set_property", "path": where, "property": "castShadow", "value": False}
 
@@ -128,7 +128,7 @@ class Unshadow:
 def material(
     colour: Sequence[float], opacity: float = 1.0, *, one_sided: bool = False
 ) -> g.Material:
-    """Return a slightly shiny material; what is translucent does not hide what is behind them."""
+    """Make a slightly shiny material; translucent ones do not write to the depth buffer."""
     options = {"shininess": 25, "specular": 0x1A1A1A, "side": 0 if one_sided else 2}
     return g.MeshPhongMaterial(
         color=hexadecimal(colour), opacity=opacity, depthWrite=opacity >= 1.0, **options
@@ -136,7 +136,7 @@ def material(
 
 
 def hexadecimal(colour: Sequence[float]) -> int:
-    """Return red, green and blue in [0, 1] as one number."""
+    """Encode red, green and blue in [0, 1] as one integer."""
     red, green, blue = (round(255.0 * min(1.0, max(0.0, float(c)))) for c in colour[:3])
     return (red << 16) + (green << 8) + blue
 
@@ -144,7 +144,7 @@ def hexadecimal(colour: Sequence[float]) -> int:
 def add_node(taken: set[str], above: str, *names: str) -> str:
     """Return the path of a new node in the viewer's tree, and add it to `taken`.
 
-    Characters that paths cannot have become "_"; a path that is taken gets "_" at its end.
+    Invalid characters become "_", and "_" is appended until the path is unique.
     """
     path = "/".join([above, *(re.sub(r"[^\w.\-]", "_", name) for name in names)])
     while path in taken:

@@ -1,4 +1,4 @@
-"""Triangles with normals, for pictures: of coal shapes, boxes and tubes."""
+"""Builds triangle meshes with normals from coal shapes, boxes and tubes."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["Solid", "box_solid", "coarse", "merge_solids", "shade", "to_solid", 
 
 _CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge between them
 _SIDES = 8  # of a tube
-_GRAIN = 2.0**-14  # [m]: vertices are rounded to this; numbers with few digits compress well
+_GRAIN = 2.0**-14  # rounding of vertices, for better compression [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """Triangles with a normal at every vertex.
+    """A triangle mesh with a normal at every vertex.
 
     Attributes:
         vertices: Shape (n, 3), float32 [m].
@@ -36,7 +36,7 @@ class Solid:
     normals: NDArray[np.float32]
 
     def moved(self, placement: pin.SE3) -> Solid:
-        """Return it at `placement`."""
+        """Return the mesh transformed by `placement`."""
         rotation = np.asarray(placement.rotation)
         vertices = self.vertices @ rotation.T + np.asarray(placement.translation)
         return Solid(
@@ -45,12 +45,12 @@ class Solid:
 
 
 def to_solid(shape: coal.CollisionGeometry) -> Solid:
-    """Return a coal shape with normals: round where it is round, sharp where it has an edge."""
+    """Convert a coal shape to a mesh with smooth surfaces and sharp edges."""
     return shade(*triangulate(shape))
 
 
 def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
-    """Return triangles with normals. Vertices on an edge are doubled, so that each side has its own normal."""
+    """Add normals to triangles; vertices on sharp edges are duplicated."""
     import trimesh
 
     mesh = trimesh.graph.smooth_shade(
@@ -62,13 +62,13 @@ def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
 
 
 def coarse(solid: Solid, width: float) -> Solid:
-    """Return a lighter copy: vertices in one cell of a grid of `width` [m] become one."""
+    """Simplify a mesh by merging the vertices in each cell of a grid of `width` [m]."""
     part = coarser(MeshPart(solid.vertices.astype(float), solid.faces.astype(np.int64)), width)
     return shade(part.vertices, part.faces)
 
 
 def merge_solids(solids: list[Solid]) -> Solid:
-    """Return several solids as one."""
+    """Merge meshes into one."""
     offsets = np.cumsum([0, *(len(s.vertices) for s in solids)])
     faces = [s.faces + np.uint32(offset) for s, offset in zip(solids, offsets[:-1], strict=True)]
     return Solid(
@@ -79,7 +79,7 @@ def merge_solids(solids: list[Solid]) -> Solid:
 
 
 def box_solid(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:
-    """Return the box between two corners, or some of its `sides`: 0, 1 face −x, +x; 2, 3 face −y, +y; 4, 5 face −z, +z."""
+    """Build sides of the box between two corners: 0, 1: −x, +x; 2, 3: −y, +y; 4, 5: −z, +z."""
     vertices: list[Floats] = []
     faces: list[NDArray[np.int64]] = []
     normals: list[Floats] = []
@@ -97,7 +97,7 @@ def box_solid(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3
 
 
 def tube(points: Floats, radius: float) -> Solid | None:
-    """Return a tube of `radius` [m] along `points`, shape (n, 3) [m], since browsers draw lines one pixel wide.
+    """Build a tube of `radius` [m] along `points`, shape (n, 3) [m]; browsers draw lines too thin.
 
     Returns:
         The tube, or None if the points lie within a radius of each other.

@@ -1,4 +1,4 @@
-"""Shows scenes and plans with meshcat: in a notebook, in the browser, or as one self-contained web page."""
+"""Shows scenes and plans with meshcat, in a notebook, a browser or a self-contained web page."""
 
 from __future__ import annotations
 
@@ -44,19 +44,17 @@ def show(
     height: int = 560,
     frames: Mapping[str, pin.SE3] | None = None,
 ) -> Any:
-    """Show a plan's motion, or a scene.
+    """Show the motion of a plan, or a scene.
 
-    In a notebook the result is an inline view, with play, pause and a time slider, that is part of
-    the notebook and survives saving it. Elsewhere a server that only this machine can reach shows
-    it in the browser.
+    In a notebook the result is an inline view with play, pause and a time slider, which is saved
+    with the notebook. Elsewhere a server on the loopback interface shows it in a browser.
 
     Args:
-        plan_or_scene: What to show.
-        open_browser: Whether to open a browser window; None opens one where there is a screen. Not
-            used in a notebook.
-        height: Of the inline view [pixels].
-        frames: Frames to draw, by name, with their placements in the world: x red, y green, z blue.
-            They stand still.
+        plan_or_scene: Plan or scene to show.
+        open_browser: Whether to open a browser window. Default: if there is a screen. Ignored in a
+            notebook.
+        height: Height of the inline view [pixels].
+        frames: Name → placement in the world of static frames to draw (x red, y green, z blue).
 
     Returns:
         In a notebook an object that displays itself; elsewhere the `meshcat.Visualizer`. Its
@@ -92,11 +90,11 @@ def show(
 
 
 def animate(plan: CheckedMotion, viewer: meshcat.Visualizer | None = None) -> meshcat.Visualizer:
-    """Put a motion into a meshcat viewer, whose controls have play, pause and a time slider in seconds.
+    """Animate a motion in a meshcat viewer with play, pause and a time slider in seconds.
 
     Args:
-        plan: What to show.
-        viewer: Where; what it shows at its path is replaced. None takes the one of `open_viewer`.
+        plan: Plan to show.
+        viewer: Viewer, whose content at its path is replaced. Default: that of `open_viewer`.
 
     Returns:
         The viewer. Give its `jupyter_cell()` as a cell's result to see it in a notebook, or visit
@@ -110,7 +108,7 @@ def animate(plan: CheckedMotion, viewer: meshcat.Visualizer | None = None) -> me
     scene, known = _parts(plan)
     if known is None:
         raise InputError(
-            "nothing moves in it", field="plan", expected="a Plan", got=type(plan).__name__
+            "a scene has no motion", field="plan", expected="a Plan", got=type(plan).__name__
         )
     viewer = open_viewer() if viewer is None else instance(viewer, meshcat.Visualizer, "viewer")
     _draw(viewer, scene, known)
@@ -123,13 +121,13 @@ def to_html(
     *,
     frames: Mapping[str, pin.SE3] | None = None,
 ) -> Path:
-    """Write one self-contained web page with the motion, or the scene; it loads nothing from elsewhere.
+    """Write a self-contained web page with the motion of a plan, or a scene.
 
     The page plays the motion, with a time slider in seconds; `page.html#t=3.5` shows it at 3.5 s.
 
     Args:
         plan_or_scene: What to show.
-        path: The file to write, whole or not at all.
+        path: File to write, atomically.
         frames: Frames to draw; see `show`.
 
     Returns:
@@ -142,9 +140,10 @@ def to_html(
 
 
 def open_viewer() -> meshcat.Visualizer:
-    """Return a viewer on this process's own meshcat server, which is started when first needed and ends with the process.
+    """Return a viewer on the process's own meshcat server, which is started on demand.
 
-    The server listens on the loopback interface only. All viewers of a process are the same window.
+    The server listens on the loopback interface only and ends with the process. All viewers of a
+    process share one window.
 
     Raises:
         VkcError: The server does not start.
@@ -237,28 +236,28 @@ def _film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
 
 
 class Recorder:
-    """Takes a viewer's commands instead of a server; give it as `window` to `meshcat.Visualizer`.
+    """Records a viewer's commands; pass it as `window` to `meshcat.Visualizer`.
 
     Attributes:
-        commands: The commands so far.
+        commands: Recorded commands.
     """
 
     def __init__(self) -> None:
         self.commands: list[dict[str, Any]] = []
 
     def send(self, command: Any) -> None:
-        """Take one of meshcat's commands."""
+        """Record a meshcat command."""
         self.commands.append(command.lower())
 
 
 def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
-    """Return a web page with a drawing: meshcat's viewer, the drawing's commands, and a bar with play and time.
+    """Render a web page with meshcat's viewer, a drawing's commands and playback controls.
 
     Args:
-        recorder: What to draw.
-        title: Of the page.
-        film: What the bar shows: "duration" [s], "phases" ("name", "last" [s]), "notes" ("text",
-            "time" [s]), "headline".
+        recorder: Commands of the drawing.
+        title: Title of the page.
+        film: Content of the controls: "duration" [s], "phases" ("name", "last" [s]), "notes"
+            ("text", "time" [s]), "headline".
     """
     import meshcat
     import umsgpack  # type: ignore[import-untyped]

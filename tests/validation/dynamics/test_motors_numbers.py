@@ -270,7 +270,7 @@ def motors(
         return np.asarray(numbers[rows] * (1.0 if full else 0.1))
 
     torque_limits = SimpleNamespace(
-        known=known, limits=np.array(limits), notes=("nothing is stated",) if not known else ()
+        is_known=known, limits=np.array(limits), notes=("nothing is stated",) if not known else ()
     )
     made._torques = SimpleNamespace(  # type: ignore[assignment]
         torque_limits=torque_limits,

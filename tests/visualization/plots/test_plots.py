@@ -125,7 +125,7 @@ def test_clearance_names_the_closest_pairs(figures: dict[str, Any], plan: Plan) 
     (legend,) = figures["clearance"].legends
     texts = [text.get_text() for text in legend.get_texts()]
     assert any(text.startswith("robot – obstacles") and " mm, " in text for text in texts)
-    assert any("asked for: 20 mm" in text for text in texts)
+    assert any("required: 20 mm" in text for text in texts)
 
 
 def test_top_view_shows_rooms_base_and_paths(figures: dict[str, Any], plan: Plan) -> None:

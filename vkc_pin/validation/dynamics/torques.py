@@ -59,7 +59,7 @@ class MotorLoads:
     @cached_property
     def torque_ratios(self) -> Floats:
         """|Torques| relative to their limits, shape (K, robot coordinates); 0 if unknown."""
-        if not self._torques.torque_limits.known:
+        if not self._torques.torque_limits.is_known:
             return np.zeros((len(self.moments.times), self.trajectory.robot_size))
         return np.asarray(np.abs(self.torques) / self._torques.torque_limits.limits)
 

@@ -1,4 +1,4 @@
-"""Pictures with matplotlib: joints and clearance over time, motions from above, and cards of notebooks."""
+"""Plots scenes and plans with matplotlib."""
 
 from vkc_pin.visualization.plots.plots import plot, plot_clearance, plot_joints, plot_top_view
 

@@ -1,4 +1,4 @@
-"""How close shapes come to each other over time, and which: for plots."""
+"""Computes the smallest distances of groups of pairs over time, for plots."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ __all__ = ["ClearanceCurve", "compute_clearance_curves"]
 
 @dataclass(frozen=True, eq=False)
 class ClearanceCurve:
-    """The smallest distance of any of some pairs over time.
+    """The smallest distance of a group of pairs over time.
 
     Attributes:
-        name: What the pairs have in common.
+        name: Name of the group.
         times: Shape (K,) [s].
-        distances: Signed, negative where they overlap, shape (K,) [m].
-        pairs: The closest pair at each time, by the names of its links or obstacles.
+        distances: Signed distances, negative for overlaps, shape (K,) [m].
+        pairs: Closest pair at each time, as names of links or obstacles.
     """
 
     name: str
@@ -38,7 +38,7 @@ class ClearanceCurve:
     pairs: tuple[tuple[str, str], ...]
 
     def closest(self) -> tuple[float, float, str]:
-        """Return the smallest distance [m], when it is reached [s], and the pair as text."""
+        """Return the smallest distance [m], its time [s] and its pair as text."""
         k = int(np.argmin(self.distances))
         return float(self.distances[k]), float(self.times[k]), " – ".join(self.pairs[k])
 
@@ -46,15 +46,15 @@ class ClearanceCurve:
 def compute_clearance_curves(
     scene: Scene, trajectory: Trajectory, times: ArrayLike
 ) -> list[ClearanceCurve]:
-    """Return how close shapes come along a motion, for each kind of pair that there is.
+    """Compute the smallest distances along a motion, for each kind of pair that occurs.
 
-    The kinds are the robot with itself, with articulated objects, with obstacles, objects with what
-    stands around them, and the gripper with what it grasps, which may touch.
+    The kinds are: robot and itself, robot and objects, robot and obstacles, objects and their
+    surroundings, and gripper and grasped objects, which may touch.
 
     Args:
-        scene: Where it happens.
-        trajectory: The motion.
-        times: When to look, shape (K,) [s].
+        scene: Scene of the motion.
+        trajectory: Motion.
+        times: Evaluation times, shape (K,) [s].
     """
     world = World(scene)
     solids = CollisionShapes(world)

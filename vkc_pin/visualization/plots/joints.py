@@ -1,4 +1,4 @@
-"""Coordinates over time: positions, velocities and accelerations, against their limits."""
+"""Plots positions, velocities, accelerations and jerks over time, with their limits."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ if TYPE_CHECKING:
 __all__ = ["QUANTITIES", "SAMPLES", "Quantity", "draw_joints", "groups_of", "name_phases"]
 
 SAMPLES = 240
-"""So many moments of a motion are drawn, and its waypoints and knots."""
-_BEFORE = 1e-9  # [s] before a knot, at which accelerations jump
+"""Number of times at which a motion is drawn, besides its waypoints and knots."""
+_BEFORE = 1e-9  # offset before a knot, where accelerations jump [s]
 _DASHES: Any = {"linestyle": (0, (5, 3)), "linewidth": 0.9}
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is drawn over time, in a column of its own.
+    """A quantity that is drawn over time, in its own column.
 
     Attributes:
-        name: In a word.
-        units: Unit of a coordinate → that of the quantity.
-        values: Returns it at times [s], shape (K,) → (K, n), and when: shape (L,) and (L, n). Where
-            it does not exist it is NaN.
-        limit: Returns how large it may be for a coordinate, by name; infinite if there is no limit.
-        style: How its lines are drawn.
+        name: Name of the quantity.
+        units: Unit of a coordinate → unit of the quantity.
+        values: Function of times [s], shape (K,), that returns the drawn times, shape (L,), and
+            values, shape (L, n); undefined values are NaN.
+        limit: Function of a coordinate's name that returns its limit, possibly infinite.
+        style: Function that returns the line style for a motion.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Quantity:
 
 
 def _limit(kind: str) -> Callable[[CheckedMotion, str], float]:
-    """Return what finds a limit, "velocity" or "acceleration"; the virtual joints of grasps have none."""
+    """Return a function that finds a limit, "velocity" or "acceleration"; grasps have none."""
 
     def limit(plan: CheckedMotion, name: str) -> float:
         robot, (owner, _, joint) = plan.scene.robot, name.partition(".")
@@ -92,11 +92,11 @@ QUANTITIES: tuple[Quantity, ...] = (
         lambda motion: {} if motion.curve is not None else {"marker": ".", "linestyle": "none"},
     ),
 )
-"""What is drawn, from left to right."""
+"""Drawn quantities, from left to right."""
 
 
 def _jerk() -> Quantity:
-    """Return what is drawn as well where jerks are limited; they are the same all along each of a curve's cubics."""
+    """Return the jerk, constant on each cubic of a curve; it is drawn where jerks are limited."""
 
     def values(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
         curve = plan.trajectory.curve
@@ -120,7 +120,7 @@ def _jerk() -> Quantity:
 
 
 def groups_of(trajectory: Trajectory) -> dict[str, list[int]]:
-    """Return the columns of a trajectory by what they belong to."""
+    """Return the columns of a trajectory that belong to base, arm and objects."""
     names, robot = trajectory.names, trajectory.robot_size
     groups = {
         "base": list(range(3)),
@@ -131,7 +131,7 @@ def groups_of(trajectory: Trajectory) -> dict[str, list[int]]:
 
 
 def draw_joints(figure: FigureBase, plan: CheckedMotion) -> None:
-    """Draw all quantities, a row each for base, arm and objects."""
+    """Draw all quantities, with one row each for base, arm and objects."""
     groups, motion = groups_of(plan.trajectory), plan.trajectory
     eased = motion.curve is not None and plan.options.jerk_time > 0.0
     drawn = (*QUANTITIES, _jerk()) if eased else QUANTITIES
@@ -176,7 +176,7 @@ def _draw(
     moments: Floats,
     values: Floats,
 ) -> None:
-    """Draw a quantity of some coordinates, and their limits."""
+    """Draw a quantity of a group of coordinates, with its limits."""
     names = plan.trajectory.names
     place.set_visible(bool(np.isfinite(values[:, columns]).any()))
     for k, column in enumerate(columns):
@@ -199,7 +199,7 @@ def _draw(
 
 
 def name_phases(axes: Axes, plan: CheckedMotion) -> None:
-    """Write the phases' names above, as far as they have room; on two levels, so that neighbours do not meet."""
+    """Write the names of phases above the axes, alternating between two levels."""
     times = plan.trajectory.times
     for k, phase in enumerate(plan.trajectory.phases):
         middle = (times[phase.first] + times[phase.last]) / 2.0

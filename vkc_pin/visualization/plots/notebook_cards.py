@@ -1,4 +1,4 @@
-"""What a notebook shows of a scene or a plan that is a cell's value: a headline, a small table, and a picture from above."""
+"""Renders scenes and plans as HTML for notebooks, with a table and a top view."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _SIDE, _DPI, _COLOURS = (
     72,
     96,
 )  # [inch] of the picture's longer side, its resolution, and its colours
-_LISTED = 6  # violations and notes that are shown; the report has them all
+_LISTED = 6  # violations and notes shown; the report has all of them
 _GOOD, _BAD = "#1a7f37", "#c62828"
 
 
 @card.register(Scene)
 def scene_html(scene: Scene) -> str:
-    """Return a scene's overview as HTML: what there is in it, and a picture from above."""
+    """Render a scene as HTML, with an overview and a top view."""
     objects = []
     for name, placed in scene.objects.items():
         joints = ", ".join(placed.object.coordinates.names)
@@ -52,7 +52,7 @@ def scene_html(scene: Scene) -> str:
 
 
 def motion_html(plan: CheckedMotion) -> str:
-    """Return what came out of planning as HTML, and the motion from above; it needs no screen, and nothing from elsewhere."""
+    """Render a plan as self-contained HTML, with its result and a top view of the motion."""
     m = plan.metrics
     good = plan.success
     status = "success" if good else f"FAILED, {plan.status}"
@@ -80,7 +80,7 @@ def motion_html(plan: CheckedMotion) -> str:
 
 
 def _table(rows: list[tuple[str, str]]) -> str:
-    """Return a table; the values are HTML."""
+    """Render a table whose values are HTML."""
     cell = "text-align: left; padding: 1px 10px 1px 0; background: none"
     body = "".join(
         f'<tr><td style="{cell}; white-space: nowrap">{escape(name)}</td><td style="{cell}">{value}</td></tr>'
@@ -90,13 +90,13 @@ def _table(rows: list[tuple[str, str]]) -> str:
 
 
 def _beside(text: str, picture: str) -> str:
-    """Return HTML of a text and, beside it where there is room, a picture."""
+    """Render a text and a picture side by side."""
     style = "display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start"
     return f'<div style="{style}"><div style="max-width: 34em">{text}</div>{picture}</div>'
 
 
 def _picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
-    """Return a picture from above; made without pyplot, so that nothing is kept open and no backend is chosen."""
+    """Render a top view without pyplot, so that no backend is selected and no figure stays open."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

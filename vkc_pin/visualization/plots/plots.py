@@ -1,6 +1,6 @@
-"""Plots of a plan with matplotlib: joints over time, clearance over time, and the motion from above.
+"""Plots joints and clearance over time, and the top view of a motion, with matplotlib.
 
-Figures are made without pyplot, so nothing depends on a screen or is kept open.
+Figures are made without pyplot: they need no screen, and none stays open.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ if TYPE_CHECKING:
 __all__ = ["PICTURES", "plot", "plot_clearance", "plot_joints", "plot_top_view"]
 
 PICTURES = (".png", ".svg", ".pdf")
-"""Ends of the names of files that get all in one figure."""
-_SHOWN = 0.30  # [m]: clearance above this is of no interest
+"""File name extensions of pictures."""
+_SHOWN = 0.30  # larger clearances are cut off [m]
 
 
 def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[str, Figure]:
     """Draw joint positions, velocities and accelerations, clearance, and a top view.
 
     Args:
-        plan: What to draw.
-        path: A folder (made if need be) that gets `joints.png`, `clearance.png` and `top_view.png`;
-            or a file ending with .png, .svg or .pdf that gets all in one figure; None writes
-            nothing. Files are written whole or not at all.
+        plan: Plan to draw.
+        path: Folder (created if necessary) for `joints.png`, `clearance.png` and `top_view.png`;
+            or a file ending with .png, .svg or .pdf for one figure with all plots. Default: no
+            file. Files are written atomically.
 
     Returns:
-        With a folder the figures by name, otherwise the one figure.
+        The figures by name if `path` is a folder, otherwise the figure.
 
     Raises:
-        InputError: Not a plan, or the folder's name is that of a file.
+        InputError: `plan` is not a plan, or `path` is a file of another type.
     """
     _check(plan)
     target = None if path is None else file_path(path, "path")
@@ -56,7 +56,7 @@ def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[s
         return save_figure(_combined(plan), target)
     if target.is_file():
         expected = f"a folder, or a name ending with {', '.join(PICTURES)}"
-        raise InputError("this is a file", field="path", file=target, expected=expected)
+        raise InputError("path is a file", field="path", file=target, expected=expected)
     figures = {
         "joints": plot_joints(plan),
         "clearance": plot_clearance(plan),
@@ -68,7 +68,7 @@ def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[s
 
 
 def plot_joints(plan: CheckedMotion) -> Figure:
-    """Return a figure of positions, velocities and accelerations over time, each against its limits; see `joints`."""
+    """Plot positions, velocities and accelerations over time with their limits; see `joints`."""
     _check(plan)
     with use_style():
         figure = new_figure(16.0, 2.5 * len(groups_of(plan.trajectory)) + 0.4)
@@ -77,7 +77,7 @@ def plot_joints(plan: CheckedMotion) -> Figure:
 
 
 def plot_clearance(plan: CheckedMotion) -> Figure:
-    """Return a figure of the smallest distances over time; the legend names the closest pairs."""
+    """Plot the smallest distances over time; the legend names the closest pairs."""
     _check(plan)
     with use_style():
         figure = new_figure(9.0, 4.2)
@@ -86,7 +86,7 @@ def plot_clearance(plan: CheckedMotion) -> Figure:
 
 
 def plot_top_view(plan: CheckedMotion) -> Figure:
-    """Return a figure of the motion from above: obstacles, objects, the base at several times, paths of base and tool."""
+    """Plot the top view: obstacles, objects, the base at several times, paths of base and tool."""
     _check(plan)
     x_min, x_max, y_min, y_max = plan.scene.arena
     with use_style():
@@ -100,7 +100,7 @@ def plot_top_view(plan: CheckedMotion) -> Figure:
 def _check(plan: CheckedMotion) -> None:
     if not isinstance(plan, CheckedMotion):
         raise InputError(
-            "this cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__
+            "cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__
         )
 
 
@@ -151,7 +151,7 @@ def _draw_clearance(figure: FigureBase, plan: CheckedMotion) -> None:
         color="0.35",
         linestyle=(0, (5, 3)),
         linewidth=0.9,
-        label=f"asked for: {1e3 * safe:.0f} mm",
+        label=f"required: {1e3 * safe:.0f} mm",
     )
     if lowest < 0.0:
         axes.axhspan(1e3 * lowest * 1.1, 0.0, color="#d1495b", alpha=0.12, linewidth=0.0)

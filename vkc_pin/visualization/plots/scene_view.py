@@ -1,4 +1,4 @@
-"""A scene from above, with where hands come from and what stands in something else."""
+"""Plots a top view of a scene with approach directions of grasps and penetrating links."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
 __all__ = ["Approach", "plot_scene"]
 
 _ARROW = 0.35  # [m]
-_BESIDE = 0.4  # [m] between arrows that share a name
+_BESIDE = 0.4  # largest distance between arrows that share a label [m]
 
 
 class Approach(NamedTuple):
-    """How a hand comes to something.
+    """An approach of the hand to an attachment.
 
     Attributes:
-        name: Of what it takes hold of.
-        at: Where the tool then is, shape (3,) [m].
-        direction: In which it comes, shape (3,).
-        base: From where, x, y [m] and yaw [rad], shape (3,); None: it does not get there.
+        name: Name of the attachment, "<object>.<attachment>".
+        at: Position of the tool at the grasp, shape (3,) [m].
+        direction: Direction of the approach, shape (3,).
+        base: Base pose x, y [m] and yaw [rad], shape (3,); None if the grasp is not reachable.
     """
 
     name: str
@@ -54,14 +54,13 @@ def plot_scene(
     """Draw a scene from above.
 
     Args:
-        scene: The scene.
-        approaches: Arrows to draw, in blue if the hand gets there, with a dot where the base
-            stands, otherwise in red.
+        scene: Scene to draw.
+        approaches: Arrows to draw: blue with a dot at the base if reachable, otherwise red.
         stuck: Labels of links and obstacles to outline in red.
-        path: Where to write the picture, a name that ends with .png, .svg or .pdf; None: nowhere.
+        path: Picture to write, ending with .png, .svg or .pdf. Default: no file.
 
     Raises:
-        InputError: The name's end is none of a picture.
+        InputError: `path` has another extension.
     """
     from matplotlib.patches import Polygon
 

@@ -1,4 +1,4 @@
-"""How all figures look: their style, their colours, phases as bands, and how they are made and written without pyplot."""
+"""Defines the common style of figures, and creates and saves them without pyplot."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["COLOURS", "STYLE", "new_figure", "save_figure", "shade_phases", "use_style"]
 
 COLOURS = ("#2f6db5", "#d1495b", "#2a9d6f", "#e08e1b", "#7a5195", "#5b6770", "#1b9aaa", "#a44a3f")
-"""Of lines and bars, in this order."""
+"""Colours of lines and bars, in this order."""
 STYLE: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -27,11 +27,11 @@ STYLE: Any = {
     "font.size": 9,
     "legend.frameon": False,
 }
-"""matplotlib's parameters for all figures."""
+"""matplotlib parameters of all figures."""
 
 
 def use_style() -> Any:
-    """Return a context in which figures have this style; in a notebook they are shown from then on."""
+    """Return a context that applies the style; in a notebook, figures are displayed afterwards."""
     import matplotlib
 
     if in_notebook():
@@ -40,14 +40,14 @@ def use_style() -> Any:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of this size [inch]."""
+    """Create an empty figure of the given size [inch]."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def save_figure(figure: Figure, path: str | Path | None) -> Figure:
-    """Write a figure whole or not at all, in the format that the name's end says; None: nowhere. Returns the figure."""
+    """Save a figure atomically in the format of the extension (None: not at all) and return it."""
     if path is not None:
         buffer = io.BytesIO()
         figure.savefig(buffer, format=Path(path).suffix.lower()[1:], dpi=130, facecolor="white")

@@ -1,4 +1,4 @@
-"""The motion from above: what stands where, and how the base, the tool and the objects move."""
+"""Draws a top view of a scene with the motion of base, tool and objects."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_top_view", "outline"]
 
-_STEP = 0.55  # [m] between two drawn footprints
-_ROBOT_HEIGHT = 1.8  # [m]: what hangs higher is drawn dashed
+_STEP = 0.55  # travel between two drawn footprints [m]
+_ROBOT_HEIGHT = 1.8  # obstacles above this height are drawn dashed [m]
 _START, _END, _TOOL, _BASE = "#3a6bc4", "#1a9961", "#e03359", "#2b5f9e"
 
 
 def draw_top_view(
     figure: FigureBase, world: World, trajectory: Trajectory | None, *, columns: int = 4
 ) -> None:
-    """Draw a motion from above into an empty figure, from the collision geometry.
+    """Draw a top view of the collision geometry into an empty figure.
 
     Args:
-        figure: Where to draw.
-        world: The scene.
-        trajectory: The motion; None: robot and objects as they are at the scene's start.
-        columns: Of the legend.
+        figure: Figure to draw into.
+        world: World of the scene.
+        trajectory: Motion; None draws the scene's start.
+        columns: Number of columns of the legend.
     """
     from matplotlib.patches import Polygon
 
@@ -60,7 +60,7 @@ def draw_top_view(
 
 
 def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> None:
-    """Draw what moves, at several times, and the paths of base and tool."""
+    """Draw moving bodies at several times, and the paths of base and tool."""
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.patches import Polygon
 
@@ -134,7 +134,7 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
 
 
 def _moments(trajectory: Trajectory) -> Floats:
-    """Return times at which the base has moved by another step, and times between where it stands and only the arm moves."""
+    """Choose times at equal steps of the travel of base and objects."""
     fine = np.linspace(trajectory.times[0], trajectory.times[-1], 400)
     rows = trajectory.at(fine)
     objects = np.abs(np.diff(rows[:, trajectory.robot_size :], axis=0)).sum(axis=1)
@@ -153,7 +153,7 @@ def _moments(trajectory: Trajectory) -> Floats:
 
 
 def _corners(world: World, index: int, joint: Floats, known: dict[int, Floats]) -> Floats:
-    """Return a collision shape's vertices, shape (n, 3) [m], with its joint at `joint`, shape (4, 4); `known` keeps its own."""
+    """Return a shape's vertices, shape (n, 3) [m], for joint placement (4, 4); `known` is a cache."""
     shape = world.shapes[index]
     if index not in known:
         known[index] = triangulate(shape.geometry)[0]
@@ -162,7 +162,7 @@ def _corners(world: World, index: int, joint: Floats, known: dict[int, Floats]) 
 
 
 def outline(points: Floats) -> Floats:
-    """Return the corners, shape (k, 2), of the convex hull of points' x and y; `points` has shape (n, ≥ 2)."""
+    """Compute the convex hull, shape (k, 2), of the x and y of points, shape (n, ≥ 2)."""
     from scipy.spatial import ConvexHull, QhullError
 
     flat = np.unique(np.round(points[:, :2], 6), axis=0)

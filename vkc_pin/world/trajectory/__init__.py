@@ -1,1 +1,1 @@
-"""Motions over time, the scene along them, and both as files."""
+"""Represents motions over time, the world along them, and their file formats."""

@@ -1,4 +1,4 @@
-"""Curve: where a motion is at every moment, smooth: cubics in time through knots."""
+"""Represents smooth motions as cubic Hermite splines in time."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from vkc_pin.utils.arrays import Floats, Ints
 __all__ = ["MIN_INTERVAL", "Curve", "concatenate_curves", "sample_evenly", "sample_intervals"]
 
 MIN_INTERVAL = 1e-9
-"""Least time from knot to knot [s]."""
-_OFF = 1e-9  # [m] or [rad] beside a waypoint
-_LARGEST = 1e12  # [m] or [rad] of a coordinate, and of its rate [m/s], [rad/s]
+"""Shortest time between knots [s]."""
+_OFF = 1e-9  # accepted distance of the curve from a waypoint [m] or [rad]
+_LARGEST = 1e12  # largest position [m], [rad] and velocity [m/s], [rad/s]
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Cubics in time between knots, with the same velocity on both sides of each (cubic Hermite splines).
+    """A cubic Hermite spline in time.
 
-    Controllers that are given positions and velocities go along the same curve (`ros2_control`'s
-    joint trajectory controller, "cubic").
+    Controllers that receive positions and velocities interpolate the same curve, e.g. the joint
+    trajectory controller of `ros2_control` ("cubic").
 
     Attributes:
-        times: Of the knots, shape (K,), increasing [s].
-        positions: Shape (K, n), [m] and [rad].
-        rates: Velocities, shape (K, n), [m/s] and [rad/s].
+        times: Increasing times of the knots, shape (K,) [s].
+        positions: Positions at the knots, shape (K, n), [m] and [rad].
+        rates: Velocities at the knots, shape (K, n), [m/s] and [rad/s].
 
     Raises:
-        InputError: Numbers that are not finite or beyond all measure, shapes that do not fit, or
-            times that do not increase.
+        InputError: Numbers are not finite or out of range, shapes do not match, or times do not
+            increase.
     """
 
     times: Floats
@@ -69,15 +69,15 @@ class Curve:
             object.__setattr__(self, name, array)
 
     def at(self, time: ArrayLike) -> Floats:
-        """Return the positions, shape (..., n), at times [s], shape (...,); outside the curve, its first or last."""
+        """Return positions, shape (..., n), at times [s], shape (...,), clamped to the curve's span."""
         return self._cubic(time, 0)
 
     def velocity(self, time: ArrayLike) -> Floats:
-        """Return the velocities, shape (..., n), at times [s], shape (...,); outside the curve 0, as all stands still there."""
+        """Return velocities, shape (..., n), at times [s], shape (...,); 0 outside the curve."""
         return self._cubic(time, 1)
 
     def acceleration(self, time: ArrayLike) -> Floats:
-        """Return the accelerations, shape (..., n), at times [s], shape (...,); at a knot, that of the cubic after it."""
+        """Return accelerations, shape (..., n), at times [s], shape (...,); knots use the next cubic."""
         return self._cubic(time, 2)
 
     def _cubic(self, time: ArrayLike, derivative: int) -> Floats:
@@ -105,13 +105,13 @@ class Curve:
         )
 
     def _control(self, k: Ints) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the control points of the cubics with these numbers: each lies in their convex hull."""
+        """Return the Bézier control points of cubics; each cubic lies in their convex hull."""
         third = (np.diff(self.times)[k] / 3.0)[..., None]
         before, after = self.positions[k], self.positions[k + 1]
         return before, before + third * self.rates[k], after - third * self.rates[k + 1], after
 
     def compute_extrema(self) -> tuple[Floats, Floats]:
-        """Return the exact least and largest position on each cubic, shape (K − 1, n) each."""
+        """Compute the exact smallest and largest positions on each cubic, shape (K − 1, n) each."""
         p, c, d, q = self._control(np.arange(len(self.times) - 1))
         first, middle, last = c - p, d - c, q - d
         bend, sides = first - 2.0 * middle + last, [p, q]
@@ -134,7 +134,7 @@ class Curve:
         return np.asarray(np.min(sides, axis=0)), np.asarray(np.max(sides, axis=0))
 
     def compute_max_rates(self) -> tuple[Floats, Floats]:
-        """Return the exact largest |velocity| and |acceleration| on each cubic, shape (K − 1, n) each."""
+        """Compute the exact largest |velocity| and |acceleration| per cubic, shape (K − 1, n) each."""
         h = np.diff(self.times)[:, None]
         p, c, d, q = self._control(np.arange(len(h)))
         first, middle, last = (3.0 / h * part for part in (c - p, d - c, q - d))
@@ -151,9 +151,9 @@ class Curve:
         return np.asarray(fastest), np.asarray(strongest)
 
     def compute_jerks(self) -> tuple[Floats, Floats]:
-        """Return the |jerk| of each cubic, shape (K − 1, n), and by how much accelerations jump at each knot, shape (K, n).
+        """Compute |jerk| of each cubic, shape (K − 1, n), and acceleration jumps at knots, (K, n).
 
-        Before the first and after the last one, all stands still.
+        Before the first and after the last knot the motion is at rest.
         """
         h = np.diff(self.times)[:, None]
         p, c, d, q = self._control(np.arange(len(h)))
@@ -163,7 +163,7 @@ class Curve:
         return np.abs(end - begin) / h, np.abs(jumps)
 
     def part(self, begin: float, end: float, columns: Sequence[int] | slice = slice(None)) -> Curve:
-        """Return what lies between two of the knots' times [s], of some columns."""
+        """Return the part between the times of two knots [s], restricted to columns."""
         rows = slice(
             int(np.searchsorted(self.times, begin)),
             int(np.searchsorted(self.times, end, side="right")),
@@ -173,15 +173,14 @@ class Curve:
         )
 
     def check_through(self, times: Floats, positions: Floats) -> None:
-        """Check that it leads from the first of some waypoints through all others to the last.
+        """Check that the curve leads from the first waypoint through all others to the last.
 
         Args:
-            times: Of the waypoints, shape (T,) [s].
-            positions: Shape (T, n).
+            times: Times of the waypoints, shape (T,) [s].
+            positions: Positions of the waypoints, shape (T, n).
 
         Raises:
-            InputError: It does not; every waypoint must be one of the knots, in time to the last
-                bit.
+            InputError: A waypoint is not one of the knots. Times must be equal to the last bit.
         """
         if self.positions.shape[1] != positions.shape[1]:
             expected, got = positions.shape[1], self.positions.shape[1]
@@ -206,11 +205,11 @@ class Curve:
             )
 
     def shift_time(self, time: float) -> Curve:
-        """Return the same, later by some time [s]."""
+        """Return the curve delayed by `time` [s]."""
         return Curve(self.times + time, self.positions, self.rates)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data of it."""
+        """Return the curve as plain data."""
         return {
             "times": self.times.tolist(),
             "positions": self.positions.tolist(),
@@ -219,31 +218,31 @@ class Curve:
 
 
 def _bernstein(s: Floats, p: Floats, c: Floats, d: Floats, q: Floats) -> Floats:
-    """Return where cubics with these control points are at a share of their time."""
+    """Evaluate cubics with these control points at the fraction `s` of their durations."""
     r = 1.0 - s
     return np.asarray(r**3 * p + 3.0 * s * r**2 * c + 3.0 * s**2 * r * d + s**3 * q)
 
 
 def sample_evenly(times: Floats, rate: float) -> Floats:
-    """Return so many moments a second between the first and the last of some times [s], and the last."""
+    """Return times at a rate [Hz] from the first to the last of `times` [s], and the last time."""
     duration = times[-1] - times[0]
     return np.append(times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, times[-1])
 
 
 def sample_intervals(knots: Floats, shares: Floats, *, last: bool = False) -> Floats:
-    """Return moments at some shares of every span between knots, shape (k,), one span after the other, and the last knot.
+    """Return times at fractions of every interval between knots, in order.
 
     Args:
-        knots: Shape (K,).
-        shares: From 0 to 1.
-        last: Whether the last knot comes after them.
+        knots: Times of the knots, shape (K,) [s].
+        shares: Fractions from 0 to 1, shape (k,).
+        last: Whether to append the last knot.
     """
     inside = (knots[:-1, None] + np.diff(knots)[:, None] * shares).ravel()
     return np.append(inside, knots[-1]) if last else inside
 
 
 def concatenate_curves(pieces: Sequence[Curve]) -> Curve:
-    """Return curves as one, the first where it is in time; each begins where, and as fast as, the one before it ends."""
+    """Concatenate curves; each begins at the position and velocity where its predecessor ends."""
     times, first = [pieces[0].times], pieces[0]
     for piece in pieces[1:]:
         times.append(times[-1][-1] + piece.times[1:] - piece.times[0])

@@ -1,4 +1,4 @@
-"""Where free objects are along a motion: with what holds them, with what they stand on, or where they were left."""
+"""Computes the placements of free objects along a motion from grasps and supports."""
 
 from __future__ import annotations
 
@@ -23,15 +23,18 @@ _STILL = 1e-12
 
 
 class FreeObjects:
-    """The free objects of a scene along a motion, every one of which moves rigidly with whatever carries it.
+    """The free objects of a scene along a motion.
 
-    What is held moves with what holds it, from where it was when that took hold. What stands on a
-    link that moves, or that is held, rides on it (see `world.scene.support`). Everything else stays
-    where it is.
+    A grasped object moves rigidly with its holder, from its placement when it was grasped. An
+    object on a moving or grasped link moves rigidly with that support (see `world.scene.support`).
+    All others keep their placements.
+
+    Attributes:
+        names: Names of the free objects.
 
     Args:
-        scene: The scene at the start.
-        trajectory: A motion in it.
+        scene: Scene at the start.
+        trajectory: Motion in the scene.
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
@@ -39,10 +42,13 @@ class FreeObjects:
         self.names = [name for name, placed in scene.objects.items() if placed.object.free]
 
     def at(self, times: Floats) -> dict[str, Floats]:
-        """Return name → coordinates of the placement in the world at some times [s], shape (K,), in order: shape (K, 7).
+        """Compute name → placements as free-joint positions, shape (K, 7), at increasing times.
 
-        Of the two quaternions of one orientation it is the nearer to the one before, so that rows
-        can be interpolated.
+        Of the two quaternions of an orientation, the one nearer to its predecessor is chosen, so
+        that rows can be interpolated.
+
+        Args:
+            times: Increasing times, shape (K,) [s].
         """
         trajectory, rows = self.trajectory, {name: np.empty((len(times), 7)) for name in self.names}
         for number, phase in enumerate(trajectory.phases):
@@ -74,12 +80,12 @@ class FreeObjects:
 
     @cached_property
     def supports(self) -> list[dict[str, str]]:
-        """For every phase, free object → "<object>.<link>" of what rides in it."""
+        """For every phase, supported free object → supporting link, "<object>.<link>"."""
         return [rides for _, rides in self._begins]
 
     @cached_property
     def _begins(self) -> list[tuple[dict[str, pin.SE3], dict[str, str]]]:
-        """Where free objects are when each phase begins, and what of them rides in it; see `rides`."""
+        """Placements of free objects when each phase begins, and the supports in it."""
         where, found = {name: self.scene.objects[name].placement for name in self.names}, []
         for phase in self.trajectory.phases:
             rides = self._rides(phase, where) if where else {}
@@ -99,7 +105,7 @@ class FreeObjects:
         where: Mapping[str, pin.SE3],
         rides: Mapping[str, str],
     ) -> dict[str, list[pin.SE3]]:
-        """Return the placements of what moves in a phase at times, the first of which is its begin, where they are `where`."""
+        """Compute placements of moving objects at times, from their placements at the phase's begin."""
         held = self._held(phase, times, where)
         return {**held, **self._riding(rides, times, where, held)}
 
@@ -175,7 +181,7 @@ class FreeObjects:
         return found
 
     def _rides(self, phase: PhaseSpan, where: Mapping[str, pin.SE3]) -> dict[str, str]:
-        """Return free object → "<object>.<link>" of what rides in a phase, before which free objects are at `where`."""
+        """Find free object → supporting link of a phase, from placements at its begin."""
         names, (low, high) = self.trajectory.names, self._ranges
         spreads = high[phase.first : phase.last].max(axis=0) - low[phase.first : phase.last].min(
             axis=0
@@ -208,5 +214,5 @@ class FreeObjects:
 
 
 def to_free_joint_positions(placement: pin.SE3) -> Floats:
-    """Return a placement as a free joint's seven coordinates."""
+    """Convert a placement to the seven positions of a free joint (translation, quaternion)."""
     return np.asarray(pin.SE3ToXYZQUAT(placement), float)

@@ -1,4 +1,4 @@
-"""What moves in a picture: placements over time, paths, and where they lie."""
+"""Samples the placements of all joints and the paths of base and tool along a motion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Motion", "key_times", "sample_motion"]
 
-# [rad] or [m] between two key frames at most: beyond π a rotation would take the shorter way round
+# Largest step between key frames [rad], [m]; beyond π an interpolated rotation would reverse.
 _TURN = 1.0
 
 
@@ -40,9 +40,9 @@ class Motion:
     moving: Bools
 
     def away(self, joints: Bools, row: int) -> Bools:
-        """Return at which times one of some joints is far from where it is at `row`, shape (K,).
+        """Return the times, shape (K,), at which a joint is far from its placement at `row`.
 
-        Far is 0.15 m, a rotation counted as what it moves at half a metre.
+        Far means 0.15 m, where rotations count with a lever arm of 0.5 m.
         """
         difference = np.abs(self.world[:, joints] - self.world[row, joints])
         turned, shifted = difference[..., :3, :3], difference[..., :3, 3]
@@ -52,14 +52,13 @@ class Motion:
 
 
 def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None) -> Floats:
-    """Return the waypoints' times and as many in between that no joint moves by more than 1 rad or m, shape (K,) [s].
+    """Return waypoint times and intermediate times at most 1 rad or m apart, shape (K,) [s].
 
-    Between these a viewer's own interpolation of positions and quaternions, joint by joint, is
-    exact.
+    Between these times a viewer's interpolation of joint positions and quaternions is exact.
 
     Args:
-        trajectory: The motion.
-        strides: Coordinate → by how much it changes then; 1 otherwise.
+        trajectory: Motion.
+        strides: Coordinate → largest step. Default: 1.
     """
     most = [(strides or {}).get(name, _TURN) for name in trajectory.names]
     steps = np.abs(np.diff(trajectory.positions, axis=0) / most).max(axis=1)
@@ -73,7 +72,7 @@ def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None
 def sample_motion(
     world: World, trajectory: Trajectory | None, times: Floats | None = None
 ) -> Motion:
-    """Return the world's motion at `times` [s], shape (K,), or at `key_times`; without a trajectory, its start."""
+    """Sample the world's motion at `times`, (K,) [s], or at key times; without a motion, its start."""
     if trajectory is None:
         times, rows = np.zeros(1), world.start[None]
     else:

@@ -1,4 +1,4 @@
-"""Motions put together, and parts of them taken out."""
+"""Concatenates motions and extracts parts of them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ __all__ = ["concatenate_trajectories", "extract_phases", "fill_missing_values"]
 
 
 def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
-    """Return motions one after the other as one.
+    """Concatenate motions.
 
     Args:
-        parts: Each begins where the one before it ends. A coordinate that a part does not have
-            keeps its value there.
-        pause: How long the robot waits between two parts where the hand closes or opens [s].
+        parts: Motions, each of which begins where its predecessor ends. Coordinates that a part
+            lacks are constant in it.
+        pause: Rest between two parts where the gripper closes or opens [s].
 
     Raises:
-        InputError: There is none, or one does not begin where the one before it ends.
+        InputError: There is no motion, or one does not begin where its predecessor ends.
     """
     if not parts:
         raise InputError(
@@ -68,7 +68,7 @@ def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Tr
 
 
 class _Rows:
-    """Rows of several motions, one after the other."""
+    """Accumulates rows of several motions."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)
@@ -87,7 +87,7 @@ class _Rows:
         rest: float,
         rates: Floats | None = None,
     ) -> None:
-        """Add rows of some coordinates, after a rest [s]; the first row is the last that there is, unless there is a rest."""
+        """Append rows after a rest [s]; without a rest, the first row repeats the last one."""
         columns, begin = (
             [self.names.index(name) for name in names],
             0.0 if not self.times else self.times[-1] + rest,
@@ -105,7 +105,7 @@ class _Rows:
         self.times += moments[skipped:].tolist()
 
     def last(self, names: Sequence[str]) -> Floats:
-        """Return the last values of some coordinates."""
+        """Return the last values of coordinates."""
         return np.asarray(self.rows[-1][[self.names.index(name) for name in names]])
 
     def at(self) -> Floats:
@@ -119,16 +119,16 @@ class _Rows:
 
 
 def _curve_of(part: Trajectory) -> Curve | None:
-    """Return a motion's curve, also of one that stands still; None: it has none."""
+    """Return a motion's curve, a constant one for a motion at rest, or None."""
     if part.curve is None and not np.ptp(part.positions, axis=0).any():
         return Curve(part.times, part.positions, np.zeros_like(part.positions))
     return part.curve
 
 
 def fill_missing_values(table: Floats) -> Floats:
-    """Return waypoints, shape (T, n), with what is not known (NaN) as it was last, or else as it will be next.
+    """Replace NaN in waypoints, shape (T, n), by the last known value, or else the next one.
 
-    A coordinate that is known nowhere stays so.
+    Coordinates without any known value keep NaN.
     """
     table = table.copy()
     for column in table.T:
@@ -145,13 +145,13 @@ def fill_missing_values(table: Floats) -> Floats:
 def extract_phases(
     trajectory: Trajectory, names: Sequence[str], begin: int, end: int | None
 ) -> Trajectory:
-    """Return a part of a motion, of some of its coordinates.
+    """Extract phases and coordinates of a motion.
 
     Args:
-        trajectory: The motion.
-        names: Of the coordinates, in the order wanted.
-        begin: The part's first phase.
-        end: The phase before which it ends; None: with the motion.
+        trajectory: Motion.
+        names: Names of the coordinates, in the wanted order.
+        begin: First phase.
+        end: Phase after the last one. Default: the end of the motion.
     """
     phases = trajectory.phases[begin:end]
     first, last = phases[0].first, phases[-1].last

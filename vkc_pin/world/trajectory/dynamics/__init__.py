@@ -1,1 +1,1 @@
-"""Forces and torques of a motion: what the motors of the arm have to do, and what is in the hand."""
+"""Computes motor torques of the arm and contact wrenches of the hand along a motion."""

@@ -1,4 +1,4 @@
-"""What a hand exerts on an object that stands fixed, to move its joints."""
+"""Computes the wrenches that a hand exerts on a fixed object to move its joints."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["Handle", "Riders"]
 
 Riders = Sequence[tuple[int, pin.Inertia]]
 """What rides on an object: the joint of its model that carries it, and its inertia in the frame of that."""
-_GRIP = 0.1  # [m] about the size of a hand: it turns what it holds by forces so far apart
-_SINGULAR = 1e-9  # of a joint that the hand cannot move, relative
-# [m/s] or [rad/s]: of a joint that rests, and [m] or [rad]: of one that is where it is held
+_GRIP = 0.1  # lever arm of a hand, for the weighting of torques [m]
+_SINGULAR = 1e-9  # relative cutoff for joints that the hand cannot move
+# Velocity of a joint at rest [m/s], [rad/s], and distance from its latch or stop [m], [rad].
 _STILL = 1e-6
 
 
 class Motion(NamedTuple):
-    """Coordinates of a motion at K moments: name → positions, velocities, accelerations, shape (K,) each."""
+    """A motion at K times: coordinate → positions, velocities, accelerations, shape (K,) each."""
 
     positions: Mapping[str, Floats]
     velocities: Mapping[str, Floats]
@@ -32,12 +32,12 @@ class Motion(NamedTuple):
 
 
 class Handle:
-    """The hand at an attachment of an object that stands fixed.
+    """A hand at an attachment of a fixed object.
 
     Args:
-        scene: Where that is.
-        hold: The hold.
-        riders: What stands on the object.
+        scene: Scene of the object.
+        hold: Grasp of the object.
+        riders: Supported loads on the object.
     """
 
     def __init__(self, scene: Scene, hold: Hold, riders: Riders = ()) -> None:
@@ -57,7 +57,7 @@ class Handle:
         self._moved = [k for k, joint in enumerate(thing.coordinates.joints) if joint in path]
 
     def wrenches(self, motion: Motion) -> Floats:
-        """Return the force and torque that the hand exerts at `point`, in the world's axes, shape (K, 6) [N], [N·m]."""
+        """Compute the hand's wrenches at `point` in world axes, shape (K, 6) [N], [N·m]."""
         thing, turn = self.placed.object, self.placed.placement.rotation
         forces, z = (
             self.forces(motion)[:, self._moved],
@@ -92,14 +92,17 @@ class Handle:
         return np.asarray((basis @ shares)[..., 0] @ np.kron(np.eye(2), turn).T)
 
     def _grasp(self, turns: Floats, origins: Floats, values: Floats) -> tuple[Floats, Floats]:
-        """Return where the hand is, shape (K, 3), and how it can move there in a grasp that does not clamp, shape (K, f or 0, 6).
+        """Compute positions of the hand and the free directions of its grasp, in the object's axes.
 
-        It exerts nothing in the ways that it can move. All is in the object's axes.
+        The hand exerts no force in a free direction. Firm grasps and pushes have none.
 
         Args:
-            turns: Of the link that it holds, shape (K, 3, 3).
-            origins: Of the same, shape (K, 3).
-            values: Of the grasp's freedoms, shape (K, f).
+            turns: Rotations of the grasped link, shape (K, 3, 3).
+            origins: Origins of the grasped link, shape (K, 3).
+            values: Values of the grasp's freedoms, shape (K, f).
+
+        Returns:
+            Positions, shape (K, 3), and directions, shape (K, f or 0, 6).
         """
         at, axes = self.attachment, list[tuple[Floats, Floats | None]]()
         rotation, origin = turns @ at.placement.rotation, origins + turns @ at.placement.translation
@@ -123,7 +126,7 @@ class Handle:
         return points, ways
 
     def forces(self, motion: Motion) -> Floats:
-        """Return what must be applied to the object's joints, shape (K, joints) [N], [N·m]; springs carry its own weight."""
+        """Compute the required joint forces, shape (K, joints) [N], [N·m]; springs carry the weight."""
         thing = self.placed.object
         z = self._rows(motion.positions, self.placed.state)
         v, a = (
@@ -148,7 +151,7 @@ class Handle:
         return found
 
     def _rows(self, part: Mapping[str, Floats], otherwise: Floats) -> Floats:
-        """Return the coordinates of the object, shape (K, joints)."""
+        """Collect the object's coordinates as columns, shape (K, joints)."""
         size = len(next(iter(part.values())))
         names = self.placed.object.coordinates.names
         columns = (
@@ -158,10 +161,10 @@ class Handle:
         return np.column_stack([np.zeros((size, 0)), *columns])
 
     def _bases(self, turns: Floats) -> Floats:
-        """Return the wrenches that count alike, shape (K, 6, r): forces, and torques by their lever; of a push that along it.
+        """Compute bases of equally weighted wrenches, shape (K, 6, r); for a push, its direction.
 
         Args:
-            turns: Of the link, shape (K, 3, 3).
+            turns: Rotations of the link, shape (K, 3, 3).
         """
         if self.attachment.contact == "push":
             return np.pad(turns @ self.attachment.placement.rotation[:, 2], ((0, 0), (0, 3)))[

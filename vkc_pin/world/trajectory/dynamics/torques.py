@@ -1,4 +1,4 @@
-"""The torques of an arm along a motion: its own weight and inertia, what it carries, and what it pulls and pushes."""
+"""Computes the arm's joint torques along a motion, with carried objects and contact wrenches."""
 
 from __future__ import annotations
 
@@ -27,12 +27,11 @@ _SHARES = np.array(
 
 @dataclass(frozen=True, eq=False)
 class MotionSamples:
-    """A motion at K moments.
+    """A motion at K times.
 
     Attributes:
         times: Shape (K,) [s].
-        pieces: Which cubic of the curve each belongs to, shape (K,); without a curve, which
-            segment.
+        pieces: Cubic of the curve at each time, shape (K,); without a curve, the segment.
         positions, velocities, accelerations: Shape (K, n) each.
     """
 
@@ -44,7 +43,7 @@ class MotionSamples:
 
 
 def sample_curve(curve: Curve) -> MotionSamples:
-    """Return the ends and the middle of every cubic of a curve, with its own accelerations at its ends."""
+    """Sample every cubic of a curve at its ends and middle, with its own accelerations there."""
     spans, count = np.diff(curve.times), len(curve.times) - 1
     times = sample_intervals(curve.times, _SHARES)
     begin, middle = (
@@ -63,24 +62,24 @@ def sample_curve(curve: Curve) -> MotionSamples:
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """What the arm has to do with in a phase: the robot with what it carries, and what it moves."""
+    """The robot model of a phase with its carried objects, and the handles that the arm moves."""
 
     model: pin.Model
     handles: tuple[Handle, ...]
 
 
 class Torques:
-    """The torques of an arm in the phases of a motion, by recursive Newton-Euler on the robot's model.
+    """The joint torques of an arm, by recursive Newton-Euler on the robot's model.
 
-    What is in the hand, and what rides on that, is part of the hand. Where the hand moves joints of
-    what stands fixed, it exerts the least wrench that does so; see `Handle`. Friction and rotors of
-    the arm's own joints are left out, as descriptions hardly know them, and where a grasp leaves
-    freedoms to what is carried, it is where it is in the middle of the phase.
+    Grasped objects, and objects that rest on them, are part of the hand. To move joints of a fixed
+    object, the hand exerts the smallest sufficient wrench; see `Handle`. Friction and rotor
+    inertias of the arm's joints are neglected, since robot descriptions rarely give them. An object
+    in a grasp with freedoms is placed as in the middle of the phase.
 
     Args:
-        scene: Robot and objects.
-        trajectory: A motion; of its times nothing matters but that its phases follow each other.
-        free: Its free objects, if somebody has them already.
+        scene: Scene with robot and objects.
+        trajectory: Motion. Only the order of its phases matters, not their times.
+        free: Free objects along the motion, if they exist already.
     """
 
     def __init__(
@@ -94,13 +93,16 @@ class Torques:
     def at(
         self, phases: Ints, positions: Floats, velocities: Floats, accelerations: Floats
     ) -> Floats:
-        """Return the torques of the robot's coordinates, shape (K, robot's) [N·m], [N]; those of the base are 0.
+        """Compute torques of the robot's coordinates; those of the base are 0.
 
         Args:
-            phases: In which phase of the motion each moment is, shape (K,).
-            positions: Of the motion's coordinates, shape (K, n).
-            velocities: Shape (K, n).
-            accelerations: Shape (K, n).
+            phases: Phase of each state, shape (K,).
+            positions: Positions of the motion's coordinates, shape (K, n) [m], [rad].
+            velocities: Shape (K, n) [m/s], [rad/s].
+            accelerations: Shape (K, n) [m/s²], [rad/s²].
+
+        Returns:
+            Torques, shape (K, robot coordinates) [N·m], [N].
         """
         found = np.zeros((len(positions), self.trajectory.robot_size))
         for number in np.unique(phases).tolist():
@@ -111,7 +113,7 @@ class Torques:
         return found
 
     def along(self, times: Floats) -> Floats:
-        """Return the torques of the robot's coordinates at times [s], shape (K,), within the motion: shape (K, robot's)."""
+        """Compute torques of the robot's coordinates at times [s], shape (K,), within the motion."""
         trajectory = self.trajectory
         steps = np.clip(
             np.searchsorted(trajectory.times, times, side="right") - 1, 0, len(trajectory.times) - 2
@@ -122,14 +124,14 @@ class Torques:
         return self.at(self.phases_of(steps), *motion)
 
     def phases_of(self, waypoints: Ints) -> Ints:
-        """Return the phases of the steps after some waypoints."""
+        """Return the phases of the segments after waypoints."""
         return np.searchsorted(
             [phase.last for phase in self.trajectory.phases[:-1]], waypoints, side="right"
         )
 
     @cached_property
     def massless_objects(self) -> tuple[str, ...]:
-        """What is carried in some phase though nobody says what it weighs."""
+        """Carried objects without mass data."""
         phases = zip(self.trajectory.phases, self._free.supports, strict=True)
         carried = dict.fromkeys(name for phase, rides in phases for name in (*phase.held, *rides))
         things = {name: self.scene.objects[name].object for name in carried}
@@ -168,7 +170,7 @@ class Torques:
         return found
 
     def _load(self, number: int) -> _Load:
-        """Return what the arm has to do with in a phase."""
+        """Return the load of a phase."""
         if number not in self._loads:
             phase, objects = self.trajectory.phases[number], self.scene.objects
             fixed = [hold for hold in phase.holds if not objects[hold.object].object.free]
@@ -185,7 +187,7 @@ class Torques:
     def _carry(
         self, number: int, model: pin.Model, riders: dict[str, list[tuple[int, pin.Inertia]]]
     ) -> None:
-        """Add what is carried in a phase to the hand, and what rides on objects that stand fixed to those."""
+        """Add the inertias of carried objects to the hand, and of supported ones to fixed objects."""
         phase, rides, objects = (
             self.trajectory.phases[number],
             self._free.supports[number],
@@ -222,7 +224,7 @@ class Torques:
 
 
 def _whole(thing: ArticulatedObject, state: Floats) -> pin.Inertia:
-    """Return the inertia of all links of an object in its base link's frame, its joints at `state`, shape (n,)."""
+    """Compute an object's total inertia at joint positions `state`, (n,), in the base link's frame."""
     data = thing.model.createData()
     pin.forwardKinematics(thing.model, data, thing.coordinates.q(state))
     return sum(
@@ -234,10 +236,10 @@ def _whole(thing: ArticulatedObject, state: Floats) -> pin.Inertia:
 def transform_to_base_axes(
     yaws: Floats, velocities: Floats, accelerations: Floats
 ) -> tuple[Floats, Floats]:
-    """Return velocities and accelerations of the base in the world, shape (K, n), as those of Pinocchio's planar joint.
+    """Transform world velocities and accelerations, shape (K, n), to Pinocchio's planar joint.
 
-    Its velocity is that in its own axes, which turn; its acceleration is the derivative of these
-    numbers.
+    The joint's velocity is expressed in the rotating base frame; its acceleration is the time
+    derivative of these components.
     """
     v, a = velocities.copy(), accelerations.copy()
     for rows in (v, a):

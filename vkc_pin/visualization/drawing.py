@@ -1,7 +1,7 @@
-"""Draws a scene and a motion in it with meshcat commands: what `visualization` shows and exports.
+"""Draws a scene and its motion with meshcat commands.
 
-Every joint is a node below its parent joint's node, so that the viewer's interpolation, joint by
-joint, follows the motion exactly, and only a few numbers per joint and key frame travel.
+Every joint is a node below its parent joint's node. The viewer's interpolation of joints then
+follows the motion exactly, from few numbers per joint and key frame.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ __all__ = ["Drawing"]
 _START, _END = (0.22, 0.42, 0.78), (0.10, 0.60, 0.38)  # of the ghosts
 _TOOL, _BASE = (0.88, 0.20, 0.35), (0.16, 0.42, 0.72)  # of the paths
 _ALARM = (0.90, 0.05, 0.05)
-_ALARM_TIME = 0.4  # [s] that an offending link stays red before and after
+_ALARM_TIME = 0.4  # duration for which colliding links are red before and after [s]
 _GHOST_DETAIL = 0.007  # [m]
 _AXES = {"x": (0.86, 0.13, 0.13), "y": (0.13, 0.60, 0.16), "z": (0.11, 0.27, 0.90)}  # of frames
 _AXIS_LENGTH, _AXIS_RADIUS = 0.16, 0.007  # [m]
-_BESIDE = "beside"  # where the other motion is in the tree
+_BESIDE = "beside"  # path of the second motion in the tree
 _meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """What to draw: its path in the viewer's tree, joint, placement in the joint's frame, shape, colour and label."""
+    """A drawn shape: path in the viewer's tree, joint, placement in its frame, mesh, colour, label."""
 
     path: str
     joint: int
@@ -70,12 +70,12 @@ class Drawing:
 
     Args:
         viewer: A meshcat viewer, or anything that takes its commands.
-        scene: What to draw, as it is at its start.
-        trajectory: The motion to animate; the start and the end appear as ghosts.
-        report: Links that it says come too close turn red at that time.
-        world: The tree that moves; None: along the trajectory.
-        times: Of the key frames, shape (K,) [s]; None: as many as it takes.
-        beside: Another motion at these times, to appear as a ghost.
+        scene: Scene to draw, at its start.
+        trajectory: Motion to animate. Its start and end appear as ghosts.
+        report: Validation report. Links in collision turn red at that time.
+        world: World of the scene. Default: built from the scene.
+        times: Times of the key frames, shape (K,) [s]. Default: as many as necessary.
+        beside: Second motion at these times, drawn as a ghost.
     """
 
     def __init__(
@@ -106,12 +106,11 @@ class Drawing:
         self.light: list[Solid | None] = []  # of what moves, for ghosts
 
     def draw(self, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None) -> None:
-        """Draw everything into the viewer, instead of what was there.
+        """Draw everything into the viewer, and replace its content.
 
         Args:
-            play: Start playing at once.
-            frames: Name → placement in the world of a frame to draw; it stays there, whatever
-                moves.
+            play: Whether to start playback at once.
+            frames: Name → placement in the world of static frames to draw.
         """
         self.viewer.delete()
         self._surroundings()
@@ -146,7 +145,7 @@ class Drawing:
         self.viewer.window.send(SetAnimation(self._animation(), play=play, repetitions=1))
 
     def viewpoint(self) -> tuple[Floats, Floats]:
-        """Return what the camera looks at, and where it is: the motion is in the picture, and objects that it could be about."""
+        """Choose target and position of the camera so that motion and objects are in the picture."""
         motion, around = (
             self.motion,
             np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)]),
@@ -168,7 +167,7 @@ class Drawing:
         return choose_viewpoint(cloud, boxes)
 
     def _nodes(self) -> list[str]:
-        """Return for every joint its path in the tree."""
+        """Return the path of every joint in the tree."""
         model, nodes = self.world.model, ["robot"]
         for j in range(1, model.njoints):
             owner, _, rest = str(model.names[j]).partition(".")
@@ -228,7 +227,7 @@ class Drawing:
         self.viewer.window.send(Unshadow(self.viewer[path].path))
 
     def _frames(self, frames: Mapping[str, pin.SE3], taken: set[str]) -> None:
-        """Draw axes, red, green and blue, in front of everything: frames of joints are inside of bodies."""
+        """Draw the axes of frames in front of everything, since they may lie inside of bodies."""
         for name, placement in frames.items():
             where = add_node(taken, "frames", name)
             for (axis, colour), end in zip(_AXES.items(), np.eye(3), strict=True):
@@ -264,7 +263,7 @@ class Drawing:
                 )
 
     def _ghosts(self, name: str, row: int, colour: tuple[float, float, float]) -> None:
-        """Draw what moves as it is at `row`, the robot and every object for itself."""
+        """Draw moving bodies at `row` as ghosts, one each for the robot and every object."""
         for owner, joints in self.movers.items():
             solids = [
                 light.moved(pin.SE3(self.motion.world[row, item.joint]) * item.placement)
@@ -277,7 +276,7 @@ class Drawing:
                 )
 
     def _other(self) -> None:
-        """Draw what moves once more, for the other motion."""
+        """Draw the ghosts of the second motion."""
         if self.beside is None:
             return
         for item, light in zip(self.items, self.light, strict=True):
@@ -291,7 +290,7 @@ class Drawing:
             )
 
     def _movers(self) -> dict[str, Bools]:
-        """Return the joints that move in the world, of the robot and of every object: name → shape (joints,)."""
+        """Return the masks of moving joints, shape (joints,), of the robot and of every object."""
         model, moves = self.world.model, self.motion.moving.copy()
         owners: dict[str, Bools] = {}
         for j in range(1, model.njoints):
@@ -304,7 +303,7 @@ class Drawing:
         return owners
 
     def _surroundings(self) -> None:
-        """Camera, lights, background; meshcat's own grid and axes give way to the room's floor."""
+        """Set up camera, lights and background, and hide meshcat's own grid and axes."""
         (target, position), place = self.viewpoint(), self.viewer
         # meshcat's camera turns about the origin of its world, so the drawing moves there, not the
         # camera.
@@ -329,7 +328,7 @@ class Drawing:
         place["/Background"].set_property("bottom_color", [0.99, 0.99, 0.99])
 
     def _animation(self) -> Animation:
-        """Return the motion with one key frame per time, in seconds, since the frame rate is 1."""
+        """Make the animation, with key frames in seconds, since the frame rate is 1."""
         movie = Animation(default_framerate=1)
         if self.trajectory is None:
             return movie
@@ -367,7 +366,7 @@ class Drawing:
         return movie
 
     def _alarm(self, item: Item, moments: list[float]) -> Track:
-        """Return a track that colours an item red around `moments` [s]."""
+        """Make a track that colours an item red around `moments` [s]."""
         first, last = self.motion.times[0], self.motion.times[-1]
         edges = (
             moment + d

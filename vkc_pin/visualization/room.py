@@ -1,4 +1,4 @@
-"""How obstacles are drawn: furniture as it is, walls so that one can look into the room from outside."""
+"""Prepares obstacles for drawing, with walls that are transparent from outside the room."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _THIN, _HIGH = (
     0.25,
     2.0,
 )  # [m]: an upright box at most this thick that reaches at least this high is a wall
-_BEYOND = 0.35  # [m]: a wall with more of the arena than this behind it divides a room
+_BEYOND = 0.35  # a wall with more of the arena behind it is a partition [m]
 _VEIL, _DIVIDER = 0.07, 0.32  # opacities
 _FLOOR_COLOUR = (0.90, 0.89, 0.87)
 _DETAIL = 1e-3  # [m] of meshes
@@ -29,11 +29,11 @@ _DETAIL = 1e-3  # [m] of meshes
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Something to draw that does not move: name, triangles in the world frame, colour, opacity and who sees it.
+    """A static mesh to draw: name, triangles in the world frame, colour and opacity.
 
     Attributes:
         shadow: Whether it casts a shadow.
-        one_sided: Whether it can be seen from its front only.
+        one_sided: Whether it is visible from its front only.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Room:
     """The obstacles of a scene and its floor.
 
     Attributes:
-        centre: Of the arena, at the floor, shape (3,) [m].
+        centre: Centre of the arena on the floor, shape (3,) [m].
         reach: Half of the arena's diagonal [m].
     """
 
@@ -64,7 +64,7 @@ class Room:
             (self._walls if is_wall(shape) else self._furniture).append(shape)
 
     def parts(self) -> list[Part]:
-        """Return what to draw."""
+        """Return the meshes to draw."""
         parts = []
         if self.scene.floor:
             x_min, x_max, y_min, y_max = self.scene.arena
@@ -83,7 +83,7 @@ class Room:
         return parts
 
     def lines(self) -> list[tuple[str, Floats, float]]:
-        """Return line segments, shape (2·k, 3) [m], with name and brightness: the floor's grid and the walls' edges."""
+        """Return name, segments, shape (2·k, 3) [m], and brightness of floor grid and wall edges."""
         drawn = []
         if self.scene.floor:
             x_min, x_max, y_min, y_max = self.scene.arena
@@ -100,7 +100,7 @@ class Room:
         return drawn
 
     def obstructions(self) -> list[tuple[Floats, Floats, float]]:
-        """Return boxes that hide what is behind them: lower and upper corner, shape (3,) each [m], and opacity."""
+        """Return the boxes of obstacles: lower and upper corner, shape (3,) each [m], and opacity."""
         opacities = [
             *((wall, 0.6 if self._divides(wall) else 0.0) for wall in self._walls),
             *((one, 1.0) for one in self._furniture),
@@ -111,7 +111,7 @@ class Room:
         ]
 
     def _inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
-        """Return the thin axis of a wall, in its own frame, and the sign of its side towards the middle of the arena."""
+        """Return a wall's thin axis in its own frame, and the sign of its side facing the centre."""
         axis = int(np.argmin(np.asarray(shape.geometry.halfSide)[:2]))
         towards = shape.placement.actInv(self.centre)[axis]
         return axis, 1.0 if towards > 0.0 else -1.0
@@ -144,7 +144,7 @@ class Room:
 
 
 def load_drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
-    """Return the solids, in the shape's own frame, and colours that a shape is drawn as: from its mesh file, if it has one."""
+    """Load meshes, in the shape's frame, and colours of a shape, from its mesh file if available."""
     colour = tuple(float(c) for c in shape.meshColor)
     if shape.meshPath and Path(shape.meshPath).is_file():
         parts = load_parts(shape.meshPath, np.asarray(shape.meshScale).ravel(), detail=_DETAIL)
@@ -157,7 +157,7 @@ def load_drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float
 
 
 def is_wall(shape: pin.GeometryObject) -> bool:
-    """Return whether a shape that stands in the world is a wall: an upright box, thin and high."""
+    """Return whether an obstacle is a wall: an upright box, thin and high."""
     if not isinstance(shape.geometry, coal.Box):
         return False
     half = np.asarray(shape.geometry.halfSide)

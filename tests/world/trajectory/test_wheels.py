@@ -43,7 +43,7 @@ def test_the_error_is_the_worst_of_slipping_and_turning() -> None:
     assert RollingLimits(turning_radius=0.8).compute_error(path) == pytest.approx(
         0.8 * 0.2 - 0.1 * np.cos(0.1)
     )
-    assert OMNIDIRECTIONAL.error(path) == 0.0
+    assert OMNIDIRECTIONAL.compute_error(path) == 0.0
 
 
 def test_gears_are_those_of_the_step_before_where_it_stands() -> None:
@@ -66,7 +66,7 @@ def test_times_are_those_of_the_faster_wheel() -> None:
     assert rolling.has_wheel_limit
     assert not RollingLimits().has_wheel_limit
     assert not RollingLimits().compute_min_times(path).any()
-    assert not OMNIDIRECTIONAL.times(path).any()
+    assert not OMNIDIRECTIONAL.compute_min_times(path).any()
 
 
 def test_the_limits_are_the_robots() -> None:

@@ -1,4 +1,4 @@
-"""Trajectory: waypoints of robot and objects over time, and the curve through them."""
+"""Represents motions of robot and objects by waypoints, phases and an optional smooth curve."""
 
 from __future__ import annotations
 
@@ -21,27 +21,26 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan, get_required
 __all__ = ["Trajectory"]
 
 MOST_SAMPLES = 1_000_000
-"""Most moments that a motion is sampled at."""
+"""Largest number of samples of a motion."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Waypoints over time, and how the motion goes on between them: along a curve, or else linearly in the coordinates.
+    """Waypoints over time, joined by a smooth curve or by linear interpolation.
 
     Attributes:
-        names: The coordinates' names, n of them: base x, y, yaw, arm joints, then
+        names: Names of the n coordinates: base x, y, yaw, arm joints, then
             `<object>.<joint>`.
-        times: Of the waypoints, shape (T,), increasing [s].
-        positions: Shape (T, n), [m] and [rad]; angles are not wrapped, so that they interpolate.
-        phases: Which stretch of it does what; each begins where the one before ends, and together
-            they cover it all.
-        robot_size: How many of the coordinates are the robot's (3 for the base, then the arm).
-        curve: Where it is at every moment; None: on the straight line between two waypoints.
+        times: Increasing times of the waypoints, shape (T,) [s].
+        positions: Positions, shape (T, n), [m] and [rad]. Angles are not wrapped.
+        phases: Consecutive phases that cover the whole motion.
+        robot_size: Number of robot coordinates (3 for the base, then the arm).
+        curve: Smooth curve through the waypoints. Default: linear interpolation.
 
     Raises:
-        InputError: Names that occur twice, numbers that are not finite, shapes that do not fit,
-            times that do not increase, phases that leave a gap, or a curve that does not lead from
-            the first waypoint through all others to the last.
+        InputError: Names are not unique, numbers are not finite, shapes do not match, times do not
+            increase, phases do not cover the motion, or the curve does not lead from the first
+            waypoint through all others to the last.
     """
 
     names: tuple[str, ...]
@@ -101,10 +100,10 @@ class Trajectory:
             object.__setattr__(self, key, value)
 
     def at(self, time: ArrayLike) -> Floats:
-        """Return the positions, shape (..., n), at `time` [s], shape (...,); outside the motion, its first or last.
+        """Return positions, shape (..., n), at `time` [s], shape (...,), clamped to the motion.
 
         Raises:
-            InputError: `time` is none.
+            InputError: `time` is not finite.
         """
         time = finite(time, "time")
         if self.curve is not None:
@@ -117,10 +116,10 @@ class Trajectory:
         return self.at(time)
 
     def velocity(self, time: ArrayLike) -> Floats:
-        """Return the velocities, shape (..., n) [m/s], [rad/s], at `time` [s], shape (...,); outside the motion, 0.
+        """Return velocities, shape (..., n) [m/s], [rad/s], at `time` [s], shape (...,).
 
-        Without a curve they jump at waypoints, to those of the segment after. Raises `InputError`
-        for what is no time.
+        Velocities are 0 outside the motion. Without a curve they jump at waypoints, where the next
+        segment counts. Raises `InputError` if `time` is not finite.
         """
         time = finite(time, "time")
         if self.curve is not None:
@@ -132,9 +131,10 @@ class Trajectory:
         return np.asarray(np.where(inside, self.velocities()[segment], 0.0))
 
     def acceleration(self, time: ArrayLike) -> Floats:
-        """Return the accelerations, shape (..., n) [m/s²], [rad/s²], at `time` [s], shape (...,); they jump at the curve's knots.
+        """Return accelerations, shape (..., n) [m/s²], [rad/s²], at `time` [s], shape (...,).
 
-        Without a curve they are 0: velocities jump then. Raises `InputError` for what is no time.
+        They jump at the curve's knots. Without a curve they are 0, and velocities jump. Raises
+        `InputError` if `time` is not finite.
         """
         time = finite(time, "time")
         if self.curve is not None:
@@ -142,10 +142,13 @@ class Trajectory:
         return np.zeros((*time.shape, len(self.names)))
 
     def sample(self, rate: float) -> tuple[Floats, Floats]:
-        """Return times, shape (K,) [s], so many a second and the last, and the positions then, shape (K, n).
+        """Sample the motion at `rate` [Hz] and at its end.
+
+        Returns:
+            Times, shape (K,) [s], and positions, shape (K, n).
 
         Raises:
-            InputError: `rate` is no positive number, or that are too many.
+            InputError: `rate` is not positive, or gives too many samples.
         """
         rate = number(rate, "rate", "samples a second, more than 0", low=0.0, above=True)
         duration = float(self.times[-1] - self.times[0])
@@ -160,7 +163,7 @@ class Trajectory:
         return times, self.at(times)
 
     def column(self, name: str) -> Floats:
-        """Return one coordinate over the waypoints, shape (T,).
+        """Return a coordinate at all waypoints, shape (T,).
 
         Raises:
             UnknownNameError: There is no such coordinate.
@@ -168,7 +171,7 @@ class Trajectory:
         return np.array(self.positions[:, self.names.index(known(name, self.names, "coordinate"))])
 
     def ranges(self) -> tuple[Floats, Floats]:
-        """Return the least and the largest position between every two waypoints, both among them, shape (T − 1, n) each."""
+        """Return the smallest and largest positions of every segment, shape (T − 1, n) each."""
         if self.curve is None:
             return np.minimum(self.positions[:-1], self.positions[1:]), np.maximum(
                 self.positions[:-1], self.positions[1:]
@@ -180,15 +183,14 @@ class Trajectory:
         )
 
     def velocities(self) -> Floats:
-        """Return the mean velocity of every segment between two waypoints, shape (T − 1, n), [m/s] and [rad/s]."""
+        """Return the mean velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
         return np.asarray(np.diff(self.positions, axis=0) / np.diff(self.times)[:, None])
 
     def accelerations(self) -> Floats:
-        """Return the acceleration at every waypoint, shape (T, n), [m/s²] and [rad/s²].
+        """Return the accelerations at waypoints as in eq. 5, shape (T, n), [m/s²] and [rad/s²].
 
-        It is the step of the mean velocities there over the shorter of the two segments' durations,
-        as eq. 5 has it; the motion starts and ends at rest. The accelerations of a curve are
-        `acceleration`'s.
+        They are differences of mean velocities over the shorter of both segments' durations. The
+        motion starts and ends at rest. For accelerations of the curve see `acceleration`.
         """
         durations = np.diff(self.times)
         velocity = np.vstack(
@@ -200,24 +202,24 @@ class Trajectory:
         return np.asarray(np.diff(velocity, axis=0) / spans[:, None])
 
     def base_effort(self) -> float:
-        """Return the distance the base travels over the floor, Σ √(δx² + δy²) [m]."""
-        return float(np.linalg.norm(np.diff(self._way[:, :2], axis=0), axis=1).sum())
+        """Return the path length of the base, Σ √(δx² + δy²) [m]."""
+        return float(np.linalg.norm(np.diff(self._path[:, :2], axis=0), axis=1).sum())
 
     def base_effort_l1(self) -> float:
-        """Return Σ |δx| + |δy| [m], which the method's authors log."""
-        return float(np.abs(np.diff(self._way[:, :2], axis=0)).sum())
+        """Return Σ |δx| + |δy| [m], the metric of the method's authors."""
+        return float(np.abs(np.diff(self._path[:, :2], axis=0)).sum())
 
     def arm_effort(self) -> float:
         """Return the sum of the arm joints' absolute displacements, Σ |δq_arm| [rad]."""
-        return float(np.abs(np.diff(self._way[:, 3 : self.robot_size], axis=0)).sum())
+        return float(np.abs(np.diff(self._path[:, 3 : self.robot_size], axis=0)).sum())
 
     @property
-    def _way(self) -> Floats:
-        """Points close enough to each other to measure the way between them, shape (K, n)."""
+    def _path(self) -> Floats:
+        """Positions at waypoints or knots, dense enough to measure path lengths, shape (K, n)."""
         return self.positions if self.curve is None else self.curve.positions
 
     def parts(self) -> list[Trajectory]:
-        """Return the motion of each phase, with its own times."""
+        """Return the motion of each phase, with its original times."""
         spans = [slice(phase.first, phase.last + 1) for phase in self.phases]
         alone = [replace(phase, first=0, last=phase.last - phase.first) for phase in self.phases]
         return [
@@ -243,7 +245,7 @@ class Trajectory:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data of it, e.g. for JSON."""
+        """Return the trajectory as plain data, e.g. for JSON."""
         data = {
             "names": list(self.names),
             "times": self.times.tolist(),
@@ -255,10 +257,10 @@ class Trajectory:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
-        """Return the trajectory that `to_dict` made `data` of.
+        """Return the trajectory described by data from `to_dict`.
 
         Raises:
-            InputError: Something is missing from it or does not fit.
+            InputError: A field is missing or invalid.
         """
         if not isinstance(data, Mapping):
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
@@ -278,24 +280,24 @@ class Trajectory:
         return cls(names, times, positions, tuple(phases), size, curve)
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
-        """Write a table with a line a waypoint: times [s], positions [m] and [rad], phases; see `tables.write_csv`."""
+        """Write a CSV table of times [s], positions [m], [rad] and phases; see `tables.write_csv`."""
         return tables.write_csv(self.to_dict(), path, **options)
 
     def to_json(self, path: str | Path) -> Path:
-        """Write `to_dict` as JSON, whole or not at all; return the path."""
+        """Write `to_dict` atomically as JSON; return the path."""
         return tables.write_json(self.to_dict(), path)
 
     def to_ros(self, **options: Any) -> dict[str, Any]:
-        """Return plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
+        """Convert to plain data with the fields of ROS' `JointTrajectory`; see `ros.to_ros`."""
         return ros.to_ros(self.to_dict(), **options)
 
     def to_rosbag(self, path: str | Path, **options: Any) -> Path:
-        """Write a recording of ROS 2 into a new folder; see `rosbag.write_rosbag`. Needs the extra `ros`."""
+        """Write a ROS 2 bag into a new folder; see `rosbag.write_rosbag`. Needs the extra `ros`."""
         return rosbag.write_rosbag(self.to_dict(), path, **options)
 
     @classmethod
     def from_csv(cls, path: str | Path, **options: Any) -> Trajectory:
-        """Return the trajectory in a table such as `to_csv` writes; see `tables.read_csv`.
+        """Read a trajectory from a table written by `to_csv`; see `tables.read_csv`.
 
         Raises:
             InputError: The file is missing, or something in it does not fit; the error names line
@@ -305,7 +307,7 @@ class Trajectory:
 
     @classmethod
     def from_json(cls, path: str | Path) -> Trajectory:
-        """Return the trajectory in a file that `to_json`, `Plan.to_json` or `vkc-pin plan --json` wrote.
+        """Read a trajectory from a file written by `to_json`, `Plan.to_json` or `plan --json`.
 
         Raises:
             InputError: The file is missing, is no JSON, or something in it does not fit; the error
@@ -324,10 +326,10 @@ class Trajectory:
         like: Trajectory | None = None,
         robot_size: int | None = None,
     ) -> Trajectory:
-        """Return the trajectory of data such as `to_ros` returns, or of a JSON file with them; see `ros.from_ros`.
+        """Convert data from `to_ros`, or a JSON file with them, to a trajectory; see `ros.from_ros`.
 
         Raises:
-            InputError: Something is missing or does not fit; the error names the field.
+            InputError: A field is missing or invalid; the error names it.
         """
         motion = None if like is None else instance(like, Trajectory, "like").to_dict()
         data = ros.from_ros(message, like=motion, robot_size=robot_size)
@@ -335,7 +337,7 @@ class Trajectory:
 
     @classmethod
     def _read(cls, data: Any, file: str | Path | None, inside: str = "") -> Trajectory:
-        """Return the trajectory that a file holds, in its field `inside`; what is wrong with it is the file's fault."""
+        """Parse the content of a file's field `inside`; errors name the file."""
         try:
             return cls.from_dict(data)
         except InputError as error:

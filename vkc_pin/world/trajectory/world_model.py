@@ -1,8 +1,8 @@
-"""The scene as one plain tree, nothing inverted: robot and objects side by side, rooted in the world.
+"""Models a scene as one plain kinematic tree of robot and objects, rooted in the world.
 
-Validation, pictures and plots use it; being built without the chain, it can catch the chain's
-mistakes. A free object has a free joint, where `carrying` has it: it moves rigidly with what holds
-it or what it stands on. Fingers that open are joints.
+Validation and visualization use this model. It is independent of the virtual kinematic chain, so
+that it reveals errors of the chain. Free objects have free joints, whose positions `FreeObjects`
+computes. The fingers of a gripper are joints.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 __all__ = ["FREE_JOINT", "World", "compute_final_scene", "find_coordinate_units"]
 
 FREE_JOINT = "placement"
-"""A free object's placement in the world is the joint `<object>.placement`."""
+"""Name of a free object's free joint: `<object>.placement`."""
 
 
 class World:
@@ -159,13 +159,13 @@ class World:
         times: ArrayLike | None = None,
         free: FreeObjects | None = None,
     ) -> Floats:
-        """Return minimal coordinates, shape (K, n), of the world along `trajectory`.
+        """Compute minimal coordinates of the world along a trajectory, shape (K, n).
 
         Args:
-            trajectory: A motion in this scene; what it does not name stays as it is at the start,
-                unless it is carried.
-            times: [s], shape (K,), in increasing order; None takes the waypoints.
-            free: The scene's free objects along it, if somebody has them already.
+            trajectory: Motion in this scene. Coordinates that it does not name keep their start
+                values, except for free objects.
+            times: Increasing times, shape (K,) [s]. Default: the waypoints.
+            free: Free objects along the trajectory, if they exist already.
         """
         times = trajectory.times if times is None else np.asarray(times, float)
         values = trajectory.at(times)
@@ -186,17 +186,17 @@ class World:
         return rows
 
     def get_joints(self, name: str) -> list[int]:
-        """Return the joints of the model that are an object's, with its free joint."""
+        """Return the joints of an object in the model, including its free joint."""
         return [joint for joint in self._joints[name] if joint]
 
     def get_placement(self, name: str, row: Floats) -> pin.SE3:
-        """Return where the base link of a free object is, of the world's coordinates, shape (n,)."""
+        """Return the placement of a free object's base link from world coordinates, shape (n,)."""
         numbers = row[self.get_placement_columns(name)].copy()
         numbers[3:] /= np.linalg.norm(numbers[3:])
         return pin.XYZQUATToSE3(numbers)
 
     def get_placement_columns(self, name: str) -> slice:
-        """Return which of the coordinates are the placement of a free object."""
+        """Return the columns of a free object's placement in the coordinates."""
         first = self.coordinates.index(f"{name}.{FREE_JOINT}_x")
         return slice(first, first + 7)
 
@@ -204,10 +204,10 @@ class World:
 def _fingers(
     gripper: Gripper, start: float | None, trajectory: Trajectory, times: Floats
 ) -> Floats:
-    """Return where a gripper's fingers are along a motion, shape (K, k), [m] or [rad].
+    """Compute finger positions along a motion, shape (K, k), [m] or [rad].
 
-    They move from one phase's opening to the next one's between the first two waypoints of that.
-    They are at the first opening from the start, unless the robot stands still there.
+    Fingers move to the opening of a phase between its first two waypoints. In the first phase they
+    have that opening from the start, unless the robot rests there.
     """
     before, moments, values = gripper.compute_positions(start), list[float](), list[Floats]()
     robot = trajectory.positions[:, : trajectory.robot_size]
@@ -224,12 +224,12 @@ def _fingers(
 
 
 def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
-    """Return the scene at the end of a motion: where robot and objects are, and what is held.
+    """Compute the scene at the end of a motion.
 
     Args:
-        scene: The scene at its start.
-        trajectory: The motion.
-        holds: What is held at its end.
+        scene: Scene at the start.
+        trajectory: Motion.
+        holds: Holds at the end.
     """
     last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
 
@@ -267,7 +267,7 @@ def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Ho
 
 
 def find_coordinate_units(scene: Scene) -> dict[str, str]:
-    """Return coordinate → "m" or "rad" of everything that can move in a scene: robot, objects, and the freedoms of grasps."""
+    """Return coordinate → unit, "m" or "rad", of robot, objects and freedoms of grasps."""
     units = dict(zip(scene.robot.coordinates.names, scene.robot.coordinates.units, strict=True))
     for owner, placed in scene.objects.items():
         own = dict(

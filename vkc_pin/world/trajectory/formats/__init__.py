@@ -1,1 +1,1 @@
-"""Motions as files and messages: saved plans, tables, JSON, ROS."""
+"""Reads and writes motions as archives of plans, tables, JSON, and ROS messages."""

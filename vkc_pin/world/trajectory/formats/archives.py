@@ -1,4 +1,4 @@
-"""The file of a saved plan: arrays and a description, read within bounds, and checked before anything is made of them."""
+"""Reads and writes archives of plans, with size limits and validation of all content."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ FORMAT = 1
 LARGEST_ARCHIVE, LARGEST_MEMBER = 20_000_000, 40_000_000
 """Largest file, and largest part of it unpacked [bytes]: some 200 000 waypoints of 25 coordinates."""
 ARRAYS = {"about": ("U", 0), "times": ("f", 1), "positions": ("f", 2)}
-"""Parts of the file: kind of their items and number of axes."""
+"""Parts of the archive: kind and number of axes of the array."""
 CURVE = {"knot_times": ("f", 1), "knot_positions": ("f", 2), "knot_rates": ("f", 2)}
-"""Parts that it has as well if the motion has a curve."""
+"""Additional parts of a motion with a curve."""
 _PARTS = ARRAYS | CURVE
 STATUSES = (
     *(
@@ -61,7 +61,7 @@ STATUSES = (
         "closure",
     ),
 )
-"""What plans end with; those in the second line are the baselines'."""
+"""Status of plans; those in the second group belong to baselines."""
 METRICS = (
     *(
         "planning_time",
@@ -85,7 +85,7 @@ METRICS = (
     ),
     *("time_retiming", "torque"),
 )
-"""What every plan is measured by; baselines have more."""
+"""Metrics of every plan; baselines have more."""
 
 _DAMAGED = (
     *(
@@ -225,9 +225,9 @@ class _About(Schema):
 
 
 def write_archive(file: str | Path, about: Mapping[str, Any]) -> Path:
-    """Write the file of a saved plan, whole or not at all, from its description; return the path.
+    """Write the archive of a plan atomically from its description; return the path.
 
-    Numbers of its `trajectory`, see `Trajectory.to_dict`, are arrays of their own in the file.
+    Numbers of the `trajectory` (see `Trajectory.to_dict`) are stored as separate arrays.
     """
     motion = dict(about["trajectory"])
     arrays = {name: np.array(motion.pop(name), float) for name in ("times", "positions")}
@@ -315,7 +315,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
 
 
 def serialize_folder(scene_folder: Path, plan: Path) -> dict[str, str]:
-    """Return where a scene's folder is: in the package, or seen from the plan's file and absolutely."""
+    """Describe a scene's folder: in the package, or by relative and absolute paths."""
     there = scene_folder.resolve()
     if there == folder("scenes").resolve():
         return {"package": "scenes"}
@@ -323,7 +323,7 @@ def serialize_folder(scene_folder: Path, plan: Path) -> dict[str, str]:
 
 
 def resolve_folder(data: Mapping[str, str], plan: Path) -> Path:
-    """Return the scene's folder that `serialize_folder` describes."""
+    """Return the folder described by `serialize_folder`."""
     if "package" in data:
         return folder(data["package"])
     beside = plan.resolve().parent / data["relative"]

@@ -1,7 +1,7 @@
-"""Motions as plain data with the fields of ROS' trajectory_msgs/JointTrajectory, and back.
+"""Converts motions to and from plain data with the fields of ROS' trajectory_msgs/JointTrajectory.
 
-A motion is plain data here, of the shape that `Trajectory.to_dict` returns. Times are seconds,
-positions metres and radians; the base is three coordinates, x, y and yaw in the world frame.
+A motion is plain data as returned by `Trajectory.to_dict`. Times are in seconds, positions in metres
+and radians. The base has three coordinates, x, y and yaw in the world frame.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ def from_ros(
 
 
 def _rates(point: Any, size: int, file: Path | None, where: str) -> list[float]:
-    """Return a point's velocities, if controllers go along cubics through it: there are some, and no accelerations."""
+    """Return a point's velocities if it defines cubics, that is, has no accelerations; else []."""
     values = point.get("velocities", ())
     if not isinstance(values, list) or not len(values) or point.get("accelerations"):
         return []
@@ -248,7 +248,7 @@ def _rates(point: Any, size: int, file: Path | None, where: str) -> list[float]:
 
 
 def _with_rests(moments: Floats, times: Floats, positions: Floats) -> Floats:
-    """Return moments, and instead of those that are next to them the times between which positions, (T, n), stay as they are."""
+    """Add the times at which positions, (T, n), begin and end to rest; they replace close moments."""
     still = ~np.diff(positions, axis=0).any(axis=1)
     rests = times[np.append(still, False) | np.append(False, still)]
     after = np.searchsorted(rests, moments - _NEXT)  # the first that is not well before each
@@ -258,10 +258,10 @@ def _with_rests(moments: Floats, times: Floats, positions: Floats) -> Floats:
 
 
 def rates(times: Floats, positions: Floats) -> tuple[Floats, Floats]:
-    """Return velocities and accelerations at waypoints, shape (T, n) each; it rests before the first and after the last.
+    """Estimate velocities and accelerations at waypoints, shape (T, n) each, with rests at the ends.
 
-    Velocities are those of SciPy's monotone cubics, but for the ends. Where a coordinate turns
-    round, its velocity is zero; where it rests before or after, its acceleration is zero as well.
+    Velocities are those of SciPy's monotone cubics, except at the ends. They are zero where a
+    coordinate reverses. Next to a rest the acceleration is zero as well.
     """
     from scipy.interpolate import PchipInterpolator
 
@@ -279,7 +279,7 @@ def rates(times: Floats, positions: Floats) -> tuple[Floats, Floats]:
 def along(
     times: Floats, positions: Floats, velocities: Floats, moments: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return positions, velocities and accelerations at `moments` on the cubics through waypoints with these velocities."""
+    """Evaluate positions, velocities and accelerations at `moments` on cubics through waypoints."""
     from scipy.interpolate import CubicHermiteSpline
 
     cubics = CubicHermiteSpline(times, positions, velocities)

@@ -1,7 +1,7 @@
-"""Motions as recordings of ROS 2 (rosbag2): trajectories of arm and base, the path of the base, and what objects do.
+"""Writes motions as ROS 2 bags with trajectories, base path and velocity, and object joint states.
 
-A motion is plain data here, of the shape that `Trajectory.to_dict` returns; messages are made of
-what `ros.to_ros` returns.
+A motion is plain data as returned by `Trajectory.to_dict`. Messages are built from the data that
+`ros.to_ros` returns.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TOPICS: Mapping[str, str] = {
     "objects/joint_states": "sensor_msgs/msg/JointState",
     "phases": "std_msgs/msg/String",
 }
-"""What is recorded: end of the topic's name → type of its messages."""
+"""Recorded topics: suffix of the topic name → message type."""
 _FORMAT = 8  # of rosbag2: the last with profiles of quality as text, which older readers want
 _NANO = 1_000_000_000
 
@@ -103,7 +103,7 @@ def import_rosbags() -> Any:
     """Return the package `rosbags`.
 
     Raises:
-        InputError: It is not installed, or cannot be imported.
+        InputError: `rosbags` is not installed or cannot be imported.
     """
     return optional_package("rosbags", "ros", what="recording for ROS")
 

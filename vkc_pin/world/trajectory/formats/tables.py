@@ -1,7 +1,7 @@
-"""Motions as tables (CSV) and as JSON, for other programs, and back.
+"""Reads and writes motions as CSV tables and as JSON.
 
-A motion is plain data here, of the shape that `Trajectory.to_dict` returns. Times are seconds,
-positions metres and radians; the base is three coordinates, x, y and yaw in the world frame.
+A motion is plain data as returned by `Trajectory.to_dict`. Times are in seconds, positions in metres
+and radians. The base has three coordinates, x, y and yaw in the world frame.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ __all__ = [
 ]
 
 GROUPS = ("all", "robot", "base", "arm", "objects")
-"""What can be asked for instead of names: everything, base and arm, the base, the arm, or what no motor of the robot moves."""
+"""Groups of coordinates: all, base and arm, base, arm, or joints of objects."""
 LARGEST_MOTION = 20_000_000
-"""Largest file that a motion is read from [bytes]: some 30 000 waypoints of 25 coordinates."""
+"""Largest file of a motion [bytes], for about 30 000 waypoints of 25 coordinates."""
 MOST_LINES, MOST_COLUMNS = 200_000, 1000
-"""Most lines and columns of a table."""
+"""Largest numbers of lines and columns of a table."""
 _TIME, _PHASES = (
     "time",
     ("phase", "phase_name", "held"),
@@ -126,7 +126,7 @@ def write_csv(
 def _written(
     motion: Mapping[str, Any], columns: Sequence[int]
 ) -> Iterator[tuple[float, int, list[float], list[str]]]:
-    """Yield the time of every line, its waypoint or the next, its numbers, and whether it is a waypoint, if that is told."""
+    """Yield time, current or next waypoint, numbers and waypoint flag of every line."""
     curve = motion.get("curve")
     if curve is None:
         for k, (moment, row) in enumerate(zip(motion["times"], motion["positions"], strict=True)):
@@ -246,12 +246,12 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
 
 
 def write_json(motion: Mapping[str, Any], path: str | Path) -> Path:
-    """Write a motion as JSON, whole or not at all; return the path."""
+    """Write a motion atomically as JSON; return the path."""
     return write_atomically(path, (json.dumps(motion, indent=1) + "\n").encode("utf-8"))
 
 
 def read_json(path: str | Path) -> Any:
-    """Return what a JSON file holds.
+    """Read a JSON file.
 
     Raises:
         InputError: The file is missing, is no JSON, or is larger than a motion can be; the error
@@ -262,7 +262,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def select_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> list[int]:
-    """Return which of a motion's coordinates are meant by one of `GROUPS`, or by names in the order wanted.
+    """Select columns of a motion by one of `GROUPS`, or by names in the wanted order.
 
     Raises:
         UnknownNameError: There is no such group or coordinate.
@@ -297,17 +297,17 @@ def select_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> li
 
 
 def infer_robot_size(names: Sequence[str]) -> int:
-    """Return how many coordinates are the robot's, if nobody says so: those before the first with a dot in its name."""
+    """Infer the number of robot coordinates: those before the first name with a dot."""
     return next((k for k, name in enumerate(names) if "." in str(name)), len(names))
 
 
 def make_single_phase(waypoints: int) -> dict[str, Any]:
-    """Return the phase that all of a motion is in if nobody says otherwise; nothing is held in it."""
+    """Make a single phase without holds for a whole motion."""
     return {"name": "motion", "first": 0, "last": waypoints - 1, "held": {}, "by": {}}
 
 
 def _lines(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the cells of every line of a table, with the number of the line."""
+    """Yield line number and cells of every line of a table."""
     reader = csv.reader(io.StringIO(text, newline=""))
     try:
         for cells in reader:
@@ -341,7 +341,7 @@ def _add_phase(
     path: Path,
     line: int,
 ) -> None:
-    """Take the last cells of a line: the phase's number, its name, what is held in it, and the gripper's opening [m]."""
+    """Parse a line's phase cells (number, name, holds) and add or extend the phase."""
     number, name, held = cells
     expected = f"{len(phases)} or {len(phases) + 1}" if phases else "1"
     if number not in expected.split(" or "):

@@ -10,7 +10,7 @@ import pytest
 from helpers.closers import changed, closer
 from oracle import motors
 from oracle.plan import read_plan
-from oracle.stage import World as CheckedMotion
+from oracle.stage import World as Judged
 
 import vkc_pin as vkc
 from vkc_pin.validation.dynamics.torques import Motors
@@ -98,7 +98,7 @@ def seen(plan: vkc.Plan, file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest torque of every joint as the package and the oracle find it."""
     own = Motors(Samples(plan.scene, plan.trajectory)).torques
     plan.save(file)
-    world = CheckedMotion(read_plan(file))
+    world = Judged(read_plan(file))
     found = dict.fromkeys(world.robot.arm, 0.0)
     excess, carries = motors.EXCESS, motors._carries
     motors.EXCESS, motors._carries = -1.0, lambda *_: True  # type: ignore[assignment]

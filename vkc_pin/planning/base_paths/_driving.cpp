@@ -1,5 +1,5 @@
-// Cheapest paths over cells and headings, found again after moves have turned out not to be free, by LPA* (Koenig, Likhachev
-// and Furcy 2004): what a change leaves as it was is not looked at again. Costs are whole numbers, so that sums are exact.
+// Searches cheapest paths over cells and headings, and repairs them after moves turn out to be blocked, by LPA* (Koenig,
+// Likhachev and Furcy 2004). Costs are integers, so that sums are exact.
 
 #include <algorithm>
 #include <queue>
@@ -21,7 +21,7 @@ using Bytes = nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb::dev
 class Paths
 {
 public:
-  // `flags` of nodes; `moves` in cells and `costs` by heading, (16, 2) and (16, 4); `begins` and `ends` are nodes and costs, (n, 2).
+  // `flags` of nodes; `moves` in cells and `costs` by heading, (16, 2) and (16, 4); `begins` and `ends`: nodes and costs, (n, 2).
   Paths(
     const Bytes & flags,
     const Indices<2> & moves,
@@ -53,7 +53,7 @@ public:
       look(begin.node);
   }
 
-  // Takes out a move from node to node, either way.
+  // Removes a move between two nodes, in both directions.
   void shut(Index node, Index kind)
   {
     if (kind < 0 || kind >= KINDS)
@@ -68,7 +68,7 @@ public:
     look(other);
   }
 
-  // Takes out a node.
+  // Removes a node.
   void block(Index node)
   {
     node = lattice_.inner(node);
@@ -79,7 +79,7 @@ public:
         look(other);
   }
 
-  // Takes out connections from the start, or to a goal, by their numbers.
+  // Removes connections from the start, or to a goal, by their numbers.
   void close(const Indices<1> & numbers, bool ends)
   {
     auto & connections = ends ? ends_ : begins_;
@@ -92,9 +92,9 @@ public:
     }
   }
 
-  // The cheapest path that costs less than `limit`: its cost, the numbers of its connections to the goal and from the start, and
-  // its nodes back from the goal to the start. No node: there is none. Of equal ones it is the first, in an order that the moves
-  // alone decide: at each node back from the goal the move that costs most. So it hangs on what is free, not on what was asked.
+  // Returns the cheapest path that costs less than `limit`: its cost, the numbers of its connections to the goal and from the
+  // start, and its nodes from the goal to the start; no nodes if there is none. Ties are broken by the moves alone: at each node
+  // back from the goal, the most expensive move is taken. So the result does not depend on the order of queries.
   std::tuple<Index, Index, Index, Array<Index>> cheapest(Index limit)
   {
     std::vector<Index> nodes;
@@ -138,7 +138,7 @@ private:
     }
   }
 
-  // Finds what is left at least from each cell on: what it costs if turns are free.
+  // Computes the heuristic: the cost from each cell to the goals if turning is free.
   void spread()
   {
     least_.assign(lattice_.size(), NEVER);
@@ -160,7 +160,7 @@ private:
     });
   }
 
-  // Where a move leads; negative where it is known not to be free.
+  // Returns the target of a move; negative if the move is known to be blocked.
   Index leads(Index node, Index kind) const
   {
     if (flags_[node] & BLOCKED)
@@ -176,7 +176,7 @@ private:
 
   Index total(const Connection & end) const { return std::min(cost_[end.node] + end.cost, NEVER); }
 
-  // Finds anew what a node costs by way of those that lead to it.
+  // Updates the cost of a node from its predecessors.
   void look(Index node)
   {
     Index least = NEVER;
@@ -200,7 +200,7 @@ private:
       queue_.push({cost + least, cost, node});
   }
 
-  // Returns what the cheapest path costs, or `limit`, after which all nodes on paths that cost no more know their costs.
+  // Returns the cost of the cheapest path, or `limit`; then all nodes on paths up to that cost are consistent.
   Index settle(Index limit)
   {
     Index best = cheapest_end(limit);
@@ -210,7 +210,7 @@ private:
       queue_.pop();
       const Index node = entry.node, before = cost_[node];
       if (before == ahead_[node] || entry.cost != std::min(before, ahead_[node]))
-        continue; // it was settled, or has another entry, since
+        continue; // an obsolete entry
       if (before > ahead_[node])
       {
         const Index cost = cost_[node] = ahead_[node];
@@ -245,7 +245,7 @@ private:
     return limit;
   }
 
-  // The last of the connections from the start by which a node costs what it costs; negative: none.
+  // Returns the last connection from the start that explains the cost of a node; negative: none.
   Index begun(Index node)
   {
     Index found = -1;
@@ -256,7 +256,7 @@ private:
     return found;
   }
 
-  // The node before another on the cheapest path to it.
+  // Returns the predecessor of a node on the cheapest path to it.
   Index source(Index node) const
   {
     Index found = -1;
@@ -272,7 +272,7 @@ private:
   Lattice lattice_;
   std::vector<Index> least_, costs_; // by cell; by heading and kind
   std::vector<std::uint8_t> flags_;
-  std::vector<Index> cost_, ahead_; // from the start; by way of the nodes that lead there
+  std::vector<Index> cost_, ahead_; // from the start; one-step lookahead
   std::vector<Connection> begins_, ends_;
   At begins_at_, ends_at_; // by node
   std::priority_queue<Entry> queue_;
@@ -283,7 +283,7 @@ private:
 NB_MODULE(_driving, module)
 {
   module.doc() = "Cheapest paths over cells and headings, found again after moves have turned out not to be free; paths of cars.";
-  nb::set_leak_warnings(false); // what caches and globals keep lives until the process ends
+  nb::set_leak_warnings(false); // caches and globals live until the process ends
   nb::class_<Paths>(module, "Paths")
     .def(nb::init<const Bytes &, const Indices<2> &, const Indices<2> &, const Indices<2> &, const Indices<2> &>())
     .def("shut", &Paths::shut)

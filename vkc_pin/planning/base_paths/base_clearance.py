@@ -30,7 +30,7 @@ _TOWARDS = np.arctan2([0, 1, 1, 2], [1, 2, 1, 1])
 _QUADRANT = np.column_stack([_TOWARDS, (_TOWARDS + np.append(_TOWARDS[1:], np.pi / 2)) / 2]).ravel()
 _ANGLES = np.concatenate([_QUADRANT + quarter * np.pi / 2 for quarter in range(4)])
 DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
-"""Unit vectors along which distances are bounded, eight per quadrant from the x axis on, (32, 2)."""
+"""Unit vectors along which distances are bounded, eight per quadrant from x on, shape (32, 2)."""
 
 _AXES = slice(0, len(DIRECTIONS), len(DIRECTIONS) // 4)  # those of `DIRECTIONS` along world axes
 _RIM_ANGLES = 2 * np.pi * np.arange(16) / 16  # corners that approximate a circle
@@ -144,7 +144,7 @@ class MovingShapes:
         return margins
 
     def _find_close_pairs(self, along: Floats) -> Ints:
-        """Return pairs that may collide, given lower bounds of the base position, shape (32,) [m]."""
+        """Return pairs that may collide, given lower bounds of the base position, (32,) [m]."""
         world = self.world
         near = np.flatnonzero((along[_AXES] - world.extent).max(axis=1) < self.exclusion_radius)
         near = near[(along - world.support[near]).max(axis=1) < self.exclusion_radius[near]]
@@ -167,7 +167,7 @@ class MovingShapes:
         )
 
     def _get_extent_table(self, start: float, end: float) -> Floats:
-        """Return upper bounds of the shapes' extents at both yaws and half-way, shape (M, 32) [m]."""
+        """Return upper bounds of the shapes' extents between two yaws, shape (M, 32) [m]."""
         key = (start, end)
         if key not in self._tables:
             if start == end:

@@ -1,4 +1,4 @@
-"""Connects the start and the goals of a base path with the cells around them and with each other."""
+"""Connects start and goals of a base path with the cells around them and with each other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-// How far the base drives at least from places to every cell, if turns are free.
+// Lower bounds of the driving distance from places to every cell, turning being free.
 #pragma once
 
 #include <array>
@@ -8,7 +8,7 @@
 class Floor
 {
 public:
-  // `stuck`: nodes in which the base surely hits something, (cells, cells, 16); `moves` in cells, (16, 2); `lengths` [m], (16,).
+  // `stuck`: certainly blocked nodes, (cells, cells, 16); `moves` in cells, (16, 2); `lengths` [m], (16,).
   Floor(
     const nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu> & stuck,
     const Indices<2> & moves,
@@ -21,7 +21,7 @@ public:
       throw std::invalid_argument("lengths are of shape (16,)");
     if (!std::all_of(lengths.data(), lengths.data() + HEADINGS, [](double length) { return length > 0.0; }))
       throw std::invalid_argument("moves lead somewhere");
-    std::vector<std::uint16_t> open(leads_.size(), 0); // at which headings the base may be in a cell
+    std::vector<std::uint16_t> open(leads_.size(), 0); // headings at which a cell may be free
     for (Index i = 0; i < cells_; ++i)
       for (Index j = 0; j < cells_; ++j)
         for (Index heading = 0; heading < HEADINGS; ++heading)
@@ -43,7 +43,7 @@ public:
       }
   }
 
-  // From W places, the k-th of which has the cells firsts[k]..firsts[k + 1] with their costs: [m], (W, cells, cells).
+  // From W places, the k-th with the cells firsts[k]..firsts[k + 1] and their costs: distances [m], (W, cells, cells).
   Array<double> distances(
     const Indices<1> & firsts, const Indices<1> & begins, const Numbers<1> & costs, std::size_t threads) const
   {
@@ -81,7 +81,7 @@ private:
 
   Index cells_;
   Lattice lattice_;
-  std::vector<std::uint16_t> leads_; // by cell, with a border: at which headings a move is not surely blocked
+  std::vector<std::uint16_t> leads_; // by cell, with a border: headings at which a move is not certainly blocked
   std::array<Index, HEADINGS> moves_{};
   std::array<double, HEADINGS> lengths_{};
 };

@@ -20,7 +20,7 @@ from vkc_pin.utils.optional_imports import compiled_module
 __all__ = ["HEADINGS", "BaseGrid", "compute_fine_cell_count"]
 
 HEADINGS = 16
-"""Number of headings: to the eight neighbours of a cell and, between these, a knight's move away."""
+"""Number of headings: to a cell's eight neighbours and, between these, a knight's move away."""
 
 _CELL_MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
 _CELL_MOVES = np.concatenate([_CELL_MOVES, -_CELL_MOVES])  # by heading, in cells

@@ -1,4 +1,4 @@
-// Numbers of nodes, which are cells and headings, where moves lead from one to the next, and what it costs to get anywhere.
+// Node numbers of cells and headings, moves between them, and a search of the cheapest costs.
 #pragma once
 
 #include <algorithm>
@@ -10,20 +10,19 @@
 
 #include "../distances/arrays.hpp"
 
-constexpr Index HEADINGS = 16, BORDER = 2; // cells that moves lead out of the arena at most
+constexpr Index HEADINGS = 16, BORDER = 2; // cells by which moves leave the arena at most
 constexpr Index NEVER = std::numeric_limits<Index>::max() / 4;
 enum Kind : Index { AHEAD, BACK, LEFT, RIGHT, KINDS };
-// What is known of a node, and of the moves ahead and to the left from it; the other two are these from their other ends.
+// Known state of a node, and of the moves ahead and to the left from it; other moves are stored at their other ends.
 enum Flag : std::uint8_t { BLOCKED = 1, NO_AHEAD = 2, NO_LEFT = 4, BEGINS = 8, ENDS = 16 };
 
-// From the start to a node, or from it to a goal.
+// A connection from the start to a node, or from it to a goal.
 struct Connection
 {
   Index node, cost;
 };
 
-// Nodes are numbered (i * cells + j) * HEADINGS + heading; here, with a border of blocked cells around these, so that no move
-// leads out of them.
+// Nodes are numbered (i * cells + j) * HEADINGS + heading, here with a border of blocked cells, so that no move leaves the array.
 class Lattice
 {
 public:
@@ -41,7 +40,7 @@ public:
     }
   }
 
-  // How many cells there are with the border.
+  // Returns the number of cells including the border.
   std::size_t size() const { return std::size_t(width_ * width_); }
 
   Index inner(Index node) const
@@ -64,7 +63,7 @@ public:
     return i < 0 || j < 0 || i >= cells_ || j >= cells_;
   }
 
-  // Where a move leads if nothing is in its way.
+  // Returns the target of a move, whether blocked or not.
   Index target(Index node, Index kind) const
   {
     const std::uint32_t heading = std::uint32_t(node) % HEADINGS;
@@ -78,18 +77,18 @@ private:
   std::vector<Index> moves_; // in nodes, by heading
 };
 
-// Lowers what it costs to reach each cell, from those where it begins, to what the cheapest moves come to: moves(cell, cost, reach)
-// calls reach(other, cost) for where moves lead from a cell, each of which costs between `shortest` and `longest`.
+// Lowers the cost of each cell to that of the cheapest moves from the starting cells: moves(cell, cost, reach) calls
+// reach(other, cost) for the targets of moves from a cell, each of which costs between `shortest` and `longest`.
 //
-// Cells wait in buckets as wide as the shortest move, so that no order is kept among them (Denardo and Fox 1979). The least of all
-// sums comes out as by Dijkstra's algorithm, to the last bit: adding never changes an order.
+// Cells wait in buckets as wide as the shortest move, without an order in a bucket (Denardo and Fox 1979). The result equals that
+// of Dijkstra's algorithm bit for bit, since addition is monotonic.
 template<typename Cost, typename Moves>
 void spread(
   std::vector<Cost> & least, std::vector<std::pair<Cost, Index>> begins, Cost shortest, Cost longest, const Moves & moves)
 {
   const double scale = 1.0 / double(shortest);
   const auto place = [scale](Cost cost) { return std::size_t(double(cost) * scale); };
-  std::vector<std::vector<std::pair<Cost, Index>>> buckets(place(longest) + 3); // in a ring
+  std::vector<std::vector<std::pair<Cost, Index>>> buckets(place(longest) + 3); // ring buffer
   std::size_t waiting = 0, level = 0;
   const auto reach = [&](Index cell, Cost cost) {
     if (cost < least[std::size_t(cell)])

@@ -112,7 +112,7 @@ class _Search:
         return flags
 
     def is_path_free(self, path: list[int], begin: int, end: int) -> bool:
-        """Return whether a path is free; otherwise remove what is blocked.
+        """Return whether a path is free; otherwise remove its blocked moves.
 
         Args:
             path: Nodes from the start on.

@@ -263,7 +263,7 @@ class SearchSpace:
     def get_goal_drive(
         self, connections: Connections, number: int, goal: int, yaw: float
     ) -> tuple[Drive, float]:
-        """Return the drive of a connection to a goal from a cell with given yaw, and the goal's yaw."""
+        """Return the drive of a connection to a goal from a yaw in its cell, and the last yaw."""
         pose = self.goals[goal]
         drive = Drive(
             self.center(connections.cell[number]),

@@ -1,4 +1,4 @@
-// The shortest paths of a car that drives ahead and back, in closed form; see reeds_shepp.py for the source.
+// Shortest paths of a car that drives forwards and backwards, in closed form; see reeds_shepp.py for the source.
 
 #pragma once
 
@@ -17,7 +17,7 @@ namespace reeds_shepp {
 constexpr std::size_t MOST = 5; // pieces of a word
 constexpr double SAME = 1e-9, PI = 3.14159265358979323846, QUARTER = PI / 2;
 
-// Lengths of pieces in radii, back < 0, and which way they turn: left 1, right -1, straight on 0.
+// Lengths of pieces in radii, backwards < 0, and their turning directions: left 1, right -1, straight 0.
 struct Word
 {
   std::array<double, MOST> pieces{};
@@ -37,13 +37,13 @@ inline double root(double square)
   return std::sqrt(std::max(square, 0.0));
 }
 
-// Where to go: a place, a heading, and the latter's sine and cosine.
+// A goal: position, heading, and the heading's sine and cosine.
 struct Goal
 {
   double x, y, phi, sin, cos;
 };
 
-// Each formula says whether a word of its kind leads to a goal, and its pieces.
+// Each formula returns whether a word of its kind reaches a goal, and the word's pieces.
 using Formula = bool (*)(const Goal & goal, Pieces & p);
 
 inline bool lsl(const Goal & goal, Pieces & p)
@@ -80,7 +80,7 @@ inline std::array<double, 2> outer(double u, double v, double xi, double eta, do
   return {first, wrapped(first - u + v - phi)};
 }
 
-// L+ R+ L- R-, both middle arcs alike.
+// L+ R+ L- R-, equal middle arcs.
 inline bool lrlr_between(const Goal & goal, Pieces & p)
 {
   const double xi = goal.x + goal.sin, eta = goal.y - 1.0 - goal.cos, rho = (2.0 + std::hypot(xi, eta)) / 4.0;
@@ -90,7 +90,7 @@ inline bool lrlr_between(const Goal & goal, Pieces & p)
   return rho <= 1.0 && t >= -SAME && v <= SAME;
 }
 
-// L+ R- L- R+, both middle arcs alike.
+// L+ R- L- R+, equal middle arcs.
 inline bool lrlr_within(const Goal & goal, Pieces & p)
 {
   const double xi = goal.x + goal.sin, eta = goal.y - 1.0 - goal.cos, rho = (20.0 - xi * xi - eta * eta) / 16.0;
@@ -126,7 +126,7 @@ inline bool lrslr(const Goal & goal, Pieces & p)
   return far >= 2.0 && u <= SAME && t >= -SAME && v >= -SAME;
 }
 
-// A formula, the way its pieces turn, how many there are, and whether it is a word of its own when reversed.
+// A formula, the turning directions of its pieces, their number, and whether the reversed word is another one.
 struct Kind
 {
   Formula formula;
@@ -148,7 +148,7 @@ constexpr std::array<Kind, 8> KINDS{{
 
 inline Word shortest(double x, double y, double phi)
 {
-  // The start as the goal sees it, mirrored.
+  // The start relative to the goal, mirrored.
   const double sin = std::sin(phi), cos = std::cos(phi), back_x = x * cos + y * sin, back_y = x * sin - y * cos;
   Word best;
   Pieces pieces;
@@ -157,7 +157,7 @@ inline Word shortest(double x, double y, double phi)
     {
       if (reverse && !kind.reverses)
         continue;
-      for (const int flip : {1, -1}) // backwards in time
+      for (const int flip : {1, -1}) // time reversal
         for (const int mirror : {1, -1})
         {
           const double px = reverse ? back_x : x, py = reverse ? back_y : y;
@@ -180,7 +180,7 @@ inline Word shortest(double x, double y, double phi)
   return best;
 }
 
-// The shortest paths of a car to goals, (n, 3), in radii: how far each of their pieces leads and how far it turns, (n, 5, 2).
+// Shortest paths of a car to goals, (n, 3), in radii: lengths and turns of their pieces, (n, 5, 2).
 inline Array<double> shortest_words(const Numbers<2> & goals)
 {
   if (goals.shape(1) != 3)

@@ -50,7 +50,7 @@ def find_shortest_path_pieces(goal: Floats, radius: float) -> list[tuple[float, 
 
 
 def _compute_words(goals: Floats) -> Floats:
-    """Return lengths in radii and turns of the pieces of paths, shape (B, 5, 2); unused ones are 0."""
+    """Return lengths in radii and turns of the pieces of paths, (B, 5, 2); 0 if unused."""
     return np.asarray(
         compiled_module("vkc_pin.planning.base_paths._driving").shortest_words(
             np.ascontiguousarray(goals, float)

@@ -38,7 +38,7 @@ class BlockedGoal(NamedTuple):
 
 
 def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
-    """Find violations that no motion can change: start in collision, lost grasps, goals beyond limits."""
+    """Find violations that no motion can change, at the start or of goals beyond limits."""
     found = []
     contacts, deepest = (
         problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0),

@@ -1,4 +1,4 @@
-"""Diagnoses whether a failed motion lacks a path of the base, with the arm at home or folded, or of the arm."""
+"""Diagnoses whether a failed motion lacks a path of the base or of the arm."""
 
 from __future__ import annotations
 

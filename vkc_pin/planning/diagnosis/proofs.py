@@ -116,7 +116,7 @@ def find_proofs(problem: TrajectoryProblem) -> list[str]:
 
 
 def _find_tracked_points(problem: TrajectoryProblem) -> list[Floats]:
-    """Return points of the base to track, shape (2,) [m] each: its origin, and where it is highest."""
+    """Return points of the base to track, (2,) [m] each: its origin, and where it is highest."""
     robot = problem.chain.robot.collision.geometryObjects
     solids = make_solids(
         [(shape.geometry, shape.placement) for shape in robot if shape.parentJoint == _BASE]
@@ -128,7 +128,7 @@ def _find_tracked_points(problem: TrajectoryProblem) -> list[Floats]:
 
 
 def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_BaseGoal], list[str]]:
-    """Return necessary base positions at the end of a phase, and explanations of unreachable goals."""
+    """Return necessary base positions at a phase's end, and reasons why goals are unreachable."""
     phase, end = problem.task.phases[number], int(problem.ends[number])
     goals, beyond = [], []
     if phase.base is not None:
@@ -143,8 +143,8 @@ def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Bas
             height = abs(at[2] - shoulder[2])
             if height > length:
                 beyond.append(
-                    f"{goal.about} at z = {at[2]:.2f} m is {height - length:.2f} m too high or low, "
-                    "wherever the base is: "
+                    f"{goal.about} at z = {at[2]:.2f} m is {height - length:.2f} m too high "
+                    "or low, wherever the base is: "
                     f"it turns about a joint at z = {shoulder[2]:.2f} m, "
                     f"and the whole arm with it is {length:.2f} m long"
                 )
@@ -185,7 +185,7 @@ def _compute_arm_reach(
 def _collect_walls(
     problem: TrajectoryProblem, number: int, point: Floats
 ) -> tuple[list[Wall], list[str]]:
-    """Return the walls that keep a point of the base away in a phase, and their obstacles' names."""
+    """Return the walls that keep a point of the base away in a phase, and their names."""
     part = problem.contacts.phases[number]
     robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
     base = [i for i, shape in enumerate(robot) if shape.parentJoint == _BASE]

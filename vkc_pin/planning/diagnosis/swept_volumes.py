@@ -1,4 +1,4 @@
-"""Proves that an object's link collides on the way to its goal, whoever moves it."""
+"""Proves that an object's link collides between its start and its goal, whoever moves it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-// Two random trees of configurations that grow towards each other (RRT-Connect, Kuffner and LaValle, ICRA 2000); see rrt.py.
+// Grows two random trees towards each other (RRT-Connect, Kuffner and LaValle, ICRA 2000); see rrt.py.
 
 #include <deque>
 #include <stdexcept>
@@ -22,7 +22,7 @@ Rows rows_of(const Numbers<2> & numbers)
   return found;
 }
 
-// For one thread at a time.
+// Not thread-safe: one thread at a time.
 class Trees
 {
 public:
@@ -60,7 +60,7 @@ public:
     }
   }
 
-  // A path from `start` to one of `ends`, empty if none was found.
+  // Returns a path from `start` to one of `ends`, empty if none was found.
   Array<double> run(const Numbers<2> & start, const Numbers<2> & ends, Index tries)
   {
     check(start);
@@ -76,7 +76,7 @@ public:
     return array(path);
   }
 
-  // Shortened by straight lines between random places on it, as many times as it has configurations.
+  // Applies shortcuts between random points of a path, as many times as it has configurations.
   Array<double> shortened(const Numbers<2> & path)
   {
     return changed(path, [this](Rows & rows) {
@@ -88,7 +88,7 @@ public:
     });
   }
 
-  // The arm, and each of its joints alone, made to move evenly: all along it (`times` 0) or so many times between random places.
+  // Applies partial shortcuts to the arm and to each of its joints: along the whole path (`times` 0) or between random points.
   Array<double> evened(const Numbers<2> & path, Index times, double worth)
   {
     return changed(path, [&](Rows & rows) {
@@ -106,7 +106,7 @@ public:
     });
   }
 
-  // Which share of the line from one configuration to another is free.
+  // Returns the collision-free share of the line between two configurations.
   double along(const Numbers<2> & ends)
   {
     check(ends);
@@ -174,7 +174,7 @@ private:
     return {};
   }
 
-  // Lets a tree grow towards a free part of the base's path, and take in all of it if it gets there.
+  // Grows a tree towards a free run of the base's path, and adds the whole run if it gets there.
   std::size_t grow_to_run(Tree & tree)
   {
     std::vector<std::size_t> left;
@@ -196,7 +196,7 @@ private:
     return node;
   }
 
-  // A configuration beside the base's path or around one of its ends, the arm at or around a likely posture.
+  // Samples a configuration near the base's path or one of its ends, with the arm at or near a likely posture.
   Row drawn(const Rows & start, const Rows & ends)
   {
     const bool guided = random_.coin();
@@ -211,7 +211,7 @@ private:
     return goal;
   }
 
-  // Lets a tree grow from its nearest node towards a configuration, as far as nothing is hit; the new node, if there is one.
+  // Extends a tree from its nearest node towards a configuration until a collision; returns the new node, if any.
   std::size_t grow(Tree & tree, const Row & goal)
   {
     const std::size_t near = tree.nearest(goal, measure_);
@@ -236,7 +236,7 @@ private:
 NB_MODULE(_trees, module)
 {
   module.doc() = "Two random trees of configurations that grow towards each other, and what makes their paths shorter.";
-  nb::set_leak_warnings(false); // what caches and globals keep lives until the process ends
+  nb::set_leak_warnings(false); // caches and globals live until the process ends
   nb::class_<Trees>(module, "Trees")
     .def(
       nb::init<

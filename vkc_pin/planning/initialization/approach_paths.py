@@ -82,7 +82,7 @@ class ApproachPaths:
         return self._move_tool(z, _UP, drives=False) if phase.held else np.empty((0, len(z)))
 
     def _get_approach_direction(self, z: Floats, frame: tuple[int, pin.SE3]) -> Floats:
-        """Return the world z axis of a frame at z, shape (n,): the approach direction, shape (3,)."""
+        """Return the approach direction at z, (n,): the world z axis of a frame, shape (3,)."""
         joint, local = frame
         rotations, _ = self.chain.joint_placements(z[None])
         return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])

@@ -1,4 +1,4 @@
-"""Finds base paths for every phase with A*, and arm postures that are folded for narrow passages."""
+"""Finds base paths for every phase with A*, and folded arm postures for narrow passages."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class BaseRoutes:
         return self._grids[key]
 
     def get_folded_arm(self, phase: int) -> Floats:
-        """Return the most compact arm posture of a phase, shape (m - 3,); see `find_folded_arms`."""
+        """Return the most compact posture in a phase, (m - 3,); see `find_folded_arms`."""
         return np.asarray(self._get_folded_arms(phase)[0])
 
     def find_nearest_folded_arm(self, phase: int, first: Floats, last: Floats) -> Floats:
@@ -221,7 +221,7 @@ def find_folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) ->
 
 
 def _is_self_clear(problem: TrajectoryProblem, phase: int, z: Floats) -> Bools:
-    """Return for which configurations, shape (B, n), robot and load keep their own margins, (B,)."""
+    """Return for which configurations, (B, n), robot and load keep their own margins, (B,)."""
     return (
         compute_shortfall(problem, z, problem.contacts.find_waypoint(phase), standing=False) <= 0.0
     )
@@ -263,7 +263,7 @@ def collect_grid_shapes(
 
     Returns:
         Shapes on the base in its frame, with their joint, robot first; obstacles in the world
-        without the floor and what the base may touch.
+        without the floor and allowed contacts.
     """
     chain, part = problem.chain, problem.contacts.phases[phase]
     rotations, translations = chain.joint_placements(z[None])

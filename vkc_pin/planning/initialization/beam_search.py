@@ -29,7 +29,7 @@ _UNREACHABLE_COST = 1e3  # cost of an infeasible configuration or a missing base
 _ACCEPTABLE_COST = 60.0  # collision cost that the solver can repair: one or two grazing contacts
 _SHORTENING_ROUNDS = 8  # times that each keyframe is moved towards its neighbours
 _SECTORS, _SECTOR_QUOTA = 8, 4  # sectors of base headings, and configurations preferred per sector
-# [m] base motion between keyframes of a closed chain above which the path surely crosses an obstacle
+# [m] base motion between keyframes of a closed chain that surely crosses an obstacle
 _MAX_JUMP = 0.5
 
 
@@ -122,7 +122,7 @@ class BeamSearch:
         return found
 
     def is_acceptable(self, found: SearchResult) -> bool:
-        """Return whether the cheapest path has few collisions and, given routes, no jumps of the base."""
+        """Return whether the cheapest path has few collisions and, given routes, no base jumps."""
         best = int(np.argmin(found.cost))
         closed = [self._is_closed_at(waypoint) for waypoint in found.waypoints[1:]]
         jumps = np.abs(np.diff(found.paths[best, :, :2], axis=0)).max(axis=1) > _MAX_JUMP
@@ -183,7 +183,7 @@ class BeamSearch:
         keyframe: int,
         phase: int,
     ) -> tuple[Ints, Floats, Floats, Floats]:
-        """Append shortened versions of the best continuations; returns parents, z, penalties, costs."""
+        """Append shortened versions of the best continuations."""
         best = np.argsort(total, kind="stable")[: 2 * _BEAM_WIDTH]
         before = found.paths[parents[best]]
         paths = np.concatenate([before, z[best, None]], axis=1)
@@ -265,7 +265,7 @@ class BeamSearch:
         )
 
     def _compute_path_cost(self, first: Floats, last: Floats, phase: int) -> Floats:
-        """Return path lengths between configurations, both (B, n), in radians of the arm, shape (B,)."""
+        """Return path lengths between configurations, both (B, n), in radians of the arm, (B,)."""
         cost = np.abs(last - first) * self.metric
         cost[:, 0], cost[:, 1] = np.hypot(cost[:, 0], cost[:, 1]), 0.0
         if self.sampler.curves is not None:
@@ -284,7 +284,7 @@ class BeamSearch:
     def _sample_continuations(
         self, paths: Floats, cost: Floats, waypoint: int, phase: int, mode: _Mode
     ) -> tuple[Ints, Floats, Floats]:
-        """Sample continuations of `paths` to a waypoint: parent indices, configurations, penalties."""
+        """Sample continuations of `paths`: parent indices, configurations, penalties."""
         sampler = self.sampler
         if not self.problem.closed(self.problem.task.phases[phase]):
             samples = []

@@ -143,7 +143,7 @@ class _Search:
         )
 
     def are_free(self, z: Floats) -> Bools:
-        """Return which configurations are nearly collision-free, shape (B,): the solver does the rest."""
+        """Return which configurations are nearly collision-free, which the solver can repair, (B,)."""
         return (
             compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
             <= self.problem.options.dist_safe
@@ -165,7 +165,7 @@ class _Search:
         return z[self.are_free(z)] if len(z) else z
 
     def run(self, through: Floats, tries: int) -> _Path | None:
-        """Find a path from the first configuration to the end of the phase; None if there is none."""
+        """Find a path from the first configuration to the end of the phase, or None."""
         ends = np.vstack([through[-1:], self.sample_free(through, self.end)])
         ends = ends[self.are_free(ends)]
         one, other = (
@@ -197,7 +197,7 @@ class _Search:
         return _Path(np.vstack([here.z[::-1], there.z]), np.concatenate([here.at[::-1], there.at]))
 
     def grow(self, tree: _Tree, goals: Floats, at: Floats) -> Ints:
-        """Grow a tree step by step towards goals; return the last node of each branch, shape (B,)."""
+        """Grow a tree step by step towards goals; return the last node of each branch, (B,)."""
         ends = np.array(
             [int(np.argmin(self.compute_distances(tree.z, goal))) for goal in goals], int
         )

@@ -1,4 +1,4 @@
-"""Samples keyframe configurations that satisfy the pose constraints, and measures their shortfall."""
+"""Samples keyframe configurations that satisfy pose constraints, and measures their shortfall."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class KeyframeSampler:
         )
 
     def find_pose(self, waypoint: int) -> int | None:
-        """Return the index of the pose constraint at a waypoint, if any; level constraints are ignored."""
+        """Return the index of the pose constraint at a waypoint, except level constraints, or None."""
         poses = self.problem.transcription.structure.poses
         return next(
             (
@@ -225,7 +225,7 @@ class KeyframeSampler:
         return exact
 
     def compute_limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:
-        """Return lower and upper limits at a waypoint after configurations `before`, (B, n) each."""
+        """Return limits at a waypoint after configurations `before`, shape (B, n) each."""
         row = waypoint - 1
         lower, upper = (
             np.tile(limits[row], (len(before), 1))
@@ -239,7 +239,7 @@ class KeyframeSampler:
         return lower, upper
 
     def find_grasp_columns(self, waypoint: int) -> list[int]:
-        """Return the columns of grasp coordinates that are fixed at a waypoint by an earlier grasp."""
+        """Return the columns of grasp coordinates that an earlier grasp fixes at a waypoint."""
         return [column for column, grasp, last in self.problem.choices if grasp < waypoint <= last]
 
     def _perturb_arms(self, z: Floats, pose: int, deviations: tuple[float, float]) -> Floats:

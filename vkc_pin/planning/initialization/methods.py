@@ -194,7 +194,7 @@ class _Shared:
         return KeyframeSampler(self.problem, np.random.default_rng(self.random_seed), self.cache)
 
     def find_phases_without_free_end(self) -> list[int]:
-        """Return the numbers of phases without a known collision-free configuration at their end."""
+        """Return the numbers of phases without a known collision-free end configuration."""
         return [
             number
             for number, end in enumerate(self.problem.ends.tolist())
@@ -251,12 +251,12 @@ class _GuessSearch:
                 return
 
     def _search(self, attempt: int) -> SearchResult | None:
-        """Run a quick search, None if its result is not acceptable, or from attempt 1 a thorough one."""
+        """Run a quick search, None if it is not acceptable; from attempt 1 on, a thorough one."""
         found = self._run_beam_search(thorough=attempt > 0)
         return found if attempt > 0 or self.beam.is_acceptable(found) else None
 
     def _run_beam_search(self, **how: bool) -> SearchResult:
-        """Run the beam search, a second time with diverse headings for a steered base that failed."""
+        """Run the beam search; if it fails for a steered base, again with diverse headings."""
         found = self.beam.search(**how)
         if self.problem.rolling.turning_radius > 0.0 and not self.beam.is_acceptable(found):
             found = min(

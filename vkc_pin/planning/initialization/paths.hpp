@@ -1,4 +1,4 @@
-// Paths straight from one configuration to the next, and what makes them shorter.
+// Paths of straight lines between configurations, and shortcuts on them.
 #pragma once
 
 #include <algorithm>
@@ -11,7 +11,7 @@
 using Row = std::vector<double>;
 using Rows = std::vector<Row>;
 
-// Lengths, with the weight of each coordinate.
+// Weighted distances between configurations.
 class Measure
 {
 public:
@@ -28,7 +28,7 @@ public:
     return sum;
   }
 
-  // How far it is along a path to each of its configurations.
+  // Returns the length of the path up to each of its configurations.
   Row passed(const Rows & path) const
   {
     Row found(path.size(), 0.0);
@@ -57,7 +57,7 @@ inline Row between(const Row & a, const Row & b, double share)
   return found;
 }
 
-// Which piece of a path a place is on that is `at` far along it; the last one at its end.
+// Returns the piece of a path at the length `at`; the last one at its end.
 inline std::size_t piece(const Row & passed, double at)
 {
   const auto after = std::upper_bound(passed.begin(), passed.end(), at);
@@ -71,7 +71,7 @@ inline Row place(const Rows & path, const Row & passed, double at)
   return between(path[k], path[k + 1], length > 0.0 ? std::clamp((at - passed[k]) / length, 0.0, 1.0) : 1.0);
 }
 
-// A path that goes straight between two places on it if nothing is in the way; otherwise the same.
+// Replaces a part of a path by a straight line if that is collision-free.
 inline void shorten(vkc_pin::StraightLines & lines, const Measure & measure, Rows & path, double from, double to)
 {
   const Row passed = measure.passed(path);
@@ -89,8 +89,8 @@ inline void shorten(vkc_pin::StraightLines & lines, const Measure & measure, Row
   path = std::move(changed);
 }
 
-// A path on which some coordinates change evenly between two places, if that saves so large a share and nothing hinders it;
-// otherwise the same. Its configurations differ.
+// Moves some coordinates evenly along a part of a path (partial shortcut) if that saves the given share of its length and is
+// collision-free. The new path has other configurations.
 inline void make_even(
   vkc_pin::StraightLines & lines,
   const Measure & measure,

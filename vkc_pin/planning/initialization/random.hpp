@@ -1,4 +1,4 @@
-// Random numbers that are the same with every compiler.
+// Random numbers that do not depend on the compiler.
 #pragma once
 
 #include <cmath>
@@ -11,13 +11,13 @@ class Random
 public:
   explicit Random(std::uint64_t seed) : engine_(seed) {}
 
-  double uniform() { return double(engine_() >> 11) * 0x1p-53; } // from 0 to 1, without 1
+  double uniform() { return double(engine_() >> 11) * 0x1p-53; } // in [0, 1)
 
   std::size_t below(std::size_t count) { return std::size_t(uniform() * double(count)); }
 
   bool coin() { return engine_() >> 63; }
 
-  // Of mean 0 and standard deviation 1 (Box and Muller 1958).
+  // Standard normal distribution (Box and Muller 1958).
   double normal()
   {
     const double radius = std::sqrt(-2.0 * std::log(1.0 - uniform()));

@@ -83,7 +83,7 @@ def has_arm_detour(problem: TrajectoryProblem, z: Floats) -> bool:
 
 
 def _compute_detour(path: Floats, metric: Floats) -> float:
-    """Return the share of a robot path, shape (K, m), by which the arm exceeds its straight path."""
+    """Return the share of a path, shape (K, m), by which the arm exceeds its straight path."""
     base, arm = np.split(path * metric, [3], axis=1)
     length, driven = (
         np.abs(np.diff(arm, axis=0)).sum(),
@@ -199,7 +199,7 @@ class _Search:
         return share
 
     def _compute_shortfall(self, rows: Floats) -> Floats:
-        """Return the clearance shortfall of overlapping pairs for robot rows, shape (B, m): (B,) [m]."""
+        """Return the shortfall of overlapping pairs for robot rows, (B, m), shape (B,) [m]."""
         z = np.tile(self.first, (len(rows), 1))
         z[:, : self.size] = rows
         return compute_shortfall(self.problem, z, self.waypoint, reach=0.0)

@@ -9,7 +9,7 @@
 
 constexpr std::size_t NONE = std::numeric_limits<std::size_t>::max();
 
-// Configurations, each with the one it was reached from.
+// Nodes with their parents.
 class Tree
 {
 public:
@@ -35,7 +35,7 @@ public:
     return nodes.size() - 1;
   }
 
-  // From a node to its root.
+  // Returns the path from a node to its root.
   Rows back(std::size_t node) const
   {
     Rows found;
@@ -45,7 +45,7 @@ public:
   }
 
   Rows nodes;
-  std::vector<bool> taken; // which runs it has taken in
+  std::vector<bool> taken; // which runs it contains
 
 private:
   std::vector<std::size_t> parents_;

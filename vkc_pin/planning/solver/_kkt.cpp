@@ -1,5 +1,5 @@
-// The linear solver of Ipopt's systems. Ipopt loads it at run time (its options `hsllib` and `linear_solver`) and speaks to it in
-// the interface of HSL's MA27, of which this is what Ipopt uses; https://www.hsl.rl.ac.uk/archive/specs/ma27.pdf describes it.
+// Linear solver for Ipopt's systems. Ipopt loads it at run time (options `hsllib` and `linear_solver`) through the interface of
+// HSL's MA27, as far as Ipopt uses it: https://www.hsl.rl.ac.uk/archive/specs/ma27.pdf.
 
 #include <algorithm>
 #include <limits>
@@ -13,7 +13,7 @@
 namespace
 {
 
-// MA27 keeps all that it knows in its caller's arrays. Here these have only the number of a system: each thread has one at a time.
+// MA27 stores its state in the caller's arrays. Here they hold only the number of a system: each thread has one at a time.
 struct System
 {
   int number = 0;
@@ -24,7 +24,7 @@ thread_local System current;
 
 Factorization * system(int number) { return number == current.number ? current.factorization.get() : nullptr; }
 
-// Places in `info`, and what can be said there.
+// Indices of `info`, and its values.
 enum Field
 {
   FLAG = 0,
@@ -41,7 +41,7 @@ enum Flag
   SINGULAR = -5
 };
 
-// Calls work, and notes in `info` how that went; no exception leaves it.
+// Calls a function and stores its result in `info`; catches allocation failures.
 template<typename Work>
 void noted(int * info, const Work & work)
 {
@@ -62,14 +62,14 @@ extern "C"
 {
 #define EXPORTED __attribute__((visibility("default")))
 
-// Settings: there are none.
+// Sets the options: there are none.
 EXPORTED void ma27id_(int * integers, double * reals)
 {
   std::fill(integers, integers + 30, 0);
   std::fill(reals, reals + 5, 0.0);
 }
 
-// Where a system has entries.
+// Analyses the sparsity pattern.
 EXPORTED void ma27ad_(
   const int * size,
   const int * entries,
@@ -98,7 +98,7 @@ EXPORTED void ma27ad_(
   info[INTEGERS] = 1;
 }
 
-// Factors a system.
+// Factors the matrix.
 EXPORTED void ma27bd_(
   const int *,
   const int *,
@@ -124,7 +124,7 @@ EXPORTED void ma27bd_(
     info[NEGATIVE] = found->negative();
 }
 
-// Solves it.
+// Solves the system.
 EXPORTED void ma27cd_(
   const int * size,
   const double *,

@@ -1,4 +1,4 @@
-// In which order the rows of a sparse symmetric matrix are eliminated: those of an interior-point method on a trajectory.
+// Elimination order for the sparse symmetric systems of an interior-point method on a trajectory.
 #pragma once
 
 #include <algorithm>
@@ -6,9 +6,9 @@
 #include <utility>
 #include <vector>
 
-using Entries = std::vector<std::pair<int, int>>; // where a matrix has any, each above or below the diagonal
+using Entries = std::vector<std::pair<int, int>>; // positions of entries, each above or below the diagonal
 
-// Calls f(i, j) and f(j, i) for every entry off the diagonal.
+// Calls f(i, j) and f(j, i) for every off-diagonal entry.
 template<typename Function>
 void each_pair(const Entries & entries, const Function & f)
 {
@@ -23,18 +23,16 @@ void each_pair(const Entries & entries, const Function & f)
 struct Order
 {
   std::vector<int> rows;
-  int alone = 0; // how many of them, the first ones, know none of those next to them: slacks, and dual rows that know one
+  int alone = 0; // number of leading rows without coupling among them: slacks, and dual rows with one
 };
 
-// A system of an interior-point method has primal rows, whose diagonals are positive at first, and dual ones, whose diagonals
-// are zero. Pivots are taken as they come, so the order has to see to it that none is zero (Bridson, "An Ordering Method for
-// the Direct Solution of Saddle-Point Matrices", 2007):
-//   1. primal rows that only one dual one knows, such as slacks: they cost nothing;
-//   2. dual rows that know one of these, each of which has a pivot now; for the rest that is as if it were not there, but for
-//      what it adds to the Hessian;
-//   3. other primal rows in the order of the program, which is that of time: what is coupled lies close together, and what is
-//      filled in is a band;
-//   4. each other dual row after the last primal one that it knows.
+// Primal rows of an interior-point method have diagonals that are positive at first, dual rows zero diagonals. There is no
+// pivoting, so the order must avoid zero pivots (Bridson, "An Ordering Method for the Direct Solution of Saddle-Point Matrices",
+// 2007):
+//   1. primal rows coupled with a single dual row, such as slacks: they cause no fill-in;
+//   2. dual rows coupled with one of these, which now have a pivot; the remaining matrix only gets additions to the Hessian;
+//   3. other primal rows in the order of the program, which is that of time: couplings are local, and the fill-in is a band;
+//   4. each other dual row after the last primal row that it is coupled with.
 inline Order elimination_order(int size, const Entries & entries, const double * values)
 {
   std::vector<double> diagonal(size, 0.0);
@@ -44,7 +42,7 @@ inline Order elimination_order(int size, const Entries & entries, const double *
   std::vector<char> dual(size);
   for (int j = 0; j < size; ++j)
     dual[j] = !(diagonal[j] > 0.0);
-  std::vector<int> degree(size, 0), primal(size, 0); // how many rows know each, and how many primal ones
+  std::vector<int> degree(size, 0), primal(size, 0); // numbers of coupled rows, and of primal ones among them
   each_pair(entries, [&](int i, int j) {
     ++degree[i];
     primal[i] += !dual[j];
@@ -52,14 +50,14 @@ inline Order elimination_order(int size, const Entries & entries, const double *
   std::vector<char> slack(size), slackened(size, false);
   for (int j = 0; j < size; ++j)
     slack[j] = !dual[j] && degree[j] <= 1 && primal[j] == 0;
-  std::vector<int> last(size, -1); // the last primal row that knows a dual one
+  std::vector<int> last(size, -1); // last primal row coupled with a dual one
   each_pair(entries, [&](int i, int j) {
     if (dual[i] && slack[j])
       slackened[i] = true;
     else if (dual[i] && !dual[j])
       last[i] = std::max(last[i], j);
   });
-  // What comes before all others, then what comes with each row of the program, then what nothing primal knows.
+  // Groups: slacks and their dual rows first, then the rows of the program, then rows without primal coupling.
   enum { SLACK = -2, SLACKENED = -1 };
   std::vector<std::pair<int, int>> when;
   Order found;

@@ -8,13 +8,13 @@
 
 #include "elimination.hpp"
 
-// Factors P·A·Pᵀ = L·D·Lᵀ with a diagonal D, a few neighbouring columns at a time: a panel of L is dense, has only the rows in which
-// one of its columns has an entry, and when it is done the columns to its right are updated (right-looking supernodes: Ng and
+// Factors P·A·Pᵀ = L·D·Lᵀ with a diagonal D, by panels of a few neighbouring columns. A panel of L is dense, has only the rows in
+// which one of its columns has an entry, and updates the columns to its right when it is done (right-looking supernodes: Ng and
 // Peyton, "Block Sparse Cholesky Algorithms on Advanced Uniprocessor Computers", 1993).
 class Factorization
 {
 public:
-  // Takes where entries are, each above or below the diagonal, counted from `base`; those in one place are summed.
+  // Takes positions of entries, each above or below the diagonal, counted from `base`; duplicates are summed.
   Factorization(std::size_t size, std::size_t entries, const int * rows, const int * columns, int base) : size_(int(size))
   {
     for (std::size_t p = 0; p < entries; ++p)
@@ -23,13 +23,13 @@ public:
 
   std::size_t size() const { return std::size_t(size_); }
   std::size_t entries() const { return entries_.size(); }
-  // Number of negative pivots: by Sylvester's law, of negative eigenvalues.
+  // Number of negative pivots, by Sylvester's law that of negative eigenvalues.
   int negative() const { return negative_; }
-  // Whether the last call of `factor` worked, so that there is something to solve with.
+  // Whether the last call of `factor` succeeded.
   bool factored() const { return factored_; }
 
-  // Factors the matrix with these entries; returns whether that worked, which it does not if it is singular. The first time, the
-  // diagonal decides which rows are dual.
+  // Factors the matrix with these entries; returns false if it is singular. The first call decides by the diagonal which rows are
+  // dual.
   bool factor(const double * values)
   {
     factored_ = false;
@@ -49,7 +49,7 @@ public:
     return factored_ = true;
   }
 
-  // Replaces b by the solution of A·x = b.
+  // Solves A·x = b in place.
   void solve(double * x)
   {
     for (int k = 0; k < size_; ++k)
@@ -86,25 +86,25 @@ public:
   }
 
 private:
-  static constexpr int WIDTH = 8; // columns of a panel at most
+  static constexpr int WIDTH = 8; // maximum number of columns of a panel
 
-  // Columns of L next to each other: `width` from the `first` on, `height` entries each, the first ones of which are of the panel's
-  // own rows; where their rows, values and updates begin.
+  // Neighbouring columns of L: `width` from `first` on, with `height` entries each, the panel's own rows first; offsets of their
+  // rows, values and updates.
   struct Panel
   {
     int first, width, height;
     std::size_t rows, values, updates, last_update;
   };
 
-  // What a panel changes in another: its rows from `begin` to `end` are columns of that, whose places in it, and those of the rows
-  // after them, are in `updated_` from `places` on.
+  // Update of another panel: rows `begin` to `end` of this panel are columns of the other; their positions there, and those of
+  // later rows, are in `updated_` from `places` on.
   struct Update
   {
     int panel, begin, end;
     std::size_t places;
   };
 
-  // Finds the panels, where entries of the matrix are in them, and what they change in others.
+  // Determines the panels, the positions of the matrix' entries in them, and the updates between them.
   void analyse(const double * values)
   {
     order_ = elimination_order(size_, entries_, values);
@@ -123,7 +123,7 @@ private:
       at[k + 1] += at[k];
     std::vector<int> next(at.begin(), at.end() - 1);
     each([&](int column, int row, std::size_t) { below[next[column]++] = row; });
-    // Rows of a panel: those of its entries, and those of panels the first of whose later rows are columns of it.
+    // Rows of a panel: those of its entries, and those of panels whose first later row is one of its columns.
     std::vector<int> seen(size_, -1);
     std::vector<std::vector<int>> children;
     for (int first = 0; first < size_;)
@@ -171,7 +171,7 @@ private:
     work_.resize(size_);
   }
 
-  // Where a row is among those of a panel.
+  // Returns the position of a row in a panel.
   int place(const Panel & panel, int row) const
   {
     const auto begin = panel_rows_.begin() + std::ptrdiff_t(panel.rows);
@@ -196,7 +196,7 @@ private:
     panel.last_update = updates_.size();
   }
 
-  // Factors the columns of a panel; false: a pivot is zero, but for what rounding leaves of the sum that it is.
+  // Factors the columns of a panel; returns false if a pivot is zero up to rounding.
   bool eliminate(const Panel & panel)
   {
     constexpr double least = 8.0 * std::numeric_limits<double>::epsilon();
@@ -223,7 +223,7 @@ private:
     return true;
   }
 
-  // Takes what a panel's columns come to off the columns to its right.
+  // Subtracts the contributions of a panel from the columns to its right.
   void update(const Panel & panel)
   {
     const int height = panel.height, width = panel.width;
@@ -251,11 +251,11 @@ private:
     }
   }
 
-  // Takes L·products, from row j on, off a column.
+  // Subtracts L·products, from row j on, from a column.
   void subtract(
     const double * values, int height, int width, const double * products, int j, const int * places, double * target)
   {
-    if (width == 1) // most panels are slacks or dual rows of these: a sixth of the time is saved
+    if (width == 1) // most panels are slacks or their dual rows: saves a sixth of the time
     {
       for (int i = j; i < height; ++i)
         target[places[i]] -= values[i] * products[0];
@@ -289,9 +289,9 @@ private:
   std::vector<Panel> panels_;
   std::vector<int> panel_rows_, updated_;
   std::vector<Update> updates_;
-  std::vector<std::size_t> places_; // of the matrix' entries in the panels
+  std::vector<std::size_t> places_; // positions of the matrix' entries in the panels
   std::vector<double> values_;      // of the panels: L below the diagonal, D on it
-  std::vector<double> sums_;        // of the sizes of all that was taken off each pivot
+  std::vector<double> sums_;        // sums of absolute values subtracted from each pivot
   std::vector<double> work_, sum_;
   int negative_ = 0;
   bool factored_ = false;

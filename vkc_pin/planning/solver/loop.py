@@ -1,4 +1,4 @@
-"""Runs the witness-plane loop: trust-region subproblems, globalized by an exact ℓ1 merit function."""
+"""Runs the witness-plane loop: trust-region subproblems with an exact ℓ1 merit function."""
 
 from __future__ import annotations
 

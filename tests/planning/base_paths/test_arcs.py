@@ -14,14 +14,14 @@ TURNING = 0.3
 
 
 def rolled(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how far each step of a path leads along and aside of the heading at its middle, and how far it turns."""
+    """Return the motion of each step along and across its mean heading, and its turn."""
     step = np.diff(path, axis=0)
     seen = np.exp(-1j * (path[:-1, 2] + step[:, 2] / 2)) * (step[:, 0] + 1j * step[:, 1])
     return seen.real, seen.imag, step[:, 2]
 
 
 def equal(pose: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two poses are the same but for whole turns."""
+    """Return whether two poses are equal up to full turns."""
     return bool(
         np.allclose(pose[:2], other[:2], atol=1e-6) and np.cos(pose[2] - other[2]) > 1.0 - 1e-9
     )
@@ -30,10 +30,10 @@ def equal(pose: np.ndarray, other: np.ndarray) -> bool:
 @pytest.mark.parametrize("radius", [0.0, 0.5, 1.3])
 @settings(deadline=None)
 @given(PLACES, PLACES, st.integers(8, 60))
-def test_every_step_of_a_curve_rolls(
+def test_every_step_of_a_curve_rolls_without_slip(
     radius: float, first: tuple[float, ...], last: tuple[float, ...], steps: int
 ) -> None:
-    """Not sideways, in no turn tighter than the radius, and to where it is to lead, in steps of any length up to 0.7 rad."""
+    """Steps up to 0.7 rad do not slip, keep the turning radius and reach the goal."""
     a, b, curves = np.array(first), np.array(last), Curves(radius, TURNING)
     corners = curves.compute_corners(a, b)
     np.testing.assert_array_equal(corners[0], a)
@@ -54,10 +54,10 @@ def test_every_step_of_a_curve_rolls(
 @given(
     PLACES, st.floats(-2.0, 2.0), st.floats(-1.5, 1.5), st.floats(-0.5, 0.5), st.floats(0.0, 1.0)
 )
-def test_the_nearest_arc(
+def test_nearest_arc_beats_random_arcs(
     first: tuple[float, ...], dx: float, dy: float, turn: float, radius: float
 ) -> None:
-    """It rolls; no other arc that is tried at random ends nearer to where it is to lead."""
+    """The arc rolls, and no random arc ends nearer to the goal."""
     a, rng = np.array(first), np.random.default_rng(0)
     b = a + np.array([dx, dy, turn])
     (found,) = find_nearest_arc(a[None], b[None], radius=radius, turning=TURNING)
@@ -79,7 +79,7 @@ def test_the_nearest_arc(
             )
 
 
-def test_an_arc_is_its_own_nearest() -> None:
+def test_nearest_arc_of_an_arc_is_itself() -> None:
     rng = np.random.default_rng(0)
     first = rng.uniform(-3, 3, (200, 3))
     turn = rng.uniform(-0.7, 0.7, 200)
@@ -101,10 +101,10 @@ def test_an_arc_is_its_own_nearest() -> None:
     st.floats(0.0, 1.0),
     st.floats(0.0, 1.0),
 )
-def test_between_two_poses_the_twist_is_constant(
+def test_twist_between_two_poses_is_constant(
     first: tuple[float, ...], dx: float, dy: float, turn: float, one: float, two: float
 ) -> None:
-    """Half of the way between two poses of it is the pose half-way between their shares, however they lie."""
+    """The midpoint between two poses of an arc is the pose at their mean share."""
     a = np.array([first])
     b = a + np.array([dx, dy, turn])
     np.testing.assert_allclose(interpolate_arcs(a, b, np.array([1.0])), b, atol=1e-9)
@@ -125,7 +125,7 @@ def test_a_path_stops_at_its_corners() -> None:
     assert lengths[-1] < lengths.max() / 2
 
 
-def test_fewer_steps_than_corners_still_lead_there() -> None:
+def test_fewer_steps_than_corners_still_reach_the_end() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.557, 1.0], [1.0, 1.557, 0.2]])
     path = sample_path(corners, 2, turning=TURNING)
     assert path.shape == (2, 3)
@@ -136,7 +136,7 @@ def test_fewer_steps_than_corners_still_lead_there() -> None:
 
 
 def test_a_car_follows_a_path_with_turns_in_place() -> None:
-    """Around a wall that the shortest curve leads through; without the wall it takes that."""
+    """The path avoids a wall; without the wall it is the shortest curve."""
     path = np.array(
         [
             [0.0, 0.0, 1.5],

@@ -30,7 +30,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
-    """Return some shapes on the base, what stands around, and the body of the former."""
+    """Return random shapes on the base, obstacles, and the moving shapes."""
     rng = np.random.default_rng(seed)
     shapes = [*chassis(), *arm()[:3], (wedge(), at(0.3, -0.1, 0.6, 0.4))]
     standing = [
@@ -42,7 +42,7 @@ def scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
 
 @settings(max_examples=30, deadline=None)
 @given(SEEDS)
-def test_a_drive_is_free_if_coal_finds_room_all_along(seed: int) -> None:
+def test_drives_agree_with_coal(seed: int) -> None:
     shapes, standing, body = scene(seed)
     rng = np.random.default_rng(seed + 1)
     a, yaw = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
@@ -58,7 +58,7 @@ def test_a_drive_is_free_if_coal_finds_room_all_along(seed: int) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(SEEDS)
-def test_a_turn_is_free_if_coal_finds_room_all_along(seed: int) -> None:
+def test_turns_agree_with_coal(seed: int) -> None:
     shapes, standing, body = scene(seed)
     rng = np.random.default_rng(seed + 1)
     place, start = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
@@ -73,8 +73,8 @@ def test_a_turn_is_free_if_coal_finds_room_all_along(seed: int) -> None:
         assert nearest < MARGIN + 0.004
 
 
-def test_both_answers_come_up() -> None:
-    """The two tests above would say little if nearly everything were free, or nearly nothing."""
+def test_random_cases_include_free_and_blocked() -> None:
+    """The two tests above need enough free and blocked cases."""
     answers = []
     for seed in range(60):
         _, _, body = scene(seed)
@@ -84,7 +84,7 @@ def test_both_answers_come_up() -> None:
     assert 0.2 < np.mean(answers) < 0.8
 
 
-def test_a_drive_along_a_wall_needs_few_questions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_along_a_wall_needs_few_distance_queries(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     distance_of = MovingShapes._compute_distance
     monkeypatch.setattr(
@@ -98,7 +98,7 @@ def test_a_drive_along_a_wall_needs_few_questions(monkeypatch: pytest.MonkeyPatc
     assert not body.is_drive_free(np.array([0.0, 0.0]), np.array([-3.0, 0.0]), 0.0)
 
 
-def test_shapes_at_other_heights_are_no_pairs() -> None:
+def test_shapes_at_different_heights_form_no_pairs() -> None:
     table = [(coal.Box(2.0, 2.0, 0.05), at(0.0, 0.0, 0.775))]
     body = MovingShapes([*chassis(), *arm()], Obstacles(table), MARGIN)
     assert 0 not in body.moving
@@ -108,7 +108,7 @@ def test_shapes_at_other_heights_are_no_pairs() -> None:
     )
 
 
-def test_nothing_to_hit() -> None:
+def test_everything_is_free_without_obstacles() -> None:
     for body in (
         MovingShapes([], Obstacles(clutter(0, 5)), MARGIN),
         MovingShapes(chassis(), Obstacles([]), MARGIN),
@@ -117,7 +117,7 @@ def test_nothing_to_hit() -> None:
         assert body.is_turn_free(np.zeros(2), 0.0, 6.0)
 
 
-def test_what_is_too_close_at_the_start_may_stay_so_close() -> None:
+def test_exit_margins_keep_the_initial_distance() -> None:
     box = (coal.Box(1.0, 1.0, 1.0), at(1.01, 0.0, 0.5))
     near, far = (
         (coal.Box(1.0, 1.0, 1.0), at(0.0, 0.845, 0.5)),
@@ -149,8 +149,10 @@ SHAPES = [
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
 @settings(max_examples=20, deadline=None)
 @given(seed=SEEDS)
-def test_outlines_are_inside_and_outside(shape: coal.CollisionGeometry, seed: int) -> None:
-    """Along any direction the shape itself, as coal has it, ends between what is inside and what is outside."""
+def test_hull_points_bound_shapes_from_inside_and_outside(
+    shape: coal.CollisionGeometry, seed: int
+) -> None:
+    """Along any direction, coal's support is between the inner and the outer points."""
     rng = np.random.default_rng(seed)
     placement = pin.SE3(
         pin.Quaternion(rng.normal(size=4)).normalized().matrix(), rng.uniform(-1.0, 1.0, 3)

@@ -98,7 +98,7 @@ def find(
 @given(st.integers(0, 2**32 - 1))
 @example(280)  # a drive whose ends differ in heading by a rounding error
 @example(955485)  # a move from near the start to near a goal, which in between is near neither
-def test_nothing_is_hit_all_along_a_path(seed: int) -> None:
+def test_paths_are_collision_free(seed: int) -> None:
     rng = np.random.default_rng(seed)
     standing = [*furniture(), *clutter(int(rng.integers(10_000)), 12)]
     grid = BaseGrid(chassis(), arm(), standing, HALL, MARGIN, near=NEAR)
@@ -113,7 +113,7 @@ def test_nothing_is_hit_all_along_a_path(seed: int) -> None:
         check(plain, start, goals, chassis(), arm(), standing)
 
 
-def test_in_an_empty_hall_the_way_is_straight() -> None:
+def test_path_in_an_empty_hall_is_straight() -> None:
     path = find([], [-3.0, -2.0, 0.3], [[3.1, 1.7, -0.4]])
     assert path is not None
     ahead = np.arctan2(3.7, 6.1)
@@ -125,15 +125,15 @@ def test_in_an_empty_hall_the_way_is_straight() -> None:
     assert path.cost == pytest.approx(np.hypot(6.1, 3.7) + TURNING * (2 * ahead + 0.1))
 
 
-def test_backwards_where_that_is_cheaper() -> None:
+def test_base_drives_backwards_where_that_is_cheaper() -> None:
     path = find([], [0.0, 0.0, 0.0], [[-1.0, 0.0, 0.0]])
     assert path is not None
     assert path.cost == pytest.approx(BACKWARDS)
     assert np.all(path.poses[:, 2] == 0.0)
 
 
-def test_sideways_where_there_is_no_room_to_turn() -> None:
-    """Parked along a wall, at both ends; in the open the base turns."""
+def test_base_drives_sideways_where_it_cannot_turn() -> None:
+    """Both poses are along a wall; in the open the base turns instead."""
     walls: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), at(x, 0.0, 0.5)) for x in (-2.0, 2.0)]
     y = 0.05 + 0.335 + 0.03
     start, goals = np.array([-2.0, y, 0.0]), np.array([[2.0, y, 0.0]])
@@ -145,7 +145,7 @@ def test_sideways_where_there_is_no_room_to_turn() -> None:
     assert free.cost == pytest.approx(2.0 + TURNING * np.pi)
 
 
-def test_to_turn_in_place_and_to_stay() -> None:
+def test_turning_in_place_and_staying() -> None:
     turned, stayed = (
         find([], [0.0, 0.0, 3.0], [[0.0, 0.0, -3.0]]),
         find([], [0.0, 0.0, 3.0], [[0.0, 0.0, 3.0]]),
@@ -158,7 +158,7 @@ def test_to_turn_in_place_and_to_stay() -> None:
     np.testing.assert_array_equal(sample_poses(stayed, 3, turning=TURNING), [[0.0, 0.0, 3.0]] * 3)
 
 
-def test_a_gap_that_only_fits_lengthwise() -> None:
+def test_narrow_gap_is_passed_lengthwise() -> None:
     standing, start, goals = wall_with_a_gap(0.85), [-2.5, 1.0, np.pi / 2], [[2.5, -1.0, np.pi / 2]]
     path = find(standing, start, goals)
     assert path is not None
@@ -171,7 +171,7 @@ def test_a_gap_that_only_fits_lengthwise() -> None:
     assert find(wall_with_a_gap(1.2), start, goals, base=chassis(1.0, 0.85)) is not None
 
 
-def test_what_is_carried_does_not_fit_through_a_gap() -> None:
+def test_load_does_not_fit_through_a_gap() -> None:
     standing, start, goals = (
         wall_with_a_gap(1.0),
         np.array([-2.5, 0.0, 0.0]),
@@ -188,8 +188,8 @@ def test_what_is_carried_does_not_fit_through_a_gap() -> None:
     assert low is not None  # it passes over
 
 
-def test_near_start_and_goals_only_the_base_counts() -> None:
-    """The arm stretches over tables of its own height there; on the way it does not pass under a third."""
+def test_only_the_base_counts_near_start_and_goals() -> None:
+    """The arm reaches over tables at either end, but does not pass under a third."""
     rod: list[Shape] = [(coal.Box(0.4, 0.05, 0.4), at(0.6, 0.0, 0.8))]
     tables = [(coal.Box(1.0, 2.0, 0.1), at(x, 0.0, 0.85)) for x in (-3.5, 3.5)]
     start, goals = np.array([-2.5, 0.0, np.pi]), np.array([[2.5, 0.0, 0.0]])
@@ -214,8 +214,8 @@ def test_near_start_and_goals_only_the_base_counts() -> None:
     )
 
 
-def test_a_start_that_is_too_close_is_left() -> None:
-    """It comes no closer, and does not cut through what it is close to."""
+def test_start_within_the_margin_is_left() -> None:
+    """The base comes no closer to the obstacle, and does not cross it."""
     wall: list[Shape] = [(coal.Box(4.0, 0.1, 1.0), at(0.0, 0.0, 0.5))]
     start, goals = [0.0, -0.05 - 0.335 - 0.01, 0.0], [[0.0, 1.5, 0.0]]
     path = find(wall, start, goals)
@@ -232,7 +232,7 @@ def test_a_start_that_is_too_close_is_left() -> None:
     assert path.cost > 4.0
 
 
-def test_a_start_inside_an_obstacle_is_left() -> None:
+def test_start_in_collision_is_left() -> None:
     block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), at(0.0, 0.0, 0.5))]
     start, goals = [-0.8, 0.0, 0.0], [[3.0, 0.0, 0.0]]
     path = find(block, start, goals)
@@ -252,7 +252,7 @@ def test_a_start_inside_an_obstacle_is_left() -> None:
     assert leaves[:, 0].max() <= -0.8  # the short way out, not through
 
 
-def test_a_start_deep_inside_has_no_way() -> None:
+def test_start_deep_in_collision_has_no_path() -> None:
     block: list[Shape] = [(coal.Box(6.0, 6.0, 1.0), at(0.0, 0.0, 0.5))]
     assert find(block, [0.0, 0.0, 0.0], [[4.0, 4.0, 0.0]]) is None
     assert (
@@ -260,7 +260,7 @@ def test_a_start_deep_inside_has_no_way() -> None:
     )  # outside the arena nothing is in the way
 
 
-def test_blocked_goals_are_passed_over() -> None:
+def test_blocked_goals_are_skipped() -> None:
     block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), at(2.0, 0.0, 0.5))]
     start, blocked, free = [0.0, 0.0, 0.0], [2.0, 0.2, 0.0], [-4.0, 0.0, 1.0]
     path = find(block, start, [blocked, free])
@@ -272,7 +272,7 @@ def test_blocked_goals_are_passed_over() -> None:
     )
 
 
-def test_a_goal_may_cost_more() -> None:
+def test_additional_goal_costs_count() -> None:
     start, goals = [0.0, 0.0, 0.0], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
     found = [
         find([], start, goals, costs=costs) for costs in (None, [0.0, 0.5], [1.5, 0.0], [1.5, 1.0])
@@ -281,7 +281,7 @@ def test_a_goal_may_cost_more() -> None:
     assert [path.cost for path in found if path is not None] == pytest.approx([1.0, 1.0, 2.0, 2.5])
 
 
-def test_no_way_round_a_closed_room() -> None:
+def test_closed_room_has_no_path() -> None:
     room: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-1.5, 1.5)]
     room += [(coal.Box(0.1, 3.0, 1.0), at(x, 0.0, 0.5)) for x in (-1.5, 1.5)]
     assert find(room, [3.0, 3.0, 0.0], [[0.0, 0.0, 0.0]]) is None
@@ -289,7 +289,7 @@ def test_no_way_round_a_closed_room() -> None:
     assert find(room, [0.3, 0.0, 0.0], [[-0.3, 0.0, 2.0]]) is not None
 
 
-def test_two_runs_are_equal() -> None:
+def test_search_is_deterministic() -> None:
     rng = np.random.default_rng(3)
     for _ in range(5):
         start, goals = (
@@ -314,13 +314,13 @@ def around_the_block() -> BasePath:
     return path
 
 
-def test_smoothing_leaves_few_turns(around_the_block: BasePath) -> None:
+def test_smoothing_removes_turns(around_the_block: BasePath) -> None:
     assert len(around_the_block.poses) <= 16
     assert 5.5 < around_the_block.cost < 8.5
 
 
 @pytest.mark.parametrize("steps", [1, 7, 40])
-def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
+def test_poses_are_sampled_along_a_path(around_the_block: BasePath, steps: int) -> None:
     path = around_the_block
     waypoints = sample_poses(path, steps, turning=TURNING)
     assert waypoints.shape == (steps, 3)
@@ -342,7 +342,7 @@ def test_waypoints_along_a_path(around_the_block: BasePath, steps: int) -> None:
         assert progress[0] == pytest.approx(passed[-1] * (3 / 40**2 - 2 / 40**3), abs=1e-3)
 
 
-def test_turning_takes_waypoints() -> None:
+def test_turning_takes_poses() -> None:
     path = find([], [0.0, 0.0, 0.0], [[1.0, 0.0, 3.0]])
     assert path is not None
     waypoints = sample_poses(path, 50, turning=TURNING)
@@ -374,8 +374,8 @@ def test_no_waypoints(around_the_block: BasePath) -> None:
         sample_poses(around_the_block, 0, turning=TURNING)
 
 
-def test_a_search_asks_about_few_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a thousand cells with a heading, fewer than one is looked at exactly: the rest is left to the heuristic."""
+def test_search_checks_few_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer than one in a thousand nodes is checked exactly."""
     move, asked = _Search._is_move_free, 0
 
     def counted(self: _Search, node: int, after: int) -> bool:

@@ -26,7 +26,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_what_is_stuck_is_blocked_and_nearly_all_that_is_blocked(name: str) -> None:
+def test_found_cells_collide_and_few_are_missed(name: str) -> None:
     standing, rng = SCENES[name], np.random.default_rng(0)
     grid = BaseGrid(chassis(), CARRIED, standing, HALL, MARGIN)
     blocked, known = np.zeros(2), np.zeros(2)
@@ -45,7 +45,7 @@ def test_what_is_stuck_is_blocked_and_nearly_all_that_is_blocked(name: str) -> N
 
 
 def test_a_box_before_a_wall() -> None:
-    """Exactly the cells whose centres are closer than half the box and the margin."""
+    """Cells are found whose centres are within half the box and the margin."""
     lattice = Lattice(np.array([0.05, 0.05]), np.array([0.1, 0.1]), 20, np.array([0.0, np.pi / 2]))
     wall: list[Shape] = [(coal.Box(0.2, 10.0, 1.0), at(1.0, 1.0, 0.5))]
     base, carried = find_colliding_cells(
@@ -58,7 +58,7 @@ def test_a_box_before_a_wall() -> None:
     assert not carried.any()
 
 
-def test_only_what_shares_heights_is_stuck() -> None:
+def test_only_shapes_of_common_heights_collide() -> None:
     lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
     table: list[Shape] = [(coal.Box(5.0, 5.0, 0.05), at(0.5, 0.5, 0.775))]
     low, high = (
@@ -75,7 +75,7 @@ def test_only_what_shares_heights_is_stuck() -> None:
     assert not over.any()  # it is within the outline of the base, which is stuck anyway
 
 
-def test_shapes_of_unknown_inside_and_flat_ones_are_left_out() -> None:
+def test_flat_shapes_and_unknown_ones_are_ignored() -> None:
     lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
     odd: list[Shape] = [
         (coal.Ellipsoid(1.0, 1.0, 1.0), at(0.5, 0.5, 0.5)),

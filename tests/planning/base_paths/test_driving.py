@@ -18,7 +18,7 @@ GRID = BaseGrid([], [], [], (-2.0, 2.0, -2.0, 2.0), 0.0, cells=CELLS)
 
 
 class Graph:
-    """The same graph as that of a `Paths`, node by node, with all that is taken out."""
+    """Reference graph of a `Paths`, with everything that was removed."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -51,7 +51,7 @@ class Graph:
         )
 
     def price(self, node: int, after: int) -> float:
-        """Return what the cheapest move between two nodes costs, infinite if there is none."""
+        """Return the cost of the cheapest move between two nodes, infinite if there is none."""
         flags, found = self.flags.reshape(-1), np.inf
         for kind in range(4):
             first = node if kind in (0, 2) else after
@@ -92,7 +92,7 @@ class Graph:
             assert self.begins[begin, 1] + moves + self.ends[end, 1] == cost
 
     def change(self, paths: Any, found: tuple[int, int, int, Any]) -> None:
-        """Take something out of the path that was found, there and here."""
+        """Remove a part of the path from both searches."""
         _, end, begin, nodes = found
         flags, path = self.flags.reshape(-1), nodes[::-1].tolist()
         what = self.rng.integers(4)
@@ -114,8 +114,8 @@ class Graph:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_cheapest_path_after_every_change(seed: int) -> None:
-    """As SciPy finds it in a graph that is built anew; and the same one as if it had been known before what is not free."""
+def test_cheapest_path_is_repaired_after_every_change(seed: int) -> None:
+    """The path equals SciPy's in a new graph, and does not depend on the order of changes."""
     graph = Graph(seed)
     paths, lengths = graph.paths(), []
     for _ in range(25):
@@ -132,7 +132,7 @@ def test_the_cheapest_path_after_every_change(seed: int) -> None:
     assert max(lengths) > 2
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_arguments_are_rejected() -> None:
     graph = Graph(0)
     paths = graph.paths()
     with pytest.raises(IndexError):

@@ -44,7 +44,7 @@ def test_cells_and_headings(grid: BaseGrid) -> None:
         assert ahead == pytest.approx(grid.lengths[heading] * np.array([np.cos(yaw), np.sin(yaw)]))
 
 
-def test_a_cell_is_free_if_coal_finds_room(grid: BaseGrid) -> None:
+def test_free_cells_agree_with_coal(grid: BaseGrid) -> None:
     answers = []
     for i, j, heading in states(400, 0):
         pose = [*grid.center(i, j), grid.yaws[heading]]
@@ -57,14 +57,14 @@ def test_a_cell_is_free_if_coal_finds_room(grid: BaseGrid) -> None:
     assert any(base and not over for base, over in answers)
 
 
-def test_any_pose_is_clear_if_coal_finds_room(grid: BaseGrid) -> None:
+def test_free_poses_agree_with_coal(grid: BaseGrid) -> None:
     for x, y, yaw in np.random.default_rng(1).uniform([-5, -5, -7], [5, 5, 7], size=(400, 3)):
         expected = distance([*chassis(), *arm()], STANDING, (x, y, yaw)) >= MARGIN
         assert grid.is_pose_free(x, y, yaw) == expected
 
 
 @pytest.mark.parametrize("reaching", [True, False])
-def test_moves_between_cells_are_free_all_along(grid: BaseGrid, reaching: bool) -> None:
+def test_moves_between_cells_agree_with_coal(grid: BaseGrid, reaching: bool) -> None:
     shapes = chassis() if reaching else [*chassis(), *arm()]
     answers = []
     for i, j, heading in states(60, 2):
@@ -85,8 +85,8 @@ def test_moves_between_cells_are_free_all_along(grid: BaseGrid, reaching: bool) 
     assert 0.2 < np.mean(answers) < 0.9
 
 
-def test_distances_are_those_of_the_moves_that_are_not_known_to_be_blocked(grid: BaseGrid) -> None:
-    """Against a graph built move by move; no way over moves that are really free is shorter."""
+def test_distances_use_the_moves_not_known_to_be_blocked(grid: BaseGrid) -> None:
+    """Distances equal those of a graph built move by move, and are lower bounds."""
     start = grid.center(30, 20)
     found = grid.compute_distances(np.array([start[:2]]))[0]
     rows, columns, lengths = [], [], []
@@ -128,7 +128,7 @@ def test_distances_around_a_wall() -> None:
         )
 
 
-def test_distances_from_where_the_base_cannot_be() -> None:
+def test_distances_from_blocked_places() -> None:
     block: list[Shape] = [(coal.Box(2.0, 2.0, 1.0), at(0.0, 0.0, 0.5))]
     grid = BaseGrid(chassis(), [], block, HALL, MARGIN)
     assert np.isfinite(grid.compute_distances(np.array([(0.7, 0.0)]))).any()
@@ -138,14 +138,14 @@ def test_distances_from_where_the_base_cannot_be() -> None:
     assert np.isinf(everywhere.compute_distances(np.zeros((1, 2)))).all()
 
 
-def test_moves_that_lead_nowhere_are_refused(grid: BaseGrid) -> None:
+def test_moves_out_of_the_arena_are_rejected(grid: BaseGrid) -> None:
     floor = compiled_module("vkc_pin.planning.base_paths._driving").Floor
     for lengths in (np.zeros(HEADINGS), -grid.lengths, np.full(HEADINGS, np.nan)):
         with pytest.raises(ValueError, match="lead"):
             floor(grid.blocked.view(np.uint8), grid.moves, lengths)
 
 
-def test_an_arena_that_is_not_square() -> None:
+def test_arena_need_not_be_square() -> None:
     grid = BaseGrid(
         chassis(),
         [],

@@ -32,7 +32,7 @@ def reference(
     goals: NDArray[np.float64],
     extra: NDArray[np.float64],
 ) -> float:
-    """Return the cost of the cheapest way over a graph of all states and free moves, built one by one; infinite: none."""
+    """Return the cost of the cheapest path over a graph of all states, or infinity."""
     count = grid.cells**2 * HEADINGS
     rows, columns, costs = [], [], []
 
@@ -69,7 +69,7 @@ def reference(
         after: float,
         how: int,
     ) -> float:
-        """Return what turning, driving and turning costs, infinite if it is not free."""
+        """Return the cost of a drive with its turns, infinite if it is blocked."""
         length = np.hypot(*(b - a))
         yaw = before + wrap_angle(yaw - before)
         after = yaw + wrap_angle(after - yaw)
@@ -131,7 +131,7 @@ def reference(
 def task(
     seed: int,
 ) -> tuple[BaseGrid, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return a small room with some obstacles, a start that is free, three goals, and what these cost."""
+    """Return a small room with obstacles, a free start, three goals and their costs."""
     rng = np.random.default_rng(seed)
     rod: list[Shape] = [(coal.Box(0.1, 0.8, 0.05), at(0.2, 0.0, 0.7))]
     standing = clutter(int(rng.integers(10_000)), 7, reach=1.8)
@@ -146,7 +146,7 @@ def task(
 @pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_no_way_over_the_grid_is_cheaper(seed: int) -> None:
+def test_no_path_over_the_grid_is_cheaper(seed: int) -> None:
     grid, start, goals, extra = task(seed)
     expected = reference(grid, start, goals, extra)
     fresh, *_ = task(seed)  # which remembers nothing
@@ -155,8 +155,8 @@ def test_no_way_over_the_grid_is_cheaper(seed: int) -> None:
         assert (np.inf if found is None else found[0]) == pytest.approx(expected, abs=1e-4)
 
 
-def test_there_are_ways_and_none() -> None:
-    """The test above would say little if there were hardly ever a way, or always a straight one."""
+def test_random_cases_include_paths_and_none() -> None:
+    """The test above needs cases with and without a path, and with detours."""
     found = []
     for seed in range(30):
         grid, start, goals, extra = task(seed)
@@ -167,7 +167,7 @@ def test_there_are_ways_and_none() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_remembering_moves_changes_nothing(seed: int) -> None:
+def test_cached_moves_do_not_change_the_result(seed: int) -> None:
     grid, start, goals, extra = task(seed)
     first, second = (find_cheapest_path(SearchSpace(grid, start, goals), extra) for _ in range(2))
     assert (first is None) == (second is None)
@@ -179,8 +179,8 @@ def test_remembering_moves_changes_nothing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_what_other_searches_found_out_changes_nothing(seed: int) -> None:
-    """The path is the same after searches for others, from other places, with the arm near other goals."""
+def test_earlier_searches_do_not_change_the_result(seed: int) -> None:
+    """The path does not depend on earlier searches with other starts and goals."""
     grid, start, goals, extra = task(seed)
     fresh, *_ = task(seed)
     rng = np.random.default_rng(seed)
@@ -200,7 +200,7 @@ def test_what_other_searches_found_out_changes_nothing(seed: int) -> None:
 
 
 def test_start_and_goal_on_cells() -> None:
-    """Ways of no length, and costs of nothing, at both ends."""
+    """Connections have zero length and cost at both ends."""
     grid = BaseGrid(
         chassis(0.7, 0.4),
         [],
@@ -220,8 +220,8 @@ def test_start_and_goal_on_cells() -> None:
     assert same[0] == 0.0
 
 
-def test_a_way_that_is_far_longer_than_it_seems(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What blocks the short way is not known in advance: the search is wrong about it, learns, and looks further."""
+def test_path_much_longer_than_the_heuristic(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The obstacle on the short path is not known in advance."""
     gate: list[Shape] = [(coal.Box(0.1, 1.4, 1.0), at(0.0, y, 0.5)) for y in (-1.3, 1.3)]
     lid: list[Shape] = [
         (coal.Ellipsoid(0.1, 0.6, 0.1), at(0.0, 0.0, 0.3))

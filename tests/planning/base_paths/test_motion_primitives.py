@@ -36,7 +36,7 @@ def space(
 
 
 @given(st.floats(-50.0, 50.0))
-def test_wrapped(angle: float) -> None:
+def test_wrap_angle(angle: float) -> None:
     assert -np.pi <= wrap_angle(angle) <= np.pi
     assert np.cos(wrap_angle(angle)) == pytest.approx(np.cos(angle), abs=1e-9)
     assert np.sin(wrap_angle(angle)) == pytest.approx(np.sin(angle), abs=1e-9)
@@ -45,14 +45,14 @@ def test_wrapped(angle: float) -> None:
 @pytest.mark.parametrize(
     ("turned", "factor"), [(0.0, 1.0), (np.pi, BACKWARDS), (0.1, SIDEWAYS), (np.pi / 2, SIDEWAYS)]
 )
-def test_what_a_drive_costs(turned: float, factor: float) -> None:
+def test_drive_cost(turned: float, factor: float) -> None:
     drive = Drive(np.zeros(2), np.array([4.0, 3.0]), np.arctan2(3.0, 4.0) + turned)
     assert drive.length == 5.0
     assert drive.cost == pytest.approx(5.0 * factor)
 
 
-def test_the_parts_of_a_drive_that_are_near_nothing() -> None:
-    """Against points on it, one by one."""
+def test_drives_are_split_outside_end_regions() -> None:
+    """The parts equal those found by sampling points."""
     rng = np.random.default_rng(0)
     places = space([], rng.uniform(-3.0, 3.0, (4, 3)).tolist())
     for _ in range(50):
@@ -76,7 +76,7 @@ def test_cells_near_start_and_goals() -> None:
     assert np.all(space([], [[3.0, 3.0, 0.0]], near=0.0).near == -1)
 
 
-def test_ways_lead_to_the_cells_around() -> None:
+def test_connections_reach_the_cells_around() -> None:
     places = space([], [[3.0, 3.0, 1.0]])
     starts, ends = places.get_starts(), places.get_ends(0)
     assert len(np.unique(starts.cell)) == np.sum(
@@ -105,7 +105,7 @@ def test_ways_lead_to_the_cells_around() -> None:
         assert kinds == {1.0, BACKWARDS, SIDEWAYS}
 
 
-def test_ways_that_it_has_no_room_to_turn_to_are_left_out() -> None:
+def test_connections_without_space_to_turn_are_omitted() -> None:
     walls: list[Shape] = [(coal.Box(4.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-0.55, 0.55)]
     places = space(walls, [[3.0, 0.0, 0.0]])
     turns = np.abs(wrap_angle(2 * places.get_starts().yaw)) / 2  # from driving ahead or back
@@ -136,7 +136,7 @@ def test_a_blocked_start() -> None:
     assert not inside.is_sweep_free(0.0, *short)
 
 
-def test_what_is_carried_counts_away_from_start_and_goals() -> None:
+def test_load_counts_away_from_start_and_goals() -> None:
     rod: list[Shape] = [(coal.Box(0.05, 2.0, 0.05), at(0.0, 0.0, 0.8))]
     post: list[Shape] = [(coal.Box(0.1, 0.1, 1.0), at(x, 0.9, 0.5)) for x in (0.0, 2.0)]
     places = space(post, [[4.0, 0.0, 0.0]], carried=rod)
@@ -151,7 +151,7 @@ def test_what_is_carried_counts_away_from_start_and_goals() -> None:
     assert places.looks_free(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))
 
 
-def test_how_far_the_base_turns_is_remembered_for_each_place_alone() -> None:
+def test_turn_limits_are_cached_per_place_and_margins() -> None:
     """The turning range depends on place and margins, not on the order of the queries."""
     walls: list[Shape] = [(coal.Box(2.0, 0.1, 1.0), at(0.0, sign * 0.5, 0.5)) for sign in (-1, 1)]
     places = [START, np.array([3.5, 0.0, 0.0])]

@@ -27,7 +27,7 @@ BASE = [
 ]
 
 
-def test_the_disc_is_that_of_all_shapes_at_a_height_together() -> None:
+def test_disc_is_inscribed_in_the_union_of_shapes() -> None:
     discs = InscribedDiscs(BASE)
     assert discs.get_radius(0.2) == pytest.approx(
         0.335
@@ -37,12 +37,12 @@ def test_the_disc_is_that_of_all_shapes_at_a_height_together() -> None:
     assert discs.get_radius(0.35) <= 0.0
 
 
-def test_shapes_that_do_not_touch_cover_no_more_than_their_own() -> None:
+def test_separate_shapes_do_not_extend_the_disc() -> None:
     apart = [box((0.4, 0.4, 0.2), (0.0, 0.0, 0.1)), box((0.4, 0.4, 0.2), (0.0, 0.5, 0.1))]
     assert InscribedDiscs(apart).get_radius(0.1) == pytest.approx(0.195)
 
 
-def test_what_is_above_or_below_the_base_keeps_nothing_away() -> None:
+def test_obstacles_above_or_below_the_base_are_no_walls() -> None:
     discs = InscribedDiscs(BASE)
     assert (
         discs.make_walls(
@@ -62,7 +62,7 @@ def test_no_base_and_no_obstacle() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_wherever_a_cell_is_taken_the_base_hits_the_obstacle_at_every_heading(seed: int) -> None:
+def test_base_collides_in_blocked_cells_at_every_heading(seed: int) -> None:
     rng = np.random.default_rng(seed)
     tilt = pin.SE3(
         pin.rpy.rpyToMatrix(*rng.uniform(-0.6, 0.6, 3)),
@@ -95,7 +95,7 @@ def test_wherever_a_cell_is_taken_the_base_hits_the_obstacle_at_every_heading(se
     assert count > 40
 
 
-def test_a_flood_passes_corners_only_if_it_may() -> None:
+def test_flood_fill_passes_corners_only_if_allowed() -> None:
     free = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 0]], bool)
     begin = np.zeros((3, 3), bool)
     begin[0, 0] = True
@@ -103,7 +103,7 @@ def test_a_flood_passes_corners_only_if_it_may() -> None:
     assert flood_fill(free, begin, corners=False).sum() == 1
 
 
-def test_a_flood_may_begin_where_all_is_taken() -> None:
+def test_flood_fill_may_begin_in_blocked_cells() -> None:
     free, begin = np.ones((1, 5), bool), np.zeros((1, 5), bool)
     free[0, 2], begin[0, 2] = False, True
     assert flood_fill(free, begin, corners=True).all()

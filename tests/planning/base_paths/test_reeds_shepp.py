@@ -16,7 +16,7 @@ RADII = st.floats(0.2, 3.0)
 
 
 def driven(pieces: list[tuple[float, float]]) -> np.ndarray:
-    """Return where pieces lead, by small steps along them."""
+    """Return the end of the pieces, by small steps along them."""
     x = y = yaw = 0.0
     for length, turn in pieces:
         count = 4000
@@ -29,7 +29,7 @@ def driven(pieces: list[tuple[float, float]]) -> np.ndarray:
 
 @settings(deadline=None)
 @given(GOALS, RADII)
-def test_pieces_are_arcs_of_the_radius_and_lines_that_lead_there(
+def test_pieces_are_arcs_and_lines_that_reach_the_goal(
     goal: tuple[float, float, float], radius: float
 ) -> None:
     pieces = find_shortest_path_pieces(np.array(goal), radius)
@@ -49,7 +49,7 @@ def test_pieces_are_arcs_of_the_radius_and_lines_that_lead_there(
 
 @settings(deadline=None)
 @given(GOALS)
-def test_it_is_as_far_there_as_back_and_in_the_mirror(goal: tuple[float, float, float]) -> None:
+def test_length_is_invariant_to_reversal_and_mirroring(goal: tuple[float, float, float]) -> None:
     x, y, yaw = goal
     back = [-(x * np.cos(yaw) + y * np.sin(yaw)), x * np.sin(yaw) - y * np.cos(yaw), -yaw]
     lengths, _ = compute_lengths(np.array([goal, back, (x, -y, -yaw), (-x, y, -yaw)]), 1.0)
@@ -58,8 +58,8 @@ def test_it_is_as_far_there_as_back_and_in_the_mirror(goal: tuple[float, float, 
     assert lengths[0] >= abs(yaw) - 1e-9
 
 
-def test_no_other_word_is_shorter() -> None:
-    """Random words of up to five pieces lead to goals that the shortest path reaches in no more."""
+def test_no_random_word_is_shorter() -> None:
+    """Random words of up to five pieces are no shorter than the shortest path."""
     rng = np.random.default_rng(0)
     for count, _ in itertools.product(range(1, 6), range(100)):
         pieces = [

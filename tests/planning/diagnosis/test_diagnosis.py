@@ -21,7 +21,7 @@ def problem(scene: vkc.Scene, *steps: vkc.steps.Step) -> vkc.TrajectoryProblem:
     return program_of(scene, list(steps), options=SHORT)
 
 
-def test_nothing_is_wrong_with_the_demo() -> None:
+def test_demo_has_no_violations() -> None:
     demo = problem(door_scene(), vkc.Actuate("door", {"hinge": 1.2}))
     assert find_impossible_conditions(demo) == []
     assert diagnose_goals(demo, 0) == []
@@ -50,7 +50,7 @@ def test_goals_beyond_limits_of_every_kind() -> None:
     assert first.waypoint < second.waypoint
 
 
-def test_a_goal_at_the_limit_is_fine() -> None:
+def test_goal_at_the_limit_is_allowed() -> None:
     scene = door_scene()
     assert find_impossible_conditions(problem(scene, vkc.Actuate("door", {"hinge": 1.57}))) == []
     assert (
@@ -58,7 +58,7 @@ def test_a_goal_at_the_limit_is_fine() -> None:
     )
 
 
-def test_a_start_that_touches() -> None:
+def test_start_in_contact() -> None:
     scene = hall(obstacles=[{**CRATE, "position": [0.7, 0.0, 0.2]}])
     (violation, *_) = find_impossible_conditions(problem(scene, vkc.GoTo(-1.0, 0.0)))
     assert (violation.constraint, violation.subject, violation.waypoint) == (
@@ -69,10 +69,11 @@ def test_a_start_that_touches() -> None:
     assert violation.amount == pytest.approx(0.495 + 0.3 - 0.7, abs=1e-6)
 
 
-def test_links_in_pieces_are_told_once() -> None:
-    """The deepest of their pairs; here many pieces of the base stand in two blocks of one URDF."""
+def test_links_of_several_shapes_are_listed_once() -> None:
+    """The deepest pair counts; here many shapes of the base touch one URDF object."""
     wall = "".join(
-        f'<collision><origin xyz="0 {y} 0.4"/><geometry><box size="0.2 0.5 0.8"/></geometry></collision>'
+        f'<collision><origin xyz="0 {y} 0.4"/>'
+        '<geometry><box size="0.2 0.5 0.8"/></geometry></collision>'
         for y in (0, 0.3)
     )
     urdf = f'<robot name="wall"><link name="wall">{wall}</link></robot>'
@@ -85,7 +86,7 @@ def test_links_in_pieces_are_told_once() -> None:
 
 
 @pytest.mark.parametrize("gap", [1e-3, 1e-17, 0.0, -5e-5, -2e-3])
-def test_what_the_hand_holds_at_the_start_may_lie_on_something(gap: float) -> None:
+def test_attached_object_may_rest_on_another_at_the_start(gap: float) -> None:
     down = reaching(tool_at(STICK), above(STICK))
     held = room(table(gap=gap)).with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
     assert find_impossible_conditions(problem(held, vkc.GoTo(0.0, 1.0))) == []
@@ -99,7 +100,7 @@ def test_what_the_hand_holds_at_the_start_may_lie_on_something(gap: float) -> No
     } == {"start"}
 
 
-def test_how_far_a_target_stays_out_of_reach() -> None:
+def test_residual_of_an_unreachable_target_is_reported() -> None:
     ((line, short_by),) = diagnose_goals(
         problem(hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))), 0
     )
@@ -109,7 +110,7 @@ def test_how_far_a_target_stays_out_of_reach() -> None:
     assert 1.5 < short < 3.0
 
 
-def test_what_blocks_every_goal_configuration() -> None:
+def test_obstacles_of_all_goal_configurations_are_reported() -> None:
     ((line, short_by),) = diagnose_goals(
         problem(hall(obstacles=[CRATE]), vkc.GoTo(1.5, 0.0, 0.0)), 0
     )
@@ -117,33 +118,33 @@ def test_what_blocks_every_goal_configuration() -> None:
     assert short_by == pytest.approx(0.27 + SHORT.dist_safe)
 
 
-def test_each_phase_is_judged_on_its_own() -> None:
+def test_phases_are_diagnosed_separately() -> None:
     two = problem(hall(obstacles=[CRATE]), vkc.GoTo(0.2, 0.0, 0.0), vkc.GoTo(1.5, 0.0, 0.0))
     assert diagnose_goal(two, 0, 0) is None
     assert [diagnose_goal(two, 1, 0)] == diagnose_goals(two, 0)
 
 
-def test_a_goal_that_leaves_the_base_free_is_not_judged() -> None:
+def test_goal_without_a_base_position_is_not_diagnosed() -> None:
     grasp = problem(door_scene(), vkc.Grasp("door"))
     assert diagnose_goals(grasp, 0) == diagnose_goals(grasp, 1) == []
 
 
-def test_the_same_seed_says_the_same() -> None:
+def test_diagnosis_is_deterministic() -> None:
     crate = problem(hall(obstacles=[CRATE]), vkc.Reach((1.5, 0.0, 0.2, 0.0, np.pi, 0.0)))
     assert diagnose_goals(crate, 3) == diagnose_goals(crate, 3)
     assert diagnose_goals(crate, 3)
 
 
-def test_how_something_is_grasped_is_open_where_it_is_put_down() -> None:
-    """Under a shelf it can be put down from the side only, by a freedom of the grasp that the start knows nothing of."""
+def test_grasp_is_free_when_placing() -> None:
+    """Under a shelf the object can be placed from the side only, with another grasp."""
     below = problem(littered(shelf(*BELOW[:2])), vkc.Place("litter", BELOW, "grip"))
     assert [phase.kind for phase in below.task.phases] == ["grasp", "place"]
     assert diagnose_goal(below, 1, 0) is None
 
 
 @pytest.mark.parametrize(("missing", "free"), [(-1e-4, True), (4e-4, True), (1e-3, False)])
-def test_where_a_motion_may_end_the_next_may_begin(missing: float, free: bool) -> None:
-    """The base stands before a crate, of whose clearance so much is missing [m]; the solver is content with less than 0.5 mm."""
+def test_tolerance_matches_the_solver(missing: float, free: bool) -> None:
+    """The base is near a crate with a given shortfall [m]; the solver accepts 0.5 mm."""
     scene = hall(obstacles=[CRATE])
     front = 1.5 - 0.3 - 0.495
     stop = problem(scene, vkc.GoTo(front - vkc.Options().dist_safe + missing, 0.0, 0.0))

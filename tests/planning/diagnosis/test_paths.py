@@ -1,4 +1,4 @@
-"""Whose way is missing: the base's, the base's but with the arm folded, or the arm's."""
+"""Tests of the diagnosis of missing paths of base and arm."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HIT = Report(
 
 
 def across(bottom: float, *, report: Report = HIT, blocked: tuple[str, ...] = ()) -> list[str]:
-    """Return what is said of a drive under a beam."""
+    """Return the diagnosis of a drive under a beam."""
     beam = {
         "name": "beam",
         "type": "box",
@@ -33,31 +33,31 @@ def across(bottom: float, *, report: Report = HIT, blocked: tuple[str, ...] = ()
     return diagnose_paths(own, z, report, blocked, 0).lines
 
 
-def test_no_way_even_with_the_arm_folded() -> None:
+def test_no_path_even_with_a_folded_arm() -> None:
     (line,) = across(0.5)
     assert (
-        line
-        == "go to: found no path for the base from (0.00, 0.00) to (3.60, 0.00), and none with the arm folded"
+        line == "go to: found no path for the base from (0.00, 0.00) to (3.60, 0.00), "
+        "and none with the arm folded"
     )
 
 
-def test_a_way_for_the_base_but_none_for_the_arm() -> None:
+def test_path_for_the_base_but_not_the_arm() -> None:
     (line,) = across(2.0)
     assert (
-        line
-        == "go to: found a path for the base from (0.00, 0.00) to (3.60, 0.00), but none for the arm at the goal"
+        line == "go to: found a path for the base from (0.00, 0.00) to (3.60, 0.00), "
+        "but none for the arm at the goal"
     )
 
 
-def test_what_hits_nothing_is_not_asked_about() -> None:
+def test_collision_free_phases_are_not_diagnosed() -> None:
     assert across(0.5, report=Report()) == []
     assert across(
         2.0, report=Report(), blocked=("go to: found no path for the base from here to there",)
     ) == ["go to: found no path for the base from here to there"]
 
 
-def test_a_door_that_is_pushed_from_the_far_side_and_leaves_no_room_to_get_there() -> None:
-    """Open by 1.2 rad the narrow door leaves too little room; every grasp that is found is behind it."""
+def test_pushed_door_blocks_the_base() -> None:
+    """At 1.2 rad the narrow door blocks the base; every known grasp is behind it."""
     scene = vkc.load_scene("household").with_state("door", {"hinge": 1.2})
     plan = vkc.plan(
         scene,
@@ -74,8 +74,8 @@ def test_a_door_that_is_pushed_from_the_far_side_and_leaves_no_room_to_get_there
     assert vkc.plan(wide, [vkc.Grasp("door", "push_back")]).success
 
 
-def test_no_way_later_on_says_nothing_of_the_whole() -> None:
-    """Where a phase after the first begins, the motion that failed decides."""
+def test_missing_path_of_a_later_phase_does_not_cut_off() -> None:
+    """The failed motion determines where later phases begin."""
     beam = {"name": "beam", "type": "box", "size": [0.2, 14.0, 1.5], "position": [1.8, 0.0, 1.25]}
     one, two = vkc.GoTo(0.5, 0.0, 0.0), vkc.GoTo(3.6, 0.0, 0.0)
     for steps, cut_off in (([two], True), ([one, two], False)):
@@ -97,7 +97,7 @@ def test_no_way_later_on_says_nothing_of_the_whole() -> None:
         assert "and none with the arm folded" in found.lines[-1]
 
 
-def test_a_bend_that_is_too_tight() -> None:
+def test_bend_too_tight_for_the_base() -> None:
     scene, steps = KINDS["bend too tight"](np.random.default_rng(0))
     plan = vkc.plan(scene, steps, options=vkc.Options(max_restarts=1))
     assert not plan.success

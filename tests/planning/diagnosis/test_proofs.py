@@ -1,4 +1,4 @@
-"""What is called impossible for certain is so: cut off, out of reach; and nothing that can be done is called so."""
+"""Tests that proven failures are impossible, and that feasible tasks are not."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def ring(x: float, y: float, half: float = 1.0) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("step", [vkc.GoTo(3.0, 0.0), vkc.GoTo(3.0, 2.0, 1.0), FAR], ids=str)
-def test_a_closed_wall(step: Any) -> None:
+def test_closed_wall_separates_the_goal(step: Any) -> None:
     clutter = [
         box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2)),
         box("shelf", (0.4, 2.0, 1.0), (5.0, 3.0, 0.5)),
@@ -67,23 +67,23 @@ def test_a_closed_wall(step: Any) -> None:
 
 
 @pytest.mark.parametrize(("x", "goal"), [(0.0, 4.0), (4.0, 4.0)], ids=["start", "goal"])
-def test_a_ring_is_named_side_by_side(x: float, goal: float) -> None:
+def test_all_sides_of_a_ring_are_named(x: float, goal: float) -> None:
     (line,) = find_proofs(problem(ring(x, 0.0), vkc.GoTo(goal, 0.0)))
     assert line.endswith("cut off by north, south, east, west")
 
 
 @pytest.mark.parametrize("width", [0.3, 0.5, 0.62])
-def test_a_gap_that_is_too_narrow(width: float) -> None:
+def test_narrow_gap_is_proven(width: float) -> None:
     (line,) = find_proofs(problem(gap(width), vkc.GoTo(3.0, 0.0)))
     assert line.endswith("cut off by left, right")
 
 
 @pytest.mark.parametrize("width", [0.68, 0.7, 0.85, 2.0])  # the base is 0.67 m wide
-def test_a_gap_through_which_the_base_fits_proves_nothing(width: float) -> None:
+def test_wide_gap_proves_nothing(width: float) -> None:
     assert find_proofs(problem(gap(width), vkc.GoTo(3.0, 0.0))) == []
 
 
-def test_over_a_wall_that_the_arm_reaches_across() -> None:
+def test_wall_that_the_arm_reaches_across_proves_nothing() -> None:
     assert (
         find_proofs(
             problem(
@@ -95,7 +95,7 @@ def test_over_a_wall_that_the_arm_reaches_across() -> None:
     )
 
 
-def test_a_wall_that_the_base_passes_under() -> None:
+def test_wall_that_the_base_passes_under_proves_nothing() -> None:
     assert (
         find_proofs(problem([box("beam", (0.1, 12.0, 0.3), (1.2, 0.0, 1.5))], vkc.GoTo(3.0, 0.0)))
         == []
@@ -103,7 +103,7 @@ def test_a_wall_that_the_base_passes_under() -> None:
 
 
 @pytest.mark.parametrize("height", [0.42, 0.47])
-def test_a_wall_that_the_base_passes_under_but_not_the_foot_of_the_arm(height: float) -> None:
+def test_wall_that_the_arm_mount_hits_is_proven(height: float) -> None:
     beam = box("beam", (0.1, 13.0, 1.0), (1.2, 0.0, 0.5 + height))
     (line,) = find_proofs(problem([beam], vkc.GoTo(3.0, 0.0)))
     assert line.endswith("cut off by beam")
@@ -114,7 +114,7 @@ def test_a_wall_that_the_base_passes_under_but_not_the_foot_of_the_arm(height: f
     assert find_proofs(problem([shorter], vkc.GoTo(3.0, 0.0))) == []
 
 
-def test_the_goal_is_taken() -> None:
+def test_blocked_goal_is_proven() -> None:
     (line,) = find_proofs(
         problem([box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))], vkc.GoTo(1.5, 0.0))
     )
@@ -122,7 +122,7 @@ def test_the_goal_is_taken() -> None:
     assert line.endswith("it hits crate")
 
 
-def test_too_high() -> None:
+def test_goal_too_high_is_proven() -> None:
     (line,) = find_proofs(problem([], vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))))
     assert line.startswith("reach with tool: out of reach, " + PROVEN)
 
@@ -130,12 +130,12 @@ def test_too_high() -> None:
 @pytest.mark.parametrize(
     "obstacles", [[], [box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2))]], ids=["empty", "crate"]
 )
-def test_outside_the_arena(obstacles: list[dict[str, Any]]) -> None:
+def test_goal_outside_the_arena_is_proven(obstacles: list[dict[str, Any]]) -> None:
     (line,) = find_proofs(problem(obstacles, vkc.Reach((8.0, 0.0, 0.8, np.pi / 2, 0.0, 0.0))))
     assert line.endswith("proven: the goal is in reach from outside the arena alone")
 
 
-def test_the_phase_that_fails_is_named() -> None:
+def test_failing_phase_is_named() -> None:
     steps = [vkc.GoTo(-1.0, 0.0), vkc.GoTo(3.0, 0.0)]
     lines = find_proofs(problem([box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5))], *steps))
     assert len(lines) == 1
@@ -147,7 +147,7 @@ def door_room(*steps: Any) -> vkc.TrajectoryProblem:
     return program_of(vkc.load_scene("door"), list(steps), options=SHORT)
 
 
-def test_a_door_that_stands_shut_is_named_unless_it_is_opened() -> None:
+def test_closed_door_is_named_unless_opened() -> None:
     (line,) = find_proofs(door_room(vkc.GoTo(4.0, 0.0)))
     assert "door.panel" in line
     assert line.endswith("; door is closed meanwhile")
@@ -155,7 +155,7 @@ def test_a_door_that_stands_shut_is_named_unless_it_is_opened() -> None:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_where_a_path_was_found_nothing_is_proven(seed: int) -> None:
+def test_existing_path_disproves_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     places = rng.uniform(-5.0, 5.0, (70, 2))
     places = places[np.hypot(*places.T) > 1.5]
@@ -180,7 +180,7 @@ def test_where_a_path_was_found_nothing_is_proven(seed: int) -> None:
 @pytest.mark.parametrize(
     "name", ["door", "drawer", "corridor_door", "aisle_drawer", "gap_table", "household", "fetch"]
 )
-def test_nothing_is_proven_of_the_scenes_that_come_along(name: str) -> None:
+def test_nothing_is_proven_for_packaged_scenes(name: str) -> None:
     scene = vkc.load_scene(name)
     fixed = [
         n

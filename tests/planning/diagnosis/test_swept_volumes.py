@@ -1,4 +1,4 @@
-"""What an object's own joint is proven to hit, and what proves nothing."""
+"""Tests of collisions that an object's own joint causes."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ from vkc_pin.world.task.steps import Actuate
 POST = (3.2, 0.14, 0.25)  # in the hall, where the leaf is at 1.14 rad
 
 
-BAR = """<robot name="bar"><link name="base"/><link name="bar"><collision><geometry><box size="0.08 0.1 0.5"/></geometry>
-</collision></link><joint name="up" type="prismatic"><parent link="base"/><child link="bar"/><origin xyz="0 0 0.25"/>
+BAR = """<robot name="bar"><link name="base"/>
+<link name="bar"><collision><geometry><box size="0.08 0.1 0.5"/></geometry>
+</collision></link><joint name="up" type="prismatic">
+<parent link="base"/><child link="bar"/><origin xyz="0 0 0.25"/>
 <axis xyz="0 0 1"/>
 <limit lower="0" upper="2" effort="1" velocity="1"/></joint></robot>"""
 
@@ -57,7 +59,7 @@ def problem(
     )
 
 
-def test_what_stands_where_the_leaf_goes_is_named() -> None:
+def test_obstacle_in_the_swept_volume_is_named() -> None:
     (line,) = find_swept_collisions(problem(1.3, POST))
     assert "no path for door.hinge, proven: between 0 and 1.3, at " in line
     assert "door.panel – post overlap by " in line
@@ -73,13 +75,11 @@ def test_what_stands_where_the_leaf_goes_is_named() -> None:
         (1.5, POST, 1.45),  # it begins beyond
     ],
 )
-def test_what_stands_elsewhere_proves_nothing(
-    hinge: float, at: Sequence[float], state: float
-) -> None:
+def test_obstacle_elsewhere_proves_nothing(hinge: float, at: Sequence[float], state: float) -> None:
     assert find_swept_collisions(problem(hinge, at, state=state)) == []
 
 
-def test_what_can_be_carried_away_proves_nothing() -> None:
+def test_movable_object_proves_nothing() -> None:
     assert find_swept_collisions(problem(1.3, (3.2, 0.14, 0.4), object_type="ball")) == []
     assert (
         find_swept_collisions(problem(1.3, (3.2, 0.14, 0.0), object_type="cabinet")) != []
@@ -93,7 +93,7 @@ def test_what_can_be_carried_away_proves_nothing() -> None:
 
 
 def around_the_hinge(angle: float, at: np.ndarray) -> np.ndarray:
-    """Return where a point of the shut door's leaf is when that is open by an angle [rad]."""
+    """Return the position of a point of the door's leaf at an angle [rad]."""
     placed = door_scene().objects["door"]
     model = placed.object.model
     hinge = placed.placement * model.jointPlacements[model.getJointId("hinge")]
@@ -101,15 +101,15 @@ def around_the_hinge(angle: float, at: np.ndarray) -> np.ndarray:
     return (hinge * turn * hinge.inverse()).act(at)
 
 
-def test_the_goal_is_the_limit_if_it_is_beyond() -> None:
+def test_goal_is_clipped_to_the_limit() -> None:
     assert np.allclose(around_the_hinge(0.8, np.array(POST))[2], POST[2])
     further = around_the_hinge(0.86, np.array(POST))  # where the leaf would be at 2 rad
     assert find_swept_collisions(problem(9.0, further)) == []
     assert find_swept_collisions(problem(9.0, around_the_hinge(0.2, np.array(POST)))) != []
 
 
-def test_a_lever_that_may_be_turned_out_of_the_way_proves_nothing() -> None:
-    """What two joints move is in no place for certain, but what one of them moves is."""
+def test_link_of_two_joints_proves_nothing() -> None:
+    """Only links that depend on a single joint prove a collision."""
     placed = door_scene().objects["door"]
     bar = placed.link_placement("lever") * placed.object.attachments["handle"].placement
     there = around_the_hinge(0.1, bar.translation)  # the leaf turns away from it
@@ -122,10 +122,8 @@ def test_a_lever_that_may_be_turned_out_of_the_way_proves_nothing() -> None:
 
 
 @pytest.mark.parametrize(("deep", "proven"), [(0.0005, False), (0.004, True)])
-def test_an_overlap_that_validation_might_overlook_proves_nothing(
-    deep: float, proven: bool
-) -> None:
-    """A slab above the floor, which the leaf's lower edge grazes from where it begins to where it is to go."""
+def test_small_overlap_proves_nothing(deep: float, proven: bool) -> None:
+    """A slab grazes the leaf's lower edge on the whole motion."""
     placed = door_scene().objects["door"].with_state({"hinge": 0.6})
     boxes = [
         compute_world_box(shape.geometry, shape.placement)
@@ -141,7 +139,7 @@ def test_an_overlap_that_validation_might_overlook_proves_nothing(
 
 
 @pytest.mark.parametrize(("margin", "proven"), [(-0.01, True), (-0.5, False), (None, False)])
-def test_what_the_scene_allows_proves_nothing(margin: float | None, proven: bool) -> None:
+def test_allowed_contact_proves_nothing(margin: float | None, proven: bool) -> None:
     pair = ["door.panel", "post"]
     allow: Any = pair if margin is None else {"pair": pair, "margin": margin}
     assert bool(find_swept_collisions(problem(1.3, POST, allow=[allow]))) == proven

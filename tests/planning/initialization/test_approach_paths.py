@@ -1,4 +1,4 @@
-"""Straight ways in and out, with a base that drives along or keeps_base_fixed."""
+"""Tests of approach and retreat paths with a moving and a fixed base."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def approach(*, keeps_base_fixed: bool) -> ApproachPaths:
 
 
 def back(z: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return how the tool at `near` is moved from where it is at `z`, in its own frame: [m] and the cosine of the turn."""
+    """Return the tool's motion from `z` to `near` in its own frame [m], and the turn's cosine."""
     hand, there = (
         dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near)
     )
@@ -41,7 +41,7 @@ def back(z: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("keeps_base_fixed", [False, True])
-def test_the_hand_goes_straight_back_from_a_handle(keeps_base_fixed: bool) -> None:
+def test_hand_retreats_straight_from_a_handle(keeps_base_fixed: bool) -> None:
     problem, z = grasp()
     (near,) = approach(keeps_base_fixed=keeps_base_fixed).find_approach_start(
         z, problem.task.phases[0]
@@ -52,7 +52,7 @@ def test_the_hand_goes_straight_back_from_a_handle(keeps_base_fixed: bool) -> No
     assert np.all(near[9:] == z[9:]), "what is grasped stays where it is"
 
 
-def test_the_base_drives_where_the_arm_alone_cannot_do_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_base_drives_if_the_arm_alone_cannot_retreat(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, z = grasp()
     for metres in (0.6, 1.0):
         monkeypatch.setattr(problem, "options", dataclasses.replace(FEW, approach=metres))

@@ -11,7 +11,7 @@ from vkc_pin.planning.initialization.keyframes import SIMILARITY_TOLERANCE
 from vkc_pin.planning.initialization.methods import initialize
 
 
-def test_the_way_leads_through_the_gap() -> None:
+def test_path_leads_through_the_gap() -> None:
     problem = walled(1.6)
     routes, start = BaseRoutes(problem), problem.start[:3]
     goal = np.array([4.0, 1.5, 0.0])
@@ -28,7 +28,7 @@ def test_the_way_leads_through_the_gap() -> None:
     )
 
 
-def test_no_way_is_said() -> None:
+def test_missing_path_is_noted() -> None:
     problem = walled(0.0)
     assert (
         BaseRoutes(problem).find_path(0, problem.start[:3], np.array([4.0, 1.5, 0.0]), 40) is None
@@ -42,7 +42,7 @@ def test_no_way_is_said() -> None:
     assert "no path for the base, proven" in plan.report()
 
 
-def test_the_seed_drives_the_way_and_the_heading_follows_it() -> None:
+def test_guess_follows_the_path_with_its_heading() -> None:
     problem = walled(1.6)
     (seed,) = initialize(problem, "astar", 0)
     assert seed.name == "astar"
@@ -56,11 +56,11 @@ def test_the_seed_drives_the_way_and_the_heading_follows_it() -> None:
 
 
 # --- narrow places
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("width", [NARROW, TIGHT])
-def test_with_the_arm_folded_there_is_a_way_through_a_narrow_gate(width: float) -> None:
+def test_folded_arm_fits_through_a_narrow_gate(width: float) -> None:
     problem = gated(width)
     routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array(GOAL)
     home, folded = (
@@ -83,14 +83,14 @@ def test_with_the_arm_folded_there_is_a_way_through_a_narrow_gate(width: float) 
     assert problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).compute_clearance() > 0.0
 
 
-def test_a_gate_too_narrow_for_the_base_has_no_way() -> None:
+def test_gate_too_narrow_for_the_base_has_no_path() -> None:
     problem = gated(0.64)
     routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array(GOAL)
     assert np.isinf(routes.compute_distances(0, start[None], goal[None], folded=True)[0])
     assert routes.find_guide_path(0, start, goal, 40) is None
 
 
-def test_the_grids_are_kept_apart() -> None:
+def test_grids_are_cached_separately() -> None:
     routes = BaseRoutes(gated(NARROW))
     home, folded = routes.get_grid(0), routes.get_grid(0, folded=True)
     assert home is routes.get_grid(0)
@@ -99,7 +99,7 @@ def test_the_grids_are_kept_apart() -> None:
     assert np.all(folded.step < home.step)
 
 
-def test_where_the_arm_at_home_fits_the_guide_is_the_usual_way() -> None:
+def test_guide_is_the_usual_path_if_the_arm_at_home_fits() -> None:
     problem = walled(1.6)
     routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array([4.0, 1.5, 0.0])
     guide, way = routes.find_guide_path(0, start, goal, 40), routes.find_path(0, start, goal, 40)
@@ -108,8 +108,8 @@ def test_where_the_arm_at_home_fits_the_guide_is_the_usual_way() -> None:
     np.testing.assert_allclose(guide, way, atol=1e-9)
 
 
-def test_a_guide_leads_to_what_is_a_little_too_close_to_something() -> None:
-    """What is sent there by inverse kinematics often is."""
+def test_guide_reaches_goals_within_the_margin() -> None:
+    """Inverse kinematics often leads there."""
     problem = walled(1.6)
     routes, start = BaseRoutes(problem), problem.start[:3]
     near, inside = (
@@ -124,14 +124,14 @@ def test_a_guide_leads_to_what_is_a_little_too_close_to_something() -> None:
     assert routes.find_guide_path(0, start, inside, 40) is None
 
 
-def test_a_guide_to_what_is_far_inside_something_does_not_exist() -> None:
+def test_guide_to_goals_in_collision_does_not_exist() -> None:
     problem = walled(0.0)
     block = np.array([5.5, 0.0, 0.0])  # behind the wall, and so is all that is beside it
     assert BaseRoutes(problem).find_guide_path(0, problem.start[:3], block, 40) is None
 
 
-def test_the_arm_is_folded_once_for_what_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With nothing in the hand in the first phase, and the cup in the second."""
+def test_folded_arm_is_cached_per_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The hand is empty in the first phase, and holds the cup in the second."""
     problem = program_of(vkc.load_scene("household"), [vkc.Grasp("cup"), vkc.GoTo(1.0, 0.5)])
     asked: list[int] = []
 
@@ -145,8 +145,8 @@ def test_the_arm_is_folded_once_for_what_is_held(monkeypatch: pytest.MonkeyPatch
     assert asked == [0, 1]
 
 
-def test_starts_share_distances_where_they_are_alike_and_nowhere_else() -> None:
-    """On either side of a wall and along it, asked together and one by one; within a square it makes its width of difference."""
+def test_similar_starts_share_distances() -> None:
+    """Starts on both sides of a wall agree, in one query or several."""
     problem = walled(1.6)
     goal = np.array([4.0, 1.5, 0.0])
     starts = np.array([[x, y, 0.0] for x in (0.5, 3.5) for y in (-0.55, -0.35, 0.05, 0.85)])

@@ -1,4 +1,4 @@
-"""From knot to knot, forwards and backwards: knots in order of time, on the closure, at the price that is said."""
+"""Tests of the beam search over keyframes, forwards and backwards."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def beam(seed: int = 0, *, around: bool = False, routes: bool = False) -> BeamSe
 @DIRECTIONS
 @pytest.mark.parametrize("thorough", [False, True], ids=["quick", "thorough"])
 @pytest.mark.parametrize("around", [False, True], ids=["alone", "driving before and after"])
-def test_knots_are_in_order_of_time_and_hold_the_closure(
+def test_keyframes_are_ordered_and_satisfy_the_closure(
     thorough: bool, backwards: bool, around: bool
 ) -> None:
     p, search = problem(around=around), beam(around=around)
@@ -75,8 +75,8 @@ def test_knots_are_in_order_of_time_and_hold_the_closure(
 
 @DIRECTIONS
 @pytest.mark.parametrize("around", [False, True], ids=["alone", "driving before and after"])
-def test_a_path_costs_its_way_and_its_trouble(backwards: bool, around: bool) -> None:
-    """Whichever way it was looked for: the ways are those from start to end."""
+def test_path_cost_is_length_plus_collisions(backwards: bool, around: bool) -> None:
+    """Paths run from start to end, whatever the search direction."""
     search = beam(1, around=around)
     found = search.search(thorough=True, backwards=backwards)
     steps = np.abs(np.diff(found.paths, axis=1)) * np.sqrt(
@@ -124,7 +124,7 @@ def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step]) -> 
         assert (row <= p.chain.upper + 1e-9).all()
 
 
-def test_shortened_paths_know_what_is_wrong_where_they_lead_now(
+def test_shortened_paths_update_collision_costs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     search = BeamSearch(
@@ -143,7 +143,7 @@ def test_shortened_paths_know_what_is_wrong_where_they_lead_now(
     )
 
 
-def test_of_paths_that_end_alike_the_cheapest_is_kept() -> None:
+def test_cheapest_of_similar_ends_is_kept() -> None:
     z = np.array([[0.0, 0.0], [0.05, 0.05], [0.3, 0.0], [0.3, 0.05], [0.3, 0.25], [2.0, 0.0]])
     total = np.array([3.0, 2.0, 4.0, 5.0, 6.0, 1.0])
     assert BeamSearch._select_beam(total, z, 6, 10).tolist() == [5, 1, 2, 4]
@@ -156,8 +156,8 @@ def test_of_paths_that_end_alike_the_cheapest_is_kept() -> None:
     ]  # two of four are shortened: no more of them
 
 
-def test_headings_are_kept_apart_if_asked_for() -> None:
-    """The cheapest head alike; with sectors, dearer ones that head elsewhere come before the fifth of them."""
+def test_diverse_headings_are_kept_on_request() -> None:
+    """With sectors, expensive paths of other headings precede the fifth of one sector."""
     z = np.zeros((12, 4))
     z[:, 0], z[10:, 2] = np.arange(12.0), (2.0, -2.0)
     total = np.arange(12.0)
@@ -166,7 +166,7 @@ def test_headings_are_kept_apart_if_asked_for() -> None:
     assert BeamSearch._select_beam(total, z, 12, 8, 8).tolist() == [0, 1, 2, 3, 10, 11, 4, 5]
 
 
-def test_no_two_paths_of_a_search_end_alike() -> None:
+def test_no_two_paths_end_at_similar_configurations() -> None:
     found = beam(1).search(thorough=True)
     ends = found.paths[:, -1]
     assert all(
@@ -175,10 +175,10 @@ def test_no_two_paths_of_a_search_end_alike() -> None:
     )
 
 
-def test_ways_to_what_is_grasped_are_short_when_they_are_found(
+def test_paths_to_grasps_are_shortened(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The best that a search returns for a grasp alone becomes hardly cheaper when it is shortened again."""
+    """Shortening the result of a search again hardly reduces its cost."""
     search = BeamSearch(
         KeyframeSampler(
             program_of(door_scene(), [vkc.Grasp("door")], options=FEW), np.random.default_rng(1)
@@ -199,7 +199,7 @@ def test_ways_to_what_is_grasped_are_short_when_they_are_found(
 
 
 @DIRECTIONS
-def test_the_same_random_numbers_find_the_same(backwards: bool) -> None:
+def test_search_is_deterministic(backwards: bool) -> None:
     one, same = (beam(2).search(thorough=True, backwards=backwards) for _ in range(2))
     np.testing.assert_array_equal(one.paths, same.paths)
     np.testing.assert_array_equal(one.cost, same.cost)
@@ -217,16 +217,16 @@ def test_without_a_grasp_backwards_is_forwards() -> None:
     assert one.waypoints == other.waypoints == [0, gone.segments]
 
 
-def test_backwards_a_firm_hand_keeps_what_it_has_chosen() -> None:
+def test_rigid_grasp_keeps_its_choice_backwards() -> None:
     clamped(backwards=True)
 
 
-def test_forwards_a_firm_hand_keeps_what_it_has_chosen() -> None:
+def test_rigid_grasp_keeps_its_choice_forwards() -> None:
     clamped(backwards=False)
 
 
 def gripping(*, firm: bool) -> vkc.TrajectoryProblem:
-    """Return the problem of opening the door with a hand that may tilt, or that only chooses how far it does."""
+    """Return a door problem with a free or a rigid grasp."""
     scene = door_scene()
     tilting = dataclasses.replace(
         scene.objects["door"].object.attachment("handle_free"), name="tilted", firm=firm
@@ -236,10 +236,10 @@ def gripping(*, firm: bool) -> vkc.TrajectoryProblem:
 
 
 @pytest.mark.parametrize("firm", [False, True])
-def test_a_hand_that_chooses_and_does_not_give_way_does_so_before_it_moves_anything(
+def test_rigid_grasp_is_chosen_before_the_object_moves(
     firm: bool,
 ) -> None:
-    """For it backwards is forwards; for one that gives way it is not."""
+    """A rigid grasp is searched forwards, a free one backwards."""
     p = gripping(firm=firm)
     assert bool(p.choices) == firm
     one, other = (
@@ -264,11 +264,11 @@ def clamped(*, backwards: bool) -> None:
 
 
 # --- what is tolerable
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 def going(jump: float, when: int, *, trouble: float = 0.0) -> SearchResult:
-    """Return two paths, of which the cheapest is where it was but for one jump of the base [m] before a knot."""
+    """Return two paths, the cheaper one with a jump of the base [m]."""
     p, at = problem(), beam().search(thorough=False).waypoints
     paths = np.tile(p.start, (2, len(at), 1))
     paths[1, at.index(when) :, 1] += jump
@@ -277,14 +277,14 @@ def going(jump: float, when: int, *, trouble: float = 0.0) -> SearchResult:
 
 
 @pytest.mark.parametrize("routes", [False, True])
-def test_grazes_are_tolerable_and_collisions_are_not(routes: bool) -> None:
+def test_grazes_are_acceptable_and_collisions_are_not(routes: bool) -> None:
     search, end = beam(routes=routes), int(problem().ends[0])
     assert search.is_acceptable(going(0.0, end))
     assert search.is_acceptable(going(0.0, end, trouble=59.0))
     assert not search.is_acceptable(going(0.0, end, trouble=61.0))
 
 
-def test_the_base_does_not_jump_while_something_is_held() -> None:
+def test_base_jumps_are_rejected_in_closed_phases() -> None:
     reach, turn, move = problem().ends.tolist()
     for when in (turn, move):
         assert beam(routes=True).is_acceptable(going(0.4, when))
@@ -297,11 +297,11 @@ def test_the_base_does_not_jump_while_something_is_held() -> None:
 
 
 # --- careful
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
-def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> None:
-    """Where the row of the straight way in stands, at the latest after the first waypoint of its phase."""
+def test_approach_precedes_the_grasp_by_its_waypoints() -> None:
+    """The approach starts after the first waypoint of its phase at the latest."""
     grasp, options = int(problem().ends[0]), problem().options
     assert beam().approaches == {grasp: grasp - options.steps(options.approach_time)}
     assert beam().sampler.find_pose(grasp - options.steps(options.approach_time)) is not None
@@ -312,10 +312,10 @@ def test_a_grasp_is_nearest_to_its_straight_way_so_many_waypoints_before() -> No
 
 
 @pytest.mark.parametrize("careful", [False, True])
-def test_a_careful_search_counts_what_is_hit_before_a_grasp(
+def test_search_for_narrow_passages_counts_approach_collisions(
     careful: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of four grasps one is blocked, one has a blocked way, one has none; and at other waypoints nothing changes."""
+    """One grasp is blocked, one has a blocked approach, and one has none."""
     search, grasp = (
         BeamSearch(
             KeyframeSampler(problem(), np.random.default_rng(0)), for_narrow_passages=careful
@@ -348,8 +348,8 @@ def test_a_careful_search_counts_what_is_hit_before_a_grasp(
     )
 
 
-def test_before_a_careful_grasp_nothing_is_hit() -> None:
-    """At the narrow door, open into the bedroom: a hand that has room at the lever may have none on the way to it."""
+def test_search_for_narrow_passages_finds_free_approaches() -> None:
+    """At the narrow door a free grasp may have a blocked approach."""
     scene = (
         vkc.load_scene("household")
         .with_state("door", {"hinge": 1.52})
@@ -375,8 +375,8 @@ def test_before_a_careful_grasp_nothing_is_hit() -> None:
     assert shares[0] < shares[1] == 1.0
 
 
-def test_a_task_that_ends_with_a_grasp_of_which_the_hand_chooses_where() -> None:
-    """Nothing comes after it that could be searched first: backwards is forwards."""
+def test_task_that_ends_with_a_free_grasp() -> None:
+    """No phase follows, so the search runs forwards."""
     scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(0))
     problem = program_of(scene, [vkc.Grasp("stick")])
     assert {grasp for _, grasp, _ in problem.choices} == {problem.segments}

@@ -15,7 +15,7 @@ def beam(seed: int = 0) -> BeamSearch:
     return BeamSearch(KeyframeSampler(problem, np.random.default_rng(seed)))
 
 
-def test_a_way_costs_what_the_program_makes_it_cost_in_radians_of_the_arm() -> None:
+def test_path_cost_equals_the_objective_in_radians_of_the_arm() -> None:
     search = beam()
     metre = 1.0 / np.sqrt(0.025)
     start = search.problem.start[None]
@@ -37,7 +37,7 @@ def test_a_way_costs_what_the_program_makes_it_cost_in_radians_of_the_arm() -> N
 
 
 class Ways:
-    """BaseRoutes twice as long as straight ones."""
+    """Routes twice as long as straight lines."""
 
     def compute_distances(
         self, phase: int, first: NDArray[np.float64], last: NDArray[np.float64], *, folded: bool
@@ -45,7 +45,7 @@ class Ways:
         return np.asarray(2.0 * np.linalg.norm(last[:, :2] - first[:, :2], axis=1))
 
 
-def test_a_way_around_costs_as_much_as_it_is_long() -> None:
+def test_path_cost_uses_route_lengths() -> None:
     search = beam()
     search.routes = Ways()  # type: ignore[assignment]
     start = search.problem.start[None]
@@ -57,7 +57,7 @@ def test_a_way_around_costs_as_much_as_it_is_long() -> None:
 
 
 def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
-    """Return how often the search draws grasps of which a share is free."""
+    """Return the number of batches if a share of the grasps is free."""
     search, draws = beam(), list[str]()
     knot = search.sampler.sample
 
@@ -95,10 +95,10 @@ def scattered(monkeypatch: pytest.MonkeyPatch, share: float) -> int:
         (True, 24, False),
     ],
 )
-def test_where_some_are_free_none_are_pushed(
+def test_no_configurations_are_pushed_if_enough_are_free(
     monkeypatch: pytest.MonkeyPatch, holding: bool, free: int, pushed: bool
 ) -> None:
-    """While something is held a few are enough: there are many such knots."""
+    """In closed phases a few are sufficient, since there are many keyframes."""
     search, called = beam(), list[int]()
 
     def clear(z: NDArray[np.float64], waypoint: int) -> NDArray[np.float64]:
@@ -115,7 +115,7 @@ def test_where_some_are_free_none_are_pushed(
 
 
 @pytest.mark.parametrize(("share", "least", "most"), [(1.0, 1, 2), (0.25, 3, 4), (0.0, 6, 6)])
-def test_grasps_are_drawn_until_enough_are_free(
+def test_grasps_are_sampled_until_enough_are_free(
     monkeypatch: pytest.MonkeyPatch, share: float, least: int, most: int
 ) -> None:
     assert least <= scattered(monkeypatch, share) <= most

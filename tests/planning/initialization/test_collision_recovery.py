@@ -27,8 +27,8 @@ def drawn(
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("coupled", [False, True])
-def test_points_move_as_finite_differences_say(seed: int, coupled: bool, tmp_path: Path) -> None:
-    """Against Pinocchio's own placements: a point fixed in a joint's frame, for every joint of a chain with a held door.
+def test_point_jacobians_match_finite_differences(seed: int, coupled: bool, tmp_path: Path) -> None:
+    """Jacobians equal differences of Pinocchio's placements for every joint of a chain.
 
     Or a drawer, held by a robot whose joints follow others.
     """
@@ -61,8 +61,8 @@ def test_points_move_as_finite_differences_say(seed: int, coupled: bool, tmp_pat
         np.testing.assert_allclose(jacobian[:, :, column], differences, atol=1e-7)
 
 
-def test_what_is_pushed_is_further_out_and_still_there() -> None:
-    """Touching a cube under a table: most random configurations collide; pushing frees many more than there were."""
+def test_pushed_configurations_are_free_and_feasible() -> None:
+    """Most random configurations collide; pushing frees many more."""
     scene = vkc.load_scene("init_1").with_held({"stick": "grip"}).with_start(base=[1.2, 1.0, 1.0])
     problem, sampler = drawn([vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))], scene)
     waypoint = problem.segments
@@ -80,7 +80,7 @@ def test_what_is_pushed_is_further_out_and_still_there() -> None:
     assert np.all(pushed <= problem.upper[-1] + 1e-12)
 
 
-def test_what_is_free_stays_where_it_is() -> None:
+def test_free_configurations_hardly_move() -> None:
     problem, sampler = drawn([vkc.Grasp("door")], door_scene())
     z, found = sampler.sample(np.tile(problem.start, (96, 1)), problem.segments, "scatter")
     free = z[found][sampler.compute_shortfall(z[found], problem.segments) <= 0.0]
@@ -102,7 +102,7 @@ class Scattered:
     z: np.ndarray
 
     def cleared(self, **changes: Any) -> np.ndarray:
-        """Return what they are cleared to, with other arguments than usual."""
+        """Return the pushed configurations, with other arguments."""
         solver, target = self.sampler.get_pose_solver(0)
         lower, upper = (
             np.tile(limits[-1], (len(self.z), 1))
@@ -114,7 +114,7 @@ class Scattered:
         )
 
     def free(self) -> np.ndarray:
-        """Return which of them need not be moved, shape (B,)."""
+        """Return which configurations are free and feasible, shape (B,)."""
         solver, target = self.sampler.get_pose_solver(0)
         residual, _ = solver.evaluate(self.z, target)
         return (self.sampler.compute_shortfall(self.z, self.problem.segments) <= 0.0) & (
@@ -137,7 +137,7 @@ def cleared(scattered: Scattered) -> Scattered:
     )
 
 
-def test_what_is_free_is_not_touched(cleared: Scattered) -> None:
+def test_free_configurations_stay_unchanged(cleared: Scattered) -> None:
     free, given = cleared.free(), cleared.z.copy()
     assert np.count_nonzero(free) > 5
     pushed = cleared.cleared()
@@ -146,7 +146,7 @@ def test_what_is_free_is_not_touched(cleared: Scattered) -> None:
     np.testing.assert_array_equal(cleared.z, given)  # what comes out is a copy
 
 
-def test_limits_hold(scattered: Scattered) -> None:
+def test_limits_are_kept(scattered: Scattered) -> None:
     z = scattered.z
     pushed = scattered.cleared(lower=z - 0.02, upper=z + 0.03)
     assert np.all((pushed >= z - 0.02) & (pushed <= z + 0.03))
@@ -161,7 +161,7 @@ def test_limits_hold(scattered: Scattered) -> None:
     assert np.abs(pushed - z).max() > 0.1
 
 
-def test_a_round_goes_no_further_than_the_linearisation_is_worth(
+def test_steps_are_limited_to_the_linear_range(
     scattered: Scattered, cleared: Scattered, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(clearing, "_CLEARING_ROUNDS", 1)
@@ -170,7 +170,7 @@ def test_a_round_goes_no_further_than_the_linearisation_is_worth(
     assert np.any((near > 0.0) & (near < 0.5 * MAX_STEP))  # short steps stay as they are
 
 
-def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_larger_weights_move_less(scattered: Scattered, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clearing, "_CLEARING_ROUNDS", 1)
     even = np.ones(scattered.problem.chain.size)
     heavy = even.copy()
@@ -182,7 +182,7 @@ def test_what_weighs_more_moves_less(scattered: Scattered, monkeypatch: pytest.M
     assert moved[1] < 0.5 * moved[0]
 
 
-def test_searches_that_share_what_they_know_find_what_they_would_alone(
+def test_shared_caches_do_not_change_searches(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem = program_of(door_scene(), [vkc.Grasp("door", "handle_free")])

@@ -1,4 +1,4 @@
-"""Trees on the manifold of what is held: around a ball in the elbow's way, with a door that may wait, and where there is none."""
+"""Tests of constrained RRT around an obstacle, with a door that may wait."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RADIUS = 0.06  # [m] of the ball
 
 @cache
 def free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
-    """Return the problem of opening the door, knots through its last phase, and its waypoints on straight lines through them."""
+    """Return the door problem, keyframes of its last phase, and straight waypoints."""
     p = program_of(door_scene(), [OPEN], options=FEW)
     sampler = KeyframeSampler(p, np.random.default_rng(0))
     found = BeamSearch(sampler).search(thorough=True)
@@ -43,7 +43,7 @@ def free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
 
 @cache
 def blocked() -> vkc.TrajectoryProblem:
-    """Return the same with a ball where the elbow is half-way."""
+    """Return the same problem with a ball in the elbow's path."""
     p, _, straight = free_door()
     robot = door_scene().robot
     _, places = p.chain.joint_placements(straight[len(straight) // 2][None])
@@ -78,7 +78,7 @@ def penetration(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_they_lead_around_what_is_in_the_way_with_the_handle_in_the_hand(seed: int) -> None:
+def test_path_avoids_an_obstacle_and_holds_the_handle(seed: int) -> None:
     p, through, straight = free_door()
     assert penetration(blocked(), straight) > 0.02, "the ball is not in the way"
     rows = search(seed)
@@ -97,7 +97,7 @@ def test_they_lead_around_what_is_in_the_way_with_the_handle_in_the_hand(seed: i
     assert steps.max() < 0.6
 
 
-def test_what_is_free_is_not_obstructed_and_neither_is_what_begins_in_collision() -> None:
+def test_free_phases_and_colliding_starts_are_not_obstructed() -> None:
     p, through, straight = free_door()
     assert penetration(p, straight) <= 0.0
     assert not is_obstructed(KeyframeSampler(p, np.random.default_rng(0)), MOVE, through, straight)
@@ -107,11 +107,11 @@ def test_what_is_free_is_not_obstructed_and_neither_is_what_begins_in_collision(
     assert not is_obstructed(sampler, MOVE, inside, straight), "no tree leads out of things"
 
 
-def test_without_tries_nothing_is_found() -> None:
+def test_no_path_without_extensions() -> None:
     assert search(0, tries=0) is None
 
 
-def test_equal_random_numbers_give_equal_paths() -> None:
+def test_equal_random_seeds_give_equal_paths() -> None:
     one, same, other = search(3), search(3), search(4)
     np.testing.assert_array_equal(one, same)
     assert one is not None
@@ -129,7 +129,7 @@ def finder(p: vkc.TrajectoryProblem, seed: int = 0) -> held._Search:
     )
 
 
-def test_between_two_waypoints_the_door_is_between_them() -> None:
+def test_door_position_is_interpolated_between_waypoints() -> None:
     p, through, _ = free_door()
     own, hinge = finder(p), p.chain.index("door.hinge")
     at = np.array([own.begin, own.begin + 7.0, own.begin + 7.25, own.begin + 8.0, own.end])
@@ -151,7 +151,7 @@ def test_between_two_waypoints_the_door_is_between_them() -> None:
     assert closed[1:4].any()
 
 
-def test_a_path_becomes_no_longer_and_keeps_its_ends() -> None:
+def test_shortcuts_do_not_lengthen_a_path_and_keep_its_ends() -> None:
     _, through, _ = free_door()
     own = finder(blocked(), 5)
     path = own.run(through, MAX_EXTENSIONS)
@@ -170,10 +170,10 @@ def test_a_path_becomes_no_longer_and_keeps_its_ends() -> None:
 
 
 @pytest.mark.parametrize("out", [False, True])
-def test_a_path_that_cannot_be_closed_somewhere_gives_no_waypoints(
+def test_path_without_closure_gives_no_waypoints(
     out: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The base has to stand where no arm reaches the handle from."""
+    """The base must be where the arm cannot reach the handle."""
     _, through, _ = free_door()
     own = finder(blocked(), 5)
     path = own.run(through, MAX_EXTENSIONS)
@@ -190,8 +190,8 @@ def test_a_path_that_cannot_be_closed_somewhere_gives_no_waypoints(
     assert (own.resample(path, own.end - own.begin) is None) == out
 
 
-def test_what_was_chosen_at_the_grasp_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Samples hold as it was grasped; here by what the base's x is, which none of them has."""
+def test_samples_keep_the_grasp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples must keep the grasp; here the base's x stands for it, so none does."""
     p, through, _ = free_door()
     assert len(finder(p).sample_free(through, finder(p).end)) > 0
     monkeypatch.setattr(KeyframeSampler, "find_grasp_columns", lambda self, waypoint: [0])

@@ -41,7 +41,7 @@ def with_arm(load: str, arm: np.ndarray) -> np.ndarray:
 
 
 def reach(load: str, z: np.ndarray, *, base: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest x, y, z of what the base carries, or of the base, by coal's boxes in numeric Pinocchio."""
+    """Return the bounding box of the load or the base, by coal and Pinocchio."""
     chain = problem(load).chain
     data, placed = chain.model.createData(), pin.GeometryData(chain.collision)
     pin.updateGeometryPlacements(chain.model, data, chain.collision, placed, chain.coordinates.q(z))
@@ -64,7 +64,7 @@ def reach(load: str, z: np.ndarray, *, base: bool = False) -> tuple[np.ndarray, 
 
 
 @pytest.mark.parametrize("load", TASKS)
-def test_it_is_much_narrower_than_at_home(load: str) -> None:
+def test_folded_arm_is_much_narrower_than_at_home(load: str) -> None:
     p = problem(load)
     arm = find_folded_arms(p, len(p.task.phases) - 1, resting(load))[0]
     low, high = reach(load, with_arm(load, arm))
@@ -77,7 +77,7 @@ def test_it_is_much_narrower_than_at_home(load: str) -> None:
 
 @pytest.mark.parametrize("number", [0, 1, -1])
 @pytest.mark.parametrize("load", TASKS)
-def test_they_keep_within_limits_and_away_from_themselves(load: str, number: int) -> None:
+def test_folded_arms_respect_limits_and_self_collisions(load: str, number: int) -> None:
     p = problem(load)
     chain, robot = p.chain, p.chain.robot
     z = with_arm(load, find_folded_arms(p, len(p.task.phases) - 1, resting(load))[number])
@@ -95,7 +95,7 @@ def test_they_keep_within_limits_and_away_from_themselves(load: str, number: int
     assert p.contacts.evaluate(z[None], last, reach=p.options.dist_safe).compute_violation() == 0.0
 
 
-def test_what_stands_does_not_count() -> None:
+def test_obstacles_do_not_count() -> None:
     """The base is in the wall between the rooms."""
     p = problem("nothing")
     z = resting("nothing")
@@ -104,14 +104,14 @@ def test_what_stands_does_not_count() -> None:
     assert compute_shortfall(p, z[None], 1, standing=False)[0] == 0.0
 
 
-def test_it_is_the_same_every_time() -> None:
+def test_folded_arm_is_deterministic() -> None:
     p = problem("stick")
     np.testing.assert_array_equal(
         find_folded_arms(p, 1, resting("stick")), find_folded_arms(p, 1, resting("stick"))
     )
 
 
-def test_where_nothing_is_free_the_arm_stays_at_home(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arm_stays_at_home_if_no_posture_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(folding, "compute_shortfall", lambda _, z, *__, **___: np.ones(len(z)))
     np.testing.assert_array_equal(
         find_folded_arms(problem("nothing"), 0, resting("nothing")),
@@ -120,8 +120,8 @@ def test_where_nothing_is_free_the_arm_stays_at_home(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("load", TASKS)
-def test_the_others_reach_no_further_over_the_floor_than_the_first_or_the_base(load: str) -> None:
-    """By boxes of coal's; what the package takes is a little larger."""
+def test_other_folded_arms_extend_no_further_than_the_first(load: str) -> None:
+    """The extents are coal's boxes; the package's are slightly larger."""
     p = problem(load)
     arms = find_folded_arms(p, len(p.task.phases) - 1, resting(load))
     assert len(arms) > 10
@@ -136,8 +136,8 @@ def test_the_others_reach_no_further_over_the_floor_than_the_first_or_the_base(l
     assert min(sizes) > sizes[0] - 0.03
 
 
-def test_the_nearest_is_that_by_way_of_which_it_is_least_far() -> None:
-    """Joints that turn wound up are the same arm, but elsewhere."""
+def test_nearest_folded_arm_minimizes_the_motion() -> None:
+    """Equivalent angles are the same posture at another joint position."""
     p = problem("cup")
     routes, arms = (
         BaseRoutes(p),

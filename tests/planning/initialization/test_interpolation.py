@@ -1,4 +1,4 @@
-"""From knots to all waypoints: straight, along what somebody says, around what stands there, and with base and arm together."""
+"""Tests of interpolation between keyframes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROBOT = 9  # x, y and yaw of the base, six joints of the arm
 
 @cache
 def door() -> tuple[vkc.TrajectoryProblem, np.ndarray, tuple[int, ...]]:
-    """Return the problem of opening the door, and knots of it and when they are."""
+    """Return the door problem, its keyframes and their waypoints."""
     p = program_of(door_scene(), [OPEN], options=FEW)
     found = BeamSearch(KeyframeSampler(p, np.random.default_rng(0))).search(thorough=True)
     best = int(np.argmin(np.where(found.collision_cost == 0.0, found.cost, np.inf)))
@@ -47,7 +47,7 @@ def trees(p: vkc.TrajectoryProblem, seed: int = 0) -> RrtPaths:
 
 
 class Say:
-    """Ways as a function of first and last says; remembers what it was asked for."""
+    """Fake paths given by a function; records its arguments."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class Say:
 
 
 def turning(by: float, columns: int = 3) -> Callable[[np.ndarray, np.ndarray, int], np.ndarray]:
-    """Return straight ways that turn by so much more."""
+    """Return a function that makes straight paths with an additional turn."""
 
     def way(first: np.ndarray, last: np.ndarray, steps: int) -> np.ndarray:
         end = last.copy()
@@ -96,10 +96,10 @@ def holds_the_handle(z: np.ndarray) -> None:
 
 
 # --- straight
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
-def test_straight_through_the_knots_and_closed_where_it_is_held() -> None:
+def test_guess_passes_keyframes_and_closes_the_chain() -> None:
     p, knots, at_ = door()
     given = knots.copy()
     z = interpolator(p).interpolate(knots, list(at_))
@@ -117,7 +117,7 @@ def test_straight_through_the_knots_and_closed_where_it_is_held() -> None:
     holds_the_handle(z)
 
 
-def test_where_nothing_is_on_the_way_the_profile_is_smooth() -> None:
+def test_free_phases_follow_the_smooth_profile() -> None:
     p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
     z = interpolator(p).interpolate(np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments])
     assert z is not None
@@ -127,10 +127,10 @@ def test_where_nothing_is_on_the_way_the_profile_is_smooth() -> None:
 
 
 # --- along what somebody says
-# --------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
-def test_a_way_is_asked_for_where_nothing_is_held_and_between_straight_ways() -> None:
+def test_paths_are_searched_between_retreat_and_approach() -> None:
     p, knots, at_ = door()
     ways = Say(turning(0.0))
     z = interpolator(p, ways).interpolate(knots, list(at_))
@@ -149,7 +149,7 @@ def test_a_way_is_asked_for_where_nothing_is_held_and_between_straight_ways() ->
 
 
 @pytest.mark.parametrize("turns", [-1, 1, 2])
-def test_what_follows_goes_on_from_a_way_that_ends_with_whole_turns(turns: int) -> None:
+def test_later_headings_continue_after_full_turns(turns: int) -> None:
     p, knots, at_ = door()
     plain = interpolator(p, Say(turning(0.0))).interpolate(knots, list(at_))
     wound = interpolator(p, Say(turning(turns * 2 * np.pi))).interpolate(knots, list(at_))
@@ -166,10 +166,10 @@ def test_what_follows_goes_on_from_a_way_that_ends_with_whole_turns(turns: int) 
 
 
 @pytest.mark.parametrize(("yaw", "turns"), [(0.5, False), (None, True)])
-def test_a_way_may_end_whole_turns_further_unless_the_goal_says_how_far_to_turn(
+def test_full_turns_are_allowed_unless_the_goal_fixes_the_heading(
     yaw: float | None, turns: bool
 ) -> None:
-    """What the way says is taken as it is: whoever finds it knows where there is room to turn."""
+    """The turns of a path are accepted: its search knows where the base can turn."""
     p = program_of(hall(), [vkc.GoTo(2.0, 1.0, yaw)])
     ways = Say(turning(0.0))
     z = interpolator(p, ways).interpolate(
@@ -182,8 +182,8 @@ def test_a_way_may_end_whole_turns_further_unless_the_goal_says_how_far_to_turn(
     )
 
 
-def test_after_a_phase_whose_arm_ends_elsewhere_the_next_begins_there() -> None:
-    """Where nothing is to be reached the arm may stay folded."""
+def test_next_phase_begins_where_the_arm_ended() -> None:
+    """Without a goal of the arm it may stay folded."""
     p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5), vkc.GoTo(0.0, 1.0, 0.5)])
 
     def lifting(first: np.ndarray, last: np.ndarray, steps: int) -> np.ndarray:
@@ -202,7 +202,7 @@ def test_after_a_phase_whose_arm_ends_elsewhere_the_next_begins_there() -> None:
     assert np.abs(np.diff(z, axis=0)).max() < 0.2
 
 
-def test_where_there_is_no_way_it_is_said_once_for_each_phase() -> None:
+def test_missing_paths_are_noted_once_per_phase() -> None:
     p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5), vkc.GoTo(0.0, 1.0, 0.5)])
     allowed: list[Any] = [None]
     ways = Say(
@@ -225,7 +225,7 @@ def test_where_there_is_no_way_it_is_said_once_for_each_phase() -> None:
     assert len(ways.asked) == 4
 
 
-def test_phases_that_are_called_differently_have_a_line_each() -> None:
+def test_phases_of_different_names_have_a_line_each() -> None:
     both = program_of(door_scene(), [vkc.GoTo(0.0, 0.0), OPEN], options=FEW)
     found = BeamSearch(KeyframeSampler(both, np.random.default_rng(0))).search(thorough=False)
     allowed: list[Any] = [None, True, None]
@@ -241,17 +241,17 @@ def test_phases_that_are_called_differently_have_a_line_each() -> None:
 
 
 # --- what is hit on the way in
-# -------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("careful", "depth", "kept"),
     [(False, 0.015, True), (True, 0.015, False), (True, 0.005, True)],
 )
-def test_a_careful_way_leaves_out_what_hits_something(
+def test_colliding_approach_is_omitted_if_checked(
     careful: bool, depth: float, kept: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """More than half of the margin, 0.02; then the way leads to the grasp itself."""
+    """A shortfall above half of the margin omits the approach."""
     p, knots, at_ = door()
     ways = Say(turning(0.0, ROBOT), checks_approach=careful)
     join = interpolator(p, ways)
@@ -275,17 +275,17 @@ def test_a_careful_way_leaves_out_what_hits_something(
     )  # a knot is rough, what it is closed to exact
 
 
-def test_only_trees_are_careful() -> None:
+def test_only_rrt_paths_check_approaches() -> None:
     p, _, _ = door()
     assert trees(p).checks_approach
     assert not AStarPaths(BaseRoutes(p)).checks_approach
 
 
 # --- around, and with base and arm
-# ---------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
-def test_around_is_the_way_of_the_base_with_a_straight_arm() -> None:
+def test_astar_paths_move_the_arm_straight() -> None:
     p = walled(1.6)
     routes, end = BaseRoutes(p), at(p, (4.0, 1.5, 0.0))
     end[3:] += 0.2
@@ -301,7 +301,7 @@ def test_around_is_the_way_of_the_base_with_a_straight_arm() -> None:
 
 
 class Winding:
-    """BaseRoutes on which the base turns so many times too often, steadily."""
+    """Routes with additional full turns of the base."""
 
     def __init__(self, turns: int) -> None:
         self.turns = turns
@@ -312,7 +312,7 @@ class Winding:
 
 
 @pytest.mark.parametrize("wound", [-1, 0, 1, 2])
-def test_around_unwinds_where_the_goal_says_how_far_to_turn(wound: int) -> None:
+def test_astar_paths_unwind_if_the_goal_fixes_the_heading(wound: int) -> None:
     ways = AStarPaths(Winding(wound))  # type: ignore[arg-type]
     first, last, share = np.zeros(ROBOT), np.zeros(ROBOT), np.arange(1, 21) / 20
     last[:3] = 2.0, 1.0, 0.5
@@ -322,7 +322,7 @@ def test_around_unwinds_where_the_goal_says_how_far_to_turn(wound: int) -> None:
         np.testing.assert_allclose(way, np.outer(share, [2.0, 1.0, yaw]), atol=1e-9)
 
 
-def test_trees_lead_base_and_arm_through_a_narrow_gate() -> None:
+def test_rrt_paths_lead_through_a_narrow_gate() -> None:
     p = gated(NARROW)
     ends = np.array([p.start, at(p, GOAL)])
     assert interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(ends, [0, p.segments]) is None
@@ -339,7 +339,7 @@ def test_trees_lead_base_and_arm_through_a_narrow_gate() -> None:
     assert np.abs(np.diff(p.waypoints(z), axis=0)).max() < 1.0
 
 
-def test_with_what_is_to_be_reached_the_arm_of_a_tree_ends_there() -> None:
+def test_rrt_paths_end_at_the_required_arm() -> None:
     p = gated(NARROW)
     end = at(p, GOAL)
     end[2] += 2 * np.pi  # as inverse kinematics may well have it
@@ -359,8 +359,8 @@ def test_with_what_is_to_be_reached_the_arm_of_a_tree_ends_there() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("wound", [-1, 1])
-def test_trees_turn_as_far_as_the_goal_says_where_there_is_room(wound: int, seed: int) -> None:
-    """A whole turn more than the guide has, which cannot be in the gate: the base is longer than that is wide."""
+def test_rrt_paths_turn_as_far_as_the_goal_requires(wound: int, seed: int) -> None:
+    """The base must turn fully, which is impossible inside the gate."""
     p = gated(NARROW)
     end = at(p, GOAL)
     end[2] += wound * 2 * np.pi
@@ -374,17 +374,17 @@ def test_trees_turn_as_far_as_the_goal_says_where_there_is_room(wound: int, seed
     assert np.abs(np.sin(way[inside, 2])).max(initial=0.0) < 0.2
 
 
-def test_trees_find_nothing_where_there_is_nothing() -> None:
+def test_rrt_paths_return_none_if_there_is_no_path() -> None:
     p = gated(0.0)
     join = interpolator(p, trees(p))
     assert join.interpolate(np.array([p.start, at(p, GOAL)]), [0, p.segments]) is None
     assert len(join.blocked) == 1
 
 
-def test_trees_that_failed_try_less_until_they_succeed_again(
+def test_extension_limit_is_halved_after_failures(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In each phase on its own."""
+    """Phases are counted separately."""
     p = gated(NARROW)
     ways, tries, found = (
         trees(p),
@@ -417,7 +417,7 @@ def test_trees_that_failed_try_less_until_they_succeed_again(
     ]
 
 
-def test_trees_that_failed_where_something_is_held_try_less_too_but_where_none_grew_nothing_failed(
+def test_extension_limit_counts_constrained_searches_that_ran(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     p, through, _ = door()
@@ -435,10 +435,10 @@ def test_trees_that_failed_where_something_is_held_try_less_too_but_where_none_g
     assert tries == [MAX_EXTENSIONS, MAX_EXTENSIONS // 2, MAX_EXTENSIONS // 4, MAX_EXTENSIONS]
 
 
-def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robot_ends(
+def test_constrained_path_determines_door_motion_and_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A door that opens in the second half of its time alone, and another posture in the end, from which the next phase leads."""
+    """The door opens in the second half of the phase, and the robot ends elsewhere."""
     p = program_of(door_scene(), [OPEN, vkc.GoTo(-1.0, 0.5)], options=FEW)
     own = KeyframeSampler(p, np.random.default_rng(0))
     found = BeamSearch(own).search(thorough=True)
@@ -492,7 +492,7 @@ def test_where_something_is_held_trees_say_how_the_door_moves_and_where_the_robo
     )
 
 
-def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rrt_paths_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*_: Any, **__: Any) -> Any:
         raise AssertionError("a base that cannot drive needs no way")
 
@@ -522,8 +522,8 @@ def test_trees_of_a_fixed_base_move_the_arm_alone(monkeypatch: pytest.MonkeyPatc
     assert grazed < p.options.dist_safe + 0.02
 
 
-def test_a_way_of_trees_stays_free_where_the_goal_says_how_far_to_turn() -> None:
-    """The guide drives backwards through the gate, which would end a whole turn further."""
+def test_rrt_paths_stay_free_if_the_goal_fixes_the_heading() -> None:
+    """The guide drives backwards through the gate, one full turn off."""
     p = program_of(gated(NARROW).scene, [vkc.GoTo(*GOAL[:2], -3.1)])
     z = interpolator(p, trees(p)).interpolate(
         np.array([p.start, at(p, (*GOAL[:2], -3.1))]), [0, p.segments]

@@ -1,4 +1,4 @@
-"""Configurations at waypoints: what must hold does, by Pinocchio, within limits, and again with the same random numbers."""
+"""Tests of keyframes: feasible by Pinocchio, within limits, and reproducible."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_profile_starts_and_ends_at_rest() -> None:
     np.testing.assert_array_equal(sample_smoothstep(1), [1.0])
 
 
-def test_objects_run_to_their_goals_phase_by_phase(problem: vkc.TrajectoryProblem) -> None:
+def test_object_joints_move_to_their_goals_phase_by_phase(problem: vkc.TrajectoryProblem) -> None:
     z = interpolate_object_joints(problem, np.tile(problem.start, (problem.segments, 1)))
     reach, turn, move = problem.ends.tolist()
     hinge, knob = (z[:, problem.chain.index(f"door.{name}")] for name in ("hinge", "knob"))
@@ -60,9 +60,7 @@ def test_objects_run_to_their_goals_phase_by_phase(problem: vkc.TrajectoryProble
 
 
 @pytest.mark.parametrize("how", ["scatter", "track", "shake"])
-def test_the_hand_is_at_the_handle_wherever_that_is(
-    problem: vkc.TrajectoryProblem, how: str
-) -> None:
+def test_hand_is_at_the_handle_at_every_waypoint(problem: vkc.TrajectoryProblem, how: str) -> None:
     search = knots(problem)
     grasp = int(problem.ends[0])
     first, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
@@ -85,7 +83,7 @@ def test_the_hand_is_at_the_handle_wherever_that_is(
         assert (z[found, arms] <= problem.upper[waypoint - 1, arms] + 1e-9).all()
 
 
-def test_tracking_stays_near_and_scattering_does_not(problem: vkc.TrajectoryProblem) -> None:
+def test_track_stays_near_and_scatter_does_not(problem: vkc.TrajectoryProblem) -> None:
     search, grasp = knots(problem), int(problem.ends[0])
     z, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
     steps = {}
@@ -95,7 +93,7 @@ def test_tracking_stays_near_and_scattering_does_not(problem: vkc.TrajectoryProb
     assert steps["track"] < steps["shake"] < steps["scatter"]
 
 
-def test_where_nothing_must_hold_robots_stay(drive: vkc.TrajectoryProblem) -> None:
+def test_robots_stay_without_a_pose_constraint(drive: vkc.TrajectoryProblem) -> None:
     search = knots(drive)
     assert search.find_pose(1) is None
     before = np.tile(drive.start, (3, 1)) + np.arange(3)[:, None] * 1e-3
@@ -105,10 +103,10 @@ def test_where_nothing_must_hold_robots_stay(drive: vkc.TrajectoryProblem) -> No
     assert search.push_clear(z, 1) is z
 
 
-def test_what_is_known_is_not_worked_out_again(
+def test_cached_results_are_not_computed_again(
     problem: vkc.TrajectoryProblem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And with the same random numbers all is as if it had been."""
+    """The random generator continues as without a cache."""
     known, grasp, start = KeyframeCache(), int(problem.ends[0]), np.tile(problem.start, (16, 1))
     one, other, alone = knots(problem, 3, known), knots(problem, 3, known), knots(problem, 3)
     first = one.sample(start, grasp, "scatter")
@@ -125,7 +123,7 @@ def test_what_is_known_is_not_worked_out_again(
     assert not np.array_equal(knots(problem, 4).sample(start, grasp, "scatter")[0], first[0])
 
 
-def test_depth_is_the_largest_shortfall_of_any_pair(problem: vkc.TrajectoryProblem) -> None:
+def test_shortfall_is_the_largest_of_any_pair(problem: vkc.TrajectoryProblem) -> None:
     """Against Pinocchio's and coal's distances of all pairs, without culling."""
     search, grasp = knots(problem), int(problem.ends[0])
     z, _ = search.sample(np.tile(problem.start, (24, 1)), grasp, "scatter")
@@ -142,7 +140,7 @@ def test_depth_is_the_largest_shortfall_of_any_pair(problem: vkc.TrajectoryProbl
     np.testing.assert_allclose(compute_shortfall(problem, z, grasp), expected, atol=1e-5)
 
 
-def test_what_is_known_to_be_free_is_what_must_hold_there(problem: vkc.TrajectoryProblem) -> None:
+def test_free_keyframes_satisfy_the_pose_constraint(problem: vkc.TrajectoryProblem) -> None:
     search, grasp = knots(problem), int(problem.ends[0])
     z, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
     away = z[found] + 0.01 * np.eye(problem.chain.size)[0]  # a centimetre from the handle
@@ -157,7 +155,7 @@ def test_what_is_known_to_be_free_is_what_must_hold_there(problem: vkc.Trajector
     assert not other.has_free_keyframe(grasp)
 
 
-def test_scatter_tells_what_does_not_fit(problem: vkc.TrajectoryProblem) -> None:
+def test_goal_configurations_report_their_residuals(problem: vkc.TrajectoryProblem) -> None:
     drawn = sample_goal_configurations(problem, int(problem.ends[0]), np.random.default_rng(0))
     assert drawn is not None
     z, residuals = drawn
@@ -170,7 +168,7 @@ def test_scatter_tells_what_does_not_fit(problem: vkc.TrajectoryProblem) -> None
     assert (residuals < 1e-4).any()
 
 
-def test_scatter_where_the_base_must_be(drive: vkc.TrajectoryProblem) -> None:
+def test_goal_configurations_at_a_base_goal(drive: vkc.TrajectoryProblem) -> None:
     assert sample_goal_configurations(drive, 1, np.random.default_rng(0)) is None, (
         "nothing must hold there"
     )
@@ -181,8 +179,8 @@ def test_scatter_where_the_base_must_be(drive: vkc.TrajectoryProblem) -> None:
     assert np.ptp(placed[0][:, 2]) > 1.0, "at any heading"
 
 
-def test_moving_costs_what_it_does_in_searches(problem: vkc.TrajectoryProblem) -> None:
-    """A radian of whatever costs 1, a metre what a radian moves the hand, but where a grasp slides."""
+def test_weights_are_those_of_searches(problem: vkc.TrajectoryProblem) -> None:
+    """Angles cost 1, lengths what they move the hand, except sliding grasps."""
     free = vkc.build(
         vkc.load_scene("init_3"), [vkc.Touch("stick.tip", (-1.0, 3.9, 0.1))], options=SHORT
     )

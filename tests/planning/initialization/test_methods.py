@@ -42,7 +42,7 @@ def seeds(method: str = "interpolated", *, seed: int = 0, count: int = 1) -> lis
 
 
 @pytest.mark.parametrize("method", INITIALIZATIONS)
-def test_seeds_are_within_bounds(method: str) -> None:
+def test_guesses_are_within_bounds(method: str) -> None:
     for z in seeds(method, count=3):
         assert z.shape == (problem().segments, problem().chain.size)
         assert np.all(z >= problem().lower)
@@ -50,7 +50,7 @@ def test_seeds_are_within_bounds(method: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_interpolated_seeds_hold_the_handle(seed: int) -> None:
+def test_interpolated_guesses_hold_the_handle(seed: int) -> None:
     chain, scene = problem().chain, door_scene()
     hinge, knob = chain.index("door.hinge"), chain.index("door.knob")
     for z in seeds(seed=seed, count=3):
@@ -67,10 +67,10 @@ def test_interpolated_seeds_hold_the_handle(seed: int) -> None:
     ids=["tank", "car"],
 )
 @pytest.mark.parametrize(("name", "goal"), [("door", {"hinge": 1.2}), ("drawer", {"slide": 0.35})])
-def test_seeds_of_bases_on_wheels_can_be_driven(
+def test_guesses_of_wheeled_bases_can_be_driven(
     name: str, goal: dict[str, float], robot: dict[str, Any], method: str
 ) -> None:
-    """They roll, turn no tighter than they can, and hold what they hold; where the arm does not reach in, the base gives way."""
+    """Bases roll with their turning radius, and the chain is closed."""
     scene = vkc.load_scene(name)
     document, rng = (
         {**scene.document, "robot": {"name": "husky_ur5e", **robot}},
@@ -90,7 +90,7 @@ def test_seeds_of_bases_on_wheels_can_be_driven(
         assert p.pose_error(seed.z) < 1e-2
 
 
-def test_a_seed_opens_the_door() -> None:
+def test_guess_opens_the_door() -> None:
     (z,) = seeds()
     hinge, knob = (z[:, problem().chain.index(name)] for name in ("door.hinge", "door.knob"))
     reach, turn, _ = problem().ends
@@ -101,7 +101,7 @@ def test_a_seed_opens_the_door() -> None:
     assert np.all(knob[turn - 1 :] >= 0.5)
 
 
-def test_seeds_go_from_the_start_without_a_jump() -> None:
+def test_guesses_start_without_a_jump() -> None:
     for z in seeds(count=2):
         path = problem().waypoints(z)
         reach = int(problem().ends[0])
@@ -123,7 +123,7 @@ def test_seeds_go_from_the_start_without_a_jump() -> None:
         assert np.abs(np.diff(path, axis=0)).max() < 0.8
 
 
-def test_the_same_seed_gives_the_same_seeds() -> None:
+def test_same_random_seed_gives_same_guesses() -> None:
     first, second = seeds(seed=4, count=4), seeds(seed=4, count=4)
     assert len(first) == len(second)
     for one, other in zip(first, second, strict=True):
@@ -131,7 +131,7 @@ def test_the_same_seed_gives_the_same_seeds() -> None:
     assert not np.array_equal(seeds(seed=5)[0], first[0])
 
 
-def test_several_seeds_are_different() -> None:
+def test_several_guesses_differ() -> None:
     found = seeds(count=3)
     assert 1 <= len(found) <= 3
     for k, z in enumerate(found):
@@ -140,7 +140,7 @@ def test_several_seeds_are_different() -> None:
     assert len(seeds(count=1)) == 1
 
 
-def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
+def test_stationary_guess_keeps_the_robot_in_place() -> None:
     for seed in (0, 1):
         z, *others = seeds("stationary", seed=seed, count=4)
         robot = problem().chain.robot.coordinates.size
@@ -162,7 +162,7 @@ def test_the_stationary_seed_leaves_the_robot_where_it_is() -> None:
         assert hinge[problem().ends[1] - 1] == 0.0
 
 
-def test_of_many_random_places_the_one_with_the_least_merit_is_taken(
+def test_random_place_of_least_merit_is_taken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drive = program_of(hall(), [vkc.Reach((2.0, 1.5, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
@@ -175,7 +175,7 @@ def test_of_many_random_places_the_one_with_the_least_merit_is_taken(
     assert max(merits(128)) < min(merits(1))
 
 
-def test_a_seed_for_the_base_takes_the_shorter_way_round() -> None:
+def test_base_turns_the_shorter_direction() -> None:
     scene = hall().with_start(base=[0.0, 0.0, 3.0])
     turn = program_of(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
     (z,) = (found.z for found in initialize(turn, "interpolated", 0))
@@ -183,14 +183,14 @@ def test_a_seed_for_the_base_takes_the_shorter_way_round() -> None:
     np.testing.assert_allclose(z[:, 3:], np.tile(scene.start[3:], (len(z), 1)))
 
 
-def test_a_seed_for_a_target_out_of_reach_is_still_a_seed() -> None:
+def test_unreachable_target_still_has_a_guess() -> None:
     lost = program_of(hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
     for z in (found.z for found in initialize(lost, "interpolated", 0, count=2)):
         assert np.isfinite(z).all()
         assert np.all((z >= lost.lower) & (z <= lost.upper))
 
 
-def test_a_fixed_base_stays_in_every_seed() -> None:
+def test_fixed_base_stays_in_every_guess() -> None:
     fixed = program_of(
         hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT
     )
@@ -202,7 +202,7 @@ def test_a_fixed_base_stays_in_every_seed() -> None:
         assert np.abs(z - still)[-1, 3:].max() > 0.1
 
 
-def test_scattered_configurations_are_where_they_say() -> None:
+def test_goal_configurations_have_the_stated_residuals() -> None:
     target = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0), np.array([1.5, 0.5, 0.9]))
     reach = program_of(hall(), [vkc.Reach(target)], options=SHORT)
     found = sample_goal_configurations(reach, reach.segments, np.random.default_rng(0))
@@ -222,7 +222,7 @@ def test_scattered_configurations_are_where_they_say() -> None:
         )
 
 
-def test_nothing_to_scatter() -> None:
+def test_no_goal_configurations_without_a_goal() -> None:
     free = program_of(
         door_scene(), [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(0.0, 0.0)], options=SHORT
     )
@@ -244,7 +244,7 @@ FINE, POOR, LOST = (
 
 
 class Looked:
-    """Stands for three searches; says what is looked for (s0), and what came to be taken (S0). None: a search finds nothing."""
+    """Fake searches that record requests (s0) and yields (S0); None: no guess."""
 
     def __init__(self, straight: Overlaps, around: Overlaps, trees: Overlaps) -> None:
         self.said: list[str] = []
@@ -292,14 +292,14 @@ class Looked:
         ([None], [None], [None], "s0 a0 t0"),
     ],
 )
-def test_straight_around_and_trees_take_turns(
+def test_methods_take_turns(
     straight: Overlaps, around: Overlaps, trees: Overlaps, expected: str
 ) -> None:
     assert Looked(straight, around, trees).said == expected.split()
 
 
 @given(*(st.lists(st.sampled_from([0.0, FINE, POOR, LOST, None]), max_size=5) for _ in range(3)))
-def test_every_seed_is_yielded_once_and_none_before_it_is_looked_for(
+def test_guesses_are_generated_on_demand_and_once(
     straight: Overlaps, around: Overlaps, trees: Overlaps
 ) -> None:
     said = Looked(straight, around, trees).said
@@ -327,7 +327,7 @@ def test_every_seed_is_yielded_once_and_none_before_it_is_looked_for(
             assert penetration[name] == min(left), "the best of those that wait comes first"
 
 
-def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
+def test_base_turns_gradually() -> None:
     scene, rng = vkc.load_scene("aisle_drawer"), np.random.default_rng(7)
     for _ in range(16):  # on some of these ways headings wind by a whole turn
         problem = program_of(
@@ -340,7 +340,7 @@ def test_the_base_turns_on_the_way_and_not_in_the_last_step() -> None:
         assert abs(seed.z[-1, 2] - problem.start[2]) <= np.pi + 1e-9
 
 
-def test_what_costs_nothing_has_a_seed() -> None:
+def test_task_without_motion_has_a_guess() -> None:
     scene = vkc.load_scene("drawer")
     problem = program_of(scene, [vkc.GoTo(*scene.start[:3].tolist())])
     with np.errstate(all="raise"):
@@ -349,12 +349,12 @@ def test_what_costs_nothing_has_a_seed() -> None:
 
 
 # --- through narrow places
-# -----------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("width", [NARROW, TIGHT])
-def test_trees_make_a_seed_through_a_narrow_gate(width: float) -> None:
-    """Where the base alone finds no way with its arm at home; what is left is a graze."""
+def test_rrt_guess_leads_through_a_narrow_gate(width: float) -> None:
+    """The base with its arm at home has no path; the rest is a graze."""
     gate = gated(width)
     assert list(initialize(gate, "astar", 0)) == []
     notes: list[str] = []
@@ -374,14 +374,14 @@ def test_trees_make_a_seed_through_a_narrow_gate(width: float) -> None:
     np.testing.assert_array_equal(seed.z, same.z)
 
 
-def test_in_turn_trees_come_first_where_the_others_hit_things() -> None:
+def test_auto_prefers_rrt_if_other_guesses_collide() -> None:
     found = list(initialize(gated(NARROW), "auto", 0, count=2))
     assert [seed.name for seed in found[:2]] == ["rrt", "interpolated"]
     assert found[0].penetration < _MAX_GOOD_PENETRATION < found[1].penetration
 
 
 @pytest.mark.parametrize("is_blocked", [True, False])
-def test_trees_grow_unless_a_goal_is_blocked_of_which_no_search_knows_better(
+def test_no_trees_grow_if_a_goal_is_blocked(
     is_blocked: bool,
 ) -> None:
     asked: list[Sequence[int]] = []
@@ -395,8 +395,8 @@ def test_trees_grow_unless_a_goal_is_blocked_of_which_no_search_knows_better(
     assert asked == [[]], "the searches before have come to the goal, where the robot is free"
 
 
-def test_no_trees_are_grown_where_the_way_is_wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They take their time; they are asked last."""
+def test_no_trees_grow_if_other_guesses_are_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trees are slow, so they come last."""
     grown: list[int] = []
     connect = joining.connect
 
@@ -411,7 +411,7 @@ def test_no_trees_are_grown_where_the_way_is_wide(monkeypatch: pytest.MonkeyPatc
     assert grown
 
 
-def test_where_there_is_no_way_trees_make_no_seed() -> None:
+def test_rrt_has_no_guess_if_there_is_no_path() -> None:
     notes: list[str] = []
     assert list(initialize(gated(0.0), "rrt", 0, count=2, notes=notes)) == []
     assert len(notes) == 1
@@ -420,16 +420,14 @@ def test_where_there_is_no_way_trees_make_no_seed() -> None:
     assert "no path for the base, proven" in plan.report()
 
 
-def test_a_motion_through_the_narrow_gate() -> None:
+def test_motion_through_the_narrow_gate() -> None:
     plan = vkc.plan(gated(NARROW).scene, [vkc.GoTo(*GOAL)])
     assert plan.success, plan.report()
     assert plan.initialization == "rrt"
 
 
 @pytest.mark.parametrize(("method", "stands"), [("astar", False), ("rrt", True)])
-def test_for_trees_the_base_stands_while_the_hand_goes_straight_in(
-    method: str, stands: bool
-) -> None:
+def test_rrt_keeps_the_base_fixed_during_approach(method: str, stands: bool) -> None:
     (z,) = seeds(method)
     reach = int(problem().ends[0])
     last = z[reach - OPENED.steps(OPENED.approach_time) - 1 : reach, :3]
@@ -437,10 +435,8 @@ def test_for_trees_the_base_stands_while_the_hand_goes_straight_in(
 
 
 @pytest.mark.parametrize("method", ["interpolated", "astar", "rrt"])
-def test_searches_are_quick_first_and_for_trees_careful_and_backwards_in_turn(
-    method: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nothing that is found is tolerable: only for trees that is a reason not to use what a thorough search finds."""
+def test_search_modes_of_successive_attempts(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No result is acceptable; only RRT rejects those of thorough searches."""
     asked: list[tuple[bool, bool, bool]] = []
     search = BeamSearch.search
 
@@ -468,7 +464,7 @@ def test_searches_are_quick_first_and_for_trees_careful_and_backwards_in_turn(
         ("", "fbfbf"),
     ],
 )
-def test_trees_search_again_in_the_direction_that_led_somewhere(
+def test_rrt_avoids_a_direction_that_failed(
     ways: str, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked, found = list[str](), SearchResult(np.zeros((0, 1, 9)), np.zeros(0), np.zeros(0), [0])
@@ -488,7 +484,7 @@ def test_trees_search_again_in_the_direction_that_led_somewhere(
 
 
 class Watched:
-    """Notes what beams find: for ways of the base alone, and, with care, for trees."""
+    """Records the results of beam searches by method."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.found: list[tuple[str, SearchResult]] = []
@@ -514,12 +510,12 @@ class Watched:
 
 
 def grasps(found: SearchResult) -> np.ndarray:
-    """Return where the robot may stand and have its arm when it grasps, shape (B, 9)."""
+    """Return robot configurations that grasp, shape (B, 9)."""
     return found.paths[:, found.waypoints.index(int(problem().ends[0])), :9]
 
 
-def test_trees_search_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With care; what is found for the base alone may be short and shut."""
+def test_rrt_uses_its_own_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """RRT searches for narrow passages; other results may be blocked."""
     watched = Watched(monkeypatch)
     assert [seed.name for seed in initialize(problem(), "rrt", 0)] == ["rrt"]
     assert watched.kinds == ["rrt"]
@@ -532,10 +528,10 @@ def test_trees_search_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.abs(apart).max(axis=1).min() < 1e-3
 
 
-def test_where_the_arm_goes_far_round_trees_grow_from_other_grasps_too_and_the_least_merit_wins(
+def test_detours_are_compared_with_other_grasps_by_merit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As many as are compared, if it goes far round from all of them; the first alone, if it does not."""
+    """All compared guesses are made if each has a detour, otherwise the first only."""
     joined, join = list[np.ndarray](), joining.Interpolator.interpolate
 
     def joins(self: joining.Interpolator, through: np.ndarray, at: list[int]) -> np.ndarray | None:
@@ -563,9 +559,7 @@ def test_where_the_arm_goes_far_round_trees_grow_from_other_grasps_too_and_the_l
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_of_every_kind_so_many_seeds_are_asked_for(
-    count: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_count_applies_to_every_method(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: dict[str, int] = {}
 
     def seeds(one: Any, most: int) -> Iterator[InitialGuess]:
@@ -577,7 +571,7 @@ def test_of_every_kind_so_many_seeds_are_asked_for(
     assert asked == {"interpolated": count, "astar": count, "rrt": count}
 
 
-def test_trees_hold_the_handle_too() -> None:
+def test_rrt_guess_holds_the_handle() -> None:
     chain = problem().chain
     hinge, knob = chain.index("door.hinge"), chain.index("door.knob")
     found = seeds("rrt", count=2)
@@ -587,8 +581,8 @@ def test_trees_hold_the_handle_too() -> None:
             assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
 
 
-def test_the_narrow_door_is_shut_from_outside() -> None:
-    """It stands open into the bedroom: a hand at its lever is in the doorway, where the arm at home has no room."""
+def test_narrow_door_is_closed_from_outside() -> None:
+    """The door is open into the bedroom, and its lever is in the doorway."""
     scene = (
         vkc.load_scene("household")
         .with_state("door", {"hinge": 1.52})

@@ -1,4 +1,4 @@
-"""Ways of base and arm that two random trees find: through a narrow gate, around a pole, and where there is none."""
+"""Tests of RRT paths of base and arm: a narrow gate, a pole, no path."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 @cache
 def gate() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
-    """Return a problem in which only a folded arm fits through, a path of the base, and postures."""
+    """Return a problem that needs a folded arm, a guide path, and postures."""
     problem = gated(TIGHT)
     routes = BaseRoutes(problem)
     guide = routes.find_guide_path(0, problem.start[:3], np.array(GOAL), 80)
@@ -71,13 +71,13 @@ def finely(path: np.ndarray, apart: float = 0.02) -> np.ndarray:
 
 
 def missing(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> np.ndarray:
-    """Return by how much the robot falls short of its margins [m], every pair looked at, shape (B,)."""
+    """Return the shortfall of the robot over all pairs, shape (B,) [m]."""
     z = np.tile(problem.start, (len(rows), 1))
     z[:, : rows.shape[1]] = rows
     return problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).compute_shortfall(len(z))
 
 
-def test_what_a_coarse_search_overlooks_a_finer_one_does_not(
+def test_finer_search_finds_collisions_that_a_coarse_one_misses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     worst = []
@@ -91,8 +91,8 @@ def test_what_a_coarse_search_overlooks_a_finer_one_does_not(
     assert worst[0] > margin + 0.02
 
 
-def test_joints_that_turn_there_and_back_for_nothing_stay_where_they_are() -> None:
-    """A wrist that turns by 2 rad on its way to 0.4 rad goes there straight."""
+def test_needless_joint_motion_is_removed() -> None:
+    """A needless turn of the wrist is straightened."""
     problem, guide, arms = gate()
     first = problem.start[:SIZE]
     middle, last = first.copy(), first.copy()
@@ -109,7 +109,7 @@ def test_joints_that_turn_there_and_back_for_nothing_stay_where_they_are() -> No
 
 @settings(max_examples=4, deadline=None)
 @given(SEEDS)
-def test_straight_ways_are_free_and_no_longer(seed: int) -> None:
+def test_straightened_paths_are_free_and_no_longer(seed: int) -> None:
     problem, guide, arms = gate()
     path = through(seed)
     assert path is not None
@@ -126,10 +126,8 @@ def test_straight_ways_are_free_and_no_longer(seed: int) -> None:
     ("there", "back", "far"),
     [(1.0, 0.0, False), (1.2, 0.2, False), (2.0, 1.5, True), (3.0, 0.0, False)],
 )
-def test_the_arm_goes_far_round_where_a_third_of_its_way_is_none_of_the_straight_one(
-    there: float, back: float, far: bool
-) -> None:
-    """A shoulder turns by so much there and back, in one phase of two."""
+def test_arm_detour_exceeds_a_third_of_the_path(there: float, back: float, far: bool) -> None:
+    """A shoulder turns back and forth in one of two phases."""
     problem = program_of(hall(), [vkc.GoTo(0.5, 0.0), vkc.GoTo(1.0, 0.0)])
     z, middle = np.tile(problem.start, (problem.segments, 1)), int(problem.ends[0])
     z[:, 0] = np.linspace(0.0, 1.0, len(z))
@@ -141,7 +139,7 @@ def test_the_arm_goes_far_round_where_a_third_of_its_way_is_none_of_the_straight
 
 
 @pytest.mark.parametrize("finer", [True, False])
-def test_what_hits_things_between_configurations_that_were_looked_at_is_no_path(
+def test_paths_in_collision_between_checks_are_rejected(
     monkeypatch: pytest.MonkeyPatch, finer: bool
 ) -> None:
     straight = np.array([gate()[0].start, at(gate()[0], GOAL)])
@@ -155,10 +153,10 @@ def test_what_hits_things_between_configurations_that_were_looked_at_is_no_path(
 
 
 @pytest.mark.parametrize(("detour", "passes"), [(0.3, 1), (0.35, 3)])
-def test_paths_are_straightened_again_where_the_arm_goes_far_round_as_long_as_that_pays(
+def test_detours_are_straightened_as_long_as_that_pays_off(
     monkeypatch: pytest.MonkeyPatch, detour: float, passes: int
 ) -> None:
-    """What is tried makes a path shorter all along it and in two passes over random places; then nothing does."""
+    """Shortcuts shorten a path as a whole and in two passes, then stop."""
     problem, guide, arms = gate()
     search = trees._Search(problem, 0, problem.start, guide, arms, np.random.default_rng(0), 0.04)
     asked: list[int] = []
@@ -175,7 +173,7 @@ def test_paths_are_straightened_again_where_the_arm_goes_far_round_as_long_as_th
     assert asked == [0, *[trees._SHORTCUT_ROUNDS] * passes]
 
 
-def test_a_detour_is_the_share_of_a_path_that_the_arm_goes_beyond_its_straight_way() -> None:
+def test_detour_is_the_excess_share_of_the_arm() -> None:
     problem, metric = gate()[0], gate()[0].chain.metric[:SIZE]
     path = np.tile(problem.start[:SIZE], (3, 1))
     path[1:, 0] += [0.5, 0.0]
@@ -197,12 +195,12 @@ def is_a_way(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
 
 
 # --- what is found
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 @settings(max_examples=8, deadline=None)
 @given(SEEDS)
-def test_a_way_leads_through_the_gate_from_one_end_to_the_other(seed: int) -> None:
+def test_path_leads_through_the_gate(seed: int) -> None:
     problem, _, _ = gate()
     straight = np.array([problem.start, at(problem, GOAL)])
     assert missing(problem, finely(straight)).max() > 0.1, (
@@ -222,7 +220,7 @@ def test_a_way_leads_through_the_gate_from_one_end_to_the_other(seed: int) -> No
 
 @settings(max_examples=4, deadline=None)
 @given(SEEDS, st.integers(1, 3))
-def test_of_several_ends_it_is_one_that_can_be_reached(seed: int, free: int) -> None:
+def test_path_ends_at_a_reachable_end(seed: int, free: int) -> None:
     problem, _, arms = gate()
     ends = np.tile(at(problem, (2.0, 1.5, 0.0)), (4, 1))  # in the wall
     ends[:free, :3] = GOAL
@@ -236,7 +234,7 @@ def test_of_several_ends_it_is_one_that_can_be_reached(seed: int, free: int) -> 
 @pytest.mark.parametrize(
     "pose", [(2.0, 1.5, 0.0), (4.0, 0.5, 0.0)], ids=["in the wall", "behind a wall without a gate"]
 )
-def test_there_is_no_way_to_what_is_walled_in(pose: tuple[float, float, float]) -> None:
+def test_walled_in_goal_has_no_path(pose: tuple[float, float, float]) -> None:
     problem = gated(0.0)
     poses, arms = np.array([problem.start[:3], pose]), problem.start[None, 3:]
     for seed in range(2):
@@ -256,8 +254,8 @@ def test_there_is_no_way_to_what_is_walled_in(pose: tuple[float, float, float]) 
         )
 
 
-def test_of_ends_that_are_all_too_close_to_something_the_least_is_tried() -> None:
-    """A goal that is a little closer than may be is where one is sent; one in the wall is not."""
+def test_least_violating_end_is_tried() -> None:
+    """A goal slightly within the margin is reached; one in the wall is not."""
     problem, _, arms = gate()
     there, allowed = (
         np.array([*at(problem, (1.895 - 0.49, 1.5, np.pi / 2))[:3], *arms[1]]),
@@ -277,7 +275,7 @@ def test_of_ends_that_are_all_too_close_to_something_the_least_is_tried() -> Non
     assert missing(problem, finely(path)).max() <= allowed + HIDDEN
 
 
-def test_who_is_there_already_stays() -> None:
+def test_path_to_the_start_stays_there() -> None:
     problem, guide, arms = gate()
     ends, rng = problem.start[None], np.random.default_rng(0)
     path = connect(problem, 0, problem.start, ends, poses=guide, arms=arms, rng=rng)
@@ -289,8 +287,8 @@ def test_who_is_there_already_stays() -> None:
     )
 
 
-def test_nothing_in_the_way_nothing_beside_it() -> None:
-    """The straight way is tried before anything is drawn."""
+def test_free_path_is_straight() -> None:
+    """The straight line is tried before sampling."""
     problem = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
     end = at(problem, (2.0, 1.0, 0.5))
     end[3:] += 0.3
@@ -308,7 +306,7 @@ def test_nothing_in_the_way_nothing_beside_it() -> None:
     assert length(path) == pytest.approx(length(np.array([problem.start, end])), rel=1e-9)
 
 
-def test_the_arm_of_a_fixed_base_goes_around_a_pole() -> None:
+def test_arm_on_a_fixed_base_avoids_a_pole() -> None:
     pole = {
         "name": "pole",
         "type": "cylinder",
@@ -341,7 +339,7 @@ def test_the_arm_of_a_fixed_base_goes_around_a_pole() -> None:
     is_a_way(problem, path)
 
 
-def test_equal_random_numbers_give_equal_ways() -> None:
+def test_equal_random_seeds_give_equal_paths() -> None:
     one, same, other = through(3), through(3), through(4)
     assert one is not None
     assert same is not None
@@ -350,8 +348,8 @@ def test_equal_random_numbers_give_equal_ways() -> None:
     assert one.shape != other.shape or not np.array_equal(one, other)
 
 
-def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The trees are the same: they are grown before."""
+def test_shortcuts_do_not_lengthen_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The trees are the same, since they grow before."""
     for seed in range(3):
         short = through(seed)
         with monkeypatch.context() as patch:
@@ -369,7 +367,7 @@ def test_what_is_shortened_is_not_longer(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 # --- parts of the way that are free
-# --------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 def search(seed: int = 0) -> trees._Search:
@@ -379,7 +377,7 @@ def search(seed: int = 0) -> trees._Search:
     )
 
 
-def test_a_line_is_free_up_to_the_last_place_before_the_first_that_is_blocked() -> None:
+def test_free_share_ends_before_the_first_collision() -> None:
     problem, guide, arms = gate()
     finder, rng, shares = search(), np.random.default_rng(5), []
     for _ in range(60):
@@ -397,8 +395,8 @@ def test_a_line_is_free_up_to_the_last_place_before_the_first_that_is_blocked() 
     assert len(set(shares)) > 5
 
 
-def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
-    """Each as long as can be, and free half-way between its configurations, too."""
+def test_runs_are_free_sections_with_each_arm() -> None:
+    """Sections are maximal, and free half-way between their rows."""
     problem, guide, arms = gate()
     allowed = GRAZE * problem.options.dist_safe + 1e-9
     through_gate, all_ = [], search().free_runs
@@ -426,12 +424,12 @@ def test_runs_are_the_free_parts_of_the_way_with_each_arm() -> None:
 
 
 def raw(one: trees._Search, ends: np.ndarray, tries: int) -> np.ndarray:
-    """Return what trees find, as it is before it is shortened."""
+    """Return the path of the trees before shortcuts."""
     return np.asarray(one._trees.run(one.first[None, :SIZE], ends, tries))
 
 
-def test_a_tree_that_gets_to_a_run_takes_in_all_of_it() -> None:
-    """The run leads through the gate; nothing else is drawn that does."""
+def test_tree_that_reaches_a_run_adds_all_of_it() -> None:
+    """Only the run leads through the gate."""
     problem, _, _ = gate()
     for seed in range(3):
         one = search(seed)
@@ -450,7 +448,7 @@ def test_a_tree_that_gets_to_a_run_takes_in_all_of_it() -> None:
         is_a_way(problem, path)
 
 
-def test_a_tree_that_is_stopped_before_a_run_does_not_take_it_in() -> None:
+def test_tree_that_is_blocked_does_not_add_a_run() -> None:
     problem, _, arms = gate()
     one = search()
     one.free_runs = [np.tile(np.append([2.0, 1.5, 0.0], arms[0]), (3, 1))]  # in the wall
@@ -462,7 +460,7 @@ def test_a_tree_that_is_stopped_before_a_run_does_not_take_it_in() -> None:
 
 @pytest.mark.parametrize("found", [True, False])
 def test_free_runs_alone_lead_through_the_gate(found: bool) -> None:
-    """Nothing is drawn that would."""
+    """No sample leads through the gate."""
     problem, _, _ = gate()
     for seed in range(3):
         one = search(seed)
@@ -474,7 +472,7 @@ def test_free_runs_alone_lead_through_the_gate(found: bool) -> None:
             is_a_way(problem, path)
 
 
-def test_what_searches_look_at_counts_as_effort() -> None:
+def test_collision_checks_count_as_evaluations() -> None:
     problem, _, _ = gate()
     with Budget().running() as budget:
         through(0)
@@ -489,7 +487,7 @@ def test_what_searches_look_at_counts_as_effort() -> None:
         through(0)
 
 
-def test_compiled_trees_refuse_what_does_not_fit() -> None:
+def test_compiled_trees_reject_invalid_arguments() -> None:
     one = search()
     rows = np.zeros((2, SIZE))
     for call in (
@@ -531,7 +529,7 @@ def test_compiled_trees_refuse_what_does_not_fit() -> None:
         made(part6=[10**6])
 
 
-def test_lines_refuse_what_does_not_fit() -> None:
+def test_lines_reject_invalid_arguments() -> None:
     one, contacts = search(), gate()[0].contacts
     how = {"weights": one.weights, "step": 0.1, "reach": 0.0, "allowed": 0.0}
     with pytest.raises(ValueError, match="more coordinates move"):
@@ -543,7 +541,7 @@ def test_lines_refuse_what_does_not_fit() -> None:
 
 
 # --- spread
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 PATHS = st.integers(1, 6).flatmap(
     lambda count: some.arrays(
@@ -553,7 +551,7 @@ PATHS = st.integers(1, 6).flatmap(
 
 
 def walk(path: np.ndarray, far: float) -> np.ndarray:
-    """Return where one is after so much of a path [rad]."""
+    """Return the point after a given length of a path [rad]."""
     for a, b in itertools.pairwise(path):
         piece = length(np.array([a, b]))
         if far <= piece:
@@ -564,7 +562,7 @@ def walk(path: np.ndarray, far: float) -> np.ndarray:
 
 @settings(max_examples=60, deadline=None)
 @given(PATHS, st.integers(1, 30))
-def test_spread_goes_along_the_path_to_its_end(path: np.ndarray, steps: int) -> None:
+def test_resampled_path_reaches_the_end(path: np.ndarray, steps: int) -> None:
     rows = resample_path(path, steps, METRE)
     assert rows.shape == (steps, SIZE)
     np.testing.assert_allclose(rows[-1], path[-1], rtol=0.0, atol=1e-9)
@@ -574,7 +572,7 @@ def test_spread_goes_along_the_path_to_its_end(path: np.ndarray, steps: int) -> 
     np.testing.assert_allclose(rows, [walk(path, far) for far in passed], rtol=0.0, atol=1e-5)
 
 
-def test_spread_is_slow_at_both_ends() -> None:
+def test_resampled_path_is_slow_at_both_ends() -> None:
     path = np.zeros((3, SIZE))
     path[1:, 0], path[2, 4] = (
         1.0,

@@ -1,4 +1,4 @@
-"""The linear solver that Ipopt loads, against dense algebra, and within Ipopt."""
+"""Tests of Ipopt's linear solver against dense algebra, and within Ipopt."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def factored(matrix: np.ndarray) -> tuple[Any, bool]:
 
 
 def system(seed: int, waypoints: int, size: int, equalities: int, planes: int) -> np.ndarray:
-    """Return a system as that of a trajectory: blocks, coupled to the next two, rows of each, and slacks of some rows."""
+    """Return a trajectory-like system: coupled blocks, their constraints, and some slacks."""
     rng = np.random.default_rng(seed)
     n, m = waypoints * size, waypoints * (equalities + planes)
     hessian = np.zeros((n, n))
@@ -69,7 +69,7 @@ def system(seed: int, waypoints: int, size: int, equalities: int, planes: int) -
     st.integers(0, 2),
     st.integers(0, 3),
 )
-def test_systems_of_trajectories_are_solved_and_their_negative_eigenvalues_counted(
+def test_trajectory_systems_are_solved_with_correct_inertia(
     seed: int, waypoints: int, size: int, equalities: int, planes: int
 ) -> None:
     matrix = system(seed, waypoints, size, min(equalities, size), planes)
@@ -87,7 +87,7 @@ def test_systems_of_trajectories_are_solved_and_their_negative_eigenvalues_count
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 12), st.floats(0.1, 1.0))
-def test_any_matrix_is_solved_or_said_to_be_singular(seed: int, size: int, density: float) -> None:
+def test_any_matrix_is_solved_or_reported_singular(seed: int, size: int, density: float) -> None:
     rng = np.random.default_rng(seed)
     matrix = np.where(rng.uniform(size=(size, size)) < density, rng.normal(size=(size, size)), 0.0)
     matrix += matrix.T
@@ -102,7 +102,7 @@ def test_any_matrix_is_solved_or_said_to_be_singular(seed: int, size: int, densi
     assert factorization.negative == np.count_nonzero(np.linalg.eigvalsh(matrix) < 0.0)
 
 
-def test_a_second_matrix_is_factored_as_if_it_were_the_first() -> None:
+def test_refactoring_does_not_depend_on_earlier_values() -> None:
     first, second = system(1, 4, 5, 2, 2), system(1, 4, 5, 2, 2)
     second[np.diag_indices(20)] += 3.0
     rows, columns, _ = lower(first)
@@ -117,7 +117,7 @@ def test_a_second_matrix_is_factored_as_if_it_were_the_first() -> None:
     np.testing.assert_array_equal(x, y)
 
 
-def test_rows_that_say_the_same_are_singular_and_what_follows_is_right() -> None:
+def test_dependent_rows_are_singular_and_the_next_system_is_solved() -> None:
     matrix = system(2, 3, 4, 2, 0)
     doubled = matrix.copy()
     doubled[-1], doubled[:, -1] = doubled[-2], doubled[:, -2]
@@ -133,8 +133,8 @@ def test_rows_that_say_the_same_are_singular_and_what_follows_is_right() -> None
 
 
 @pytest.mark.parametrize("size", [3, 9, 20])
-def test_what_only_rounding_keeps_from_being_zero_is_singular(size: int) -> None:
-    """The last pivot, also where nothing but other panels is taken off it."""
+def test_pivots_of_rounding_size_are_singular(size: int) -> None:
+    """The last pivot is tested, also if only other panels update it."""
     root = np.eye(size, size - 1) + 0.1 * np.random.default_rng(size).normal(
         size=(size, size - 1)
     )  # no other pivot is small
@@ -144,7 +144,7 @@ def test_what_only_rounding_keeps_from_being_zero_is_singular(size: int) -> None
 
 
 def test_dual_rows_may_come_first() -> None:
-    """Where they are numbered makes no difference: they are eliminated after what they know."""
+    """Their numbering makes no difference: they follow the rows that they couple."""
     matrix = system(5, 4, 5, 2, 3)[::-1, ::-1]
     factorization, done = factored(matrix)
     assert done
@@ -154,14 +154,14 @@ def test_dual_rows_may_come_first() -> None:
     np.testing.assert_allclose(x, 1.0, atol=1e-7)
 
 
-def test_not_a_number_is_no_pivot() -> None:
+def test_nan_is_no_pivot() -> None:
     matrix = system(3, 2, 3, 1, 0)
     rows, columns, values = lower(matrix)
     values[0] = np.nan
     assert not KKT.Factorization(len(matrix), rows, columns).factor(values)
 
 
-def test_entries_above_the_diagonal_and_those_in_one_place_are_summed() -> None:
+def test_duplicate_and_upper_entries_are_summed() -> None:
     matrix = system(4, 3, 4, 1, 2)[::-1, ::-1]  # dual rows first
     rows, columns, values = lower(matrix)
     flipped = np.arange(len(rows)) % 2 == 0
@@ -185,14 +185,14 @@ def test_entries_above_the_diagonal_and_those_in_one_place_are_summed() -> None:
         (2, [0, 1], [0, -1], "in the matrix"),
     ],
 )
-def test_places_outside_of_the_matrix_are_refused(
+def test_entries_outside_the_matrix_are_rejected(
     size: int, rows: list[int], columns: list[int], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
         KKT.Factorization(size, np.array(rows, np.int32), np.array(columns, np.int32))
 
 
-def test_as_many_values_as_places() -> None:
+def test_number_of_values_is_checked() -> None:
     factorization = KKT.Factorization(1, np.zeros(1, np.int32), np.zeros(1, np.int32))
     with pytest.raises(ValueError, match="one value for each entry"):
         factorization.factor(np.ones(2))
@@ -201,8 +201,8 @@ def test_as_many_values_as_places() -> None:
         factorization.solve(np.ones(2))
 
 
-def test_ipopt_does_the_same_every_time_and_in_every_thread() -> None:
-    """Also where the first system has the wrong number of negative eigenvalues, and where others are solved meanwhile."""
+def test_ipopt_is_deterministic_and_thread_safe() -> None:
+    """The result holds for a wrong inertia at first, and with other systems in between."""
     x = ca.MX.sym("x", 40)
     f = ca.sumsqr(x[1:] - ca.sin(3.0 * x[:-1])) - 0.5 * ca.sumsqr(x[::3])
     program = {"x": x, "f": f, "g": x[:-1] * x[1:]}
@@ -221,8 +221,8 @@ def test_ipopt_does_the_same_every_time_and_in_every_thread() -> None:
 @pytest.mark.parametrize(
     "bounds", [(0.0, 0.0), (-np.inf, 0.0), (0.0, np.inf)], ids=["equal", "below", "above"]
 )
-def test_ipopt_goes_where_it_goes_with_mumps(bounds: tuple[float, float]) -> None:
-    """A program with a Hessian that is not definite, and more rows than it needs: two say the same."""
+def test_ipopt_finds_the_same_solution_as_with_mumps(bounds: tuple[float, float]) -> None:
+    """The program has an indefinite Hessian and two dependent rows."""
     x = ca.MX.sym("x", 6)
     f = ca.sumsqr(x[1:] - x[:-1] ** 2) + ca.sumsqr(1.0 - x[:-1]) + ca.cos(3.0 * x[5])
     g = ca.vertcat(

@@ -51,7 +51,7 @@ def solved() -> Solution:
 
 @cache
 def hard() -> Solution:
-    """The whole task from a stationary seed, not given up: steps are rejected."""
+    """Return a solution from a stationary guess, without the progress test: steps are rejected."""
     options = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12, max_outer=10)
     problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
     (seed,) = initialize(problem, "stationary", 0)
@@ -61,7 +61,7 @@ def hard() -> Solution:
 
 
 def feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
-    """Everything holds at the waypoints, and nothing collides between them."""
+    """Check all constraints at the waypoints, and collisions between them."""
     z = solution.z
     assert np.all((z >= problem.lower - 1e-6) & (z <= problem.upper + 1e-6))
     assert problem.evaluate_contacts(z, reach=0.1).compute_violation() < 1e-3
@@ -78,7 +78,7 @@ def feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
     assert len(between.waypoint) == 0, between.distance.min()
 
 
-def test_it_goes_round_what_stands_in_the_way() -> None:
+def test_solver_avoids_an_obstacle() -> None:
     problem = round_a_pillar()
     assert problem.evaluate_contacts(straight(problem, 3.2), reach=0.0).compute_clearance() < -0.1
     assert solved().converged
@@ -86,7 +86,7 @@ def test_it_goes_round_what_stands_in_the_way() -> None:
     feasible(problem, solved())
 
 
-def test_counts_and_times() -> None:
+def test_rounds_iterations_and_times_are_recorded() -> None:
     for solution in (solved(), hard()):
         assert solution.rounds == len(solution.history)
         assert solution.iterations == solution.history[-1].iterations
@@ -95,7 +95,7 @@ def test_counts_and_times() -> None:
 
 
 @pytest.mark.parametrize("solution", [solved, hard], ids=["pillar", "door"])
-def test_columns_that_only_grow(solution) -> None:  # type: ignore[no-untyped-def]
+def test_history_is_monotonic(solution) -> None:  # type: ignore[no-untyped-def]
     history = solution().history
     assert all(
         0.0 <= row.time < 1000.0 for row in history
@@ -109,8 +109,8 @@ def test_columns_that_only_grow(solution) -> None:  # type: ignore[no-untyped-de
         assert row.objective >= 0.0
 
 
-def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
-    """Few enough waypoints to share one radius, and a straight way through two walls."""
+def test_rejection_shrinks_the_trust_region() -> None:
+    """All waypoints share one radius, and the straight path crosses two walls."""
     walls = [
         {
             "name": f"wall_{k}",
@@ -130,7 +130,7 @@ def test_the_trust_region_shrinks_when_a_step_is_rejected() -> None:
         assert after.radius < row.radius or after.penalty > row.penalty
 
 
-def test_a_trust_region_goes_on_with_what_it_is_given() -> None:
+def test_trust_region_continues_with_given_radii() -> None:
     given = np.linspace(0.01, 0.3, 40)
     region = trust_region.TrustRegion(40, 10, given)
     np.testing.assert_array_equal(region.radius, given)
@@ -141,12 +141,12 @@ def test_a_trust_region_goes_on_with_what_it_is_given() -> None:
 
 
 def blank_trial(segments: int) -> trust_region.Trial:
-    """Return a trial in which every coordinate went 0.3 and nothing else is said."""
+    """Return a trial with steps of 0.3 and no other fields."""
     fields = dict.fromkeys(field.name for field in dataclasses.fields(trust_region.Trial))
     return trust_region.Trial(**{**fields, "step": np.full(segments, 0.3)})  # type: ignore[arg-type]
 
 
-def test_a_solution_goes_on_with_the_radius_that_another_ended_with() -> None:
+def test_solution_continues_with_the_radius_of_another() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
     first = solve(problem, seed, rounds=3)
     assert first.history[0].radius == trust_region.FIRST_RADIUS
@@ -169,7 +169,7 @@ def make_infeasibility(clearance: float, other: float = 0.0) -> Infeasibility:
 
 
 class Scripted:
-    """Stands for the loop's state: every round leads where it is said, and is accepted if that is said."""
+    """Fake loop whose rounds have given results and acceptance."""
 
     def __init__(
         self,
@@ -251,10 +251,10 @@ def scripted(*rounds: tuple[float, float, bool], **how: Any) -> Scripted:
         (8.1, 0.009, False, False),
     ],
 )
-def test_what_is_nearly_free_is_first_made_free(
+def test_radius_is_limited_near_feasibility(
     objective: float, shortfall: float, accepted: bool, small: bool
 ) -> None:
-    """With small steps, on which planes are as good as distances."""
+    """Steps are small, so that the planes are accurate."""
     _, after = scripted((objective, shortfall, accepted)).radii
     assert bool((after <= trust_region.SETTLE_RADIUS).all()) == small
     assert small or (after > trust_region.SETTLE_RADIUS).all()
@@ -264,7 +264,7 @@ def test_what_is_nearly_free_is_first_made_free(
     assert (after > trust_region.SETTLE_RADIUS).all()
 
 
-def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
+def test_grasp_between_obstacles_is_freed_with_small_steps() -> None:
     scene = vkc.load_scene("init_2").sample_start(np.random.default_rng(5))
     problem = program_of(scene, [vkc.Grasp("stick")])
     seed = next(initialize(problem, "astar", 0)).z
@@ -296,17 +296,15 @@ def test_a_grasp_between_obstacles_is_made_free_with_small_steps() -> None:
         ([(10.0, 1e-3, True)] * 20, 6),  # however little it is
     ],
 )
-def test_what_does_not_get_better_is_given_up(
-    rounds: list[tuple[float, float, bool]], expected: int
-) -> None:
+def test_loop_ends_without_progress(rounds: list[tuple[float, float, bool]], expected: int) -> None:
     loop = scripted(*rounds)
     assert loop.solution.rounds == expected
     assert loop.solution.status == "not converged"
 
 
 @pytest.mark.parametrize(("drift", "converged"), [(0.95, True), (1.05, False)])
-def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool) -> None:
-    """No round can help that; it is not said to have converged."""
+def test_drifting_motion_ends_the_loop_without_convergence(drift: float, converged: bool) -> None:
+    """No round can repair drift, so the loop has not converged."""
     solution = scripted((8.0, 0.0, True), (1.0, 0.0, True), drift=drift, done=True).solution
     assert (solution.rounds, solution.converged) == (
         1,
@@ -325,7 +323,7 @@ def test_what_only_drifts_ends_as_if_it_were_good(drift: float, converged: bool)
         ([8.0, 7.0, 6.0], 0.85, 1),  # nothing held it back
     ],
 )
-def test_what_is_good_is_improved_as_long_as_that_is_worth_while(
+def test_feasible_motion_is_improved_as_long_as_worthwhile(
     objectives: list[float], step: float, expected: int
 ) -> None:
     rounds = [(objective, 0.0, True) for objective in objectives]
@@ -334,10 +332,10 @@ def test_what_is_good_is_improved_as_long_as_that_is_worth_while(
 
 
 @pytest.mark.parametrize(("shortfall", "expected"), [(0.009, 2), (0.011, 3)])
-def test_a_motion_that_nearly_held_is_one_to_compare_with(
+def test_nearly_feasible_motion_is_the_reference_of_improvement(
     shortfall: float, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first motion at which everything holds is hardly better than it; one that was far from free says nothing."""
+    """A nearly feasible motion is the reference, an infeasible one is not."""
     monkeypatch.setattr(
         Scripted, "has_converged", lambda _, trial: trial.contacts.compute_violation() == 0.0
     )
@@ -348,13 +346,13 @@ def test_a_motion_that_nearly_held_is_one_to_compare_with(
 
 
 @pytest.mark.parametrize(("done", "small"), [(True, False), (False, True)])
-def test_only_what_is_not_yet_free_needs_small_steps(done: bool, small: bool) -> None:
+def test_feasible_motion_needs_no_small_steps(done: bool, small: bool) -> None:
     _, after, *_ = scripted((8.1, 0.0, True), (8.1, 0.0, True), done=done, step=1.0).radii
     assert bool((after <= trust_region.SETTLE_RADIUS).all()) == small
 
 
-def test_where_nothing_moves_and_little_is_missing_that_becomes_dearer() -> None:
-    """Until it is given up; where much is missing, other seeds come to more."""
+def test_penalties_are_raised_if_stalled_near_feasibility() -> None:
+    """Weights are raised until the loop ends; far from feasibility it ends at once."""
     few = scripted(*[(10.0, 1.2e-3, True)] * 20, step=1e-4)
     assert few.merit.weights["clearance"] > GROWTH * 200.0  # more than once
     assert few.merit.weights["poses"] == 200.0
@@ -365,8 +363,8 @@ def test_where_nothing_moves_and_little_is_missing_that_becomes_dearer() -> None
     assert much.solution.rounds == 1
 
 
-def test_motions_that_stay_far_from_free_are_given_up_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wall from side to side: whatever is done, something is in it."""
+def test_motions_far_from_feasible_end_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wall blocks the whole hall."""
     wall = {"name": "wall", "type": "box", "size": [1.0, 12.0, 2.0], "position": [2.0, 0.0, 1.0]}
     problem = program_of(hall(obstacles=[wall]), [vkc.GoTo(4.0, 0.0, 0.0)], options=FEW)
     seed = straight(problem, 4.0)
@@ -380,8 +378,8 @@ def test_motions_that_stay_far_from_free_are_given_up_soon(monkeypatch: pytest.M
     assert solve(problem, seed, rounds=2).rounds == 2
 
 
-def test_where_something_would_be_carried_through_waypoints_may_move_less() -> None:
-    """Whatever the merit says: it has no say in that."""
+def test_crossings_shrink_the_trust_region() -> None:
+    """The merit does not matter here."""
     loop = Scripted((1.0, 0.0, False))
     loop.crossed = [Crossing((3, 5), 12, 13)]
     region = trust_region.TrustRegion(40, 10)
@@ -392,8 +390,8 @@ def test_where_something_would_be_carried_through_waypoints_may_move_less() -> N
     np.testing.assert_array_equal(narrowed, np.isin(region.block, region.block[11:14]))
 
 
-def test_nothing_is_carried_through_anything(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A seed that goes round a post the long way must not jump through it, though that is shorter and free at all waypoints."""
+def test_crossings_are_never_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A guess on the long path around a post must not jump through the post."""
     post = {
         "name": "post",
         "type": "cylinder",
@@ -427,8 +425,8 @@ def test_nothing_is_carried_through_anything(monkeypatch: pytest.MonkeyPatch) ->
     assert (True, True) in seen, "nothing was carried through: choose a harder problem"
 
 
-def test_standing_still_where_one_is_already() -> None:
-    """The objective vanishes there; what is left is Ipopt's tolerance."""
+def test_motion_to_the_start_is_stationary() -> None:
+    """The objective is zero up to Ipopt's tolerance."""
     problem = program_of(hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=FEW)
     still = np.tile(problem.start, (problem.segments, 1))
     solution = solve(problem, still)
@@ -437,10 +435,10 @@ def test_standing_still_where_one_is_already() -> None:
     assert problem.objective(solution.z, solution.dt) <= 1e-3
 
 
-def test_the_merit_falls_from_one_accepted_step_to_the_next(
+def test_merit_decreases_with_accepted_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """While weights and times stay: f and what all that is missing costs. No round promises more than staying would cost."""
+    """The merit decreases, and no prediction exceeds the merit of the iterate."""
     problem = round_a_pillar()
     merits: list[tuple[float, float, bool]] = []
     judge = solver._Loop.is_acceptable
@@ -467,8 +465,8 @@ def test_the_merit_falls_from_one_accepted_step_to_the_next(
 
 
 @pytest.mark.parametrize("radius", [1e-3, 1e-2])
-def test_what_a_round_promises_comes_true_where_steps_are_small(radius: float) -> None:
-    """Planes and slopes are as good as what they stand for there: of a motion far from its goals as well."""
+def test_prediction_is_accurate_for_small_steps(radius: float) -> None:
+    """Linear models are accurate for small steps, also far from the goals."""
     options = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12)
     problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=options)
     (seed,) = initialize(problem, "stationary", 0)
@@ -480,8 +478,8 @@ def test_what_a_round_promises_comes_true_where_steps_are_small(radius: float) -
     assert trial.predicted_penalty.sum() == pytest.approx(after, abs=0.01 * (before - after))
 
 
-def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rounds go on for a shorter motion; if they fail, the feasible one is returned."""
+def test_feasible_motion_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The feasible motion is returned if later rounds fail."""
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
     done = solver._Loop.has_converged
     kept: list[np.ndarray] = []
@@ -500,7 +498,7 @@ def test_the_motion_that_was_feasible_is_kept(monkeypatch: pytest.MonkeyPatch) -
     feasible(problem, solution)
 
 
-def test_no_time_at_all() -> None:
+def test_no_time() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
     with Budget(seconds=0.0).running():
         solution = solve(problem, seed)
@@ -508,7 +506,7 @@ def test_no_time_at_all() -> None:
     np.testing.assert_array_equal(solution.z, problem.clip(seed))
 
 
-def test_time_that_runs_out_in_the_middle() -> None:
+def test_time_limit_returns_the_best_iterate() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
     with Budget(seconds=1e-3).running():
         solution = solve(problem, seed)
@@ -517,8 +515,8 @@ def test_time_that_runs_out_in_the_middle() -> None:
     assert np.isfinite(solution.z).all()
 
 
-def test_effort_that_runs_out_ends_it_at_the_same_place() -> None:
-    """The best iterate is returned, and with enough of it nothing is different."""
+def test_evaluation_limit_is_deterministic() -> None:
+    """The best iterate is returned; a sufficient budget changes nothing."""
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
     with Budget().running() as budget:
         whole = solve(problem, seed)
@@ -536,7 +534,7 @@ def test_effort_that_runs_out_ends_it_at_the_same_place() -> None:
     np.testing.assert_array_equal(cut[0].z, cut[1].z)
 
 
-def test_seeds_outside_their_bounds_are_moved_inside() -> None:
+def test_guesses_outside_the_bounds_are_clipped() -> None:
     problem = round_a_pillar()
     wild = straight(problem, 3.2) + 20.0
     with Budget(seconds=0.0).running():
@@ -544,8 +542,8 @@ def test_seeds_outside_their_bounds_are_moved_inside() -> None:
     assert np.all((solution.z >= problem.lower) & (solution.z <= problem.upper))
 
 
-def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """When it may not take more."""
+def test_velocity_limits_are_active_in_short_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The duration is limited."""
     options = vkc.Options(reach_waypoints=12, dt=0.25)  # 2.4 m in 3 s at no more than 1 m/s
     problem = program_of(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
     least = problem.timing_for(problem.still)
@@ -561,7 +559,7 @@ def test_velocity_bounds_bind_when_time_is_short(monkeypatch: pytest.MonkeyPatch
     feasible(problem, solution)
 
 
-def test_a_way_that_is_too_long_takes_longer() -> None:
+def test_long_paths_take_longer() -> None:
     options = vkc.Options(reach_waypoints=12, dt=0.25)
     problem = program_of(hall(), [vkc.GoTo(2.4, 0.0, 0.0)], options=options)
     solution = solve(problem, straight(problem, 2.4))
@@ -570,7 +568,7 @@ def test_a_way_that_is_too_long_takes_longer() -> None:
     feasible(problem, solution)
 
 
-def test_the_same_seed_gives_the_same_motion() -> None:
+def test_same_guess_gives_same_motion() -> None:
     again = solve(round_a_pillar(), straight(round_a_pillar(), 3.2))
     np.testing.assert_array_equal(again.z, solved().z)
     assert [row.objective for row in again.history] == [row.objective for row in solved().history]

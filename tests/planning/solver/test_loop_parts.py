@@ -1,4 +1,4 @@
-"""The parts of a round of the loop, each on its own: what is clear, what is dear, what is gone on from, and what is returned."""
+"""Tests of the parts of a round of the solver loop."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def make_infeasibility(**amounts: float) -> Infeasibility:
 
 
 def parts(**fields: Any) -> Any:
-    """Return a loop that nobody set up, with these attributes."""
+    """Return a loop with the given attributes only."""
     loop = object.__new__(_Loop)
     for name, value in fields.items():
         setattr(loop, name, value)
@@ -48,7 +48,7 @@ def parts(**fields: Any) -> Any:
 
 
 # --- what is close
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def parts(**fields: Any) -> Any:
         (1.1, False, False),
     ],
 )
-def test_all_is_clear_if_it_is_at_the_waypoints_and_between(
+def test_contacts_are_clear_at_waypoints_and_within_segments(
     short: float, free: bool, clear: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at, between, crossed = (
@@ -91,14 +91,14 @@ def test_all_is_clear_if_it_is_at_the_waypoints_and_between(
 
 
 # --- what it costs
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("first", "last", "dear"),
     [(3, 4, [2, 3, 4]), (0, 0, [0]), (1, 1, [0, 1]), (0, 2, [0, 1, 2]), (7, 7, [6, 7])],
 )
-def test_a_passage_makes_the_waypoints_around_its_segments_too_dear(
+def test_crossing_makes_penalties_around_its_segments_infinite(
     first: int, last: int, dear: list[int]
 ) -> None:
     """Segment k ends at row k of z_1..z_N and begins at the one before."""
@@ -118,7 +118,7 @@ def test_a_passage_makes_the_waypoints_around_its_segments_too_dear(
 
 
 @pytest.mark.parametrize(("poses", "counts"), [(0.009, True), (0.011, False), (1.0, False)])
-def test_of_what_is_no_motion_yet_passages_say_nothing(poses: float, counts: bool) -> None:
+def test_crossings_are_ignored_while_poses_are_infeasible(poses: float, counts: bool) -> None:
     loop = parts(merit=Merit(1.0), found=make_infeasibility(poses=poses), crossings=[])
     trial: Any = SimpleNamespace(
         infeasibility=make_infeasibility(), crossings=[Crossing((1, 2), 2, 2)]
@@ -126,8 +126,8 @@ def test_of_what_is_no_motion_yet_passages_say_nothing(poses: float, counts: boo
     assert np.isinf(loop.compute_penalties(trial)[1]).any() == counts
 
 
-def test_what_was_promised_and_what_came_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Decreases of f and of what is missing, and the merit before."""
+def test_predicted_and_actual_reduction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The arguments are predicted and actual reduction, and the merit before."""
     given: list[tuple[float, ...]] = []
     monkeypatch.setattr(
         module, "is_step_acceptable", lambda *numbers: given.append(numbers) or True
@@ -138,11 +138,11 @@ def test_what_was_promised_and_what_came_of_it(monkeypatch: pytest.MonkeyPatch) 
 
 
 # --- going on
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 class Clock:
-    """Stands for `Timing`: what it takes, and by how much it is too fast, before and after it is stretched."""
+    """Fake `Timing` with given rate violations before and after stretching."""
 
     def __init__(self, name: str, *, over: float = 0.0, left: float = 0.0) -> None:
         self.dt, self.over, self.left = name, over, left
@@ -164,7 +164,7 @@ def gone_on(
     rate: float = 0.0,
     left: float = 0.0,
 ) -> tuple[Any, list[str]]:
-    """Return a loop that has accepted a trial, and what it has done on the way."""
+    """Return a loop that has accepted a trial, and its recorded actions."""
     done: list[str] = []
     problem = SimpleNamespace(
         timing_for=lambda z: Clock(f"of {z}"), pace=lambda z: ("fast", "faster")
@@ -199,7 +199,7 @@ def gone_on(
     return loop, done
 
 
-def test_what_was_a_motion_keeps_its_time() -> None:
+def test_feasible_motion_keeps_its_timing() -> None:
     for how in (
         {},
         {"others": 0.9 * TOLERANCE},
@@ -210,7 +210,7 @@ def test_what_was_a_motion_keeps_its_time() -> None:
         assert (loop.timing.dt, done, loop.rates) == ("old", [], how.get("rates", False))
 
 
-def test_what_was_none_gets_another() -> None:
+def test_infeasible_motion_gets_new_timing() -> None:
     for others in (0.01, 1.5 * TOLERANCE):
         loop, done = gone_on(others=others)
         assert (loop.timing.dt, done, loop.rates) == ("of new", ["look"], False)
@@ -219,7 +219,7 @@ def test_what_was_none_gets_another() -> None:
 @pytest.mark.parametrize(
     ("short", "rate", "slower"), [(0.009, 1.5e-4, True), (0.011, 1.0, False), (0.0, 0.9e-4, False)]
 )
-def test_what_nearly_holds_and_is_too_fast_is_given_time(
+def test_nearly_clear_motion_that_is_too_fast_is_slowed_down(
     short: float, rate: float, slower: bool
 ) -> None:
     loop, done = gone_on(short=short, rate=rate)
@@ -227,7 +227,7 @@ def test_what_nearly_holds_and_is_too_fast_is_given_time(
     assert not loop.rates
 
 
-def test_where_time_does_not_help_limits_on_rates_become_rows() -> None:
+def test_rate_limits_become_constraints_if_slowing_down_fails() -> None:
     loop, done = gone_on(short=0.0, rate=1.0, left=1.5 * TOLERANCE)
     assert (loop.rates, done) == (True, ["forget", "look"])
     loop, done = gone_on(short=0.0, rate=1.0, left=0.9 * TOLERANCE)
@@ -247,7 +247,7 @@ def test_where_time_does_not_help_limits_on_rates_become_rows() -> None:
         ({"over": 1.5 * TOLERANCE}, False),
     ],
 )
-def test_it_is_done_where_everything_holds(change: dict[str, Any], done: bool) -> None:
+def test_loop_converges_if_all_constraints_hold(change: dict[str, Any], done: bool) -> None:
     told = {"succeeded": True, "clear": True, "pose_error": 0.0, "over": 0.0, **change}
     problem = SimpleNamespace(pace=lambda z: ("fast", "faster"))
     loop = parts(
@@ -262,9 +262,7 @@ def test_it_is_done_where_everything_holds(change: dict[str, Any], done: bool) -
 @pytest.mark.parametrize(
     ("short", "grows"), [(0.9 * CLEARANCE_TOLERANCE, False), (1.1 * CLEARANCE_TOLERANCE, True)]
 )
-def test_only_what_is_missing_becomes_dearer_and_multipliers_are_forgotten(
-    short: float, grows: bool
-) -> None:
+def test_only_violated_constraints_get_higher_weights(short: float, grows: bool) -> None:
     done: list[str] = []
     subproblem = SimpleNamespace(reset_multipliers=lambda: done.append("forget"))
     loop = parts(subproblem=subproblem, merit=Merit(2.0), found=make_infeasibility(clearance=short))
@@ -274,14 +272,14 @@ def test_only_what_is_missing_becomes_dearer_and_multipliers_are_forgotten(
 
 
 # --- when it is given up
-# ----------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("short", "accepted", "rounds"),
     [(0.009, False, 12), (0.011, False, 5), (0.009, True, 5), (0.011, True, 5), (0.0, False, 12)],
 )
-def test_steps_that_are_too_long_are_no_lack_of_progress_where_hardly_any_clearance_is_missing(
+def test_rejected_rounds_do_not_count_as_stalled_near_feasibility(
     short: float, accepted: bool, rounds: int
 ) -> None:
     found = make_infeasibility(clearance=short, poses=0.1)
@@ -310,7 +308,7 @@ def test_steps_that_are_too_long_are_no_lack_of_progress_where_hardly_any_cleara
 
 
 # --- what is returned
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------
 
 
 def drive() -> vkc.TrajectoryProblem:
@@ -320,7 +318,7 @@ def drive() -> vkc.TrajectoryProblem:
 
 
 @pytest.mark.parametrize(("short", "astray"), [(0.009, 0.0), (0.011, 0.011), (0.0, 0.0)])
-def test_what_is_clearly_in_something_is_said_to_be_astray(
+def test_large_shortfall_is_reported(
     short: float, astray: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, asked = drive(), list[Any]()
@@ -340,10 +338,10 @@ def test_what_is_clearly_in_something_is_said_to_be_astray(
 
 
 @pytest.mark.parametrize("good", [False, True])
-def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(
+def test_exhausted_budget_is_the_status_unless_feasible(
     good: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was not finished is not said to be astray; what was good is returned as it was."""
+    """An unfinished solution reports no shortfall; a feasible one is returned."""
     problem = drive()
     kept = problem.still + 0.1, np.full(N, 0.5)
 
@@ -366,8 +364,8 @@ def test_a_budget_at_its_end_is_the_status_unless_a_motion_was_good(
     assert (solution.dt is kept[1]) == good
 
 
-def test_rounds_are_timed_from_where_they_begin(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a clock that began long ago, and goes on by one whenever it is looked at."""
+def test_time_counts_from_the_start_of_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fake clock started long ago and advances at every query."""
     clock = itertools.count(1_000_000)
     monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: float(next(clock))))
     problem = drive()

@@ -23,7 +23,7 @@ FEW = vkc.Options(reach_waypoints=5, dt=1.0)
 
 
 def past_a_post(reach: float = 0.02) -> vkc.Scene:
-    """Return a hall in which the hand, driven sideways, sweeps through a post `reach` [m] ahead of the tool's frame."""
+    """Return a hall in which the hand, moving sideways, passes through a post."""
     tool = hall().with_start(arm=ARM).tool_placement().translation
     x, y = float(tool[0]) + reach, float(tool[1]) + WIDTH / 2
     post = {
@@ -37,7 +37,7 @@ def past_a_post(reach: float = 0.02) -> vkc.Scene:
 
 
 def straight(scene: vkc.Scene) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return a problem of few waypoints, and the straight way sideways without the start, shape (N, n)."""
+    """Return a problem with few waypoints and the straight sideways path, shape (N, n)."""
     problem = program_of(scene, [vkc.GoTo(0.0, WIDTH, 0.0)], options=FEW)
     return problem, through(
         scene, scene.start, moved(scene.start, y=WIDTH), steps=FEW.reach_waypoints
@@ -45,12 +45,12 @@ def straight(scene: vkc.Scene) -> tuple[TrajectoryProblem, np.ndarray]:
 
 
 def sub_states(problem: TrajectoryProblem, z: np.ndarray, segment: int, count: int) -> np.ndarray:
-    """Return states of one segment, its ends among them, shape (count, n)."""
+    """Return states of one segment including its ends, shape (count, n)."""
     path, s = problem.waypoints(z), np.linspace(0.0, 1.0, count)[:, None]
     return (1 - s) * path[segment] + s * path[segment + 1]
 
 
-def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thin_obstacle_between_waypoints_is_avoided(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, steps = past_a_post(), [vkc.GoTo(0.0, WIDTH, 0.0)]
     plan = vkc.plan(scene, steps, options=FEW)
     assert plan.success, plan.report()
@@ -83,7 +83,7 @@ def test_a_thin_obstacle_between_waypoints(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(ends.waypoint) == 0  # free at both waypoints
 
 
-def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
+def test_planes_are_placed_at_both_ends_of_the_segment() -> None:
     problem, z = straight(past_a_post())
     assert problem.evaluate_contacts(z, reach=0.02).compute_clearance() == np.inf
     found = find_segment_contacts(problem, z).contacts
@@ -96,7 +96,7 @@ def test_planes_are_asked_for_at_both_ends_of_the_segment() -> None:
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, atol=1e-9)
 
 
-def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
+def test_required_lift_equals_the_missing_clearance() -> None:
     problem, z = straight(past_a_post())
     found = find_segment_contacts(problem, z).contacts
     states = sub_states(problem, z, 2, 400)
@@ -111,8 +111,8 @@ def test_what_is_asked_for_is_what_is_missing_in_between() -> None:
         np.testing.assert_allclose(missing, SEGMENT_MARGIN - deepest, atol=1e-3)
 
 
-def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
-    """Moving both waypoints by ε along the normal moves the sub-state's distance by ε, up to ε²."""
+def test_lifting_both_ends_lifts_the_segment_to_first_order() -> None:
+    """Moving both waypoints by ε along the normal moves the sample's distance by ε + O(ε²)."""
     problem, z = straight(past_a_post())
     found = find_segment_contacts(problem, z).contacts
     index = int(np.argmax(found.margin - found.distance))
@@ -136,7 +136,7 @@ def test_lifting_both_ends_lifts_what_is_between_to_first_order() -> None:
         assert depth(lift) - depth(0.0) == pytest.approx(lift * horizontal, rel=0.15, abs=2e-4)
 
 
-def test_a_start_that_is_close_to_something_may_leave_it() -> None:
+def test_start_close_to_an_obstacle_can_be_left() -> None:
     wall = {"name": "wall", "type": "box", "size": [0.1, 2.0, 0.5], "position": [0.546, 0.0, 0.25]}
     scene = hall(obstacles=[wall])
     assert 0.0 < scene.start_clearance() < SEGMENT_MARGIN
@@ -151,7 +151,7 @@ def test_a_start_that_is_close_to_something_may_leave_it() -> None:
     assert 0 in find_segment_contacts(problem, into).contacts.waypoint
 
 
-def test_merged_contacts_are_in_order() -> None:
+def test_merged_contacts_are_sorted() -> None:
     problem, z = straight(past_a_post())
     found = find_segment_contacts(problem, z).contacts
     near = problem.evaluate_contacts(z, reach=0.3)
@@ -165,7 +165,7 @@ def test_merged_contacts_are_in_order() -> None:
     np.testing.assert_array_equal(merge_contacts(shuffled).waypoint, both.waypoint)
 
 
-def test_standing_still_has_nothing_in_between() -> None:
+def test_stationary_segments_have_no_contacts() -> None:
     problem, _ = straight(hall().with_start(arm=ARM))
     assert (
         len(

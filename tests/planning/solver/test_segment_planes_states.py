@@ -1,4 +1,4 @@
-"""Where the solver looks between waypoints, and what it makes of what it sees there."""
+"""Tests of the samples within segments and the contacts made of them."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def contacts(
     )
 
 
-def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(
+def test_samples_are_even_and_refined_near_obstacles(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The middles of pieces that are no longer than `SPACING`; then `REFINEMENT` in each of those that something is near."""
+    """Samples are `SPACING` apart, and refined by `REFINEMENT` near obstacles."""
     scene = hall(obstacles=[POST])
     problem = program_of(scene, [vkc.GoTo(0.0, 3.0)], options=vkc.Options(reach_waypoints=4))
     ways = np.array([0.0, 0.5, 0.5, 1.51, 3.0])  # [m] aside; in the second it stands still
@@ -91,8 +91,8 @@ def test_states_lie_evenly_in_each_segment_and_closer_where_something_is_near(
     )
 
 
-def test_contacts_at_both_ends_stand_for_what_is_between() -> None:
-    """Witness points fixed in their bodies, asked for by what is missing; of a pair of bodies in translation, exactly."""
+def test_contacts_at_both_ends_represent_the_segment() -> None:
+    """Witness points are fixed in their bodies; for translations the lift is exact."""
     scene = hall(obstacles=[POST])
     problem = program_of(scene, [vkc.GoTo(0.0, 3.0)], options=vkc.Options(reach_waypoints=3))
     z = np.array([moved(scene.start, y=y) for y in (1.0, 2.0, 3.0)])
@@ -117,8 +117,8 @@ def test_contacts_at_both_ends_stand_for_what_is_between() -> None:
 
 
 @pytest.mark.parametrize(("gap", "free"), [(0.9, False), (1.1, True)])
-def test_what_is_far_enough_between(gap: float, free: bool) -> None:
-    """Driven past a wall at `gap` of what will do."""
+def test_segment_clearance_threshold(gap: float, free: bool) -> None:
+    """The base passes a wall at `gap` times the tolerance."""
     half = 0.5
     scene = hall(
         obstacles=[
@@ -143,7 +143,7 @@ pairs = st.tuples(st.integers(0, 6), st.integers(0, 6))
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), pairs, st.floats(-1.0, 1.0)), max_size=30))
-def test_of_each_segment_and_pair_the_deepest_is_kept(
+def test_deepest_contact_of_each_segment_and_pair_is_kept(
     rows: list[tuple[int, tuple[int, int], float]],
 ) -> None:
     segment = np.array([0, 0, 1, 2, 2, 3])
@@ -160,7 +160,7 @@ def test_of_each_segment_and_pair_the_deepest_is_kept(
     assert len(keys) == len(least)
 
 
-def test_merged_contacts_come_by_waypoint_and_those_first_that_fall_shortest() -> None:
+def test_merged_contacts_are_sorted_by_waypoint_and_violation() -> None:
     one = contacts(
         np.array([0, 1]), np.array([[0, 1], [0, 2]]), np.array([0.3, 0.1]), np.array([0.02, 0.02])
     )

@@ -1,4 +1,4 @@
-"""What a solution says before anything has been solved."""
+"""Tests of a solution before the first round."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from vkc_pin.planning.solver.solution import Solution
 
 
-def test_nothing_has_happened_yet() -> None:
+def test_solution_is_not_converged_initially() -> None:
     one, other = (Solution(np.zeros((2, 1)), np.ones(2)) for _ in range(2))
     assert (one.converged, one.status, one.shortfall, one.radius) == (
         False,

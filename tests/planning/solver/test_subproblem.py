@@ -1,4 +1,4 @@
-"""One round: the minimum of the merit's model in the trust region."""
+"""Tests of the subproblem: the minimum of the merit model in the trust region."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def loop(kind: str) -> _Loop:
 @pytest.mark.parametrize("kind", ["far", "there"])
 @pytest.mark.parametrize("rates", [False, True])
 @pytest.mark.parametrize("size", [0.05, 0.5])
-def test_it_promises_no_more_than_a_motion_within_the_region_keeps(
+def test_predicted_reduction_is_achieved_within_the_region(
     kind: str, rates: bool, size: float
 ) -> None:
-    """Without obstacles near the model is exact but for Ipopt's tolerance: what is left comes true."""
+    """Without close obstacles the model is exact up to Ipopt's tolerance."""
     state = loop(kind)
     state.rates = rates
     state.evaluate_iterate()
@@ -68,7 +68,7 @@ def test_it_promises_no_more_than_a_motion_within_the_region_keeps(
         assert size > 0.1 or (step.relaxation > 0.5).any(), "a small step does not get there"
 
 
-def test_multipliers_are_of_the_round_before() -> None:
+def test_multipliers_are_those_of_the_last_round() -> None:
     state = loop("there")
     radius = np.full(state.problem.segments, 0.1)
     counts = []
@@ -85,8 +85,8 @@ def test_multipliers_are_of_the_round_before() -> None:
 
 
 @pytest.mark.parametrize("missing", [False, True])
-def test_only_planes_that_are_short_at_the_iterate_may_stay_short(missing: bool) -> None:
-    """However little it costs: next to a box that is in the way, beside which the iterate keeps its margin or not."""
+def test_only_planes_violated_at_the_iterate_have_slack(missing: bool) -> None:
+    """The penalty weight does not matter, next to a box within or beyond the margin."""
     box = {
         "name": "box",
         "type": "box",

@@ -1,4 +1,4 @@
-"""What a round asks of Ipopt and what it makes of the answer, with an Ipopt that notes the one and gives the other."""
+"""Tests of the arguments for Ipopt and of its results, with a fake Ipopt."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOWER, UPPER = np.array([-0.05, -5.0]), np.array([5.0, 0.65])
 
 
 class Ipopt:
-    """Notes what it is asked, and answers with numbers that tell where they come from."""
+    """Fake Ipopt that records its arguments and returns identifiable numbers."""
 
     evaluation_time = 0.001
 
@@ -42,7 +42,7 @@ class Ipopt:
 
 
 class Made:
-    """A program that is numbers alone."""
+    """Fake program of plain numbers."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ipopt, self.noted = Ipopt(), dict[str, Any]()
@@ -62,16 +62,14 @@ class Made:
             upper=UPPER,
             start="start",
             target_matrix=lambda: "targets",
-            contacts=SimpleNamespace(
-                compute_compute_planes=lambda z, at, slots: ("planes", "offsets")
-            ),
+            contacts=SimpleNamespace(compute_planes=lambda z, at, slots: ("planes", "offsets")),
             row_bounds=lambda timing: (
                 f"low {timing and timing.dt}",
                 f"high {timing and timing.dt}",
             ),
             rates=lambda z: ("first", "second"),
             effort=SimpleNamespace(weights=lambda *rates: ("weights", *rates)),
-            rolling=SimpleNamespace(gears=lambda path: ("gears", path)),
+            rolling=SimpleNamespace(compute_gears=lambda path: ("gears", path)),
             waypoints=lambda z: "path",
         )
         monkeypatch.setattr(
@@ -100,7 +98,7 @@ class Made:
         rates: bool = False,
         short: list[tuple[int, float]] | None = None,
     ) -> Step:
-        """Return where a round leads, of which so much of poses, and of the clearance of pairs, is missing."""
+        """Solve a round with given violations of poses and clearances."""
         rows = {kind: np.zeros(N) for kind in Merit(1.0).weights}
         rows["poses"], rows["clearance"] = np.array(poses), np.full(N, 0.5)
         found = Infeasibility(rows, np.full((N, 1, 7), 0.5), np.array([0.25]), np.array([8.0, 9.0]))
@@ -129,7 +127,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
     return Made(monkeypatch)
 
 
-def test_waypoints_move_within_the_region_and_their_limits(made: Made) -> None:
+def test_waypoints_stay_within_region_and_limits(made: Made) -> None:
     made.solve(poses=[0.0, 0.0, 0.0])
     (asked,) = made.ipopt.asked
     lower, upper = asked["lbx"], asked["ubx"]
@@ -138,7 +136,7 @@ def test_waypoints_move_within_the_region_and_their_limits(made: Made) -> None:
     assert lower[1:] == (0.0, 0.0)
 
 
-def test_what_keeps_its_margin_has_no_slack_and_what_falls_short_has_all(made: Made) -> None:
+def test_only_violated_planes_have_slack(made: Made) -> None:
     made.solve(poses=[0.0, 0.0, 0.0], short=[(0, 0.01), (0, -0.01), (0, 0.5), (2, 0.0), (2, 0.004)])
     (asked,) = made.ipopt.asked
     short = np.array([[0.01, 0.0], [0.0, 0.0], [0.0, 0.004]])
@@ -156,7 +154,7 @@ def test_what_keeps_its_margin_has_no_slack_and_what_falls_short_has_all(made: M
         ([0.01, 0.0, 1e-9], [1.0, 0.0, 1.0]),  # one waypoint that is far off lets all be
     ],
 )
-def test_shares_are_where_something_else_is_missing(
+def test_relaxation_is_active_where_other_constraints_are_violated(
     made: Made, poses: list[float], shares: list[float]
 ) -> None:
     made.solve(poses=poses)
@@ -166,7 +164,7 @@ def test_shares_are_where_something_else_is_missing(
     np.testing.assert_allclose(made.noted["relaxation_weights"], 3.0 * np.array(poses))
 
 
-def test_rows_on_rates_are_there_if_they_are_asked_for(made: Made) -> None:
+def test_rate_limits_are_rows_on_request(made: Made) -> None:
     for rates in (False, True):
         made.solve(poses=[0.0, 0.0, 0.0], rates=rates)
         asked = made.ipopt.asked[-1]
@@ -177,7 +175,7 @@ def test_rows_on_rates_are_there_if_they_are_asked_for(made: Made) -> None:
         assert asked["p"].tolist() == [1.0, 2.0, 8.0, 9.0]
 
 
-def test_what_the_program_is_given(made: Made) -> None:
+def test_parameters_of_the_program(made: Made) -> None:
     made.solve(poses=[0.0, 0.0, 0.0])
     noted = made.noted
     assert noted["given"] == ("start", "planes", "offsets", "targets")
@@ -190,8 +188,8 @@ def test_what_the_program_is_given(made: Made) -> None:
     assert (noted["pose_offsets"].shape, noted["excess"].tolist()) == ((N, 1, 7), [0.25])
 
 
-def test_multipliers_are_taken_over_only_from_one_exact_round_to_the_next(made: Made) -> None:
-    """Roughly, where much is missing; warm, where the round before was as exact."""
+def test_multipliers_are_reused_only_between_exact_rounds(made: Made) -> None:
+    """The tolerance is rough if infeasible; the start is warm after an exact round."""
     exact, far = [0.0, 0.0, 0.0], [0.0, 0.01, 0.0]
     kinds = {1e-2: "cold", 1e-3: "warm", 1.0: "rough"}
     for poses, kind, before in (
@@ -219,8 +217,8 @@ def test_multipliers_are_taken_over_only_from_one_exact_round_to_the_next(made: 
 
 
 @pytest.mark.parametrize("success", [True, False])
-def test_what_becomes_of_the_answer(made: Made, success: bool) -> None:
-    """Slacks are added up, and both are within what they can be."""
+def test_solution_is_converted_to_a_step(made: Made, success: bool) -> None:
+    """Slacks are summed, and slack and relaxation are clipped."""
     made.ipopt.stats = {"iter_count": 11, "success": success}
     step = made.solve(poses=[0.0, 0.0, 0.0])
     np.testing.assert_array_equal(step.z, [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])

@@ -1,4 +1,4 @@
-"""From the program's waypoints to a motion over time: what is held when, and where the robot waits."""
+"""Tests of the conversion of waypoints to trajectories with pauses."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
     return (np.flatnonzero(still) + 1).tolist()
 
 
-def test_what_is_held_when_and_through_what() -> None:
+def test_phases_list_attached_objects() -> None:
     _, motion = unfolded(fetching())
     names = ["reach ball.pull by stick.tip", "place ball", "go to"]
     assert [phase.name for phase in motion.phases] == names
@@ -71,7 +71,7 @@ def test_what_is_held_when_and_through_what() -> None:
     assert pauses(fetching(), motion) == [n + 1, 2 * n + 2]
 
 
-def test_what_is_put_down_last_is_let_go_of_at_the_end() -> None:
+def test_last_object_is_released_at_the_end() -> None:
     _, motion = unfolded(placing())
     assert [phase.name for phase in motion.phases] == ["reach stick.grip", "place stick", "let go"]
     assert [dict(phase.held) for phase in motion.phases] == [{}, {"stick": "grip"}, {}]
@@ -90,7 +90,7 @@ def test_what_is_put_down_last_is_let_go_of_at_the_end() -> None:
         ([Release()], {"door": "handle"}, "let go"),
     ],
 )
-def test_a_hand_opens_at_the_end_only_if_it_is_told_to(
+def test_hand_opens_at_the_end_only_on_request(
     steps: list[Step], held: dict[str, str], last: str
 ) -> None:
     scene = door_scene().with_held(held) if steps[0] == Release() else door_scene()
@@ -101,8 +101,8 @@ def test_a_hand_opens_at_the_end_only_if_it_is_told_to(
         assert motion.phases[-1].last - motion.phases[-1].first == 1
 
 
-def test_what_is_let_go_of_before_anything_happens() -> None:
-    """A door in the hand at the start is held in no phase. What the hand chose means nothing any more; it keeps its value."""
+def test_object_grasped_at_the_start_is_released_first() -> None:
+    """A door grasped at the start is attached in no phase; its grasp keeps its value."""
     for attachment in ("handle", "handle_free"):
         problem = program_of(
             door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT
@@ -113,7 +113,7 @@ def test_what_is_let_go_of_before_anything_happens() -> None:
 
 
 @pytest.mark.parametrize("make", [fetching, placing])
-def test_the_robot_goes_where_the_program_has_it(make) -> None:  # type: ignore[no-untyped-def]
+def test_robot_follows_the_waypoints(make) -> None:  # type: ignore[no-untyped-def]
     problem = make()
     z, motion = unfolded(problem)
     rows = np.delete(motion.positions, pauses(problem, motion), axis=0)
@@ -122,8 +122,8 @@ def test_the_robot_goes_where_the_program_has_it(make) -> None:  # type: ignore[
 
 
 @pytest.mark.parametrize("make", [fetching, placing])
-def test_where_a_hand_holds_something_is_what_it_chose(make) -> None:  # type: ignore[no-untyped-def]
-    """While it holds it the values are the program's; before and after, those at which it took it, or last had it."""
+def test_grasp_coordinates_hold_their_values(make) -> None:  # type: ignore[no-untyped-def]
+    """During the grasp, values are the program's; before and after, the nearest ones."""
     problem = make()
     z, motion = unfolded(problem)
     path = problem.waypoints(z)

@@ -1,4 +1,4 @@
-"""From waypoints to a motion, of phases that are made up: where it waits, how long each step takes, and what a hand chose."""
+"""Tests of pauses, times and grasp coordinates with fake phases."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def made(
     after: tuple[Hold, ...] = (),
     holds: tuple[Hold, ...] = (),
 ) -> tuple[Trajectory, np.ndarray]:
-    """Return the motion and the waypoints, of one joint and two that rest, and of what the hand chose of the door.
+    """Return the trajectory and the waypoints of a fake problem.
 
     Steps take 1, 2, 3, ... seconds, and the gripper a tenth of one.
     """
@@ -66,8 +66,8 @@ def seen(motion: Trajectory) -> tuple[list[float], list[float], list[tuple[str, 
     return motion.positions[:, 0].tolist(), np.diff(motion.times).round(9).tolist(), spans
 
 
-def test_it_waits_where_something_is_grasped() -> None:
-    """At the begin of the phase after."""
+def test_robot_waits_after_grasping() -> None:
+    """The pause is at the beginning of the next phase."""
     motion, _ = made(
         [phase("reach", grasps=(STICK,)), phase("carry", held=(STICK,))], [2, 4], after=(STICK,)
     )
@@ -80,8 +80,8 @@ def test_it_waits_where_something_is_grasped() -> None:
     assert [span.holds for span in motion.phases] == [(), (STICK,)]
 
 
-def test_it_waits_where_something_is_let_go_of() -> None:
-    """In the first phase, too."""
+def test_robot_waits_while_releasing() -> None:
+    """The first phase may begin with a release, too."""
     motion, _ = made(
         [phase("away", released=(STICK,)), phase("on"), phase("again", released=(STICK,))],
         [1, 2, 4],
@@ -95,7 +95,7 @@ def test_it_waits_where_something_is_let_go_of() -> None:
     assert seen(made(both, [1, 2])[0])[1] == [1, 0.1, 2]  # once, for both
 
 
-def test_at_the_very_end_it_waits_if_something_is_let_go_of() -> None:
+def test_robot_waits_for_a_final_release() -> None:
     held = [phase("carry", held=(STICK,), opening=0.05)]
     motion, _ = made(held, [2], after=())
     assert seen(motion) == ([10, 11, 12, 12], [1, 2, 0.1], [("carry", 0, 2), ("let go", 2, 3)])
@@ -115,15 +115,15 @@ def chosen(
     holds: tuple[Hold, ...] = (),
     after: tuple[Hold, ...] = (),
 ) -> list[int]:
-    """Return from which waypoint the hand's choice is, at every one; pauses left out."""
+    """Return the source waypoint of each grasp coordinate, without pauses."""
     motion, _ = made(phases, ends, holds=holds, after=after)
     column, rows = motion.positions[:, 3] - 100.0, motion.positions[:, 0] - 10.0
     _, first = np.unique(rows, return_index=True)
     return [int(value) for value in column[first]]
 
 
-def test_what_the_hand_will_choose_is_open_until_then_and_kept_after() -> None:
-    """While the door is held it is the program's own; where it is grasped and held on to are the same place."""
+def test_inactive_grasp_coordinates_take_the_next_or_last_value() -> None:
+    """During the grasp, the program's own values are used."""
     hold = (DOOR,)
     grasp = [phase("reach", grasps=hold), phase("pull", held=hold), phase("away", released=hold)]
     assert chosen(grasp, [2, 4, 6]) == [2, 2, 2, 3, 4, 4, 4]

@@ -1,4 +1,4 @@
-"""What is accepted, and how far planes are believed after that."""
+"""Tests of step acceptance and trust-region adaptation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SEGMENTS, BLOCK = 30, 10  # three blocks
 
 
 def trial(predicted_penalty: Any = 0.0, *, step: Any = 0.1) -> Trial:
-    """Return where a round led: what the planes promised would be left, and how far it went."""
+    """Return a trial with a predicted penalty and a step."""
     rows = [
         np.broadcast_to(np.asarray(values, float), (SEGMENTS,)).copy()
         for values in (predicted_penalty, step)
@@ -33,7 +33,7 @@ def trial(predicted_penalty: Any = 0.0, *, step: Any = 0.1) -> Trial:
 
 @settings(max_examples=100, deadline=None)
 @given(st.floats(-1.0, 10.0), st.floats(-10.0, 10.0), st.floats(0.0, 100.0))
-def test_a_step_is_accepted_that_keeps_enough_of_its_promise(
+def test_step_is_accepted_if_enough_of_the_prediction_is_achieved(
     promised: float, actual: float, merit: float
 ) -> None:
     accepted = is_step_acceptable(promised, actual, merit)
@@ -43,7 +43,7 @@ def test_a_step_is_accepted_that_keeps_enough_of_its_promise(
         assert accepted == (actual >= -1e-4 * max(1.0, merit))
 
 
-def test_blocks_are_alike_in_size() -> None:
+def test_blocks_have_similar_sizes() -> None:
     for segments in (1, 4, 9, 10, 14, 15, 16, 57, 100):
         sizes = np.bincount(TrustRegion(segments, BLOCK).block)
         assert sizes.sum() == segments
@@ -51,7 +51,7 @@ def test_blocks_are_alike_in_size() -> None:
         assert np.ptp(sizes) <= 1
 
 
-def test_each_block_learns_from_what_happened_in_it() -> None:
+def test_each_block_adapts_separately() -> None:
     """The radius grows in the first block, shrinks in the second and stays in the third."""
     region, before = TrustRegion(SEGMENTS, BLOCK), np.zeros(SEGMENTS)
     before[:20] = 2.0
@@ -63,13 +63,13 @@ def test_each_block_learns_from_what_happened_in_it() -> None:
     np.testing.assert_allclose(region.radius[20:], FIRST_RADIUS)
 
 
-def test_what_is_rejected_makes_steps_smaller() -> None:
+def test_rejection_shrinks_the_radius() -> None:
     region = TrustRegion(SEGMENTS, BLOCK)
     region.adapt(np.zeros(SEGMENTS), np.zeros(SEGMENTS), trial(step=0.3), False)
     np.testing.assert_allclose(region.radius, 0.4 * 0.3)
 
 
-def test_what_half_keeps_its_promise_keeps_the_radius() -> None:
+def test_half_of_the_prediction_keeps_the_radius() -> None:
     region = TrustRegion(SEGMENTS, BLOCK)
     region.adapt(np.full(SEGMENTS, 2.0), np.ones(SEGMENTS), trial(step=FIRST_RADIUS), True)
     np.testing.assert_array_equal(region.radius, FIRST_RADIUS)
@@ -77,7 +77,7 @@ def test_what_half_keeps_its_promise_keeps_the_radius() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_radii_stay_positive_and_one_to_a_block(seed: int) -> None:
+def test_radii_stay_positive_and_equal_within_a_block(seed: int) -> None:
     rng, region = (
         np.random.default_rng(seed),
         TrustRegion(SEGMENTS, BLOCK, np.repeat([0.5, 1e-3, 1e-6], 10)),
@@ -89,7 +89,7 @@ def test_radii_stay_positive_and_one_to_a_block(seed: int) -> None:
         assert all(np.ptp(region.radius[region.block == b]) == 0.0 for b in range(3))
 
 
-def test_stuck_is_where_something_is_in_the_way_and_does_not_move() -> None:
+def test_region_has_stalled_if_violated_waypoints_do_not_move() -> None:
     region, shortfall = TrustRegion(SEGMENTS, BLOCK), np.zeros(SEGMENTS)
     shortfall[12] = 2 * CLEARANCE_TOLERANCE
     step = np.full(SEGMENTS, 0.1)
@@ -108,7 +108,7 @@ def test_stuck_is_where_something_is_in_the_way_and_does_not_move() -> None:
     np.testing.assert_array_equal(region.radius, FIRST_RADIUS)
 
 
-def test_the_radii_of_another_solution_are_taken_over_and_left_alone() -> None:
+def test_given_radii_are_copied() -> None:
     given_radii = np.full(SEGMENTS, 0.07)
     region = TrustRegion(SEGMENTS, BLOCK, given_radii)
     region.adapt(np.zeros(SEGMENTS), np.zeros(SEGMENTS), trial(step=0.07), False)

@@ -1,4 +1,4 @@
-"""When blocks become wider or narrower, on either side of every threshold."""
+"""Tests of the trust region on either side of every threshold."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def adapted(
     accepted: bool = True,
     radius: float = 0.5,
 ) -> list[float]:
-    """Return the radii of two blocks of two waypoints each, of which so much was promised and came; in units of the radius."""
+    """Return the adapted radii of two blocks, in units of the radius."""
     region = TrustRegion(4, 2, np.full(4, radius))
     before, predicted_penalty, after = np.full(4, 100.0), np.full(4, 100.0), np.full(4, 100.0)
     predicted_penalty[::2] -= np.array(promised)  # all of it at one waypoint of a block
@@ -48,7 +48,7 @@ def adapted(
     return [float(value) / radius for value in region.radius[::2]]
 
 
-def test_what_kept_its_promise_at_the_edge_becomes_wider() -> None:
+def test_good_prediction_at_the_boundary_widens_the_block() -> None:
     for step, wider in (
         (1.0, True),
         (1.01 * ACTIVE_FRACTION, True),
@@ -61,8 +61,8 @@ def test_what_kept_its_promise_at_the_edge_becomes_wider() -> None:
         ]
 
 
-def test_seven_tenths_of_a_promise_are_enough() -> None:
-    """And a little less, in what does not matter."""
+def test_seven_tenths_of_the_prediction_are_good() -> None:
+    """Negligible changes are ignored."""
     for share, wider in (
         (7.1, True),
         (7.0 - 0.9 * NEGLIGIBLE_CHANGE, True),
@@ -75,7 +75,7 @@ def test_seven_tenths_of_a_promise_are_enough() -> None:
         ]
 
 
-def test_what_came_to_less_than_a_quarter_becomes_narrower() -> None:
+def test_less_than_a_quarter_of_the_prediction_shrinks_the_block() -> None:
     for share, narrower in ((2.4, True), (2.6, False), (-3.0, True)):
         expected = SHRINK * 0.8 if narrower else 1.0
         assert adapted([10.0, 10.0], [share, 5.0], [0.8, 0.8]) == [pytest.approx(expected), 1.0]
@@ -87,11 +87,11 @@ def test_what_came_to_less_than_a_quarter_becomes_narrower() -> None:
         ]
 
 
-def test_a_step_that_was_longer_than_the_radius_does_not_count_as_such() -> None:
+def test_step_longer_than_the_radius_counts_as_the_radius() -> None:
     assert adapted([10.0, 10.0], [0.0, 10.0], [1.2, 0.5]) == [pytest.approx(SHRINK), 1.0]
 
 
-def test_what_is_refused_makes_all_smaller_unless_one_is_to_blame() -> None:
+def test_rejection_shrinks_all_blocks_unless_one_is_poor() -> None:
     assert adapted([10.0, 10.0], [10.0, 10.0], [1.0, 0.5], accepted=False) == pytest.approx(
         [SHRINK, 0.5 * SHRINK]
     )
@@ -106,7 +106,7 @@ def test_what_is_refused_makes_all_smaller_unless_one_is_to_blame() -> None:
     )
 
 
-def test_radii_do_not_vanish() -> None:
+def test_radii_stay_positive() -> None:
     assert adapted([10.0, 10.0], [0.0, 0.0], [0.0, 1.0]) == pytest.approx([1e-6 / 0.5, SHRINK])
 
 
@@ -126,12 +126,12 @@ def test_radii_do_not_vanish() -> None:
         (-1.0, 0.0, 1.0, True),
     ],
 )
-def test_what_is_accepted(promised: float, actual: float, merit: float, accepted: bool) -> None:
+def test_step_acceptance(promised: float, actual: float, merit: float, accepted: bool) -> None:
     assert is_step_acceptable(promised, actual, merit) == accepted
 
 
-def test_where_nothing_moves_any_more() -> None:
-    """Either as the region is too small, or as the step was; at all waypoints at which something is in the way."""
+def test_stalling() -> None:
+    """The region has stalled if radius or step is small at all violated waypoints."""
     fields: dict[str, Any] = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
 
     def has_stalled(radius: list[float], step: list[float], short: list[float]) -> bool:
@@ -147,7 +147,7 @@ def test_where_nothing_moves_any_more() -> None:
     assert has_stalled([0.9, 0.9, 0.9], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0])
 
 
-def test_smaller_steps_and_beginning_again() -> None:
+def test_limit_and_reset() -> None:
     region = TrustRegion(3, 1, np.array([0.01, SETTLE_RADIUS, 0.3]))
     region.limit()
     np.testing.assert_array_equal(region.radius, [0.01, SETTLE_RADIUS, SETTLE_RADIUS])
@@ -167,7 +167,7 @@ def test_smaller_steps_and_beginning_again() -> None:
         (5, 1, [1] * 5),
     ],
 )
-def test_blocks(segments: int, length: int, blocks: list[int]) -> None:
+def test_block_sizes(segments: int, length: int, blocks: list[int]) -> None:
     found = TrustRegion(segments, length).block
     assert sorted(np.bincount(found).tolist()) == sorted(blocks)
     assert (np.diff(found) >= 0).all()

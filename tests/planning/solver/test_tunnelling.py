@@ -1,4 +1,4 @@
-"""What goes through each other, and what only dips into something: against where the shapes are on either side."""
+"""Tests of the detection of shapes that pass through each other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FEW = vkc.Options(reach_waypoints=STEPS)
 
 
 def past(x: float, *obstacles: dict[str, object]) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return a problem in a hall, and the straight way of the base ahead to `x` [m], shape (N, n)."""
+    """Return a problem in a hall and the straight path ahead to `x` [m], shape (N, n)."""
     scene = hall(obstacles=list(obstacles))
     problem = program_of(scene, [vkc.GoTo(x, 0.0, 0.0)], options=FEW)
     return problem, through(scene, scene.start, moved(scene.start, x=x), steps=STEPS).positions[1:]
@@ -39,7 +39,7 @@ def pairs(problem: TrajectoryProblem, z: np.ndarray) -> set[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("y", [0.0, 0.1, -0.2])
-def test_the_base_goes_through_a_post(y: float) -> None:
+def test_base_passes_through_a_post(y: float) -> None:
     problem, z = past(4.0, post(2.0, y))
     assert ("base_link", "post") in pairs(problem, z)
     found = find_segment_contacts(problem, z).crossings
@@ -49,8 +49,8 @@ def test_the_base_goes_through_a_post(y: float) -> None:
         assert last - first < 1.0 / length + 2
 
 
-def test_what_is_dipped_into_is_none() -> None:
-    """There and back again: into the post, and out where it came in."""
+def test_entering_and_leaving_on_one_side_is_no_crossing() -> None:
+    """The base enters the post and leaves it on the same side."""
     problem, z = past(1.6, post(2.0))
     there_and_back = np.concatenate([z[1::2], z[1::2][::-1]])
     there_and_back[-1] = problem.start
@@ -58,8 +58,8 @@ def test_what_is_dipped_into_is_none() -> None:
     assert ("base_link", "post") not in pairs(problem, there_and_back)
 
 
-def test_what_is_grazed_is_none() -> None:
-    """Past the front corner of the base, on the same side before and after."""
+def test_grazing_is_no_crossing() -> None:
+    """The post passes the front corner of the base on one side."""
     problem, z = past(4.0, post(2.0, 0.37, radius=0.04))
     between = find_segment_contacts(problem, z)
     assert between.contacts.compute_violation() > 0.0
@@ -67,7 +67,7 @@ def test_what_is_grazed_is_none() -> None:
     assert ("base_link", "post") not in pairs(problem, z)
 
 
-def test_what_is_free_and_what_does_not_come_out_again() -> None:
+def test_no_crossing_if_free_or_still_inside() -> None:
     problem, z = past(4.0, post(2.0, 2.0))
     assert pairs(problem, z) == set()
     problem, z = past(1.6, post(2.0))
@@ -75,7 +75,7 @@ def test_what_is_free_and_what_does_not_come_out_again() -> None:
     assert ("base_link", "post") not in pairs(problem, z)
 
 
-def test_only_pairs_that_did_not_before_are_new() -> None:
+def test_new_crossings_are_of_new_pairs() -> None:
     first, moved_on, other = Crossing((1, 2), 3, 4), Crossing((1, 2), 5, 6), Crossing((1, 3), 3, 4)
     assert find_new_crossings([moved_on], [first]) == []
     assert find_new_crossings([first, other], [moved_on]) == [other]

@@ -1,4 +1,4 @@
-"""Which overlaps are passages: with normals that are made up, so that every case is there."""
+"""Tests of crossings with fake normals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SEGMENTS = np.array([0, 0, 0, 1, 1, 2, 3, 3])
 
 
 class Made:
-    """Stands for `ContactModel`: normals point along x, but back at some states; a phase begins after some waypoint."""
+    """Fake `ContactModel` whose normals point along ±x by state."""
 
     def __init__(self, back: set[int], *, boundary: int = 99, aside: bool = False) -> None:
         self.back, self.boundary, self.aside = back, boundary, aside
@@ -50,8 +50,8 @@ def found(contacts: Contacts, back: set[int], **how: Any) -> list[Crossing]:
     return find_crossings(made, np.arange(float(S))[:, None], SEGMENTS, contacts)
 
 
-def test_it_comes_out_on_the_other_side() -> None:
-    """From the segment of the state before to that of the state after."""
+def test_opposite_normals_make_a_crossing() -> None:
+    """The crossing spans the segments of the states before and after."""
     assert found(overlaps((3, 0, 1), (4, 0, 1)), {5, 6, 7}) == [Crossing((0, 1), 0, 2)]
     assert found(overlaps((5, 0, 1)), {6, 7}) == [Crossing((0, 1), 1, 3)]
     assert found(overlaps((3, 0, 1), (4, 0, 1)), set()) == []
@@ -61,7 +61,7 @@ def test_it_comes_out_on_the_other_side() -> None:
 
 
 @pytest.mark.parametrize("state", range(S))
-def test_what_begins_or_ends_inside_is_none(state: int) -> None:
+def test_overlap_at_either_end_is_no_crossing(state: int) -> None:
     back = set(range(state + 1, S))
     expected = (
         [Crossing((0, 1), int(SEGMENTS[state - 1]), int(SEGMENTS[state + 1]))]
@@ -71,8 +71,8 @@ def test_what_begins_or_ends_inside_is_none(state: int) -> None:
     assert found(overlaps((state, 0, 1)), back) == expected
 
 
-def test_each_time_it_overlaps_is_one_of_its_own() -> None:
-    """Out between the two states 2 and 4, and back through the other way."""
+def test_separate_overlaps_are_separate_crossings() -> None:
+    """The shape leaves between states 2 and 4, and crosses back."""
     twice = overlaps((2, 0, 1), (4, 0, 1), (5, 0, 1))
     assert found(twice, {3}) == [Crossing((0, 1), 0, 1), Crossing((0, 1), 1, 3)]
     assert found(twice, {6, 7}) == [Crossing((0, 1), 1, 3)]
@@ -80,33 +80,33 @@ def test_each_time_it_overlaps_is_one_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("other", [(0, 2), (2, 1), (1, 2)])
-def test_another_pair_is_another_overlap(other: tuple[int, int]) -> None:
-    """Though it begins where the first ends."""
+def test_pairs_are_separate_crossings(other: tuple[int, int]) -> None:
+    """The second pair begins where the first ends."""
     both = found(overlaps((2, 0, 1), (3, *other)), {3})
     assert both == [Crossing((0, 1), 0, 1)]
     both = found(overlaps((2, 0, 1), (3, *other)), {4, 5, 6, 7})
     assert both == [Crossing(other, 0, 1)]
 
 
-def test_pairs_that_overlap_at_the_same_states_do_not_mix() -> None:
+def test_simultaneous_pairs_do_not_mix() -> None:
     both = overlaps(
         *((row, 0, k) for row in (2, 3, 4) for k in (1, 2)), *((row, 1, 2) for row in (2, 3, 4))
     )
     assert found(both, {5, 6, 7}) == [Crossing(pair, 0, 2) for pair in ((0, 1), (0, 2), (1, 2))]
 
 
-def test_what_overlaps_from_one_phase_to_the_next_is_none() -> None:
-    """Shapes are others then."""
+def test_overlap_across_phases_is_no_crossing() -> None:
+    """Geometry indices differ between phases."""
     contacts = overlaps((4, 0, 1))
     assert found(contacts, {5, 6, 7}, boundary=3) == [Crossing((0, 1), 1, 2)]
     assert found(contacts, {5, 6, 7}, boundary=2) == []
 
 
-def test_only_what_overlaps_counts() -> None:
+def test_only_overlaps_count() -> None:
     for depth in (0.0, -0.5):
         assert found(overlaps((3, 0, 1), depth=depth), {4, 5, 6, 7}) == []
 
 
 def test_only_opposite_normals_count() -> None:
-    """Past a corner they are at right angles."""
+    """Normals are perpendicular at a corner."""
     assert found(overlaps((3, 0, 1)), {4, 5, 6, 7}, aside=True) == []

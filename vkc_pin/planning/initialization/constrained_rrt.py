@@ -143,7 +143,7 @@ class _Search:
         )
 
     def are_free(self, z: Floats) -> Bools:
-        """Return which configurations are nearly collision-free, which the solver can repair, (B,)."""
+        """Return which configurations are nearly collision-free, shape (B,)."""
         return (
             compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
             <= self.problem.options.dist_safe

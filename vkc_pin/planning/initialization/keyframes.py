@@ -107,7 +107,7 @@ class KeyframeSampler:
         )
 
     def find_pose(self, waypoint: int) -> int | None:
-        """Return the index of the pose constraint at a waypoint, except level constraints, or None."""
+        """Return the index of the pose constraint at a waypoint; None: at most a level one."""
         poses = self.problem.transcription.structure.poses
         return next(
             (

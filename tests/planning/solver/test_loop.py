@@ -199,8 +199,8 @@ class Scripted:
         objective, shortfall, self.taken = next(self.rounds)
         found = make_infeasibility(shortfall, self.other)
         contacts = SimpleNamespace(
-            compute_compute_compute_clearance=lambda: -shortfall,
-            compute_compute_compute_violation=lambda: shortfall,
+            compute_clearance=lambda: -shortfall,
+            compute_violation=lambda: shortfall,
         )
         return dataclasses.replace(
             blank_trial(40),

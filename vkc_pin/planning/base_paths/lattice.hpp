@@ -8,7 +8,7 @@
 #include <utility>
 #include <vector>
 
-#include "../distances/arrays.hpp"
+#include "../../world/collision/arrays.hpp"
 
 constexpr Index HEADINGS = 16, BORDER = 2; // cells by which moves leave the arena at most
 constexpr Index NEVER = std::numeric_limits<Index>::max() / 4;

@@ -10,7 +10,7 @@
 #include <utility>
 #include <vector>
 
-#include "../distances/arrays.hpp"
+#include "../../world/collision/arrays.hpp"
 
 namespace reeds_shepp {
 

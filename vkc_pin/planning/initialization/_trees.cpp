@@ -5,7 +5,7 @@
 #include <utility>
 
 
-#include "../distances/arrays.hpp"
+#include "../../world/collision/arrays.hpp"
 #include "paths.hpp"
 #include "random.hpp"
 #include "tree.hpp"

@@ -6,7 +6,7 @@
 #include <cstddef>
 #include <vector>
 
-#include "../distances/straight.hpp"
+#include "../../world/collision/straight.hpp"
 
 using Row = std::vector<double>;
 using Rows = std::vector<Row>;

@@ -7,7 +7,7 @@
 #include <new>
 #include <stdexcept>
 
-#include "../distances/arrays.hpp"
+#include "../../world/collision/arrays.hpp"
 #include "factorization.hpp"
 
 namespace

@@ -107,7 +107,7 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
     assert [coupling.joint for coupling in followed.values()] == ["joint_arm_l3"] * 3
     rolls = check(Document(yaml.safe_load(wheels)), RobotSchema).base
     assert rolls.wheels is not None
-    assert (round(rolls.wheels.rim, 3), rolls.turning_radius) == (1.0, 1.2)
+    assert (round(rolls.wheels.rim_speed, 3), rolls.turning_radius) == (1.0, 1.2)
     assert check(Document(yaml.safe_load(robot)), RobotSchema).tool_frame == "tool"
 
 

@@ -26,8 +26,8 @@ from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.following import Followed, follow
 from vkc_pin.baselines.paths import BasePaths
 from vkc_pin.benchmarks.household import TASKS
-from vkc_pin.planning.results import TIMES
 from vkc_pin.planning.solver.to_trajectory import make_trajectory
+from vkc_pin.planning.statistics import STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 PULL = vkc.Actuate("drawer", {"slide": 0.3})
@@ -108,7 +108,7 @@ def test_efforts_are_the_trajectorys(task: str, method: str) -> None:
     assert m["closure_error"] == plan.validation.closure_error
     assert m["rounds"] == 1.0
     assert m["iterations"] > 0.0
-    parts = sum(m[f"time_{part}"] for part in (*TIMES, "following"))
+    parts = sum(m[f"time_{part}"] for part in (*STAGES, "following"))
     assert 0.0 < parts <= m["planning_time"]
     assert m["build_time"] >= 0.0
 
@@ -409,7 +409,7 @@ class Tries:
 
     def __call__(self, scene: vkc.Scene, options: vkc.Options, **keywords: Any) -> Any:
         self.seeds.append(list(keywords["seed"]))
-        times = dict.fromkeys([*TIMES, "following"], 1.0)
+        times = dict.fromkeys([*STAGES, "following"], 1.0)
         return SimpleNamespace(run=self.run, times=times, build_time=0.0, iterations=10)
 
     def run(self, steps: Any) -> tuple[vkc.Trajectory, float, str]:

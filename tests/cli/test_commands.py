@@ -20,7 +20,7 @@ from vkc_pin.benchmarks import door, initialization
 from vkc_pin.benchmarks.harness import record, runner
 from vkc_pin.cli import commands
 from vkc_pin.planning import planner
-from vkc_pin.planning.sequential import all_at_once
+from vkc_pin.planning.sequential import plan_simultaneously
 
 ROOT = Path(__file__).resolve().parents[2]
 UNFINISHED = [
@@ -298,7 +298,7 @@ def test_places_that_cannot_be_written(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """They are refused before there is anything to lose."""
-    monkeypatch.setattr(planner, "all_at_once", None)
+    monkeypatch.setattr(planner, "plan_simultaneously", None)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
@@ -334,9 +334,9 @@ def test_one_file_that_fails_is_not_all(
 
     def late(*arguments: Any) -> vkc.Plan:
         (tmp_path / "new").write_text("")
-        return all_at_once(*arguments)
+        return plan_simultaneously(*arguments)
 
-    monkeypatch.setattr(planner, "all_at_once", late)
+    monkeypatch.setattr(planner, "plan_simultaneously", late)
     files = {
         "save": tmp_path / "plan.npz",
         "json": tmp_path / "new" / "plan.json",

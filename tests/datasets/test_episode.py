@@ -11,7 +11,7 @@ from vkc_pin.datasets import episode as module
 from vkc_pin.datasets.episode import attempt, made_of, packed, scene_name, unpacked
 from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.planning import outcome
+from vkc_pin.planning import results
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import load_scene
@@ -58,7 +58,7 @@ def test_attempts_are_determined_by_their_number() -> None:
 def test_attempts_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is kept of rooms and programs is kept once; ten thousand attempts of a process must not add up."""
     monkeypatch.setattr(
-        outcome, "Plan", Plan
+        results, "Plan", Plan
     )  # the second opinion keeps plans; the same ones are judged in other tests
     left, _ = growth(lambda: attempt(DOCUMENT, 0, {}), warm=8)
     assert left <= 3500.0  # [bytes], where eigenpy's copies in one attempt take 5000

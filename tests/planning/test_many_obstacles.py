@@ -152,7 +152,7 @@ def check_contacts(
     which = np.array([number[tuple(pair)] for pair in contacts.pair.tolist()], int)
     every, same = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
     margins = np.array(
-        [part.get_margins(every, same, z, np.full(len(every), row)) for row in range(len(z))]
+        [part.margins_at(every, same, z, np.full(len(every), row)) for row in range(len(z))]
     )
     assert len(set(zip(contacts.waypoint.tolist(), which.tolist(), strict=True))) == len(which)
     np.testing.assert_allclose(
@@ -306,7 +306,8 @@ def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     for smallest in (1e-3, 0.1):
         active = set(
             zip(
-                *map(np.ndarray.tolist, _Sweep(table)._active(placed, moved, smallest)), strict=True
+                *map(np.ndarray.tolist, _Sweep(table)._find_active_pairs(placed, moved, smallest)),
+                strict=True,
             )
         )
         assert set(map(tuple, np.argwhere(floor < smallest - COAL).tolist())) <= active

@@ -466,7 +466,9 @@ def test_a_differential_base_does_not_slip(step: Any) -> None:
 def test_a_steered_base_drives_as_a_car(step: Any) -> None:
     plan = vkc.plan(hall(base="ackermann", turning_radius=0.8), [step])
     confirm(plan)
-    along, aside, turn = make_rolling_limits(plan.scene.robot).steps(plan.trajectory.positions)
+    along, aside, turn = make_rolling_limits(plan.scene.robot).compute_steps(
+        plan.trajectory.positions
+    )
     assert np.abs(aside).max() < 1e-4
     assert (0.8 * np.abs(turn) - np.abs(along)).max() < 1e-4
     assert plan.metrics["base_effort"] > 0.3
@@ -488,7 +490,7 @@ def test_wheels_make_a_motion_slow(tmp_path: Path) -> None:
     for scene in (quick, slow):
         plan = vkc.plan(scene, [vkc.GoTo(4.0, 1.0, 1.0)])
         confirm(plan)
-        along, _, turn = make_rolling_limits(scene.robot).steps(plan.trajectory.positions)
+        along, _, turn = make_rolling_limits(scene.robot).compute_steps(plan.trajectory.positions)
         rims.append(
             (np.abs(along) + scene.robot.wheels.track / 2 * np.abs(turn))
             / np.diff(plan.trajectory.times)

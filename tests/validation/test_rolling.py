@@ -81,7 +81,7 @@ def test_wheels_turn_no_faster_than_they_can(base: str) -> None:
     scene = hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {}))
     wheels = scene.robot.wheels
     assert wheels is not None
-    assert wheels.rim == pytest.approx(
+    assert wheels.rim_speed == pytest.approx(
         1.0, rel=1e-3
     )  # Clearpath's limit on the speed of a Husky [m/s]
     heading = np.concatenate(
@@ -97,12 +97,12 @@ def test_wheels_turn_no_faster_than_they_can(base: str) -> None:
     assert (found.constraint, found.subject, found.unit) == ("wheels", "base", "m/s")
     turn = np.diff(heading).max()
     fastest = (2.0 * np.sin(turn / 2) + turn * wheels.track / 2) / 0.05
-    assert found.amount == pytest.approx(fastest - wheels.rim)
+    assert found.amount == pytest.approx(fastest - wheels.rim_speed)
     for excess, right in (
         (0.5, True),
         (2.0, False),
     ):  # times what is all right, a thousandth of what the wheels can
-        dt = 0.05 * fastest / (wheels.rim * (1.0 + excess * 1e-3))
+        dt = 0.05 * fastest / (wheels.rim_speed * (1.0 + excess * 1e-3))
         assert validate(scene, goal, of_rows(scene, rows, dt=dt)).ok == right
     assert validate(scene, goal, of_rows(scene, rows, dt=0.05 * fastest)).ok
     everywhere = hall()
@@ -181,11 +181,11 @@ def test_wheels_along_a_curve() -> None:
     """The outer ones go 1 + track / 2 times as fast on a circle of 1 m."""
     scene = hall(base="differential")
     assert scene.robot.wheels is not None
-    peak = scene.robot.wheels.rim / (1.0 + scene.robot.wheels.track / 2)
+    peak = scene.robot.wheels.rim_speed / (1.0 + scene.robot.wheels.track / 2)
     assert validate(scene, *circled(scene, peak=0.999 * peak)).ok
     found = only(validate(scene, *circled(scene, peak=1.02 * peak)))
     assert (found.constraint, found.subject, found.unit) == ("wheels", "base", "m/s")
-    assert found.amount == pytest.approx(0.02 * scene.robot.wheels.rim, rel=0.02)
+    assert found.amount == pytest.approx(0.02 * scene.robot.wheels.rim_speed, rel=0.02)
 
 
 def test_between_waypoints_a_spline_through_them_slips() -> None:

@@ -153,14 +153,16 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
         scene, {"cabinet": dataclasses.replace(placed, placement=tool * hand.inverse())}
     )
     np.testing.assert_allclose(
-        Samples(here, trajectory).grasp_errors("cabinet", grasp, np.array([0])), 0.0, atol=1e-7
+        Samples(here, trajectory).compute_grasp_errors("cabinet", grasp, np.array([0])),
+        0.0,
+        atol=1e-7,
     )
     shift, turn = rng.normal(size=3), rng.uniform(-1.0, 1.0, 3)
     off = tool * pin.SE3(pin.exp3(turn), shift)
     there = with_objects(
         scene, {"cabinet": dataclasses.replace(placed, placement=off * hand.inverse())}
     )
-    (errors,) = Samples(there, trajectory).grasp_errors("cabinet", grasp, np.array([0]))
+    (errors,) = Samples(there, trajectory).compute_grasp_errors("cabinet", grasp, np.array([0]))
     assert errors[0] == pytest.approx(np.linalg.norm(shift))
     assert errors[1] == pytest.approx(np.linalg.norm(turn))
 

@@ -91,7 +91,7 @@ def test_poses_are_those_of_configurations_that_touch_nothing(
 
     over = poses.pose_over(layout, scene, table, rng)
     free(scene, over, drawn[-1][1])
-    assert table.footprint.distance([over.translation[:2]])[0] == 0.0
+    assert table.footprint.compute_distances([over.translation[:2]])[0] == 0.0
     assert 0.05 < over.translation[2] - table.size[2] < 0.45
 
     among = poses.pose_among(layout, scene, rng)

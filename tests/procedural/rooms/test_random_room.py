@@ -214,7 +214,7 @@ def test_unknown_settings_and_parts_are_rejected() -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'clutter'"):
         vkc.random_room(0, cluter=0.5)
     with pytest.raises(vkc.UnknownNameError, match="table_9"):
-        sample_layout(0).part("table_9")
+        sample_layout(0).find_part("table_9")
 
 
 def test_error_if_parts_do_not_fit() -> None:

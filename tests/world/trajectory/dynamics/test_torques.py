@@ -13,7 +13,7 @@ from oracle.plan import read_plan
 from oracle.stage import World as Judged
 
 import vkc_pin as vkc
-from vkc_pin.validation.dynamics.torques import Motors
+from vkc_pin.validation.dynamics.torques import MotorLoads
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.dynamics.torques import Torques
@@ -96,7 +96,7 @@ def test_a_payload_at_rest_weighs_by_its_lever() -> None:
 
 def seen(plan: vkc.Plan, file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest torque of every joint as the package and the oracle find it."""
-    own = Motors(Samples(plan.scene, plan.trajectory)).torques
+    own = MotorLoads(Samples(plan.scene, plan.trajectory)).torques
     plan.save(file)
     world = Judged(read_plan(file))
     found = dict.fromkeys(world.robot.arm, 0.0)

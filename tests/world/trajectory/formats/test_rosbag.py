@@ -16,7 +16,6 @@ from rosbags.typesys import Stores, get_typestore
 import vkc_pin as vkc
 from vkc_pin import cli
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.results import spent
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.formats.rosbag import TOPICS
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -36,7 +35,6 @@ def plan() -> Plan:
         motion.names, motion.times, motion.positions, motion.phases, motion.robot_size, curve
     )
     object.__setattr__(made, "trajectory", again)
-    object.__setattr__(made, "metrics", spent())
     return made
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.declared import SCRIPTS, find_undeclared, run_without
 from packaging.requirements import Requirement
 
 import vkc_pin
@@ -50,6 +51,15 @@ def test_dependencies_are_ranges(project: dict[str, Any]) -> None:
         operators = {specifier.operator for specifier in specifiers}
         assert operators == {">=", "<"}, text
         assert metadata.version(Requirement(text).name) in specifiers, text
+
+
+@pytest.mark.parametrize(("extra", "script"), [("", "meshes"), ("import", "imports")])
+def test_declared_dependencies_suffice(extra: str, script: str, tmp_path: Path) -> None:
+    """Optional packages of dependencies, such as those of trimesh, are not needed, or declared."""
+    modules = find_undeclared(extra)
+    assert {"pytest", "sphinx"} & set(modules)
+    assert "trimesh" not in modules
+    run_without([*modules, "networkx"], SCRIPTS / f"{script}.py", tmp_path)
 
 
 def test_compiled_against_what_is_required(project: dict[str, Any]) -> None:

@@ -17,7 +17,7 @@ import coal
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.slicing import flat, slices, thickened
+from vkc_pin.importing.slicing import is_flat, slice_mesh, thicken
 from vkc_pin.utils.arguments import number, quantity, whole
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.disk_cache import record
@@ -29,7 +29,7 @@ from vkc_pin.world.files.resources import file_path
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["ERROR", "PIECES", "Pieces", "concavity", "decompose", "solid_volume"]
+__all__ = ["ERROR", "PIECES", "Pieces", "compute_concavity", "compute_solid_volume", "decompose"]
 
 ERROR = 0.02
 """How far pieces may stand out over the surface before more of them are made, [m]: about the margin that motions keep anyway."""
@@ -122,7 +122,7 @@ def decompose(
         file = file_path(mesh, "mesh", "a mesh or a mesh file")
         given = load_mesh(file)
     hull = _hull(given.vertices, file)
-    found, solid = [hull], min(solid_volume(given), float(hull.volume))
+    found, solid = [hull], min(compute_solid_volume(given), float(hull.volume))
     if (
         most_pieces > 1
         and hull.volume > (1.0 + overhead) * solid
@@ -147,7 +147,7 @@ def decompose(
     return Pieces(pieces, solid, _standing_out(pieces, given))
 
 
-def concavity(mesh: trimesh.Trimesh) -> float:
+def compute_concavity(mesh: trimesh.Trimesh) -> float:
     """Return how far the convex hull of a mesh stands out over its surface at most [m], measured at points.
 
     Raises:
@@ -156,7 +156,7 @@ def concavity(mesh: trimesh.Trimesh) -> float:
     return _standing_out([_hull(mesh.vertices, None)], mesh)
 
 
-def solid_volume(mesh: trimesh.Trimesh) -> float:
+def compute_solid_volume(mesh: trimesh.Trimesh) -> float:
     """Return the volume of a mesh [m³]; of one that is not closed, that of the cells of a grid that nothing reaches from outside.
 
     Cells that the skin itself passes count half. Holes narrower than a hundredth of the mesh count
@@ -203,7 +203,7 @@ def _bodies(mesh: trimesh.Trimesh, most: int) -> list[trimesh.Trimesh]:
     bodies = [
         np.asarray(body.vertices) for body in merged.split(only_watertight=False, repair=False)
     ]
-    return [] if any(map(flat, bodies)) else [_hull(body, None) for body in bodies]
+    return [] if any(map(is_flat, bodies)) else [_hull(body, None) for body in bodies]
 
 
 def _cut(
@@ -219,7 +219,8 @@ def _cut(
             merged.extents.max() / _CELLS,
         )
         return [
-            thickened(part) for part in slices(trimesh.Trimesh(coarse.vertices, coarse.faces), most)
+            thicken(part)
+            for part in slice_mesh(trimesh.Trimesh(coarse.vertices, coarse.faces), most)
         ]
     coacd = optional_package(
         "coacd", "import", what="cutting a concave mesh into convex pieces", file=file
@@ -235,7 +236,7 @@ def _cut(
         preprocess_mode="off",
         **_SEARCH,
     )
-    return [corners for vertices, _ in parts if not flat(corners := np.asarray(vertices))]
+    return [corners for vertices, _ in parts if not is_flat(corners := np.asarray(vertices))]
 
 
 def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -247,7 +248,7 @@ def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def _hull(points: Any, file: Path | None) -> trimesh.Trimesh:
     points = np.asarray(points, float)
-    if flat(points):
+    if is_flat(points):
         raise InputError(
             "the mesh is flat",
             file=file,

@@ -15,7 +15,7 @@ from vkc_pin.utils.arrays import Floats, Ints
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["THICKNESS", "flat", "slices", "thickened"]
+__all__ = ["THICKNESS", "is_flat", "slice_mesh", "thicken"]
 
 THICKNESS = 1e-3
 """Of what is flat, as a part [m]."""
@@ -25,7 +25,7 @@ _PLACES = 12  # of planes along each axis
 _GAIN = 0.01  # of the whole hull's volume: a cut that takes away less is not worth a part
 
 
-def slices(mesh: trimesh.Trimesh, most: int) -> list[Floats]:
+def slice_mesh(mesh: trimesh.Trimesh, most: int) -> list[Floats]:
     """Return the points of parts of a mesh, shape (n, 3) each, cut at planes so that the volume of their hulls is small.
 
     One after the other, that part is cut into two where its best cut takes away most. Planes are
@@ -51,7 +51,7 @@ def slices(mesh: trimesh.Trimesh, most: int) -> list[Floats]:
     return [points for points, _ in parts]
 
 
-def flat(points: Floats) -> bool:
+def is_flat(points: Floats) -> bool:
     """Return whether points, shape (n, 3) [m], lie in one plane, or so close to it that they span no volume to speak of."""
     if len(points) < 4:
         return True
@@ -59,9 +59,9 @@ def flat(points: Floats) -> bool:
     return bool(spread[-1] <= max(_THIN, _FLAT * spread[0]))
 
 
-def thickened(points: Floats) -> Floats:
+def thicken(points: Floats) -> Floats:
     """Return points that span a volume: these, or two layers of them `THICKNESS` apart if they are flat."""
-    if not flat(points):
+    if not is_flat(points):
         return points
     axes = np.linalg.svd(points - points.mean(axis=0))[2]
     layers = [

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from vkc_pin.errors import InputError
 
-__all__ = ["check_target", "format_comment", "made_by"]
+__all__ = ["check_target", "format_comment", "get_origin_marker"]
 
 _FIRST = 4096  # characters of a first line: names of files have up to 255 bytes, escaped up to 1530
 
 
-def made_by(command: str) -> str:
+def get_origin_marker(command: str) -> str:
     """Return what the first line of a YAML file says by which a folder is known to be made by a command, e.g. "import-home"."""
     return f"by vkc-pin {command}"
 
@@ -44,7 +44,7 @@ def check_target(folder: Path, command: str, *, force: bool) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     own = folder.is_dir() and any(
-        made_by(command) in _first_line(file) for file in folder.glob("*.yaml")
+        get_origin_marker(command) in _first_line(file) for file in folder.glob("*.yaml")
     )
     if force and own:
         return

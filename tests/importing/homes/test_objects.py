@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.importing.homes.objects import write_thing
+from vkc_pin.importing.homes.objects import write_object
 from vkc_pin.importing.homes.splitting import Thing
 from vkc_pin.importing.objects.description import Description, Link, Part
 
@@ -29,7 +29,7 @@ def _can(radius: float) -> Thing:
 
 
 def test_what_is_carried_has_no_joint_and_is_held_above_what_it_stands_on(tmp_path: Path) -> None:
-    done = write_thing(_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
+    done = write_object(_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
     item = vkc.load_object(tmp_path / "objects" / "can" / "can.yaml")
     assert item.free
     assert item.coordinates.size == 0
@@ -51,6 +51,6 @@ def test_what_is_carried_has_no_joint_and_is_held_above_what_it_stands_on(tmp_pa
 
 
 def test_what_is_too_thick_says_so(tmp_path: Path) -> None:
-    done = write_thing(_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
+    done = write_object(_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
     assert not vkc.load_object(tmp_path / "objects" / "can" / "can.yaml").attachments
     assert "carried by no hand: nothing of it fits" in done.report()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.importing.homes.splitting import split
+from vkc_pin.importing.homes.splitting import split_home
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 
 
@@ -59,7 +59,7 @@ def test_on_the_building_each_joint_is_a_thing_of_its_own() -> None:
         _hung("world", "cabinet", "fixed"),
         _hung("cabinet", "leaf", "revolute"),
     ]
-    home = split(_home(links, joints))
+    home = split_home(_home(links, joints))
     assert [link.name for link in home.building] == ["walls"]
     assert not home.furniture
     found = {thing.name: set(thing.description.links) for thing in home.things}
@@ -77,7 +77,7 @@ def test_joints_that_move_nothing_or_nowhere_are_fixed_where_they_are() -> None:
         _hung("room", "dead", "revolute"),
         _hung("room", "leaf", "revolute"),
     ]
-    home = split(_home(links, joints))
+    home = split_home(_home(links, joints))
     assert [thing.name for thing in home.things] == ["leaf"]
     assert [link.name for link in home.furniture] == ["stuck"]
     assert home.furniture[0].collision[0].placement.translation == pytest.approx([0.7, 0.0, 0.5])
@@ -101,7 +101,7 @@ def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
         _hung("laptop", "lid", "revolute"),
         _hung("world", "ghost", "floating", None),
     ]
-    home = split(_home(links, joints))
+    home = split_home(_home(links, joints))
     case, laptop = home.things
     assert set(case.description.links) == {"case", "drawer"}
     assert case.position[2] == 0.0  # on the floor, above which it hangs
@@ -116,7 +116,7 @@ def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
 def test_what_is_carried_is_as_far_open_as_it_must_be() -> None:
     """A lid that cannot be shut is fixed at its lower limit, not where the file's zero is."""
     links = [Link("world"), _box("laptop"), _box("lid")]
-    home = split(
+    home = split_home(
         _home(
             links,
             [
@@ -128,7 +128,7 @@ def test_what_is_carried_is_as_far_open_as_it_must_be() -> None:
     (laptop,) = home.things
     (hinge,) = laptop.description.joints.values()
     assert hinge.kind == "fixed"
-    where = laptop.description.placements()
+    where = laptop.description.compute_placements()
     base, lid = (
         where[name].act(laptop.description.links[name].solid[0].placement.translation)
         for name in ("laptop", "lid")
@@ -142,7 +142,9 @@ def test_what_is_flat_on_the_floor_is_part_of_it() -> None:
         _box("carpet", (1.0, 1.0, 0.02), 0.01),
         _box("step", (1.0, 1.0, 0.05), 0.025),
     ]
-    home = split(_home(links, [_hung("world", "carpet", "fixed"), _hung("world", "step", "fixed")]))
+    home = split_home(
+        _home(links, [_hung("world", "carpet", "fixed"), _hung("world", "step", "fixed")])
+    )
     assert home.floor == ("world", "carpet")
     assert [link.name for link in home.furniture] == ["step"]
     assert not home.building
@@ -167,7 +169,7 @@ def test_no_shape_is_lost_whatever_the_tree(data: st.DataObject) -> None:
             else None
         )
         joints.append(_hung(parent, name, kind, limits))
-    home = split(_home(links, joints))
+    home = split_home(_home(links, joints))
     kept = [part.name for link in (*home.building, *home.furniture) for part in link.solid] + list(
         home.floor
     )

@@ -7,7 +7,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.importing.homes.home_import import _started
-from vkc_pin.importing.homes.start_pose import free_start
+from vkc_pin.importing.homes.start_pose import find_free_start
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
 
@@ -37,7 +37,7 @@ def test_the_start_is_where_things_are_reached_not_where_most_floor_is(
     drawer_x: float, side: float
 ) -> None:
     for seed in range(3):
-        scene, reached = free_start(_halves(drawer_x), np.random.default_rng(seed))
+        scene, reached = find_free_start(_halves(drawer_x), np.random.default_rng(seed))
         assert np.sign(scene.start[0]) == side
         assert reached == 1
         assert scene.start_clearance() >= START_CLEARANCE
@@ -48,7 +48,7 @@ def test_where_no_robot_fits_that_is_said() -> None:
         {"name": "block", "type": "box", "size": [10.0, 4.0, 2.0], "position": [-1.0, 0.0, 1.0]}
     ]
     with pytest.raises(vkc.InputError, match="floor"):
-        free_start(_halves(3.0, obstacles=full), np.random.default_rng(0))
+        find_free_start(_halves(3.0, obstacles=full), np.random.default_rng(0))
     with pytest.raises(vkc.InputError, match=r"home\.xml: robot, floor: no place") as caught:
         _started(_halves(3.0, obstacles=full), Path("home.xml"), np.random.default_rng(0))
     assert caught.value.field == "robot, floor"

@@ -13,17 +13,17 @@ from pydantic import TypeAdapter
 
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.importing.objects.clean_up import (
-    bounds,
+    add_missing_limits,
     choose_name,
-    only,
-    renamed,
-    rooted,
-    scaled,
-    several,
-    surfaces,
-    tidied,
-    upright,
-    with_limits,
+    compute_bounds,
+    extract_subtree,
+    find_multiple_objects,
+    load_surfaces,
+    make_upright,
+    merge_fixed_links,
+    move_root,
+    rename_for_scenes,
+    scale_object,
 )
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.urdf import read_object_urdf
@@ -36,11 +36,14 @@ def cabinet(tmp_path: Path) -> Description:
 
 
 def test_fixed_links_become_one_and_dead_ones_go(cabinet: Description) -> None:
-    found = tidied(cabinet)
+    found = merge_fixed_links(cabinet)
     assert set(found.links) == {"base", "link_0", "link_1"}
     assert found.joints["link_0"].parent == "base"
     assert any("joint_3" in note and "no" in note for note in found.notes)
-    before, after = bounds(cabinet, surfaces(cabinet)), bounds(found, surfaces(found))
+    before, after = (
+        compute_bounds(cabinet, load_surfaces(cabinet)),
+        compute_bounds(found, load_surfaces(found)),
+    )
     assert np.allclose(before, after)
     assert "link_2_frame-1" in [part.name for part in found.links["base"].visual]
 
@@ -78,7 +81,7 @@ def test_a_handle_fixed_to_a_door_is_part_of_it_and_keeps_its_name() -> None:
         for k, name in enumerate(links)
     }
     links = {name: dataclasses.replace(link, inertia=weights[name]) for name, link in links.items()}
-    found = tidied(Description(Path("f"), links, joints))
+    found = merge_fixed_links(Description(Path("f"), links, joints))
     assert set(found.links) == {"case", "door"}
     assert found.links["case"].inertia.mass == 1.0
     assert found.links["door"].inertia.mass == 2.0 + 3.0 + 4.0
@@ -103,9 +106,9 @@ def test_scaling_scales_everything(
     factor: float, slide: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     cabinet = read_object_urdf(partnet(tmp_path_factory.mktemp("p") / "x"))
-    large = scaled(cabinet, factor)
-    one = bounds(cabinet, surfaces(cabinet), {"joint_0": slide})
-    other = bounds(large, surfaces(large), {"joint_0": factor * slide})
+    large = scale_object(cabinet, factor)
+    one = compute_bounds(cabinet, load_surfaces(cabinet), {"joint_0": slide})
+    other = compute_bounds(large, load_surfaces(large), {"joint_0": factor * slide})
     assert np.allclose(factor * np.array(one), other, rtol=1e-9, atol=1e-9)
     assert large.joints["link_0"].limits == pytest.approx((0.0, factor * 0.36))
 
@@ -113,25 +116,25 @@ def test_scaling_scales_everything(
 def test_masses_stay_as_stated_when_scaled_and_turn_with_the_root() -> None:
     weight = pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.25]))
     one = Description(Path("f"), {"a": Link("a", inertia=weight)}, {})
-    large = scaled(one, 3.0).links["a"].inertia
+    large = scale_object(one, 3.0).links["a"].inertia
     assert large.mass == 2.0
     assert np.allclose(large.lever, 3.0 * weight.lever)
     assert np.allclose(large.inertia, 9.0 * weight.inertia)
-    turned = upright(one, "y").links["a"].inertia
+    turned = make_upright(one, "y").links["a"].inertia
     assert np.allclose(turned.lever, [0.1, -0.3, 0.2])
     assert sorted(np.diag(turned.inertia)) == pytest.approx([0.1, 0.2, 0.25])
-    assert not one.weightless
-    assert Description(Path("f"), {"a": Link("a")}, {}).weightless
+    assert not one.is_massless
+    assert Description(Path("f"), {"a": Link("a")}, {}).is_massless
 
 
 def test_limits_that_are_missing_open_outwards(cabinet: Description) -> None:
-    found = tidied(cabinet)
-    meshes = surfaces(found)
-    limited = with_limits(found, meshes)
+    found = merge_fixed_links(cabinet)
+    meshes = load_surfaces(found)
+    limited = add_missing_limits(found, meshes)
     low, high = limited.joints["link_1"].limits or (0.0, 0.0)
     assert sorted(map(abs, (low, high))) == pytest.approx([0.0, np.pi / 2])
     shut, opened = (
-        bounds(limited, surfaces(limited), {"joint_1": value})
+        compute_bounds(limited, load_surfaces(limited), {"joint_1": value})
         for value in (0.0, low if abs(low) > high else high)
     )
     front = shut[0][0] < opened[0][0] or shut[1][0] > opened[1][0]
@@ -141,20 +144,21 @@ def test_limits_that_are_missing_open_outwards(cabinet: Description) -> None:
     little = dataclasses.replace(
         limited.joints["link_1"], limits=(0.0, 0.0274)
     )  # 1.57, taken for degrees
-    noted = with_limits(
-        dataclasses.replace(limited, joints={**limited.joints, "link_1": little}), surfaces(limited)
+    noted = add_missing_limits(
+        dataclasses.replace(limited, joints={**limited.joints, "link_1": little}),
+        load_surfaces(limited),
     ).notes
     assert any("1.6° only" in note or "2° only" in note for note in noted)
 
 
 def test_up_root_and_part_of_it(cabinet: Description) -> None:
-    found = upright(only(cabinet, "link_2"), "y")
-    low, high = bounds(found, surfaces(found))
+    found = make_upright(extract_subtree(cabinet, "link_2"), "y")
+    low, high = compute_bounds(found, load_surfaces(found))
     assert (high - low)[2] == pytest.approx(1.0)
-    moved = rooted(found, pin.SE3(np.eye(3), np.array([0.0, 0.0, -low[2]])))
-    assert bounds(moved, surfaces(moved))[0][2] == pytest.approx(0.0)
+    moved = move_root(found, pin.SE3(np.eye(3), np.array([0.0, 0.0, -low[2]])))
+    assert compute_bounds(moved, load_surfaces(moved))[0][2] == pytest.approx(0.0)
     with pytest.raises(UnknownNameError, match="link_2"):
-        only(cabinet, "link2")
+        extract_subtree(cabinet, "link2")
 
 
 def test_names_without_dots_and_slashes_that_differ() -> None:
@@ -165,7 +169,7 @@ def test_names_without_dots_and_slashes_that_differ() -> None:
         )
         for k, name in enumerate(("a.b", "c d"))
     }
-    found = renamed(Description(Path("f"), links, joints))
+    found = rename_for_scenes(Description(Path("f"), links, joints))
     assert list(found.links) == ["a_b", "a_b_2", "c_d"]
     assert [joint.name for joint in found.joints.values()] == ["j_0", "j_0_2"]
     assert {joint.parent for joint in found.joints.values()} == {"a_b"}
@@ -181,7 +185,7 @@ def test_a_file_of_several_things_is_told_from_one_with_several_joints(tmp_path:
         (tmp_path / "it.urdf").write_text(
             f'<robot name="it"><link name="world"/>{"".join(parts)}</robot>'
         )
-        return several(read_object_urdf(tmp_path / "it.urdf"))
+        return find_multiple_objects(read_object_urdf(tmp_path / "it.urdf"))
 
     oven = box("oven", "world", "fixed") + box("door", "oven", "revolute")
     (note,) = said(

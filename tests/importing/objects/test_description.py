@@ -35,9 +35,10 @@ def test_placements_follow_the_joints() -> None:
     found = Description(Path("f"), {name: Link(name) for name in "abc"}, joints)
     assert found.root == "a"
     assert np.allclose(
-        found.placements({"turn": np.pi / 2, "slide": 0.3})["c"].translation, [1.0, 1.0, 0.3]
+        found.compute_placements({"turn": np.pi / 2, "slide": 0.3})["c"].translation,
+        [1.0, 1.0, 0.3],
     )
-    assert found.below("b") == {"b", "c"}
+    assert found.subtree("b") == {"b", "c"}
 
 
 def test_what_is_seen_is_solid_where_nothing_else_is(tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from helpers.downloads import partnet
 
-from vkc_pin.importing.objects.clean_up import surfaces, tidied
+from vkc_pin.importing.objects.clean_up import load_surfaces, merge_fixed_links
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.importing.objects.pieces import Known, with_pieces
+from vkc_pin.importing.objects.pieces import Known, decompose_links
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
 HERE = pin.SE3.Identity()
@@ -28,7 +28,7 @@ def alone(*meshes: trimesh.Trimesh) -> Description:
 
 
 def pieces(description: Description) -> tuple[tuple[Part, ...], tuple[str, ...]]:
-    found = with_pieces(description, surfaces(description))
+    found = decompose_links(description, load_surfaces(description))
     return found.links["b"].collision, found.notes
 
 
@@ -53,8 +53,8 @@ def test_a_bracket_leaves_room_for_fingers() -> None:
 
 
 def test_flat_shapes_get_thick_and_are_named(tmp_path: Path) -> None:
-    found = tidied(read_object_urdf(partnet(tmp_path)))
-    done = with_pieces(found, surfaces(found))
+    found = merge_fixed_links(read_object_urdf(partnet(tmp_path)))
+    done = decompose_links(found, load_surfaces(found))
     decoration = next(
         part for part in done.links["link_0"].collision if part.name == "decoration-6"
     )
@@ -71,7 +71,9 @@ def test_what_lies_inside_of_another_piece_goes() -> None:
 
 def test_boxes_stay_boxes_and_what_is_seen_collides_where_nothing_else_does() -> None:
     box = Part(name="", placement=HERE, kind="box", size=(0.1, 0.1, 0.1))
-    found = with_pieces(Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.mesh()})
+    found = decompose_links(
+        Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.mesh()}
+    )
     assert found.links["a"].collision == (box,)
     assert any("collides as what it looks like" in note for note in found.notes)
 
@@ -89,7 +91,9 @@ def test_a_file_that_is_there_twice_is_cut_once_and_is_where_it_stands(tmp_path:
     found = []
     for part in parts:
         description = Description(tmp_path / "t.urdf", {"ring": Link("ring", (), (part,))}, {})
-        found.append(with_pieces(description, surfaces(description), known).links["ring"].collision)
+        found.append(
+            decompose_links(description, load_surfaces(description), known).links["ring"].collision
+        )
     assert len(known) == 1
     (cut,) = known.values()
     assert len(found[0]) == len(found[1]) == len(cut) > 1

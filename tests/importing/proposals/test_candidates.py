@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.importing.proposals.candidates import Candidate, Thickness, candidates
+from vkc_pin.importing.proposals.candidates import Candidate, Thickness, find_candidates
 from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.importing.proposals.sections import Piece
 
@@ -19,8 +19,10 @@ def found(
     geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None
 ) -> tuple[list[Candidate], Thickness]:
     seen = Thickness()
-    piece = Piece.of(pin.GeometryObject("link_0", 0, 0, placement or pin.SE3.Identity(), geometry))
-    return list(candidates(piece, HAND, 0.005, UP, seen)), seen
+    piece = Piece.from_shape(
+        pin.GeometryObject("link_0", 0, 0, placement or pin.SE3.Identity(), geometry)
+    )
+    return list(find_candidates(piece, HAND, 0.005, UP, seen)), seen
 
 
 def test_a_bar_is_taken_around_in_its_middle() -> None:

@@ -10,7 +10,7 @@ from helpers.furniture import BAR, flap
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.fitting import Blocked, Fitting
-from vkc_pin.importing.proposals.hand import hand_of
+from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.world.models.shapes import compute_clearance
 
 FRONT = np.column_stack(
@@ -21,36 +21,36 @@ FRONT = np.column_stack(
 @pytest.fixture
 def fitting(tmp_path: Path) -> Fitting:
     return Fitting(
-        flap(tmp_path, BAR.format("")), hand_of(vkc.load_robot("husky_ur5e")), 0.02, 0.005
+        flap(tmp_path, BAR.format("")), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
     )
 
 
 def test_a_hand_around_a_bar_has_room(fitting: Fitting) -> None:
-    assert fitting.blocked(pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5])), "flap") is None
+    assert fitting.find_obstruction(pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5])), "flap") is None
 
 
 def test_what_is_in_the_way_is_named(fitting: Fitting) -> None:
     beside = pin.SE3(FRONT, np.array([-0.08, 0.535, 0.5]))
-    assert fitting.blocked(beside, "flap") == Blocked("fingers", "flap")
-    assert fitting.blocked(pin.SE3(FRONT, np.array([0.0, 0.3, 0.5])), "case") == Blocked(
+    assert fitting.find_obstruction(beside, "flap") == Blocked("fingers", "flap")
+    assert fitting.find_obstruction(pin.SE3(FRONT, np.array([0.0, 0.3, 0.5])), "case") == Blocked(
         "others", "flap"
     )
     below = pin.SE3(
         np.column_stack([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
         np.array([-0.3, 0.5, 0.15]),
     )
-    assert fitting.blocked(below, "flap") == Blocked("floor")
+    assert fitting.find_obstruction(below, "flap") == Blocked("floor")
 
 
 def test_the_object_is_where_its_joints_are(fitting: Fitting) -> None:
     tool = pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5]))
     fitting.place(np.array([1.2]))
     assert (
-        fitting.blocked(pin.SE3(FRONT, np.array([-0.14, 0.5, 0.5])), "case") is None
+        fitting.find_obstruction(pin.SE3(FRONT, np.array([-0.14, 0.5, 0.5])), "case") is None
     )  # the flap has gone
     hinge = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5]))
     turned = hinge * pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 1.2), np.zeros(3)) * hinge.inverse()
-    assert fitting.blocked(turned * tool, "flap") is None
+    assert fitting.find_obstruction(turned * tool, "flap") is None
 
 
 def test_clearance_is_that_of_coal(fitting: Fitting) -> None:
@@ -77,7 +77,7 @@ def test_clearance_is_that_of_coal(fitting: Fitting) -> None:
             and compute_clearance([*touch, *others], groups["case"]) >= 0.02
             and compute_clearance(others, groups["flap"]) >= 0.02
         )
-        assert (fitting.blocked(tool, "flap") is None) == found
+        assert (fitting.find_obstruction(tool, "flap") is None) == found
         return found
 
     places = np.linspace(-0.4, 0.1, 26).tolist()

@@ -7,22 +7,22 @@ import pytest
 from helpers.furniture import BAR, flap
 
 import vkc_pin as vkc
-from vkc_pin.importing.proposals.candidates import Thickness, candidates
+from vkc_pin.importing.proposals.candidates import Thickness, find_candidates
 from vkc_pin.importing.proposals.fitting import Fitting
 from vkc_pin.importing.proposals.freedom import Grip
-from vkc_pin.importing.proposals.hand import hand_of
-from vkc_pin.importing.proposals.ranking import Opening, openings
+from vkc_pin.importing.proposals.hand import make_hand
+from vkc_pin.importing.proposals.ranking import Opening, find_openings
 from vkc_pin.importing.proposals.sections import Piece
 
 
 def grip(folder: Path, **what: str) -> tuple[Grip, Opening, Fitting]:
     """Return the hand at the middle of the bar, from the front."""
     fitting = Fitting(
-        flap(folder, BAR.format(""), **what), hand_of(vkc.load_robot("husky_ur5e")), 0.02, 0.005
+        flap(folder, BAR.format(""), **what), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
     )
     pieces = {
         1: [
-            Piece.of(shape)
+            Piece.from_shape(shape)
             for shape in fitting.item.collision.geometryObjects
             if shape.parentJoint == 1
         ]
@@ -32,13 +32,13 @@ def grip(folder: Path, **what: str) -> tuple[Grip, Opening, Fitting]:
         for piece in pieces[1]
         if np.ptp(piece.vertices[:, 0]) < 0.03 and np.ptp(piece.vertices[:, 1]) < 0.03
     )
-    grasps = candidates(bar, fitting.hand, 0.005, np.array([0.0, 0.0, 1.0]), Thickness())
+    grasps = find_candidates(bar, fitting.hand, 0.005, np.array([0.0, 0.0, 1.0]), Thickness())
     front = next(
         g
         for g in grasps
         if g.placement.rotation[0, 2] > 0.99 and abs(g.placement.translation[2]) < 1e-6
     )
-    return Grip(fitting, front, 0.0), openings(fitting.item, pieces)[1], fitting
+    return Grip(fitting, front, 0.0), find_openings(fitting.item, pieces)[1], fitting
 
 
 def test_a_free_bar_can_be_slid_along_and_turned_about(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from helpers.grippers import cheeky_drawer, write_gripper
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.fitting import Fitting
-from vkc_pin.importing.proposals.hand import hand_of
+from vkc_pin.importing.proposals.hand import make_hand
 
 POSTS = "".join(
     f'<collision><origin xyz="-0.045 0.5 {z}"/><geometry><box size="0.07 0.09 0.014"/></geometry></collision>'
@@ -60,7 +60,7 @@ def test_every_proposal_has_the_clearance_that_plans_must_keep() -> None:
             fitting.place(state)
             grip = proposal.attachment
             tool = item.link_placement(grip.link, state) * grip.tool(np.zeros(len(grip.freedoms)))
-            assert fitting.blocked(tool, grip.link) is None, (name, grip.name)
+            assert fitting.find_obstruction(tool, grip.link) is None, (name, grip.name)
 
 
 def test_a_door_in_the_way_is_opened_first() -> None:
@@ -213,12 +213,12 @@ def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_pat
     assert best.attachment.opening == pytest.approx(0.03)  # 5 mm on both sides
     assert best.description()["opening"] == 0.03
     assert "20 mm thick, fingers 30 mm apart" in found.report()
-    fitting = Fitting(item, hand_of(robot.opened(best.attachment.opening)), 0.02, 0.005)
+    fitting = Fitting(item, make_hand(robot.opened(best.attachment.opening)), 0.02, 0.005)
     tool = item.link_placement("front", [0.0]) * best.attachment.tool(
         np.zeros(len(best.attachment.freedoms))
     )
-    assert fitting.blocked(tool, "front") is None
-    assert Fitting(item, found.hand, 0.02, 0.005).blocked(tool, "front") is not None
+    assert fitting.find_obstruction(tool, "front") is None
+    assert Fitting(item, found.hand, 0.02, 0.005).find_obstruction(tool, "front") is not None
     still = dataclasses.replace(robot, gripper=None)
     assert best.kind not in {one.kind for one in vkc.propose_attachments(item, still).found}
 

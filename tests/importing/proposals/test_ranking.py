@@ -11,7 +11,12 @@ from helpers.furniture import BAR, flap
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.candidates import Candidate
-from vkc_pin.importing.proposals.ranking import Opening, names_of_pieces, openings, worth
+from vkc_pin.importing.proposals.ranking import (
+    Opening,
+    find_named_handles,
+    find_openings,
+    score_grasp,
+)
 from vkc_pin.importing.proposals.sections import Piece
 
 FRONT = np.column_stack(
@@ -23,8 +28,8 @@ def opening_of(name_or_path: str | Path) -> Opening:
     item = vkc.load_object(name_or_path)
     pieces: dict[int, list[Piece]] = {}
     for shape in item.collision.geometryObjects:
-        pieces.setdefault(shape.parentJoint, []).append(Piece.of(shape))
-    return openings(item, pieces)[1]
+        pieces.setdefault(shape.parentJoint, []).append(Piece.from_shape(shape))
+    return find_openings(item, pieces)[1]
 
 
 def test_how_a_hinge_and_a_slide_open(tmp_path: Path) -> None:
@@ -54,7 +59,7 @@ def test_leverage_side_pull_and_name_count(tmp_path: Path) -> None:
     def at(
         *place: float, rotation: np.ndarray = FRONT, named: bool = False, grasp: Candidate = bar
     ) -> float:
-        return worth(grasp, pin.SE3(rotation, np.array(place)), hinge, named=named)
+        return score_grasp(grasp, pin.SE3(rotation, np.array(place)), hinge, named=named)
 
     best = at(-0.08, 0.55, 0.5)
     assert best > at(-0.08, 0.3, 0.5) > at(-0.08, 0.05, 0.5) > 0.0  # leverage
@@ -75,7 +80,7 @@ def test_what_is_called_a_handle() -> None:
     text = """<robot><link name="door"><collision/><collision name="Handle-3"/>
     <collision><geometry><mesh filename="meshes/knob_7.obj"/></geometry></collision></link>
     <link name="lever"><collision/></link></robot>"""
-    assert names_of_pieces(ElementTree.fromstring(text)) == {
+    assert find_named_handles(ElementTree.fromstring(text)) == {
         "door_0": False,
         "door_1": True,
         "door_2": True,

@@ -11,7 +11,9 @@ from vkc_pin.importing.proposals.sections import Piece, Section
 
 
 def piece(geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None) -> Piece:
-    return Piece.of(pin.GeometryObject("link_0", 0, 0, placement or pin.SE3.Identity(), geometry))
+    return Piece.from_shape(
+        pin.GeometryObject("link_0", 0, 0, placement or pin.SE3.Identity(), geometry)
+    )
 
 
 angles = st.floats(-3.0, 3.0)
@@ -39,12 +41,12 @@ def test_a_round_bar_has_the_axes_of_its_frame() -> None:
 def test_the_section_of_a_tilted_box_is_where_and_as_large_as_it_should_be() -> None:
     turn = pin.rpy.rpyToMatrix(0.0, 0.0, 0.7)
     box = piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(turn, np.array([1.0, 0.0, 0.0])))
-    section = box.section(0, float(box.extents[0].mean()))
+    section = box.cut(0, float(box.extents[0].mean()))
     assert section is not None
     assert np.allclose(section.centre, [1.0, 0.0, 0.0], atol=1e-9)
     widths = sorted(np.ptp(section.polygon, axis=0))
     assert widths == pytest.approx([0.05, 0.2])
-    assert box.section(0, float(box.extents[0, 1]) + 0.01) is None
+    assert box.cut(0, float(box.extents[0, 1]) + 0.01) is None
 
 
 SQUARE = Section(
@@ -55,15 +57,15 @@ SQUARE = Section(
 
 
 def test_fingers_slip_off_corners_and_hold_on_faces() -> None:
-    assert SQUARE.holds(np.array([1.0, 0.0]))
-    assert SQUARE.holds(np.array([np.cos(0.3), np.sin(0.3)]))
-    assert not SQUARE.holds(np.array([1.0, 1.0]) / np.sqrt(2.0))
+    assert SQUARE.is_graspable(np.array([1.0, 0.0]))
+    assert SQUARE.is_graspable(np.array([np.cos(0.3), np.sin(0.3)]))
+    assert not SQUARE.is_graspable(np.array([1.0, 1.0]) / np.sqrt(2.0))
 
 
 def test_what_is_before_a_limit_has_the_area_that_is_left() -> None:
-    left = SQUARE.before(np.array([1.0, 0.0]), -0.005)
+    left = SQUARE.clip(np.array([1.0, 0.0]), -0.005)
     assert left is not None
     assert left.extent(np.array([1.0, 0.0])) == pytest.approx((-0.01, -0.005))
     assert left.extent(np.array([0.0, 1.0])) == pytest.approx((-0.01, 0.01))
-    assert SQUARE.before(np.array([1.0, 0.0]), -0.02) is None
-    assert np.allclose(left.point(np.array([0.001, 0.002])), [0.001, 0.002, 0.0])
+    assert SQUARE.clip(np.array([1.0, 0.0]), -0.02) is None
+    assert np.allclose(left.to_joint_frame(np.array([0.001, 0.002])), [0.001, 0.002, 0.0])

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 from helpers.arm_urdf import write_arms
 
-from vkc_pin.importing.robots.arms import Arm, bodies, find_arms
-from vkc_pin.importing.robots.hands import look_at
+from vkc_pin.importing.robots.arms import Arm, build_body_tree, find_arms
+from vkc_pin.importing.robots.hands import analyze_hand
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.robot_model import build_full_model
 
 
 def found(path: Path) -> tuple[Arm, object]:
     file = read_urdf(path)
-    arm = find_arms(file, bodies(file), {}, {shape.link for shape in file.shapes("collision")})[0]
-    return arm, look_at(file, build_full_model(file), arm)
+    arm = find_arms(
+        file, build_body_tree(file), {}, {shape.link for shape in file.shapes("collision")}
+    )[0]
+    return arm, analyze_hand(file, build_full_model(file), arm)
 
 
 def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.mesh_pieces import own_meshes
+from vkc_pin.importing.robots.mesh_pieces import write_meshes
 from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 
@@ -42,7 +42,7 @@ def file(tmp_path: Path) -> Path:
 
 def test_pieces_stand_where_the_mesh_stood(file: Path, tmp_path: Path) -> None:
     folder = tmp_path / "own"
-    root, pieces, notes = own_meshes(read_urdf(file), folder, most_pieces=4)
+    root, pieces, notes = write_meshes(read_urdf(file), folder, most_pieces=4)
     (folder / "r.urdf").write_bytes(ElementTree.tostring(root))
     shapes = read_urdf(folder / "r.urdf").shapes("collision")
     assert [shape.kind for shape in shapes] == ["box", "mesh", "mesh"]
@@ -62,7 +62,7 @@ def test_pieces_stand_where_the_mesh_stood(file: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_seen_is_copied_with_its_colours(file: Path, tmp_path: Path) -> None:
-    root, _, _ = own_meshes(read_urdf(file), tmp_path / "own", most_pieces=1)
+    root, _, _ = write_meshes(read_urdf(file), tmp_path / "own", most_pieces=1)
     assert {path.name for path in (tmp_path / "own" / "visual").iterdir()} == {
         "seen.obj",
         "paint.mtl",
@@ -74,7 +74,7 @@ def test_what_is_seen_is_copied_with_its_colours(file: Path, tmp_path: Path) -> 
 def test_a_mesh_that_collides_must_be_there(file: Path, tmp_path: Path) -> None:
     (tmp_path / "angle.stl").unlink()
     with pytest.raises(vkc.InputError, match="there is no such mesh"):
-        own_meshes(read_urdf(file), tmp_path / "own", most_pieces=4)
+        write_meshes(read_urdf(file), tmp_path / "own", most_pieces=4)
 
 
 def write_obj(file: Path, size: float, colour: str) -> Path:
@@ -101,7 +101,7 @@ def own(folder: Path, *links: str) -> UrdfFile:
     (folder / "r.urdf").write_text(
         f'<robot name="r"><link name="root"/>{"".join(links)}</robot>', encoding="utf-8"
     )
-    root, _, _ = own_meshes(read_urdf(folder / "r.urdf"), folder / "own", most_pieces=1)
+    root, _, _ = write_meshes(read_urdf(folder / "r.urdf"), folder / "own", most_pieces=1)
     (folder / "own" / "r.urdf").write_bytes(ElementTree.tostring(root))
     return read_urdf(folder / "own" / "r.urdf")
 

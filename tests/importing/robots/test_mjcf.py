@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.mjcf import convert
+from vkc_pin.importing.robots.mjcf import convert_mjcf
 from vkc_pin.world.files.kinematic_tree import check_tree
 from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.models.robot_model import make_configuration
@@ -50,7 +50,7 @@ def file(tmp_path: Path) -> Path:
 
 def test_links_are_where_mujoco_has_the_bodies(file: Path, tmp_path: Path) -> None:
     """Several joints of a body, anchors away from its origin, references: at random positions."""
-    root = convert(file, tmp_path / "meshes").root
+    root = convert_mjcf(file, tmp_path / "meshes").root
     for limit in root.iter("limit"):  # Pinocchio insists on them
         limit.attrib.update(effort="1", velocity="1")
     model = pin.buildModelFromXML(ElementTree.tostring(root, encoding="unicode"))
@@ -69,7 +69,7 @@ def test_links_are_where_mujoco_has_the_bodies(file: Path, tmp_path: Path) -> No
 
 
 def test_limits_shapes_couplings_and_states_are_kept(file: Path, tmp_path: Path) -> None:
-    made = convert(file, tmp_path / "meshes")
+    made = convert_mjcf(file, tmp_path / "meshes")
     joints = {joint.get("name"): joint for joint in made.root.findall("joint")}
 
     def limit(name: str, key: str) -> float:
@@ -111,7 +111,7 @@ def test_what_mujoco_does_not_take_is_named(tmp_path: Path) -> None:
         path = tmp_path / name
         path.write_text(text, encoding="utf-8")
         with pytest.raises(vkc.InputError, match=said) as caught:
-            convert(path, tmp_path)
+            convert_mjcf(path, tmp_path)
         assert caught.value.file == path
 
 
@@ -154,7 +154,7 @@ def test_couplings_become_a_tree(
 ) -> None:
     path = tmp_path / "arm.xml"
     path.write_text(coupled(*equalities))
-    made = convert(path, tmp_path / "meshes")
+    made = convert_mjcf(path, tmp_path / "meshes")
     said = {joint.get("name"): joint.find("mimic") for joint in made.root.findall("joint")}
     assert {
         name: mimic.get("joint") for name, mimic in said.items() if mimic is not None
@@ -168,7 +168,7 @@ def test_a_coupling_the_other_way_round_has_its_inverse(tmp_path: Path) -> None:
     path.write_text(coupled(same("j0", "j1"), same("j0", "j2", 'polycoef="0.1 2 0 0 0"')))
     joints = {
         joint.get("name"): joint
-        for joint in convert(path, tmp_path / "meshes").root.findall("joint")
+        for joint in convert_mjcf(path, tmp_path / "meshes").root.findall("joint")
     }
     mimic = joints["j2"].find("mimic")
     assert mimic is not None
@@ -192,7 +192,7 @@ def test_names_that_look_alike_become_different_links_and_joints(tmp_path: Path)
         '<mujoco><worldbody><body name="base"><geom size="0.2"/>'
         f"{bodies}</body></worldbody></mujoco>"
     )
-    root = convert(path, tmp_path / "meshes").root
+    root = convert_mjcf(path, tmp_path / "meshes").root
     check_tree(path, root)
     radii = {
         link.get("name"): [
@@ -242,7 +242,7 @@ def test_meshes_whose_names_look_alike_keep_their_own_files(tmp_path: Path) -> N
         f"<mujoco><asset>{meshes}</asset><worldbody><body><joint range='-1 1'/>{geoms}"
         "</body></worldbody></mujoco>"
     )
-    root = convert(path, tmp_path / "meshes").root
+    root = convert_mjcf(path, tmp_path / "meshes").root
     files = [
         Path(mesh.get("filename", "")) for mesh in root.findall("link/collision/geometry/mesh")
     ]

@@ -12,8 +12,8 @@ from vkc_pin.importing.robots.rest_configuration import (
     HOME_ROOM,
     Clearances,
     find_home,
-    never_apart,
-    standing,
+    find_inseparable_pairs,
+    measure_floor_heights,
 )
 
 
@@ -60,23 +60,23 @@ def test_home_is_searched_for_where_none_is_named(robot: vkc.Robot) -> None:
 
 def test_pairs_that_stay_close_are_found(tmp_path: Path) -> None:
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
-    near = never_apart(
+    near = find_inseparable_pairs(
         robot, 0.035, samples=50
     )  # the first link turns about the vertical, 30 mm above the body
     assert near[("body", "arm_1")] == pytest.approx(0.03)
     assert ("body", "arm_5") not in near
     assert ("arm_1", "arm_2") not in near
-    assert never_apart(robot, 0.025, samples=50) == {}
+    assert find_inseparable_pairs(robot, 0.025, samples=50) == {}
 
 
 def test_pairs_that_are_close_mostly(tmp_path: Path) -> None:
     """The boxes of arm_2 and arm_3 are 40 mm apart where they are in line, and closer by the more they turn."""
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
-    assert ("arm_2", "arm_3") not in never_apart(robot, 0.035, samples=50)
-    assert ("arm_2", "arm_3") in never_apart(robot, 0.035, samples=50, share=0.5)
+    assert ("arm_2", "arm_3") not in find_inseparable_pairs(robot, 0.035, samples=50)
+    assert ("arm_2", "arm_3") in find_inseparable_pairs(robot, 0.035, samples=50, share=0.5)
 
 
 def test_what_stands_and_what_the_arm_can_clear(robot: vkc.Robot) -> None:
-    low, above = standing(robot)
+    low, above = measure_floor_heights(robot)
     assert low == pytest.approx(-HEIGHT)
     assert above == pytest.approx(0.16 + 0.02, abs=0.01)  # its first link turns about the vertical

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.importing.proposals.hand import hand_of
+from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
 from vkc_pin.options import Options
@@ -174,7 +174,7 @@ def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
         seed: Of the configurations that are looked for.
     """
     try:
-        hand_of(robot)
+        make_hand(robot)
     except InputError as error:
         return Pair(None, None, str(error))
     description = description_of(name)

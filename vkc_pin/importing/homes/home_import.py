@@ -14,15 +14,20 @@ import pinocchio as pin
 import yaml
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.homes.objects import ImportedThing, write_thing
+from vkc_pin.importing.homes.objects import ImportedHomeObject, write_object
 from vkc_pin.importing.homes.obstacles import write_obstacles
-from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, split
-from vkc_pin.importing.homes.start_pose import free_start
-from vkc_pin.importing.objects.clean_up import bounds, renamed, rooted, surfaces
+from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, split_home
+from vkc_pin.importing.homes.start_pose import find_free_start
+from vkc_pin.importing.objects.clean_up import (
+    compute_bounds,
+    load_surfaces,
+    move_root,
+    rename_for_scenes,
+)
 from vkc_pin.importing.objects.description import WEIGHTLESS
 from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import Known
-from vkc_pin.importing.targets import check_target, format_comment, made_by
+from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import flag, instance, number, whole
 from vkc_pin.world.files.documents import read_text
@@ -55,7 +60,7 @@ class ImportedHome:
 
     file: Path
     scene: Scene
-    things: tuple[ImportedThing, ...]
+    things: tuple[ImportedHomeObject, ...]
     shapes: Mapping[str, int]
     reached: int
     notes: tuple[str, ...]
@@ -128,11 +133,12 @@ def import_home(
             expected="<robot> or <mujoco>",
             got="<sdf>",
         )
-    description = rooted(
-        renamed(read_description(path, free=True)), pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor]))
+    description = move_root(
+        rename_for_scenes(read_description(path, free=True)),
+        pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor])),
     )
-    low, high = bounds(description, surfaces(description))
-    home = split(description)
+    low, high = compute_bounds(description, load_surfaces(description))
+    home = split_home(description)
     if not home.things:
         expected = (
             "joints that are revolute, continuous, prismatic or floating, with shapes on them"
@@ -149,7 +155,7 @@ def import_home(
         taken = {FLOOR, *names}
         clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
         things = tuple(
-            write_thing(thing, hand, made, known, stem=stem, most=most, **clearances)
+            write_object(thing, hand, made, known, stem=stem, most=most, **clearances)
             for thing, stem in zip(home.things, choose_file_names(names), strict=True)
         )
         obstacles, changed = write_obstacles(home, path, made, taken, known)
@@ -167,7 +173,7 @@ def import_home(
             scene, reached = _started(Scene.from_document(document, made), path, rng)
         document["start"] = {"base": scene.start[:3].tolist()}
         _write(made / "scene.yaml", path, document)
-    weight = (WEIGHTLESS,) if all(thing.description.weightless for thing in home.things) else ()
+    weight = (WEIGHTLESS,) if all(thing.description.is_massless for thing in home.things) else ()
     notes = (
         *home.notes,
         *weight,
@@ -186,9 +192,9 @@ def import_home(
 
 
 def _started(scene: Scene, path: Path, rng: np.random.Generator) -> tuple[Scene, int]:
-    """Return what `free_start` does. Raises its error with the file's name."""
+    """Return what `find_free_start` does. Raises its error with the file's name."""
     try:
-        return free_start(scene, rng)
+        return find_free_start(scene, rng)
     except InputError as error:
         raise InputError(
             error.problem, file=path, field=error.field, expected=error.expected, got=error.got
@@ -212,7 +218,7 @@ def _robot(robot: str | Path) -> str:
 
 
 def _write(file: Path, source: Path, document: Mapping[str, Any]) -> None:
-    head = format_comment(f"Made of {source.name} {made_by(_COMMAND)}.")
+    head = format_comment(f"Made of {source.name} {get_origin_marker(_COMMAND)}.")
     write_atomically(
         file,
         (

@@ -12,22 +12,22 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.homes.splitting import Thing
-from vkc_pin.importing.objects.clean_up import surfaces, tidied, with_limits
+from vkc_pin.importing.objects.clean_up import add_missing_limits, load_surfaces, merge_fixed_links
 from vkc_pin.importing.objects.description import Description, Joint, Link
-from vkc_pin.importing.objects.pieces import Known, with_pieces
+from vkc_pin.importing.objects.pieces import Known, decompose_links
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["ImportedThing", "write_thing"]
+__all__ = ["ImportedHomeObject", "write_object"]
 
 _LIFT = 0.2  # [m]: how far a thing is lifted from where it stands, to try whether a hand holds it
 
 
 @dataclass(frozen=True, eq=False)
-class ImportedThing:
+class ImportedHomeObject:
     """Something in a home that moves.
 
     Attributes:
@@ -62,7 +62,7 @@ class ImportedThing:
         return f"{self.name}: {'; '.join(said)}"
 
 
-def write_thing(
+def write_object(
     thing: Thing,
     robot: Robot,
     folder: Path,
@@ -71,7 +71,7 @@ def write_thing(
     stem: str,
     most: int,
     **clearances: float,
-) -> ImportedThing:
+) -> ImportedHomeObject:
     """Write an object, and return what it is in a scene.
 
     What is carried is taken hold of as what slides upwards from where it stands.
@@ -88,11 +88,11 @@ def write_thing(
     Raises:
         InputError: A mesh is concave, and CoACD is not installed.
     """
-    description = tidied(thing.description)
+    description = merge_fixed_links(thing.description)
     if thing.free:
         description = _standing(description)
-    description = with_limits(description, surfaces(description))
-    description = with_pieces(description, surfaces(description), known)
+    description = add_missing_limits(description, load_surfaces(description))
+    description = decompose_links(description, load_surfaces(description), known)
     address = f"objects/{stem}/{stem}.yaml"
     yaml, urdf = folder / address, (folder / address).with_suffix(".urdf")
     with tempfile.TemporaryDirectory() as scratch:
@@ -115,7 +115,7 @@ def write_thing(
         proposals, object=dataclasses.replace(proposals.object, urdf=None)
     )  # its file does not stay
     entry = {"name": thing.name, "type": address, "position": list(thing.position)}
-    return ImportedThing(thing.name, thing.free, proposals, entry, description.notes)
+    return ImportedHomeObject(thing.name, thing.free, proposals, entry, description.notes)
 
 
 def _standing(description: Description) -> Description:

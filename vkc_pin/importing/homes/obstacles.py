@@ -11,9 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.homes.splitting import Home
-from vkc_pin.importing.objects.clean_up import bounds, choose_name, rooted, surfaces
+from vkc_pin.importing.objects.clean_up import choose_name, compute_bounds, load_surfaces, move_root
 from vkc_pin.importing.objects.description import Colour, Description, Link, Part
-from vkc_pin.importing.objects.pieces import Known, with_pieces
+from vkc_pin.importing.objects.pieces import Known, decompose_links
 from vkc_pin.importing.objects.writing import write_urdf
 from vkc_pin.world.files.resources import choose_file_names
 
@@ -50,10 +50,10 @@ def write_obstacles(
             entries.append(_simple(name, link))
             continue
         description = Description(source, {name: Link(name, link.visual, link.collision)}, {})
-        low, high = bounds(description, surfaces(description))
+        low, high = compute_bounds(description, load_surfaces(description))
         origin = np.array([*((low + high) / 2.0)[:2], 0.0]).round(6)
-        description = rooted(description, pin.SE3(np.eye(3), -origin))
-        description = with_pieces(description, surfaces(description), known)
+        description = move_root(description, pin.SE3(np.eye(3), -origin))
+        description = decompose_links(description, load_surfaces(description), known)
         notes += description.notes
         address = f"obstacles/{stems[name]}/{stems[name]}.urdf"
         write_urdf(description, folder / address)

@@ -9,10 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.objects.clean_up import bounds, closed, only, rooted, surfaces
+from vkc_pin.importing.objects.clean_up import (
+    compute_bounds,
+    extract_subtree,
+    find_closed_positions,
+    load_surfaces,
+    move_root,
+)
 from vkc_pin.importing.objects.description import Description, Joint, Link
 
-__all__ = ["FLOOR_RISE", "Home", "Thing", "split"]
+__all__ = ["FLOOR_RISE", "Home", "Thing", "split_home"]
 
 FLOOR_RISE = 0.02
 """What rises no higher above the floor is part of it [m]: slabs, carpets and thresholds, which wheels roll over."""
@@ -59,7 +65,7 @@ class Home:
     notes: tuple[str, ...]
 
 
-def split(description: Description) -> Home:
+def split_home(description: Description) -> Home:
     """Return what a home consists of.
 
     A link that stands fixed and has joints on it becomes one thing with all that moves on it. On
@@ -71,8 +77,8 @@ def split(description: Description) -> Home:
     """
     description = _unstuck(description)
     joints, notes = description.joints, list(description.notes)
-    places, values = description.placements(), closed(description)
-    now = description.placements(values)
+    places, values = description.compute_placements(), find_closed_positions(description)
+    now = description.compute_placements(values)
     free = [child for child, joint in joints.items() if joint.kind == "floating"]
     fixed = {description.root}
     while (
@@ -86,7 +92,7 @@ def split(description: Description) -> Home:
         fixed |= grown
     building, furniture, floor, things = list[Link](), list[Link](), list[str](), list[Thing]()
     for name in (name for name in description.links if name in fixed):
-        link = description.links[name].placed(places[name])
+        link = description.links[name].transform(places[name])
         moved = [
             child
             for child, joint in joints.items()
@@ -115,7 +121,7 @@ def split(description: Description) -> Home:
         stiff = dict(part.joints)
         for child, joint in part.joints.items():
             if joint.kind in _MOVING:
-                placement = joint.placement * joint.motion(values.get(joint.name, 0.0))
+                placement = joint.placement * joint.compute_motion(values.get(joint.name, 0.0))
                 stiff[child] = dataclasses.replace(
                     joint, kind="fixed", placement=placement, limits=None
                 )
@@ -136,11 +142,11 @@ def _unstuck(description: Description) -> Description:
         if joint.kind not in _MOVING:
             continue
         stuck = joint.limits is not None and joint.limits[0] == joint.limits[1]
-        if stuck or not any(description.links[link].solid for link in description.below(child)):
+        if stuck or not any(description.links[link].solid for link in description.subtree(child)):
             notes.append(
                 f"joint '{joint.name}' {'has one value only' if stuck else 'moves nothing that has a shape'}: fixed"
             )
-            placement = joint.placement * joint.motion(
+            placement = joint.placement * joint.compute_motion(
                 joint.limits[0] if stuck and joint.limits else 0.0
             )
             joints[child] = dataclasses.replace(
@@ -151,16 +157,16 @@ def _unstuck(description: Description) -> Description:
 
 def _carried(description: Description, link: str) -> set[str]:
     """Return a link and what hangs on it, without what moves freely."""
-    found = description.below(link)
+    found = description.subtree(link)
     for child, joint in description.joints.items():
         if child != link and child in found and joint.kind == "floating":
-            found -= description.below(child)
+            found -= description.subtree(child)
     return found
 
 
 def _part(description: Description, root: str, kept: Collection[str]) -> Description:
     """Return some links and the joints between them as a description, whose notes begin anew."""
-    part = only(description, root)
+    part = extract_subtree(description, root)
     links = {name: link for name, link in part.links.items() if name in kept}
     return Description(
         description.file,
@@ -182,11 +188,11 @@ def _on_nothing(description: Description, child: str) -> Description:
 
 def _thing(name: str, description: Description, place: pin.SE3, *, free: bool = False) -> Thing:
     """Return a thing whose root is at a place in the world."""
-    inside = rooted(description, place)
-    low, high = bounds(inside, surfaces(inside), closed(inside))
+    inside = move_root(description, place)
+    low, high = compute_bounds(inside, load_surfaces(inside), find_closed_positions(inside))
     x, y = ((low + high) / 2.0).round(6)[:2].tolist()
     z = float(low[2].round(6)) if free else 0.0
-    return Thing(name, rooted(inside, pin.SE3(np.eye(3), -np.array([x, y, z]))), (x, y, z), free)
+    return Thing(name, move_root(inside, pin.SE3(np.eye(3), -np.array([x, y, z]))), (x, y, z), free)
 
 
 def _length(link: Link) -> float:

@@ -14,7 +14,7 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
-__all__ = ["free_start"]
+__all__ = ["find_free_start"]
 
 _BASE = 1  # the joint of a robot's base
 _CELL = 0.1  # [m]
@@ -24,7 +24,7 @@ _TRIES = 4000  # places
 _CHOICE = 12  # free places of which the clearest is taken
 
 
-def free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
+def find_free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
     """Return the scene with a start that is free, on the floor from which most objects are reached, and how many these are.
 
     All that moves counts as shut. The floor is judged by discs inside the base; the start with all

@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Surfaces",
-    "bounds",
+    "add_missing_limits",
     "choose_name",
-    "closed",
-    "only",
-    "renamed",
-    "rooted",
-    "scaled",
-    "several",
-    "surfaces",
-    "tidied",
-    "upright",
-    "with_limits",
+    "compute_bounds",
+    "extract_subtree",
+    "find_closed_positions",
+    "find_multiple_objects",
+    "load_surfaces",
+    "make_upright",
+    "merge_fixed_links",
+    "move_root",
+    "rename_for_scenes",
+    "scale_object",
 ]
 
 Surfaces = Mapping[int, "trimesh.Trimesh"]
@@ -41,7 +41,7 @@ _PULLED = 0.8  # of the depth of a drawer: how far it slides then
 _UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 
 
-def only(description: Description, link: str) -> Description:
+def extract_subtree(description: Description, link: str) -> Description:
     """Return a link and all that hangs on it as an object of its own.
 
     Raises:
@@ -49,7 +49,7 @@ def only(description: Description, link: str) -> Description:
     """
     if link not in description.links:
         raise UnknownNameError("link", link, description.links, file=description.file, field="link")
-    kept = description.below(link)
+    kept = description.subtree(link)
     links = {name: found for name, found in description.links.items() if name in kept}
     joints = {
         child: joint
@@ -59,7 +59,7 @@ def only(description: Description, link: str) -> Description:
     return dataclasses.replace(description, links=links, joints=joints)
 
 
-def several(description: Description) -> tuple[str, ...]:
+def find_multiple_objects(description: Description) -> tuple[str, ...]:
     """Return a note about a file that holds several things with joints of their own; none if it holds one.
 
     They stand on a root without shapes, as of a whole scene; drawers that slide on one, all of
@@ -68,7 +68,7 @@ def several(description: Description) -> tuple[str, ...]:
     joints, root = description.joints, description.root
     hung = [child for child, joint in joints.items() if joint.parent == root]
     counts = {
-        link: sum(joints[child].kind != "fixed" for child in description.below(link))
+        link: sum(joints[child].kind != "fixed" for child in description.subtree(link))
         for link in hung
     }
     things = {link: count for link, count in counts.items() if count}
@@ -101,7 +101,7 @@ def choose_name(wanted: str, taken: set[str]) -> str:
     return name
 
 
-def renamed(description: Description) -> Description:
+def rename_for_scenes(description: Description) -> Description:
     """Return the object with names of links and joints that scenes and steps accept."""
     links_taken, joints_taken = set[str](), set[str]()
     names = {name: choose_name(name, links_taken) for name in description.links}
@@ -121,7 +121,7 @@ def renamed(description: Description) -> Description:
     return dataclasses.replace(description, links=links, joints=joints)
 
 
-def tidied(description: Description) -> Description:
+def merge_fixed_links(description: Description) -> Description:
     """Return the same object with every link a body that moves: fixed links become part of what they are fixed to.
 
     Links without any shape that nothing with a shape hangs on are left out, and noted. A joint with
@@ -133,7 +133,7 @@ def tidied(description: Description) -> Description:
         list(description.notes),
     )
     for child in list(joints):
-        below = description.below(child)
+        below = description.subtree(child)
         if not any(links[name].solid for name in below if name in links):
             notes.append(
                 f"joint '{joints[child].name}' moves nothing that has a shape: left out with link '{child}'"
@@ -147,7 +147,7 @@ def tidied(description: Description) -> Description:
             and joint.limits is not None
             and joint.limits[0] == joint.limits[1] != 0.0
         ):
-            placement = joint.placement * joint.motion(joint.limits[0])
+            placement = joint.placement * joint.compute_motion(joint.limits[0])
             joints[child] = dataclasses.replace(joint, placement=placement, limits=(0.0, 0.0))
     for child in list(joints):
         joint = joints[child]
@@ -190,7 +190,7 @@ def _moved(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Par
     )
 
 
-def surfaces(description: Description) -> Surfaces:
+def load_surfaces(description: Description) -> Surfaces:
     """Return the surfaces of all shapes, those that are seen and those that collide."""
     parts = [
         part for link in description.links.values() for part in (*link.visual, *link.collision)
@@ -198,7 +198,7 @@ def surfaces(description: Description) -> Surfaces:
     return {id(part): part.mesh() for part in parts}
 
 
-def bounds(
+def compute_bounds(
     description: Description, meshes: Surfaces, values: Mapping[str, float] | None = None
 ) -> tuple[Floats, Floats]:
     """Return the box around what collides, in the root's frame, [m], joints at `values` or at zero.
@@ -206,7 +206,7 @@ def bounds(
     Raises:
         InputError: Nothing has a shape.
     """
-    places = description.placements(values)
+    places = description.compute_placements(values)
     points = [
         np.asarray(meshes[id(part)].vertices) @ places[name].rotation.T + places[name].translation
         for name, link in description.links.items()
@@ -222,7 +222,7 @@ def bounds(
     return joined.min(axis=0), joined.max(axis=0)
 
 
-def closed(description: Description) -> dict[str, float]:
+def find_closed_positions(description: Description) -> dict[str, float]:
     """Return the values at which joints are closed, zero or the limit next to it, [rad] or [m]."""
     return {
         joint.name: min(max(0.0, joint.limits[0]), joint.limits[1])
@@ -231,7 +231,7 @@ def closed(description: Description) -> dict[str, float]:
     }
 
 
-def scaled(description: Description, factor: float) -> Description:
+def scale_object(description: Description, factor: float) -> Description:
     """Return the object made larger by a factor: shapes, places of joints, and how far they slide; masses stay as stated."""
     links = {}
     for name, link in description.links.items():
@@ -260,15 +260,15 @@ def _scaled(part: Part, factor: float) -> Part:
     )
 
 
-def upright(description: Description, up: str) -> Description:
+def make_upright(description: Description, up: str) -> Description:
     """Return the object turned so that its axis `up`, "y" or "z", points upwards."""
-    return rooted(description, pin.SE3(_UP[up], np.zeros(3)))
+    return move_root(description, pin.SE3(_UP[up], np.zeros(3)))
 
 
-def rooted(description: Description, placement: pin.SE3) -> Description:
+def move_root(description: Description, placement: pin.SE3) -> Description:
     """Return the object with its root's frame where the old one is at `placement`."""
     links, root = dict(description.links), description.root
-    links[root] = links[root].placed(placement)
+    links[root] = links[root].transform(placement)
     joints = {
         child: dataclasses.replace(joint, placement=placement * joint.placement)
         if joint.parent == root
@@ -278,14 +278,14 @@ def rooted(description: Description, placement: pin.SE3) -> Description:
     return dataclasses.replace(description, links=links, joints=joints)
 
 
-def with_limits(description: Description, meshes: Surfaces) -> Description:
+def add_missing_limits(description: Description, meshes: Surfaces) -> Description:
     """Return the object with limits for hinges and slides that have none, each noted.
 
     A hinge opens by a right angle, a drawer by most of its depth, in the direction that brings what
     moves away from the middle of the object.
     """
     joints, notes = dict(description.joints), list(description.notes)
-    places, (low, high) = description.placements(), bounds(description, meshes)
+    places, (low, high) = description.compute_placements(), compute_bounds(description, meshes)
     for child, joint in description.joints.items():
         if joint.kind == "revolute" and joint.limits is not None and np.ptp(joint.limits) < _HARDLY:
             degrees = float(np.degrees(np.ptp(joint.limits)))
@@ -293,7 +293,7 @@ def with_limits(description: Description, meshes: Surfaces) -> Description:
             notes.append(f"joint '{joint.name}' turns by {degrees:.1g}° only: {unit}")
         if joint.kind not in ("revolute", "prismatic") or joint.limits is not None:
             continue
-        below = description.below(child)
+        below = description.subtree(child)
         points = np.vstack(
             [
                 np.asarray(meshes[id(part)].vertices) @ places[name].rotation.T

@@ -17,7 +17,7 @@ from vkc_pin.world.files.meshes import load_mesh
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["WEIGHTLESS", "Colour", "Description", "Joint", "Link", "Part", "inertia"]
+__all__ = ["WEIGHTLESS", "Colour", "Description", "Joint", "Link", "Part", "make_inertia"]
 
 Colour = tuple[float, float, float, float]
 WEIGHTLESS = "no mass is stated: torques of the arm leave weight and inertia out, physics assumes a density"  # said once
@@ -85,7 +85,7 @@ class Link:
         """What collides; what it looks like where the file says nothing about that."""
         return self.collision or self.visual
 
-    def placed(self, placement: pin.SE3) -> Link:
+    def transform(self, placement: pin.SE3) -> Link:
         """Return the link as seen from a frame in which its own is at `placement`."""
         visual, collision = (
             tuple(replace(part, placement=placement * part.placement) for part in kind)
@@ -121,7 +121,7 @@ class Joint:
     damping: float = 0.0
     friction: float = 0.0
 
-    def motion(self, value: float) -> pin.SE3:
+    def compute_motion(self, value: float) -> pin.SE3:
         """Return the child's frame at a value, [rad] or [m], in its frame at zero."""
         if self.kind == "prismatic":
             return pin.SE3(np.eye(3), self.axis * value)
@@ -149,22 +149,24 @@ class Description:
         """The link that hangs on no joint."""
         return next(name for name in self.links if name not in self.joints)
 
-    def placements(self, values: Mapping[str, float] | None = None) -> dict[str, pin.SE3]:
+    def compute_placements(self, values: Mapping[str, float] | None = None) -> dict[str, pin.SE3]:
         """Return the frames of the links in the root's frame, at values of joints by their names [rad] or [m]; others at zero."""
         found = {self.root: pin.SE3.Identity()}
         while len(found) < len(self.links):
             for child, joint in self.joints.items():
                 if child not in found and joint.parent in found:
                     value = (values or {}).get(joint.name, 0.0)
-                    found[child] = found[joint.parent] * joint.placement * joint.motion(value)
+                    found[child] = (
+                        found[joint.parent] * joint.placement * joint.compute_motion(value)
+                    )
         return found
 
     @property
-    def weightless(self) -> bool:
+    def is_massless(self) -> bool:
         """Whether no link has a mass."""
         return not any(link.inertia.mass > 0.0 for link in self.links.values())
 
-    def below(self, link: str) -> set[str]:
+    def subtree(self, link: str) -> set[str]:
         """Return a link and all that hang on it."""
         found, before = {link}, 0
         while len(found) > before:
@@ -173,7 +175,7 @@ class Description:
         return found
 
 
-def inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.Inertia:
+def make_inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.Inertia:
     """Return what a link weighs, from what URDF and SDF state.
 
     Args:

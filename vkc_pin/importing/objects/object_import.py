@@ -14,28 +14,28 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, shown
 from vkc_pin.importing.objects.clean_up import (
-    bounds,
-    closed,
-    only,
-    renamed,
-    rooted,
-    scaled,
-    several,
-    surfaces,
-    tidied,
-    upright,
-    with_limits,
+    add_missing_limits,
+    compute_bounds,
+    extract_subtree,
+    find_closed_positions,
+    find_multiple_objects,
+    load_surfaces,
+    make_upright,
+    merge_fixed_links,
+    move_root,
+    rename_for_scenes,
+    scale_object,
 )
 from vkc_pin.importing.objects.description import WEIGHTLESS, Description
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
-from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.pieces import decompose_links
 from vkc_pin.importing.objects.sdf import read_object_sdf
 from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
-from vkc_pin.importing.targets import check_target, made_by
+from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import flag, instance, quantity, whole
 from vkc_pin.utils.arrays import Floats
@@ -180,21 +180,23 @@ def import_object(
     check_target(target, _COMMAND, force=flag(force, "force"))
     description = read_description(path)
     description = (
-        only(description, link)
+        extract_subtree(description, link)
         if link
-        else dataclasses.replace(description, notes=description.notes + several(description))
+        else dataclasses.replace(
+            description, notes=description.notes + find_multiple_objects(description)
+        )
     )
-    description = upright(tidied(renamed(description)), up)
+    description = make_upright(merge_fixed_links(rename_for_scenes(description)), up)
     description, size = _sized(description, height, scale)
-    meshes = surfaces(description)
-    description = _settled(with_limits(description, meshes))
-    if description.weightless:
+    meshes = load_surfaces(description)
+    description = _settled(add_missing_limits(description, meshes))
+    if description.is_massless:
         description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
-    description = with_pieces(description, surfaces(description))
+    description = decompose_links(description, load_surfaces(description))
     with folder_at_once(target, force=True) as made:  # what is there may be replaced
         yaml, urdf, picture = made / f"{name}.yaml", made / f"{name}.urdf", made / "attachments.png"
         write_urdf(description, urdf)
-        about = [f"Made of {path.name} {made_by(_COMMAND)}."]
+        about = [f"Made of {path.name} {get_origin_marker(_COMMAND)}."]
         if link is not None and link != name:
             about.append(f"Name of the link: {link}")
         write_description(yaml, urdf.name, (), about=about)
@@ -228,7 +230,7 @@ def _sized(
     description: Description, height: float | None, scale: float | None
 ) -> tuple[Description, Floats]:
     """Return the object in its size, and that [m]; what is not plausible is noted."""
-    low, high = bounds(description, surfaces(description))
+    low, high = compute_bounds(description, load_surfaces(description))
     if not (high > low).all():
         raise InputError(
             "the object is flat", file=description.file, expected="shapes around a volume"
@@ -238,13 +240,15 @@ def _sized(
     if height is None and not _SMALL <= size[2] <= _LARGE:
         note = f"it is {size[2]:.3g} m high: if it is not, say how high it is (height) or in which unit the file is (scale)"
         description = dataclasses.replace(description, notes=(*description.notes, note))
-    return scaled(description, factor), size
+    return scale_object(description, factor), size
 
 
 def _settled(description: Description) -> Description:
     """Return the object with its root's frame on the floor, below its middle, joints closed."""
-    low, high = bounds(description, surfaces(description), closed(description))
-    return rooted(
+    low, high = compute_bounds(
+        description, load_surfaces(description), find_closed_positions(description)
+    )
+    return move_root(
         description,
         pin.SE3(np.eye(3), -np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])),
     )

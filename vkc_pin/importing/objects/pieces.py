@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.convex import ERROR, concavity, decompose
+from vkc_pin.importing.convex import ERROR, compute_concavity, decompose
 from vkc_pin.importing.objects.clean_up import Surfaces
 from vkc_pin.importing.objects.description import Description, Link, Part
-from vkc_pin.importing.slicing import THICKNESS, flat, thickened
+from vkc_pin.importing.slicing import THICKNESS, is_flat, thicken
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.hulls import compute_hull
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["Known", "with_pieces"]
+__all__ = ["Known", "decompose_links"]
 
 # [m]: how far pieces of what moves may stand out; a finger keeps about as much from a handle
 _FINE = 0.006
@@ -31,7 +31,7 @@ Known = dict[tuple[Path | None, tuple[float, ...], float], "Sequence[trimesh.Tri
 """Pieces of mesh files, in the frame of their mesh, by file, scale and error [m]."""
 
 
-def with_pieces(
+def decompose_links(
     description: Description, meshes: Surfaces, known: Known | None = None
 ) -> Description:
     """Return the object with convex shapes alone to collide with, what is flat or lies inside of others noted.
@@ -57,7 +57,7 @@ def with_pieces(
             if part.kind != "mesh":
                 solids.append(part)
                 continue
-            if flat(mesh.vertices):
+            if is_flat(mesh.vertices):
                 thick.append(part.name or "a mesh")
             found = (
                 _convex(mesh, error)
@@ -98,9 +98,9 @@ def _placed(part: Part, error: float, known: Known) -> Sequence[trimesh.Trimesh]
 
 def _convex(mesh: trimesh.Trimesh, error: float) -> Sequence[trimesh.Trimesh]:
     """Return convex pieces that contain a mesh."""
-    if flat(mesh.vertices):
-        return [compute_hull(thickened(np.asarray(mesh.vertices)))]
-    if concavity(mesh) <= error:  # quicker to tell than all that `decompose` says
+    if is_flat(mesh.vertices):
+        return [compute_hull(thicken(np.asarray(mesh.vertices)))]
+    if compute_concavity(mesh) <= error:  # quicker to tell than all that `decompose` says
         return [compute_hull(mesh.vertices)]
     return decompose(mesh, error=error).meshes
 

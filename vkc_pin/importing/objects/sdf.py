@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_inertia
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import MOMENTS, numbers_of
 from vkc_pin.world.files.xml import line_of, parse_xml
@@ -258,7 +258,7 @@ class _Reader:
                 raise InputError("an <inertial> without both <mass> and <inertia>", field=link)
             (mass,) = self._numbers(stated, "mass", 1, None, link)
             entries = (self._numbers(moments, key, 1, "0", link)[0] for key in MOMENTS)
-            return inertia(mass, entries, frame.inverse() * self._own(stated, link))
+            return make_inertia(mass, entries, frame.inverse() * self._own(stated, link))
         except InputError as error:
             self.notes.append(f"link '{link}': {error}: its <inertial> counts as none")
             return pin.Inertia.Zero()

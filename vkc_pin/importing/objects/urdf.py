@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_inertia
 from vkc_pin.world.files.kinematic_tree import check_tree, inertial_of, numbers_of, origin_of
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import read_xml
@@ -118,7 +118,7 @@ def _inertia(file: Path, link: ElementTree.Element, notes: list[str]) -> pin.Ine
         return pin.Inertia.Zero()
     try:
         mass, moments, origin = inertial_of(file, stated, name)
-        return inertia(mass, moments, _placed(origin))
+        return make_inertia(mass, moments, _placed(origin))
     except InputError as error:
         notes.append(f"link '{name}': {error}: its <inertial> counts as none")
         return pin.Inertia.Zero()

@@ -12,7 +12,7 @@ from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.importing.proposals.sections import Piece, Section
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["Candidate", "Thickness", "candidates"]
+__all__ = ["Candidate", "Thickness", "find_candidates"]
 
 DEEP = 0.06
 """Deeper than this [m], seen along the approach, a piece is no bar that fingers reach around but an edge that they take."""
@@ -59,7 +59,7 @@ class Thickness:
     thinnest: float = np.inf
 
 
-def candidates(
+def find_candidates(
     piece: Piece, hand: Hand, clearance: float, up: Floats, seen: Thickness
 ) -> Iterator[Candidate]:
     """Yield the grasps of a piece that its thickness allows.
@@ -76,7 +76,7 @@ def candidates(
         low, high = piece.extents[axis].tolist()
         for share in _PLACES if high - low > _LONG else _PLACES[:1]:
             at = low + share * (high - low)
-            section = piece.section(axis, at)
+            section = piece.cut(axis, at)
             if section is None:
                 continue
             for turn in np.arange(_TURNS) * 2.0 * np.pi / _TURNS:
@@ -85,7 +85,9 @@ def candidates(
                 if found is None:
                     continue
                 centre, thickness, deep = found
-                placement = pin.SE3(_tool(section.axes, approach, up), section.point(centre))
+                placement = pin.SE3(
+                    _tool(section.axes, approach, up), section.to_joint_frame(centre)
+                )
                 ends = (
                     (low - at, high - at)
                     if (placement.rotation[:, 1] @ piece.axes[axis]) > 0.0
@@ -103,8 +105,8 @@ def _grasp(
     closing = np.array([-approach[1], approach[0]])
     near, far = section.extent(approach)
     deep = far - near > DEEP
-    between = section.before(approach, near + _DEPTH + hand.tip) if deep else section
-    if between is None or not between.holds(closing):
+    between = section.clip(approach, near + _DEPTH + hand.tip) if deep else section
+    if between is None or not between.is_graspable(closing):
         return None
     low, high = between.extent(closing)
     seen.tried += 1

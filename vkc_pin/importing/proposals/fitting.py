@@ -75,7 +75,7 @@ class Fitting:
         """Return the placement of a joint of the object's model in the frame of its base."""
         return self._data.oMi[number]
 
-    def blocked(self, tool: pin.SE3, held: str, *, more: float = 0.0) -> Blocked | None:
+    def find_obstruction(self, tool: pin.SE3, held: str, *, more: float = 0.0) -> Blocked | None:
         """Return why a hand at `tool`, in the frame of the object's base, has no room; None if it has.
 
         Args:

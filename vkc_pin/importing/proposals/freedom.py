@@ -86,7 +86,7 @@ class Grip:
             * self._grasp.placement
             * pin.SE3(pin.exp3(_BAR * turn), _BAR * slide)
         )
-        return self._fitting.blocked(tool * self._offset, self._grasp.piece.link) is None
+        return self._fitting.find_obstruction(tool * self._offset, self._grasp.piece.link) is None
 
     def _all_free(self) -> Bools:
         return np.array([self._free(0.0, angle) for angle in self._angles])

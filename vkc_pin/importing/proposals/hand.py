@@ -13,7 +13,7 @@ from vkc_pin.world.models.grippers.bar_width import BAR_THICKNESS, find_widest_b
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import compute_world_box, list_placed_shapes
 
-__all__ = ["Hand", "hand_of"]
+__all__ = ["Hand", "make_hand"]
 
 Placed = tuple[coal.CollisionGeometry, pin.SE3]
 
@@ -41,7 +41,7 @@ class Hand:
     width: float
 
 
-def hand_of(robot: Robot) -> Hand:
+def make_hand(robot: Robot) -> Hand:
     """Return the hand of a robot, open as the robot's description has it.
 
     Raises:

@@ -10,12 +10,17 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.proposals.candidates import Candidate, Thickness, candidates
+from vkc_pin.importing.proposals.candidates import Candidate, Thickness, find_candidates
 from vkc_pin.importing.proposals.fitting import Blocked, Fitting
 from vkc_pin.importing.proposals.freedom import Grip
-from vkc_pin.importing.proposals.hand import hand_of
+from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.proposals.proposal import Proposal, Proposals
-from vkc_pin.importing.proposals.ranking import Opening, names_of_pieces, openings, worth
+from vkc_pin.importing.proposals.ranking import (
+    Opening,
+    find_named_handles,
+    find_openings,
+    score_grasp,
+)
 from vkc_pin.importing.proposals.sections import Piece
 from vkc_pin.utils.arguments import instance, number, whole
 from vkc_pin.utils.arrays import Floats
@@ -116,17 +121,17 @@ class _Search:
         grasp_clearance: float,
         most: int,
     ) -> None:
-        self.item, self.robot, self.hand, self.most = item, robot, hand_of(robot), most
+        self.item, self.robot, self.hand, self.most = item, robot, make_hand(robot), most
         self.safe, self.close = dist_safe, grasp_clearance
         self.pieces: dict[int, list[Piece]] = {}
         for shape in item.collision.geometryObjects:
-            self.pieces.setdefault(int(shape.parentJoint), []).append(Piece.of(shape))
-        self.openings = openings(item, self.pieces)
+            self.pieces.setdefault(int(shape.parentJoint), []).append(Piece.from_shape(shape))
+        self.openings = find_openings(item, self.pieces)
         self.fitting = Fitting(item, self.hand, dist_safe, grasp_clearance)
         self.narrower: dict[float, Fitting] = {}
         self.closed = self.fitting.state.copy()
         self.tallies: dict[int, _Tally] = {}
-        self._handles = {} if item.urdf is None else names_of_pieces(read_urdf(item.urdf).root)
+        self._handles = {} if item.urdf is None else find_named_handles(read_urdf(item.urdf).root)
 
     def body(self, number: int) -> list[Proposal]:
         """Return the proposals for what joint `number` moves itself, best first.
@@ -162,10 +167,12 @@ class _Search:
         self.fitting.place(state)
         at, opening = self.fitting.joint(number).copy(), self.openings[number]
         ranked = [
-            (worth(grasp, at * grasp.placement, opening, named=named), grasp, named)
+            (score_grasp(grasp, at * grasp.placement, opening, named=named), grasp, named)
             for piece in self.pieces.get(number, ())
             for named in (self._handles.get(piece.name, False),)
-            for grasp in candidates(piece, self.hand, self.close, at.rotation[2], tally.thickness)
+            for grasp in find_candidates(
+                piece, self.hand, self.close, at.rotation[2], tally.thickness
+            )
         ]
         ranked.sort(
             key=lambda entry: -entry[0]
@@ -202,7 +209,7 @@ class _Search:
             return None
         if wide not in self.narrower:
             self.narrower[wide] = Fitting(
-                self.item, hand_of(self.robot.opened(wide)), self.safe, self.close
+                self.item, make_hand(self.robot.opened(wide)), self.safe, self.close
             )
         open_, self.fitting = self.fitting, self.narrower[wide]
         try:
@@ -223,7 +230,7 @@ class _Search:
         reasons = list[Blocked]()
         for standoff in dict.fromkeys((0.0, furthest / 2.0, furthest)):
             tool = at * grasp.placement * _back(standoff)
-            blocked = self.fitting.blocked(tool, link) or self._drawn_back(tool, link)
+            blocked = self.fitting.find_obstruction(tool, link) or self._drawn_back(tool, link)
             if blocked is None:
                 break
             reasons.append(blocked)
@@ -231,7 +238,12 @@ class _Search:
             tally.blocked[reasons[0]] += 1
             return None
         room = next(
-            (room for room in _ROOM if self.fitting.blocked(tool, link, more=room) is None), 0.0
+            (
+                room
+                for room in _ROOM
+                if self.fitting.find_obstruction(tool, link, more=room) is None
+            ),
+            0.0,
         )
         grip, opens = Grip(self.fitting, grasp, standoff), dict[str, float]()
         for joint in self.item.model.supports[opening.number]:
@@ -275,7 +287,7 @@ class _Search:
     def _drawn_back(self, tool: pin.SE3, link: str) -> Blocked | None:
         """Return what is in the way of a hand that draws back straight."""
         for way in np.arange(_STEP, _WAY + _STEP / 2.0, _STEP):
-            if (blocked := self.fitting.blocked(tool * _back(way), link)) is not None:
+            if (blocked := self.fitting.find_obstruction(tool * _back(way), link)) is not None:
                 return blocked
         return None
 

@@ -13,7 +13,7 @@ from vkc_pin.importing.proposals.sections import Piece
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 
-__all__ = ["Opening", "names_of_pieces", "openings", "worth"]
+__all__ = ["Opening", "find_named_handles", "find_openings", "score_grasp"]
 
 _WORDS = ("handle", "knob", "lever", "grip", "pull")
 _KINDS = {"bar": 1.0, "knob": 0.8, "edge": 0.4}
@@ -53,7 +53,7 @@ class Opening:
     reach: float
 
 
-def openings(item: ArticulatedObject, pieces: dict[int, list[Piece]]) -> dict[int, Opening]:
+def find_openings(item: ArticulatedObject, pieces: dict[int, list[Piece]]) -> dict[int, Opening]:
     """Return how the joints of an object open, by their numbers in its model.
 
     Args:
@@ -104,7 +104,7 @@ def openings(item: ArticulatedObject, pieces: dict[int, list[Piece]]) -> dict[in
     return found
 
 
-def worth(grasp: Candidate, tool: pin.SE3, opening: Opening, *, named: bool) -> float:
+def score_grasp(grasp: Candidate, tool: pin.SE3, opening: Opening, *, named: bool) -> float:
     """Return how good a grasp is for opening a joint, from 0 to 1.
 
     A product: of its kind; its name; its leverage; how near to the middle it pulls, where off it
@@ -143,7 +143,7 @@ def worth(grasp: Candidate, tool: pin.SE3, opening: Opening, *, named: bool) -> 
     )
 
 
-def names_of_pieces(root: ElementTree.Element) -> dict[str, bool]:
+def find_named_handles(root: ElementTree.Element) -> dict[str, bool]:
     """Return which collision elements of a URDF are called handles: `<link>_<k>` → whether it, its link or its mesh is."""
     found = {}
     for link in root.findall("link"):

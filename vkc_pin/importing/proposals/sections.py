@@ -43,7 +43,7 @@ class Section:
         along = self.polygon @ direction
         return float(along.min()), float(along.max())
 
-    def before(self, direction: Floats, limit: float) -> Section | None:
+    def clip(self, direction: Floats, limit: float) -> Section | None:
         """Return the part of the cut up to `limit` [m] along a unit direction, shape (2,); None if nothing is left."""
         along, kept = self.polygon @ direction - limit, list[Floats]()
         for k, (here, there) in enumerate(zip(along, np.roll(along, -1), strict=True)):
@@ -56,7 +56,7 @@ class Section:
                 )
         return Section(self.centre, self.axes, np.array(kept)) if len(kept) > 2 else None
 
-    def holds(self, closing: Floats) -> bool:
+    def is_graspable(self, closing: Floats) -> bool:
         """Return whether fingers that close along a unit direction, shape (2,), meet faces that they do not slip off from."""
         edges = np.roll(self.polygon, -1, axis=0) - self.polygon
         lengths = np.linalg.norm(edges, axis=1)
@@ -68,7 +68,7 @@ class Section:
             len(facing) and facing.max() >= np.cos(_SLIP) and facing.min() <= -np.cos(_SLIP)
         )
 
-    def point(self, place: Floats) -> Floats:
+    def to_joint_frame(self, place: Floats) -> Floats:
         """Return a point of the plane, shape (2,), in the frame of the joint, shape (3,) [m]."""
         return np.asarray(self.centre + place @ self.axes)
 
@@ -90,7 +90,7 @@ class Piece:
     faces: NDArray[np.int64]
 
     @classmethod
-    def of(cls, shape: pin.GeometryObject) -> Piece:
+    def from_shape(cls, shape: pin.GeometryObject) -> Piece:
         """Return the piece that a shape of an object is."""
         vertices, faces = triangulate(shape.geometry)
         placed = vertices @ shape.placement.rotation.T + shape.placement.translation
@@ -131,7 +131,7 @@ class Piece:
         )
         return np.unique(pairs, axis=0)
 
-    def section(self, axis: int, at: float) -> Section | None:
+    def cut(self, axis: int, at: float) -> Section | None:
         """Return the cut across `axes[axis]` at `at` [m] along it; None where there is none."""
         normal, plane = self.axes[axis], np.delete(self.axes, axis, axis=0)
         height = self.vertices @ normal - at

@@ -13,7 +13,16 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.urdf import UrdfFile
 
-__all__ = ["Arm", "Body", "base_kind", "bodies", "choose", "find_arms", "own_base", "telescopes"]
+__all__ = [
+    "Arm",
+    "Body",
+    "build_body_tree",
+    "choose_arm",
+    "find_arms",
+    "find_own_base",
+    "find_telescopes",
+    "guess_base_kind",
+]
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _FINGER = 7  # joints in the longest finger of a hand
@@ -58,7 +67,7 @@ class Body:
         return "" if self.joint is None else self.joint.get("name", "")
 
     @property
-    def plans(self) -> bool:
+    def is_planned(self) -> bool:
         """Whether the joint above can be planned: it moves by one coordinate, of its own."""
         return (
             self.joint is not None
@@ -70,13 +79,13 @@ class Body:
         """Return the bodies from below the root to this one."""
         return [] if self.parent is None else [*self.parent.path(), self]
 
-    def below(self) -> list[Body]:
+    def subtree(self) -> list[Body]:
         """Return this body and all that hang on it."""
-        return [self, *(body for child in self.children for body in child.below())]
+        return [self, *(body for child in self.children for body in child.subtree())]
 
     def depth(self) -> int:
         """Return the largest number of joints one after the other below it that can be planned."""
-        return max((child.plans + child.depth() for child in self.children), default=0)
+        return max((child.is_planned + child.depth() for child in self.children), default=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +111,7 @@ class Arm:
     score: float
 
 
-def bodies(file: UrdfFile) -> Body:
+def build_body_tree(file: UrdfFile) -> Body:
     """Return the root of a robot's tree of bodies."""
     below: dict[str, list[ElementTree.Element]] = {}
     children = set()
@@ -123,13 +132,13 @@ def bodies(file: UrdfFile) -> Body:
     return root
 
 
-def own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
+def find_own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
     """Return the joints by which a robot drives in its own file: the first ones below the root, of links without shapes.
 
     They slide, or turn about the vertical, and there are at least two of them.
 
     Args:
-        root: See `bodies`.
+        root: See `build_body_tree`.
         solid: The links that have shapes.
     """
     found, body = [], root
@@ -144,7 +153,7 @@ def own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
     return tuple(found) if len(found) > 1 else ()
 
 
-def base_kind(root: ElementTree.Element) -> tuple[str, str]:
+def guess_base_kind(root: ElementTree.Element) -> tuple[str, str]:
     """Return how a base moves, by its wheels, and what speaks for it."""
     turning = [
         joint.get("name", "").lower()
@@ -177,26 +186,26 @@ def find_arms(
 
     Args:
         file: The robot.
-        root: See `bodies`.
+        root: See `build_body_tree`.
         groups: Groups of an SRDF, which name arms.
         solid: The links that have shapes.
     """
-    base = own_base(root, solid)
-    everything, found = root.below(), []
+    base = find_own_base(root, solid)
+    everything, found = root.subtree(), []
     palms: list[Body] = []
     for body in everything:
         if any(above in palms for above in body.path()[:-1]) or len(_planned(body, base)) < _ARM:
             continue
         if _is_palm(body):
             palms.append(body)
-    inside = {id(below) for palm in palms for below in palm.below()}
+    inside = {id(below) for palm in palms for below in palm.subtree()}
     carrying = {id(above) for palm in palms for above in palm.path()}
     tips = [body for body in everything if not body.children and id(body) not in inside | carrying]
     for body in palms + tips:
         fingers = tuple(
             child
             for child in body.children
-            if any(solid & set(below.links) for below in child.below())
+            if any(solid & set(below.links) for below in child.subtree())
         )
         joints = _planned(body, base)
         own = [*joints[-5:], *body.links[:2]]
@@ -224,7 +233,7 @@ def find_arms(
     ]
 
 
-def choose(
+def choose_arm(
     arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mapping[str, Sequence[str]]
 ) -> Arm:
     """Return the arm of a name, or that a group of this name has the last joints of, or whose name contains it, or the best one.
@@ -259,7 +268,7 @@ def choose(
     return fitting[0]
 
 
-def telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, ...]]:
+def find_telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, ...]]:
     """Return joints of an arm, one right after the other, that slide alike along one direction and equally far.
 
     Nothing but a telescope has a use for them, and one motor moves all its segments.
@@ -306,7 +315,7 @@ def _is_palm(body: Body) -> bool:
     if (
         not body.children
         or body.depth() > _FINGER
-        or not any(below.plans for below in body.below()[1:])
+        or not any(below.is_planned for below in body.subtree()[1:])
     ):
         return False
     if any(_TRUNK_WORDS.search(f"{child.name} {child.links[0]}") for child in body.children):
@@ -324,7 +333,7 @@ def _is_palm(body: Body) -> bool:
 
 
 def _planned(body: Body, base: Collection[str]) -> tuple[str, ...]:
-    return tuple(above.name for above in body.path() if above.plans and above.name not in base)
+    return tuple(above.name for above in body.path() if above.is_planned and above.name not in base)
 
 
 def _named(joints: Sequence[str], palm: Body, groups: Mapping[str, Sequence[str]]) -> str:

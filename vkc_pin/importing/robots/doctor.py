@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.convex import concavity
-from vkc_pin.importing.proposals.hand import hand_of
-from vkc_pin.importing.robots.envelopes import envelopes
-from vkc_pin.importing.robots.rest_configuration import Clearances, never_apart
+from vkc_pin.importing.convex import compute_concavity
+from vkc_pin.importing.proposals.hand import make_hand
+from vkc_pin.importing.robots.envelopes import find_envelopes
+from vkc_pin.importing.robots.rest_configuration import Clearances, find_inseparable_pairs
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import number, whole
 from vkc_pin.world.files.meshes import load_mesh
@@ -166,7 +166,9 @@ def _pairs(robot: Robot, margin: float, samples: int, seed: int) -> list[Finding
             f"{one} and {other} were never more than {1e3 * furthest:.1f} mm apart",
             hint,
         )
-        for (one, other), furthest in never_apart(robot, margin, samples=samples, seed=seed).items()
+        for (one, other), furthest in find_inseparable_pairs(
+            robot, margin, samples=samples, seed=seed
+        ).items()
     ]
     pairs = [
         (robot.link_of(pair.first), robot.link_of(pair.second))
@@ -237,14 +239,14 @@ def _mass(link: ElementTree.Element) -> float:
 def _hand(robot: Robot) -> list[Finding]:
     found = []
     try:
-        hand_of(robot)
+        make_hand(robot)
     except InputError as error:
         if robot.touch_links:
             hint = f"attachments are proposed for {error.expected}, see docs/robots.md"
             found.append(
                 Finding("warning", "hand", f"{error.problem}: it takes hold of nothing", hint)
             )
-    for link, share in envelopes(robot).items():
+    for link, share in find_envelopes(robot).items():
         text = f"{link} is a shape around the hand, {share:.0%} of which is in it: the fingers get at nothing"
         hint = "remove its <collision> from the URDF, as `vkc-pin import-robot` does"
         found.append(Finding("warning", "hand", text, hint))
@@ -286,7 +288,7 @@ def _shapes(robot: Robot) -> list[Finding]:
             seen[shape.file, shape.size] = shape.link
     deep = []
     for (file, size), link in seen.items():
-        stands_out = concavity(load_mesh(file, size))
+        stands_out = compute_concavity(load_mesh(file, size))
         if stands_out > _CONCAVE:
             deep.append((stands_out, link, file.name))
     if deep:

@@ -11,14 +11,14 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import triangulate
 
-__all__ = ["envelopes", "leave_out"]
+__all__ = ["find_envelopes", "remove_collision_shapes"]
 
 _FEW = 3  # links that a shape has to be around, at least: palm and two fingers
 _MOST = 0.5  # of the hand that is in it, at least: fingertips may reach out
 _SLACK = 1e-3  # [m] by which a corner may lie beyond it
 
 
-def envelopes(robot: Robot) -> dict[str, float]:
+def find_envelopes(robot: Robot) -> dict[str, float]:
     """Return the links that are nothing but a shape around the hand → how much of the hand is in it, from 0 to 1.
 
     Such are links fixed to the tool frame that are not seen, while others there are, and in whose
@@ -51,7 +51,7 @@ def envelopes(robot: Robot) -> dict[str, float]:
     return dict(sorted(found.items()))
 
 
-def leave_out(root: ElementTree.Element, links: Collection[str]) -> None:
+def remove_collision_shapes(root: ElementTree.Element, links: Collection[str]) -> None:
     """Take what collides of some links out of a URDF."""
     for link in (element for element in root.findall("link") if element.get("name") in links):
         for shape in link.findall("collision"):

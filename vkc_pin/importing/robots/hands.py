@@ -16,7 +16,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.robot_model import compute_rest_positions, make_configuration
 
-__all__ = ["Hand", "look_at"]
+__all__ = ["Hand", "analyze_hand"]
 
 _POINTS = 120  # of a finger
 _TIP = 0.025  # [m] of a finger, from its end, that is its tip
@@ -69,7 +69,7 @@ class Hand:
         }
 
 
-def look_at(file: UrdfFile, full: pin.Model, arm: Arm) -> Hand:
+def analyze_hand(file: UrdfFile, full: pin.Model, arm: Arm) -> Hand:
     """Return how an arm's hand grasps.
 
     Args:
@@ -83,7 +83,9 @@ def look_at(file: UrdfFile, full: pin.Model, arm: Arm) -> Hand:
 class _Looker:
     def __init__(self, file: UrdfFile, full: pin.Model, arm: Arm) -> None:
         self._file, self._full, self._arm, self._data = file, full, arm, full.createData()
-        self._points = _points_of(file, [link for body in arm.palm.below() for link in body.links])
+        self._points = _points_of(
+            file, [link for body in arm.palm.subtree() for link in body.links]
+        )
         self._link = arm.palm.links[0]
         self._palm = full.getFrameId(self._link, pin.FrameType.BODY)
 
@@ -94,13 +96,13 @@ class _Looker:
             finger for finger in self._arm.fingers if reach[finger] > _STUB * max(reach.values())
         ]
         touch = tuple(
-            link for body in self._arm.palm.below() for link in body.links if link in self._points
+            link for body in self._arm.palm.subtree() for link in body.links if link in self._points
         )
         if not fingers or (len(fingers) == 1 and not len(self._of(self._arm.palm, {}, alone=True))):
             return self._flange(touch)
         first, second = self._sides(fingers)
         self._ahead = approach = self._approach(fingers)
-        joints = [body.name for finger in fingers for body in finger.below() if body.plans]
+        joints = [body.name for finger in fingers for body in finger.subtree() if body.is_planned]
         opened, shut, gap, closed = self._opened(first, second, joints)
         a, b = self._tips(first, second, opened, approach)
         closing = b.mean(axis=0) - a.mean(axis=0)
@@ -143,7 +145,7 @@ class _Looker:
         """Return points of a body and all below it in the palm's frame, shape (n, 3) [m], with joints at `positions`."""
         palm = self._place(positions)
         found = [np.zeros((0, 3))]
-        for part in [body] if alone else body.below():
+        for part in [body] if alone else body.subtree():
             for link in part.links:
                 if link in self._points:
                     place = palm.actInv(
@@ -159,7 +161,7 @@ class _Looker:
         thumbs = [
             finger
             for finger in fingers
-            if any("thumb" in link.lower() for body in finger.below() for link in body.links)
+            if any("thumb" in link.lower() for body in finger.subtree() for link in body.links)
         ]
         if thumbs and len(thumbs) < len(fingers):
             return thumbs, [finger for finger in fingers if finger not in thumbs]
@@ -334,7 +336,7 @@ def _points_of(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
 
 def _last(finger: Body, points: Mapping[str, Floats]) -> Body:
     """Return the body at the end of a finger's longest chain that has a shape."""
-    ends = [body for body in finger.below() if any(link in points for link in body.links)]
+    ends = [body for body in finger.subtree() if any(link in points for link in body.links)]
     return max(ends, key=lambda body: len(body.path()))
 
 

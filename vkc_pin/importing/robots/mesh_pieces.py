@@ -16,7 +16,7 @@ from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape
 
-__all__ = ["Piece", "own_meshes"]
+__all__ = ["Piece", "write_meshes"]
 
 _WHOLE = 0.02  # [m] between a hull and its mesh that matters nowhere on a robot,
 _MORE = 0.15  # nor does a hull that fills so much more than its mesh,
@@ -45,7 +45,7 @@ class Piece:
     error: float
 
 
-def own_meshes(
+def write_meshes(
     file: UrdfFile, folder: Path, *, most_pieces: int
 ) -> tuple[ElementTree.Element, list[Piece], list[str]]:
     """Return a URDF whose meshes are in `folder`, what became of those that collide, and notes of what was left out.

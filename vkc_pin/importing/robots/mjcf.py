@@ -20,7 +20,7 @@ from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.xml import replace_forbidden
 
-__all__ = ["Converted", "convert"]
+__all__ = ["Converted", "convert_mjcf"]
 
 _FAR = 20.0  # [m] limits of a joint that slides without any
 
@@ -40,7 +40,7 @@ class Converted:
     notes: list[str] = field(default_factory=list)
 
 
-def convert(file: Path, folder: Path) -> Converted:
+def convert_mjcf(file: Path, folder: Path) -> Converted:
     """Return the largest tree of joints in an MJCF file as a URDF, with its meshes as STL files in `folder`.
 
     Bodies become links, several joints of a body a chain of links. What cannot be said in a URDF is

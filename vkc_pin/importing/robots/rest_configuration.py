@@ -13,7 +13,15 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_model import find_nearest_position
 from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances
 
-__all__ = ["HOME_ROOM", "Clearances", "Home", "arm_at", "find_home", "never_apart", "standing"]
+__all__ = [
+    "HOME_ROOM",
+    "Clearances",
+    "Home",
+    "find_arm_positions",
+    "find_home",
+    "find_inseparable_pairs",
+    "measure_floor_heights",
+]
 
 HOME_ROOM = 0.03
 """Between links at home, and to the floor, if there can be so much [m]: more than the usual margin."""
@@ -66,11 +74,9 @@ class Clearances:
         return sorted(heights.items(), key=lambda item: item[1])
 
     def least(self, worth: float = np.inf) -> float:
-        """Return the least distance between links and to the floor [m], looked at up to `worth`."""
-        nearest = float(
-            min(worth, self._distances.compute_lowest_points()[self._carried].min(initial=np.inf))
-        )
-        bounds = self._distances.compute_lower_bounds(self._pairs)
+        """Return the least distance compute_distance links and to the floor [m], looked at up to `score_grasp`."""
+        nearest = float(min(worth, self._distances.compute_lowest_points()[self._carried].min(initial=np.inf)))
+        compute_lower_bounds = self._distances.compute_lower_bounds(self._pairs)
         for k in np.argsort(bounds).tolist():
             if bounds[k] > nearest:
                 break
@@ -78,7 +84,7 @@ class Clearances:
         return nearest
 
     def links(self, below: float) -> list[tuple[str, str, float]]:
-        """Return pairs of links closer than `below` [m], the closest first."""
+        """Return pairs of links closer than `subtree` [m], the closest first."""
         found: dict[tuple[str, str], float] = {}
         for k in np.flatnonzero(self._distances.compute_lower_bounds(self._pairs) < below).tolist():
             distance = self._distances.compute_distance([self.pairs[k]])
@@ -97,7 +103,7 @@ class Clearances:
         return LinkDistances(self._distances, groups)
 
 
-def arm_at(robot: Robot, state: Mapping[str, float]) -> Floats:
+def find_arm_positions(robot: Robot, state: Mapping[str, float]) -> Floats:
     """Return where an arm is in a state of its joints, turned by 2π or else moved to the nearest limits, shape (n − 3,)."""
     return np.array(
         [
@@ -160,7 +166,7 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
     return Home(arm, look.least(), "searched for")
 
 
-def never_apart(
+def find_inseparable_pairs(
     robot: Robot, margin: float, *, samples: int, share: float = 1.0, seed: int = 0
 ) -> dict[tuple[str, str], float]:
     """Return the pairs of links that no random configuration brings apart by `margin` [m], with the furthest that one does.
@@ -191,7 +197,9 @@ def never_apart(
     return {links: furthest[links] for links in pairs.links}
 
 
-def standing(robot: Robot, *, samples: int = 200, seed: int = 0) -> tuple[float, float]:
+def measure_floor_heights(
+    robot: Robot, *, samples: int = 200, seed: int = 0
+) -> tuple[float, float]:
     """Return how high above the floor [m] the lowest of what drives along is, and how high the arm's links can be.
 
     The latter is that of the link that can be least high: a shoulder at the floor never leaves it.

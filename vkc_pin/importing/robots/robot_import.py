@@ -16,27 +16,27 @@ import yaml
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.robots.arms import (
     Arm,
-    base_kind,
-    bodies,
-    choose,
+    build_body_tree,
+    choose_arm,
     find_arms,
-    own_base,
-    telescopes,
+    find_own_base,
+    find_telescopes,
+    guess_base_kind,
 )
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
-from vkc_pin.importing.robots.envelopes import envelopes, leave_out
-from vkc_pin.importing.robots.hands import Hand, look_at
-from vkc_pin.importing.robots.mesh_pieces import Piece, own_meshes
+from vkc_pin.importing.robots.envelopes import find_envelopes, remove_collision_shapes
+from vkc_pin.importing.robots.hands import Hand, analyze_hand
+from vkc_pin.importing.robots.mesh_pieces import Piece, write_meshes
 from vkc_pin.importing.robots.rest_configuration import (
     HOME_ROOM,
     Home,
-    arm_at,
+    find_arm_positions,
     find_home,
-    never_apart,
-    standing,
+    find_inseparable_pairs,
+    measure_floor_heights,
 )
-from vkc_pin.importing.robots.sources import Source, free_name, read_source
-from vkc_pin.importing.targets import check_target, format_comment, made_by
+from vkc_pin.importing.robots.sources import Source, choose_free_name, read_source
+from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import flag, mapping, text, whole
 from vkc_pin.utils.arrays import Floats
@@ -172,21 +172,21 @@ class _Importer:
             raise UnknownNameError(
                 "frame", tool_frame, names, file=self._file.path, field="tool_frame"
             )
-        tree = bodies(self._file)
-        driving = own_base(tree, solid)
+        tree = build_body_tree(self._file)
+        driving = find_own_base(tree, solid)
         arms = find_arms(self._file, tree, self._source.groups, solid)
         chosen = (
             None
             if tool_frame is not None and not arms
-            else choose(arms, arm, self._file, self._source.groups)
+            else choose_arm(arms, arm, self._file, self._source.groups)
         )
         self._arm(chosen, arms, driving)
-        root, pieces, notes = own_meshes(self._file, self._folder, most_pieces=most_pieces)
+        root, pieces, notes = write_meshes(self._file, self._folder, most_pieces=most_pieces)
         self._findings += [Finding("warning", "shapes", note) for note in notes]
         text = ElementTree.tostring(root, encoding="unicode")
         self._file = UrdfFile(self._folder / self._settings["urdf"], text, root)
         if chosen is not None:
-            self._hand(look_at(self._file, build_full_model(self._file), chosen), tool_frame)
+            self._hand(analyze_hand(self._file, build_full_model(self._file), chosen), tool_frame)
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
         robot = self._on_the_floor(self._without_envelopes(self._loaded()), seed)
@@ -232,11 +232,11 @@ class _Importer:
                 "sure",
                 f"the file has a base of its own, which the planner's replaces: {', '.join(driving)} are locked",
             )
-        kind, why = base_kind(self._file.root)
+        kind, why = guess_base_kind(self._file.root)
         sure = "likely" if kind != "omni" else "guess"
         self._guess(sure, f"base: {kind} ({why})", "scenes and `load_robot` choose it: `base: ...`")
         if chosen is not None:
-            for leader, *others in telescopes(build_full_model(self._file), chosen.joints):
+            for leader, *others in find_telescopes(build_full_model(self._file), chosen.joints):
                 self._settings.setdefault("couplings", {}).update(dict.fromkeys(others, leader))
                 told = (
                     f"{', '.join(others)} slide along with {leader}, as a telescope: one coordinate"
@@ -260,7 +260,7 @@ class _Importer:
         for key, said in hand.settings().items():
             self._settings.setdefault(key, {}).update(said)
         if tool_frame is None:
-            tool = free_name("tool", self._names())
+            tool = choose_free_name("tool", self._names())
             self._add_link(tool, hand.link, hand.tool)
             self._settings["tool_frame"] = tool
             self._guess(
@@ -315,7 +315,7 @@ class _Importer:
             if key != "srdf" or (self._folder / value).is_file()
         }
         ElementTree.indent(self._file.root)
-        source = f"{self._source.file.path.name} ({self._source.kind}) {made_by('import-robot')}"
+        source = f"{self._source.file.path.name} ({self._source.kind}) {get_origin_marker('import-robot')}"
         head = format_comment(f"Made of {source}. Units: m, rad, s.")
         body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
         (self._folder / "robot.yaml").write_text(head + body, encoding="utf-8")
@@ -324,9 +324,9 @@ class _Importer:
 
     def _without_envelopes(self, robot: Robot) -> Robot:
         """Return the robot without shapes that are but around its hand."""
-        if not (found := envelopes(robot)):
+        if not (found := find_envelopes(robot)):
             return robot
-        leave_out(self._file.root, found)
+        remove_collision_shapes(self._file.root, found)
         self._settings["touch_links"] = [
             link for link in self._settings.get("touch_links", ()) if link not in found
         ]
@@ -339,12 +339,12 @@ class _Importer:
 
     def _on_the_floor(self, robot: Robot, seed: int) -> Robot:
         """Return the robot with a root that stands on the floor, so high that its arm can be clear of it."""
-        low, above = standing(robot, seed=seed)
+        low, above = measure_floor_heights(robot, seed=seed)
         lift = -low if abs(low) > _STANDING else 0.0
         raised = max(0.0, HOME_ROOM - above - lift)
         if lift + raised == 0.0:
             return robot
-        floor, root = free_name("floor", self._names()), bodies(self._file).links[0]
+        floor, root = choose_free_name("floor", self._names()), build_body_tree(self._file).links[0]
         self._file.root.insert(0, ElementTree.Element("link", name=floor))
         joint = ElementTree.SubElement(
             self._file.root, "joint", name=f"{floor}_joint", type="fixed"
@@ -371,7 +371,7 @@ class _Importer:
             **sample_allowed_pairs(robot, samples=samples, seed=seed),
         }
         sampled = set_collision_pairs(robot, allowed)
-        for one, other in never_apart(
+        for one, other in find_inseparable_pairs(
             sampled, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed
         ):
             text = f"{one} and {other} are hardly ever {1e3 * _NEIGHBOURS:.0f} mm apart: they are not kept apart"
@@ -384,7 +384,8 @@ class _Importer:
             if set(arm) <= set(state)
         ]
         named = [
-            (f"the state '{name}' of the file", arm_at(robot, state)) for name, state in states
+            (f"the state '{name}' of the file", find_arm_positions(robot, state))
+            for name, state in states
         ]
         home = find_home(apart, [*named, ("joints at 0, or in the middle", robot.home)], seed=seed)
         self._settings["home"] = {

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.robots.mjcf import convert
-from vkc_pin.importing.robots.xacro_files import expand
+from vkc_pin.importing.robots.mjcf import convert_mjcf
+from vkc_pin.importing.robots.xacro_files import expand_xacro
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import check_tree
 from vkc_pin.world.files.srdf import Srdf, read_groups, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import parse_xml
 
-__all__ = ["Source", "free_name", "read_source"]
+__all__ = ["Source", "choose_free_name", "read_source"]
 
 _KEPT = (
     "link",
@@ -69,7 +69,7 @@ def read_source(
     notes: list[str] = []
     states: dict[str, dict[str, float]] = {}
     if root.tag == "mujoco":
-        converted = convert(file, scratch)
+        converted = convert_mjcf(file, scratch)
         kind, notes, states, text = (
             "MJCF",
             converted.notes,
@@ -80,7 +80,7 @@ def read_source(
         expected = "<robot> (URDF or xacro) or <mujoco> (MJCF)"
         raise InputError("not a robot's file", file=file, expected=expected, got=f"<{root.tag}>")
     elif "xmlns:xacro" in root.attrib or file.suffix == ".xacro":
-        kind, text = "xacro", expand(file, packages, arguments)
+        kind, text = "xacro", expand_xacro(file, packages, arguments)
     else:
         kind = "URDF"
     root = parse_xml(text, file)
@@ -108,10 +108,12 @@ def read_source(
     )
 
 
-def free_name(name: str, taken: set[str]) -> str:
+def choose_free_name(name: str, taken: set[str]) -> str:
     """Return a name for a link that is none of those taken, nor is that of its joint, `<name>_joint`."""
     return (
-        name if name not in taken and f"{name}_joint" not in taken else free_name(f"{name}_", taken)
+        name
+        if name not in taken and f"{name}_joint" not in taken
+        else choose_free_name(f"{name}_", taken)
     )
 
 

@@ -12,10 +12,10 @@ from typing import Any
 from vkc_pin.errors import InputError
 from vkc_pin.utils.optional_imports import optional_package
 
-__all__ = ["expand"]
+__all__ = ["expand_xacro"]
 
 
-def expand(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
+def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
     """Return the URDF that a xacro file stands for.
 
     Args:

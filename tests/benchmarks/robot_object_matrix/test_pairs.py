@@ -19,7 +19,7 @@ from vkc_pin.benchmarks.robot_object_matrix.pairs import (
     kind_of,
     pair,
 )
-from vkc_pin.planning.diagnosis.diagnosis import BlockedGoal
+from vkc_pin.planning.diagnosis.diagnosis import Obstruction
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.furniture.catalogue import KINDS
 from vkc_pin.world.files.resources import folder
@@ -112,11 +112,11 @@ def test_what_is_reached_shut_but_not_open_is_not_taken_first(
     looked: list[str] = []
     real = pairs.diagnose_goals
 
-    def diagnose_goals(problem: TrajectoryProblem, seed: int) -> list[BlockedGoal]:
+    def diagnose_goals(problem: TrajectoryProblem, seed: int) -> list[Obstruction]:
         (hold,) = problem.task.holds
         looked.append(hold.attachment)
         return (
-            [BlockedGoal("move it.lid: out of reach", 0.3)]
+            [Obstruction("move it.lid: out of reach", 0.3)]
             if len(looked) == 1
             else real(problem, seed)
         )
@@ -130,7 +130,7 @@ def test_what_is_reached_shut_but_not_open_is_not_taken_first(
         "it is left to planning, after the other"
     )
     monkeypatch.setattr(
-        pairs, "diagnose_goals", lambda *_: [BlockedGoal("move it.lid: out of reach", 0.3)]
+        pairs, "diagnose_goals", lambda *_: [Obstruction("move it.lid: out of reach", 0.3)]
     )
     nowhere = pair(husky, "husky_ur5e", "chest_0")
     assert (nowhere.step, nowhere.because.split("; ")[0]) == (

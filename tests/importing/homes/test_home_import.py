@@ -24,7 +24,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedHome:
     return vkc.import_home(file, folder / "out")
 
 
-def test_every_shape_of_the_file_is_somewhere(home: vkc.ImportedHome, tmp_path: Path) -> None:
+def test_every_shape_of_the_file_is_imported(home: vkc.ImportedHome, tmp_path: Path) -> None:
     _, shapes = home_urdf(tmp_path)
     assert home.shapes["file"] == shapes
     assert home.shapes["floor"] == 2
@@ -42,11 +42,11 @@ def test_every_shape_of_the_file_is_somewhere(home: vkc.ImportedHome, tmp_path: 
         for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True)
         if label == "sofa"
     ]
-    assert len(sofa) == 2, "a concave mesh, whose hull would fill what is above the seat"
+    assert len(sofa) == 2, "a concave mesh, whose hull would fill the space above the seat"
     assert len(scene.obstacles) == home.shapes["obstacles"] + 2  # with the floor
 
 
-def test_everything_stands_where_the_file_has_it(home: vkc.ImportedHome) -> None:
+def test_placements_agree_with_the_file(home: vkc.ImportedHome) -> None:
     scene = home.scene
     assert scene.arena == pytest.approx((-4.8, 4.8, -4.1, 6.1))
     for kind in PLACES:
@@ -85,28 +85,28 @@ def test_everything_stands_where_the_file_has_it(home: vkc.ImportedHome) -> None
     ]
 
 
-def test_the_start_is_free_in_the_room_with_most(home: vkc.ImportedHome) -> None:
+def test_start_is_free_and_reaches_most_objects(home: vkc.ImportedHome) -> None:
     assert home.scene.start_clearance() >= START_CLEARANCE
-    assert home.scene.start[1] < 2.9  # the bedroom has the lump alone, which no hand takes
+    assert home.scene.start[1] < 2.9  # the bedroom has the lump alone, which no hand can grasp
     assert home.reached == 6
     assert home.scene.sample_start(np.random.default_rng(1)).start_clearance() >= START_CLEARANCE
 
 
-def test_what_no_hand_takes_is_said(home: vkc.ImportedHome) -> None:
+def test_report_names_objects_that_no_hand_can_grasp(home: vkc.ImportedHome) -> None:
     report = home.report()
     for text in (
         "67 shapes",
         "part of it: slab, carpet",
         "lump: carried by no hand",
         "refrigerator_hinge by",
-        "4 with joints, 3 to carry",
+        "4 articulated objects, 3 free objects",
     ):
         assert text in report, text
     assert not home.scene.objects["lump"].object.attachments
     assert "lump" not in {getattr(step, "object", None) for step in vkc.goals(home.scene)}
 
 
-def test_its_things_are_opened_and_its_cups_taken(home: vkc.ImportedHome) -> None:
+def test_imported_objects_can_be_opened_and_grasped(home: vkc.ImportedHome) -> None:
     steps = {
         step.object: step
         for step in vkc.goals(home.scene)
@@ -120,7 +120,7 @@ def test_its_things_are_opened_and_its_cups_taken(home: vkc.ImportedHome) -> Non
             assert plan.trajectory.column(f"{name}.{joint}")[-1] == pytest.approx(value, abs=1e-3)
 
 
-def test_a_home_of_mujoco(tmp_path: Path) -> None:
+def test_mjcf_home_is_imported(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(HOME_MJCF)
     done = vkc.import_home(tmp_path / "small.xml", tmp_path / "out")
@@ -139,7 +139,7 @@ def test_a_home_of_mujoco(tmp_path: Path) -> None:
         assert plan.success, plan.report()
 
 
-def test_a_floor_that_is_higher_in_the_file(tmp_path: Path) -> None:
+def test_floor_height_is_respected(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(
         HOME_MJCF.replace("<worldbody>", '<worldbody><body name="storey" pos="0 0 2.8">')
@@ -157,7 +157,7 @@ def test_a_floor_that_is_higher_in_the_file(tmp_path: Path) -> None:
     assert low == pytest.approx(0.0, abs=1e-6)
 
 
-def test_what_is_no_home_and_wrong_arguments(tmp_path: Path) -> None:
+def test_invalid_homes_and_arguments_are_refused(tmp_path: Path) -> None:
     still = tmp_path / "still.urdf"
     still.write_text(
         '<robot name="s"><link name="a"><collision><geometry><box size="1 1 1"/></geometry></collision></link></robot>'
@@ -165,8 +165,8 @@ def test_what_is_no_home_and_wrong_arguments(tmp_path: Path) -> None:
     (tmp_path / "box.sdf").write_text(SDF)
     for file, wrong, word in (
         (tmp_path / "none.urdf", {}, r"none\.urdf"),
-        (still, {}, r"still\.urdf.*nothing in this file can move"),
-        (tmp_path / "box.sdf", {}, "URDF and MJCF alone"),
+        (still, {}, r"still\.urdf.*the home has nothing movable"),
+        (tmp_path / "box.sdf", {}, "URDF and MJCF only"),
         (still, {"floor": float("nan")}, "floor"),
         (still, {"most": 0}, "most"),
         (still, {"robot": "husky_ur5"}, "husky_ur5e"),
@@ -178,14 +178,14 @@ def test_what_is_no_home_and_wrong_arguments(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".import-home-*"))
 
 
-def test_a_folder_is_replaced_only_if_it_was_made_so_and_that_is_wanted(tmp_path: Path) -> None:
+def test_folder_is_replaced_only_with_force(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(HOME_MJCF)
     out = tmp_path / "out"
     out.mkdir()
     (out / "letter.txt").write_text("mine")
     for force in (False, True):
-        with pytest.raises(vkc.InputError, match="something already"):
+        with pytest.raises(vkc.InputError, match="already exists"):
             vkc.import_home(tmp_path / "small.xml", out, force=force)
     assert (out / "letter.txt").read_text() == "mine"
     (out / "letter.txt").unlink()
@@ -245,7 +245,7 @@ def write_halves(file: Path, wardrobe: str, cabinet: str) -> None:
         ("a+b", "a b", ("a_b_2", "a_b")),
     ],
 )
-def test_objects_whose_names_look_alike_stay_what_they_are(
+def test_objects_with_similar_names_stay_distinct(
     wardrobe: str, cabinet: str, files: tuple[str, str], tmp_path: Path
 ) -> None:
     write_halves(tmp_path / "h.urdf", wardrobe, cabinet)
@@ -278,7 +278,7 @@ def test_objects_whose_names_look_alike_stay_what_they_are(
     assert again.scene.document == done.scene.document
 
 
-def test_a_file_name_cannot_add_fields_to_the_scene(tmp_path: Path) -> None:
+def test_file_name_cannot_add_fields_to_the_scene(tmp_path: Path) -> None:
     file = tmp_path / "x\nfloor: false\n#\x01\udcff.urdf"
     write_halves(file, "wardrobe", "cabinet")
     done = vkc.import_home(file, tmp_path / "out")

@@ -7,20 +7,20 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.importing.homes.objects import write_object
-from vkc_pin.importing.homes.splitting import Thing
+from vkc_pin.importing.homes.splitting import HomeObject
 from vkc_pin.importing.objects.description import Description, Link, Part
 
 SETTINGS = {"stem": "can", "most": 2, "dist_safe": 0.02, "grasp_clearance": 0.005}
 
 
-def _can(radius: float) -> Thing:
+def _can(radius: float) -> HomeObject:
     part = Part(
         name="",
         placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.06])),
         kind="cylinder",
         size=(radius, 0.12),
     )
-    return Thing(
+    return HomeObject(
         "can",
         Description(Path("home.urdf"), {"can": Link("can", (part,), (part,))}, {}),
         (1.0, 2.0, 0.7),
@@ -28,7 +28,7 @@ def _can(radius: float) -> Thing:
     )
 
 
-def test_what_is_carried_has_no_joint_and_is_held_above_what_it_stands_on(tmp_path: Path) -> None:
+def test_free_object_has_no_joint(tmp_path: Path) -> None:
     done = write_object(_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
     item = vkc.load_object(tmp_path / "objects" / "can" / "can.yaml")
     assert item.free
@@ -50,7 +50,7 @@ def test_what_is_carried_has_no_joint_and_is_held_above_what_it_stands_on(tmp_pa
     assert done.report().startswith("can: carried by can_")
 
 
-def test_what_is_too_thick_says_so(tmp_path: Path) -> None:
+def test_thick_object_is_reported(tmp_path: Path) -> None:
     done = write_object(_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
     assert not vkc.load_object(tmp_path / "objects" / "can" / "can.yaml").attachments
     assert "carried by no hand: nothing of it fits" in done.report()

@@ -14,22 +14,25 @@ from vkc_pin.importing.objects.description import Link, Part
 from vkc_pin.world.scene.scene import Scene
 
 
-def _part(name: str, kind: str, size: tuple[float, ...], at: pin.SE3, **more: object) -> Part:
+def make_part(name: str, kind: str, size: tuple[float, ...], at: pin.SE3, **more: object) -> Part:
     return Part(name=name, placement=at, kind=kind, size=size, **more)  # type: ignore[arg-type]
 
 
-def test_simple_shapes_stay_what_they_are_and_others_become_urdf(tmp_path: Path) -> None:
+def test_primitive_shapes_stay_and_others_become_urdf(tmp_path: Path) -> None:
     turned = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.1), np.array([1.0, 2.0, 0.7]))
     red = (1.0, 0.0, 0.0, 1.0)
-    seen = _part("looks", "box", (2.0, 0.1, 2.0), turned, colour=red)
+    seen = make_part("looks", "box", (2.0, 0.1, 2.0), turned, colour=red)
     wedge = trimesh.convex.convex_hull([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     building = Link(
         "walls",
         (seen,),
-        (_part("a wall", "box", (2.0, 0.1, 2.0), turned), _part("", "capsule", (0.1, 1.0), turned)),
+        (
+            make_part("a wall", "box", (2.0, 0.1, 2.0), turned),
+            make_part("", "capsule", (0.1, 1.0), turned),
+        ),
     )
-    mesh = Link("wedge", (), (_part("", "mesh", (1.0, 1.0, 1.0), turned, triangles=wedge),))
-    ball = Link("a wall", (), (_part("", "sphere", (0.2,), turned),))
+    mesh = Link("wedge", (), (make_part("", "mesh", (1.0, 1.0, 1.0), turned, triangles=wedge),))
+    ball = Link("a wall", (), (make_part("", "sphere", (0.2,), turned),))
     home = Home((building,), (mesh, ball), (), (), 4, ())
     taken = {"ball", "wedge"}
     entries, notes = write_obstacles(home, tmp_path / "home.urdf", tmp_path, taken, {})
@@ -73,12 +76,13 @@ def test_simple_shapes_stay_what_they_are_and_others_become_urdf(tmp_path: Path)
         ("con", "x" * 300, ("con_", "x" * 64)),
     ],
 )
-def test_links_whose_names_look_alike_keep_their_own_shapes(
+def test_links_with_similar_names_keep_their_own_shapes(
     first: str, second: str, files: tuple[str, str], tmp_path: Path
 ) -> None:
     def pair(name: str, size: tuple[float, float, float], x: float) -> Link:
         boxes = (
-            _part("", "box", size, pin.SE3(np.eye(3), np.array([x, y, 1.0]))) for y in (0.0, 0.1)
+            make_part("", "box", size, pin.SE3(np.eye(3), np.array([x, y, 1.0])))
+            for y in (0.0, 0.1)
         )
         return Link(name, (), tuple(boxes))
 

@@ -41,7 +41,7 @@ def _home(links: list[Link], joints: list[Joint]) -> Description:
     )
 
 
-def test_on_the_building_each_joint_is_a_thing_of_its_own() -> None:
+def test_each_joint_of_the_building_is_an_object() -> None:
     links = [
         Link("world"),
         _box("walls", (8.0, 0.1, 2.5)),
@@ -62,7 +62,7 @@ def test_on_the_building_each_joint_is_a_thing_of_its_own() -> None:
     home = split_home(_home(links, joints))
     assert [link.name for link in home.building] == ["walls"]
     assert not home.furniture
-    found = {thing.name: set(thing.description.links) for thing in home.things}
+    found = {thing.name: set(thing.description.links) for thing in home.objects}
     assert found == {
         "left": {"left", "left_base"},
         "right": {"right", "right_base", "knob"},
@@ -70,7 +70,7 @@ def test_on_the_building_each_joint_is_a_thing_of_its_own() -> None:
     }
 
 
-def test_joints_that_move_nothing_or_nowhere_are_fixed_where_they_are() -> None:
+def test_immovable_joints_are_fixed() -> None:
     links = [_box("room"), _box("stuck"), Link("dead"), _box("leaf")]
     joints = [
         _hung("room", "stuck", "prismatic", (0.4, 0.4)),
@@ -78,14 +78,14 @@ def test_joints_that_move_nothing_or_nowhere_are_fixed_where_they_are() -> None:
         _hung("room", "leaf", "revolute"),
     ]
     home = split_home(_home(links, joints))
-    assert [thing.name for thing in home.things] == ["leaf"]
+    assert [thing.name for thing in home.objects] == ["leaf"]
     assert [link.name for link in home.furniture] == ["stuck"]
     assert home.furniture[0].collision[0].placement.translation == pytest.approx([0.7, 0.0, 0.5])
-    assert any("to_stuck" in note and "one value" in note for note in home.notes)
-    assert any("to_dead" in note and "moves nothing" in note for note in home.notes)
+    assert any("to_stuck" in note and "single value" in note for note in home.notes)
+    assert any("to_dead" in note and "moves no shape" in note for note in home.notes)
 
 
-def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
+def test_free_object_is_rigid_and_separate() -> None:
     links = [
         Link("world"),
         _box("case"),
@@ -102,7 +102,7 @@ def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
         _hung("world", "ghost", "floating", None),
     ]
     home = split_home(_home(links, joints))
-    case, laptop = home.things
+    case, laptop = home.objects
     assert set(case.description.links) == {"case", "drawer"}
     assert case.position[2] == 0.0  # on the floor, above which it hangs
     assert laptop.free
@@ -113,7 +113,7 @@ def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
     assert any("'to_lid'" in note for note in home.notes)
 
 
-def test_what_is_carried_is_as_far_open_as_it_must_be() -> None:
+def test_free_object_joints_are_fixed_within_limits() -> None:
     """A lid that cannot be shut is fixed at its lower limit, not where the file's zero is."""
     links = [Link("world"), _box("laptop"), _box("lid")]
     home = split_home(
@@ -125,7 +125,7 @@ def test_what_is_carried_is_as_far_open_as_it_must_be() -> None:
             ],
         )
     )
-    (laptop,) = home.things
+    (laptop,) = home.objects
     (hinge,) = laptop.description.joints.values()
     assert hinge.kind == "fixed"
     where = laptop.description.compute_placements()
@@ -136,7 +136,7 @@ def test_what_is_carried_is_as_far_open_as_it_must_be() -> None:
     assert lid - base == pytest.approx([0.3 + 0.25, 0.0, 0.0])
 
 
-def test_what_is_flat_on_the_floor_is_part_of_it() -> None:
+def test_flat_shapes_are_part_of_the_floor() -> None:
     links = [
         _box("world", (9.0, 9.0, 0.2), -0.1),
         _box("carpet", (1.0, 1.0, 0.02), 0.01),
@@ -152,7 +152,7 @@ def test_what_is_flat_on_the_floor_is_part_of_it() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_no_shape_is_lost_whatever_the_tree(data: st.DataObject) -> None:
+def test_no_shape_is_lost_for_any_tree(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 12))
     links = [_box("link_0", z=data.draw(st.sampled_from([0.5, -0.1])))]
     joints = []
@@ -175,11 +175,11 @@ def test_no_shape_is_lost_whatever_the_tree(data: st.DataObject) -> None:
     )
     kept += [
         part.name
-        for thing in home.things
+        for thing in home.objects
         for link in thing.description.links.values()
         for part in link.solid
     ]
     assert sorted(kept) == sorted(part.name for link in links for part in link.solid)
     assert home.shapes == len(kept)
-    names = [thing.name for thing in home.things]
+    names = [thing.name for thing in home.objects]
     assert len(set(names)) == len(names)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.importing.homes.home_import import _started
+from vkc_pin.importing.homes.home_import import _find_start
 from vkc_pin.importing.homes.start_pose import find_free_start
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
 
-def _halves(drawer_x: float, **more: object) -> vkc.Scene:
-    """Return a floor of 10 m by 4 m that a wall cuts into a larger and a smaller half, with a drawer in one of them."""
+def make_divided_room(drawer_x: float, **more: object) -> vkc.Scene:
+    """Return a floor of 10 m × 4 m, divided by a wall, with a drawer in one part."""
     return vkc.Scene.from_document(
         {
             "robot": "husky_ur5e",
@@ -33,22 +33,22 @@ def _halves(drawer_x: float, **more: object) -> vkc.Scene:
 
 
 @pytest.mark.parametrize(("drawer_x", "side"), [(3.0, 1.0), (-2.0, -1.0)])
-def test_the_start_is_where_things_are_reached_not_where_most_floor_is(
-    drawer_x: float, side: float
-) -> None:
+def test_start_is_where_objects_are_reachable(drawer_x: float, side: float) -> None:
     for seed in range(3):
-        scene, reached = find_free_start(_halves(drawer_x), np.random.default_rng(seed))
+        scene, reached = find_free_start(make_divided_room(drawer_x), np.random.default_rng(seed))
         assert np.sign(scene.start[0]) == side
         assert reached == 1
         assert scene.start_clearance() >= START_CLEARANCE
 
 
-def test_where_no_robot_fits_that_is_said() -> None:
+def test_missing_start_pose_is_reported() -> None:
     full = [
         {"name": "block", "type": "box", "size": [10.0, 4.0, 2.0], "position": [-1.0, 0.0, 1.0]}
     ]
     with pytest.raises(vkc.InputError, match="floor"):
-        find_free_start(_halves(3.0, obstacles=full), np.random.default_rng(0))
-    with pytest.raises(vkc.InputError, match=r"home\.xml: robot, floor: no place") as caught:
-        _started(_halves(3.0, obstacles=full), Path("home.xml"), np.random.default_rng(0))
+        find_free_start(make_divided_room(3.0, obstacles=full), np.random.default_rng(0))
+    with pytest.raises(vkc.InputError, match=r"home\.xml: robot, floor: no start pose") as caught:
+        _find_start(
+            make_divided_room(3.0, obstacles=full), Path("home.xml"), np.random.default_rng(0)
+        )
     assert caught.value.field == "robot, floor"

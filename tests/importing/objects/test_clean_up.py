@@ -148,7 +148,7 @@ def test_limits_that_are_missing_open_outwards(cabinet: Description) -> None:
         dataclasses.replace(limited, joints={**limited.joints, "link_1": little}),
         load_surfaces(limited),
     ).notes
-    assert any("1.6° only" in note or "2° only" in note for note in noted)
+    assert any("only 1.6°" in note or "only 2°" in note for note in noted)
 
 
 def test_up_root_and_part_of_it(cabinet: Description) -> None:
@@ -179,7 +179,7 @@ def test_a_file_of_several_things_is_told_from_one_with_several_joints(tmp_path:
     def box(name: str, parent: str, kind: str) -> str:
         link = f'<link name="{name}"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>'
         ends = f'<parent link="{parent}"/><child link="{name}"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
-        return f'{link}<joint name="{name}_joint" type="{kind}">{ends}</joint>'
+        return f'{link}<joint name="{name}_read_joint" type="{kind}">{ends}</joint>'
 
     def said(*parts: str) -> tuple[str, ...]:
         (tmp_path / "it.urdf").write_text(

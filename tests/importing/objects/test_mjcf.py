@@ -28,7 +28,7 @@ def test_bodies_joints_and_shapes(tmp_path: Path) -> None:
     assert found.links["door"].collision[1].size == pytest.approx((0.01, 0.3))
     assert [part.name for part in found.links["door"].visual] == ["leaf", "handle", "looks"]
     notes = " ".join(found.notes)
-    assert "'cup' moves freely" in notes
+    assert "'cup' is free" in notes
     assert "'floor'" in notes
 
 

@@ -52,7 +52,7 @@ def test_handles_are_found_named_or_not(cabinet: vkc.ImportedObject) -> None:
     ]
 
 
-def test_the_report_says_what_was_changed(cabinet: vkc.ImportedObject) -> None:
+def test_report_lists_changes(cabinet: vkc.ImportedObject) -> None:
     report = cabinet.report()
     for text in (
         "joint_1' states no limits",
@@ -107,7 +107,7 @@ def test_a_link_alone(tmp_path: Path) -> None:
     assert done.size[2] == pytest.approx(1.0)
 
 
-def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
+def test_invalid_objects_and_arguments_are_refused(tmp_path: Path) -> None:
     (tmp_path / "page.xml").write_text("<html/>")
     with pytest.raises(vkc.InputError, match=r"page\.xml.*<html>"):
         read_description(tmp_path / "page.xml")
@@ -117,8 +117,8 @@ def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
         ({"height": 1.0, "scale": 2.0}, "scale"),
         ({"up": "x"}, "up"),
         ({"link": "link_9"}, "link_2"),
-        ({"folder": tmp_path / "in"}, "something already"),
-        ({"folder": tmp_path / "in", "force": True}, "something already"),
+        ({"folder": tmp_path / "in"}, "already exists"),
+        ({"folder": tmp_path / "in", "force": True}, "already exists"),
         ({"most": 0}, "most"),
     ):
         with pytest.raises(vkc.InputError, match=word):
@@ -126,7 +126,7 @@ def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_nothing_is_left_of_what_fails_halfway(tmp_path: Path) -> None:
+def test_failed_import_leaves_no_files(tmp_path: Path) -> None:
     (tmp_path / "box.sdf").write_text(SDF)
     out = tmp_path / "made" / "box"
     handless = dataclasses.replace(vkc.load_robot("husky_ur5e"), touch_links=())

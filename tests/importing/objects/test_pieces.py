@@ -10,7 +10,7 @@ from helpers.downloads import partnet
 
 from vkc_pin.importing.objects.clean_up import load_surfaces, merge_fixed_links
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.importing.objects.pieces import Known, decompose_links
+from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
 HERE = pin.SE3.Identity()
@@ -75,7 +75,7 @@ def test_boxes_stay_boxes_and_what_is_seen_collides_where_nothing_else_does() ->
         Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.mesh()}
     )
     assert found.links["a"].collision == (box,)
-    assert any("collides as what it looks like" in note for note in found.notes)
+    assert any("visual geometry is used" in note for note in found.notes)
 
 
 def test_a_file_that_is_there_twice_is_cut_once_and_is_where_it_stands(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_a_file_that_is_there_twice_is_cut_once_and_is_where_it_stands(tmp_path:
         Part(name="", placement=at, kind="mesh", size=(1.0, 1.0, 1.0), file=tmp_path / "ring.stl")
         for at in places
     )
-    known: Known = {}
+    known: PieceCache = {}
     found = []
     for part in parts:
         description = Description(tmp_path / "t.urdf", {"ring": Link("ring", (), (part,))}, {})

@@ -37,7 +37,8 @@ def test_limits_the_wrong_way_round_and_unknown_joints_are_noted(tmp_path: Path)
     assert np.allclose(found.joints["b"].axis, [1.0, 0.0, 0.0])
     assert found.joints["c"].kind == "fixed"
     assert [
-        word in " ".join(found.notes) for word in ("wrong way round", "floating", "mimics")
+        word in " ".join(found.notes)
+        for word in ("lower limit above its upper limit", "floating", "mimics")
     ] == [True] * 3
     free = read_object_urdf(tmp_path / "t.urdf", free=True)
     assert free.joints["c"].kind == "floating"
@@ -59,7 +60,7 @@ def test_errors_name_file_and_element(tmp_path: Path) -> None:
         read_object_urdf(file)
 
 
-def test_what_joints_resist_with(tmp_path: Path) -> None:
+def test_joint_resistance_is_read(tmp_path: Path) -> None:
     text = """<robot name="t"><link name="a"/><link name="b"/><link name="c"/>
     <joint name="j" type="continuous"><parent link="a"/><child link="b"/><dynamics damping="0.4" friction="0.2"/></joint>
     <joint name="k" type="continuous"><parent link="b"/><child link="c"/><dynamics damping="-1"/></joint></robot>"""
@@ -68,7 +69,7 @@ def test_what_joints_resist_with(tmp_path: Path) -> None:
     assert [(joint.damping, joint.friction) for joint in found.values()] == [(0.4, 0.2), (0.0, 0.0)]
 
 
-def test_what_links_weigh(tmp_path: Path) -> None:
+def test_inertia_is_read(tmp_path: Path) -> None:
     placed = '<origin xyz="0.1 0.2 0.3" rpy="0 0 1.5707963267948966"/>'
     whole = f'<inertial>{placed}<mass value="2"/><inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0.01"/></inertial>'
     text = f"""<robot name="t"><link name="a">{whole}</link><link name="b"/>
@@ -88,9 +89,11 @@ def test_what_links_weigh(tmp_path: Path) -> None:
         stated.inertia, [[0.2, -0.01, 0.0], [-0.01, 0.1, 0.0], [0.0, 0.0, 0.25]]
     )  # along the link's axes
     assert [found.links[name].inertia.mass for name in "bcdef"] == [0.0] * 5
-    said = [next(note for note in found.notes if f"'{name}'" in note) for name in "cdef"]
+    link_notes = [next(note for note in found.notes if f"'{name}'" in note) for name in "cdef"]
     for note, words in zip(
-        said, ("without <inertia>", "a mass below zero", "moments of inertia", "heavy"), strict=True
+        link_notes,
+        ("without <inertia>", "a negative mass", "moments of inertia", "heavy"),
+        strict=True,
     ):
         assert words in note
         assert "counts as none" in note

@@ -109,7 +109,7 @@ def test_links_whose_names_look_alike_keep_their_own_meshes(
     links = {"case": Link("case"), **{name: Link(name, own, own) for name, own in parts.items()}}
     joints = {
         name: Joint(
-            name=f"{name}_joint",
+            name=f"{name}_format_joint",
             kind="prismatic",
             parent="case",
             child=name,

@@ -9,7 +9,7 @@ import pytest
 from helpers.furniture import BAR, flap
 
 import vkc_pin as vkc
-from vkc_pin.importing.proposals.fitting import Blocked, Fitting
+from vkc_pin.importing.proposals.fitting import HandClearance, Obstruction
 from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.world.models.shapes import compute_clearance
 
@@ -19,30 +19,30 @@ FRONT = np.column_stack(
 
 
 @pytest.fixture
-def fitting(tmp_path: Path) -> Fitting:
-    return Fitting(
+def fitting(tmp_path: Path) -> HandClearance:
+    return HandClearance(
         flap(tmp_path, BAR.format("")), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
     )
 
 
-def test_a_hand_around_a_bar_has_room(fitting: Fitting) -> None:
+def test_a_hand_around_a_bar_has_room(fitting: HandClearance) -> None:
     assert fitting.find_obstruction(pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5])), "flap") is None
 
 
-def test_what_is_in_the_way_is_named(fitting: Fitting) -> None:
+def test_what_is_in_the_way_is_named(fitting: HandClearance) -> None:
     beside = pin.SE3(FRONT, np.array([-0.08, 0.535, 0.5]))
-    assert fitting.find_obstruction(beside, "flap") == Blocked("fingers", "flap")
-    assert fitting.find_obstruction(pin.SE3(FRONT, np.array([0.0, 0.3, 0.5])), "case") == Blocked(
-        "others", "flap"
-    )
+    assert fitting.find_obstruction(beside, "flap") == Obstruction("fingers", "flap")
+    assert fitting.find_obstruction(
+        pin.SE3(FRONT, np.array([0.0, 0.3, 0.5])), "case"
+    ) == Obstruction("others", "flap")
     below = pin.SE3(
         np.column_stack([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
         np.array([-0.3, 0.5, 0.15]),
     )
-    assert fitting.find_obstruction(below, "flap") == Blocked("floor")
+    assert fitting.find_obstruction(below, "flap") == Obstruction("floor")
 
 
-def test_the_object_is_where_its_joints_are(fitting: Fitting) -> None:
+def test_the_object_is_where_its_joints_are(fitting: HandClearance) -> None:
     tool = pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5]))
     fitting.place(np.array([1.2]))
     assert (
@@ -53,7 +53,7 @@ def test_the_object_is_where_its_joints_are(fitting: Fitting) -> None:
     assert fitting.find_obstruction(turned * tool, "flap") is None
 
 
-def test_clearance_is_that_of_coal(fitting: Fitting) -> None:
+def test_clearance_is_that_of_coal(fitting: HandClearance) -> None:
     """A hand at places on a line: blocked if and only if coal finds it closer than the options allow."""
     shapes, hand = fitting.item.collision.geometryObjects, fitting.hand
     data = fitting.item.model.createData()

@@ -8,16 +8,16 @@ from helpers.furniture import BAR, flap
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.candidates import Thickness, find_candidates
-from vkc_pin.importing.proposals.fitting import Fitting
-from vkc_pin.importing.proposals.freedom import Grip
+from vkc_pin.importing.proposals.fitting import HandClearance
+from vkc_pin.importing.proposals.freedom import GraspMotion
 from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.proposals.ranking import Opening, find_openings
 from vkc_pin.importing.proposals.sections import Piece
 
 
-def grip(folder: Path, **what: str) -> tuple[Grip, Opening, Fitting]:
+def grip(folder: Path, **what: str) -> tuple[GraspMotion, Opening, HandClearance]:
     """Return the hand at the middle of the bar, from the front."""
-    fitting = Fitting(
+    fitting = HandClearance(
         flap(folder, BAR.format(""), **what), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
     )
     pieces = {
@@ -38,7 +38,7 @@ def grip(folder: Path, **what: str) -> tuple[Grip, Opening, Fitting]:
         for g in grasps
         if g.placement.rotation[0, 2] > 0.99 and abs(g.placement.translation[2]) < 1e-6
     )
-    return Grip(fitting, front, 0.0), find_openings(fitting.item, pieces)[1], fitting
+    return GraspMotion(fitting, front, 0.0), find_openings(fitting.item, pieces)[1], fitting
 
 
 def test_a_free_bar_can_be_slid_along_and_turned_about(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from helpers.furniture import BAR, flap
 from helpers.grippers import cheeky_drawer, write_gripper
 
 import vkc_pin as vkc
-from vkc_pin.importing.proposals.fitting import Fitting
+from vkc_pin.importing.proposals.fitting import HandClearance
 from vkc_pin.importing.proposals.hand import make_hand
 
 POSTS = "".join(
@@ -52,7 +52,7 @@ def test_every_proposal_has_the_clearance_that_plans_must_keep() -> None:
     for name in ("drawer", "cabinet", "door", "dishwasher"):
         item = vkc.load_object(name)
         found = vkc.propose_attachments(item)
-        fitting = Fitting(item, found.hand, 0.02, 0.005)
+        fitting = HandClearance(item, found.hand, 0.02, 0.005)
         for proposal in found.found:
             state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
             for joint, value in proposal.when.items():
@@ -213,12 +213,12 @@ def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_pat
     assert best.attachment.opening == pytest.approx(0.03)  # 5 mm on both sides
     assert best.description()["opening"] == 0.03
     assert "20 mm thick, fingers 30 mm apart" in found.report()
-    fitting = Fitting(item, make_hand(robot.opened(best.attachment.opening)), 0.02, 0.005)
+    fitting = HandClearance(item, make_hand(robot.opened(best.attachment.opening)), 0.02, 0.005)
     tool = item.link_placement("front", [0.0]) * best.attachment.tool(
         np.zeros(len(best.attachment.freedoms))
     )
     assert fitting.find_obstruction(tool, "front") is None
-    assert Fitting(item, found.hand, 0.02, 0.005).find_obstruction(tool, "front") is not None
+    assert HandClearance(item, found.hand, 0.02, 0.005).find_obstruction(tool, "front") is not None
     still = dataclasses.replace(robot, gripper=None)
     assert best.kind not in {one.kind for one in vkc.propose_attachments(item, still).found}
 

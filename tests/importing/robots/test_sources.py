@@ -22,8 +22,8 @@ def test_what_a_urdf_does_not_have_is_left_out_and_what_is_missing_is_told(tmp_p
     )
     source = read(path, tmp_path)
     assert source.kind == "URDF"
-    assert "left out what a URDF does not have: <gazebo>, <transmission>" in source.notes
-    assert any("name no effort or no velocity: arm_1_joint" in note for note in source.notes)
+    assert "left out elements that a URDF does not have: <gazebo>, <transmission>" in source.notes
+    assert any("state no effort or velocity limit: arm_1_joint" in note for note in source.notes)
     assert source.file.root.find("gazebo") is None
 
 
@@ -41,6 +41,6 @@ def test_an_srdf_of_another_robot_is_named(tmp_path: Path) -> None:
     other = "<robot name='x'><disable_collisions link1='elsewhere' link2='body'/></robot>"
     (tmp_path / "robot.srdf").write_text(other, encoding="utf-8")
     source = read(path, tmp_path)
-    assert any("is of another robot" in note for note in source.notes)
+    assert any("links of another robot" in note for note in source.notes)
     with pytest.raises(vkc.UnknownNameError):
         read_source(path, tmp_path, packages={}, arguments={}, srdf=tmp_path / "robot.srdf")

@@ -1,4 +1,4 @@
-"""Writes what moves in a home as objects of a scene, with proposed attachments."""
+"""Writes the movable parts of a home as objects of a scene, with proposed attachments."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.homes.splitting import Thing
+from vkc_pin.importing.homes.splitting import HomeObject
 from vkc_pin.importing.objects.clean_up import add_missing_limits, load_surfaces, merge_fixed_links
 from vkc_pin.importing.objects.description import Description, Joint, Link
-from vkc_pin.importing.objects.pieces import Known, decompose_links
+from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
@@ -23,20 +23,20 @@ from vkc_pin.world.models.robot import Robot
 
 __all__ = ["ImportedHomeObject", "write_object"]
 
-_LIFT = 0.2  # [m]: how far a thing is lifted from where it stands, to try whether a hand holds it
+_LIFT = 0.2  # [m] by which a free object is lifted to test whether a hand can hold it
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedHomeObject:
-    """Something in a home that moves.
+    """A movable object of a home.
 
     Attributes:
-        name: Its name in the scene.
+        name: Name in the scene.
         free: Whether it can be carried.
-        proposals: How good its attachments are, and which joints have none; those of what is
-            carried are for lifting it.
-        entry: It, as a scene's object.
-        notes: What was changed.
+        proposals: Proposed attachments, and joints that have none; for free objects, those for
+            lifting.
+        entry: The scene's object entry.
+        notes: Changes to the description.
     """
 
     name: str
@@ -46,62 +46,62 @@ class ImportedHomeObject:
     notes: tuple[str, ...]
 
     def report(self) -> str:
-        """Return what can be done with it, as text."""
+        """Return a line about the attachments of the object."""
         best = {
             joint: self.proposals.opening(joint)
             for joint in self.proposals.object.coordinates.names
         }
-        said = []
-        for joint, found in best.items():
+        parts = []
+        for joint, proposals in best.items():
             by = (
-                f"by {found[0].attachment.name}"
-                if found
-                else f"by no hand: {self.proposals.because.get(joint, 'nothing fits')}"
+                f"by {proposals[0].attachment.name}"
+                if proposals
+                else f"by no hand: {self.proposals.because.get(joint, 'no grasp fits')}"
             )
-            said.append(f"carried {by}" if self.free else f"{joint} {by}")
-        return f"{self.name}: {'; '.join(said)}"
+            parts.append(f"carried {by}" if self.free else f"{joint} {by}")
+        return f"{self.name}: {'; '.join(parts)}"
 
 
 def write_object(
-    thing: Thing,
+    item: HomeObject,
     robot: Robot,
     folder: Path,
-    known: Known,
+    known: PieceCache,
     *,
     stem: str,
     most: int,
     **clearances: float,
 ) -> ImportedHomeObject:
-    """Write an object, and return what it is in a scene.
+    """Write an object, and return its entry in the scene.
 
-    What is carried is taken hold of as what slides upwards from where it stands.
+    Attachments of a free object are proposed as if it slid upwards from its place.
 
     Args:
-        thing: The thing.
-        robot: Whose hand the attachments are for.
-        folder: The scene's.
-        known: Pieces of files that were cut before; its own are added.
+        item: The object.
+        robot: Robot whose hand the attachments are for.
+        folder: Folder of the scene.
+        known: Cache of pieces of mesh files; new ones are added.
         stem: Name of the object's folder and files, without extension.
-        most: Attachments for one joint at most.
-        clearances: As of `propose_attachments`.
+        most: Largest number of attachments of one joint.
+        clearances: Clearances as in `propose_attachments`.
 
     Raises:
         InputError: A mesh is concave, and CoACD is not installed.
     """
-    description = merge_fixed_links(thing.description)
-    if thing.free:
-        description = _standing(description)
+    description = merge_fixed_links(item.description)
+    if item.free:
+        description = _add_lift_joint(description)
     description = add_missing_limits(description, load_surfaces(description))
     description = decompose_links(description, load_surfaces(description), known)
     address = f"objects/{stem}/{stem}.yaml"
     yaml, urdf = folder / address, (folder / address).with_suffix(".urdf")
     with tempfile.TemporaryDirectory() as scratch:
-        tried = Path(scratch) / yaml.name if thing.free else yaml
-        write_urdf(description, tried.with_suffix(".urdf"))
-        write_description(tried, urdf.name, (), about=())
-        proposals = propose_attachments(load_object(tried), robot, most=most, **clearances)
-    if thing.free:
-        write_urdf(_lifted(description), urdf)
+        trial = Path(scratch) / yaml.name if item.free else yaml
+        write_urdf(description, trial.with_suffix(".urdf"))
+        write_description(trial, urdf.name, (), about=())
+        proposals = propose_attachments(load_object(trial), robot, most=most, **clearances)
+    if item.free:
+        write_urdf(_remove_lift_joint(description), urdf)
     about = [f"Attachments as proposed for the hand of {proposals.hand.robot}, best first."]
     about += [f"No hand can move {joint}: {reason}." for joint, reason in proposals.because.items()]
     write_description(
@@ -109,17 +109,18 @@ def write_object(
         urdf.name,
         [item.description() for item in proposals.found],
         about=about,
-        free=thing.free,
+        free=item.free,
     )
+    # The trial file is temporary.
     proposals = dataclasses.replace(
         proposals, object=dataclasses.replace(proposals.object, urdf=None)
-    )  # its file does not stay
-    entry = {"name": thing.name, "type": address, "position": list(thing.position)}
-    return ImportedHomeObject(thing.name, thing.free, proposals, entry, description.notes)
+    )
+    entry = {"name": item.name, "type": address, "position": list(item.position)}
+    return ImportedHomeObject(item.name, item.free, proposals, entry, description.notes)
 
 
-def _standing(description: Description) -> Description:
-    """Return a thing that is carried as one that slides upwards."""
+def _add_lift_joint(description: Description) -> Description:
+    """Return a free object as one that slides upwards."""
     child = description.root
     base, up = f"{child}_stand", np.array([0.0, 0.0, 1.0])
     lift = Joint(
@@ -136,7 +137,7 @@ def _standing(description: Description) -> Description:
     )
 
 
-def _lifted(description: Description) -> Description:
-    """Return the thing without what it stands on."""
+def _remove_lift_joint(description: Description) -> Description:
+    """Return the object without its lift joint."""
     ((child, _),) = description.joints.items()
     return dataclasses.replace(description, links={child: description.links[child]}, joints={})

@@ -1,4 +1,4 @@
-"""Finds where a robot can start in a home: in the room from which it gets to most."""
+"""Finds a start pose of a robot in a home, in the room from which it reaches most objects."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
 __all__ = ["find_free_start"]
 
-_BASE = 1  # the joint of a robot's base
-_CELL = 0.1  # [m]
-_BEFORE = 0.9  # [m] from a handle to where a robot stands that takes it, about
-_NEAR = 0.5  # [m] around that which count
-_TRIES = 4000  # places
-_CHOICE = 12  # free places of which the clearest is taken
+_BASE = 1  # joint number of a robot's base
+_CELL = 0.1  # [m] edge of a grid cell
+_STANDOFF = 0.9  # [m] typical distance of a robot's base from a handle that it grasps
+_RADIUS = 0.5  # [m] around this position within which free floor counts as reaching the handle
+_TRIES = 4000  # sampled poses
+_CHOICE = 12  # free poses of which the one with the largest clearance is chosen
 
 
 def find_free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
-    """Return the scene with a start that is free, on the floor from which most objects are reached, and how many these are.
+    """Return the scene with a free start pose, and the number of objects that it reaches.
 
-    All that moves counts as shut. The floor is judged by discs inside the base; the start with all
-    of the robot.
+    The start is on the connected floor from which most objects can be reached. All joints count as
+    closed. The floor is checked with discs inside the base, the start with the whole robot.
 
     Args:
         scene: The scene.
-        rng: Where random numbers come from.
+        rng: Random generator.
 
     Raises:
-        InputError: There is no free place.
+        InputError: There is no free pose.
     """
     from scipy import ndimage
 
@@ -57,16 +57,16 @@ def find_free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]
     regions, count = ndimage.label(free)
     middles = np.stack(np.broadcast_arrays(*cells.centers()), axis=-1)
     reached = np.zeros(count + 1, int)
-    for fronts in _fronts(scene).values():
+    for positions in _find_grasp_positions(scene).values():
         near = np.zeros(cells.shape, bool)
-        for front in fronts:
-            near |= np.linalg.norm(middles - front, axis=-1) < _NEAR
+        for position in positions:
+            near |= np.linalg.norm(middles - position, axis=-1) < _RADIUS
         reached[np.setdiff1d(regions[near], [0])] += 1
     order = sorted(range(1, count + 1), key=lambda k: (-reached[k], -int((regions == k).sum())))
     for region in order:
         places = middles[regions == region]
         draws = (
-            scene.with_start(base=_drawn(places, rng, low, high))
+            scene.with_start(base=_sample_pose(places, rng, low, high))
             for _ in range(_TRIES // len(order) + 1)
         )
         found = list(
@@ -77,15 +77,17 @@ def find_free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]
         )
         if found:
             return max(found, key=lambda entry: entry[1])[0], int(reached[region])
-    problem = f"no place on the floor is {START_CLEARANCE} m from everything for {robot.name}"
-    expected = "a home with room for the robot, its floor at the height `floor`"
+    problem = f"no start pose of {robot.name} has a clearance of {START_CLEARANCE} m"
+    expected = "a home with free floor for the robot, at the height `floor`"
     raise InputError(
         problem, field="robot, floor", expected=expected, got=f"none in {_TRIES} tries"
     )
 
 
-def _drawn(places: Floats, rng: np.random.Generator, low: Floats, high: Floats) -> list[float]:
-    """Return a random place in one of some cells, and a heading."""
+def _sample_pose(
+    places: Floats, rng: np.random.Generator, low: Floats, high: Floats
+) -> list[float]:
+    """Return a random position in one of some cells, and a random heading."""
     place = places[int(rng.integers(len(places)))] + rng.uniform(-0.5, 0.5, 2) * _CELL
     return [
         *np.clip(place, low, high).round(3).tolist(),
@@ -93,14 +95,14 @@ def _drawn(places: Floats, rng: np.random.Generator, low: Floats, high: Floats) 
     ]
 
 
-def _fronts(scene: Scene) -> dict[str, list[Floats]]:
-    """Return before which places a robot stands that takes an object, shape (2,) [m]."""
+def _find_grasp_positions(scene: Scene) -> dict[str, list[Floats]]:
+    """Return the base positions from which a robot grasps each object, shape (2,) [m] each."""
     found: dict[str, list[Floats]] = {}
     for name, placed in scene.objects.items():
         for attachment in placed.object.attachments.values():
             tool = placed.link_placement(attachment.link) * attachment.placement
-            way = tool.rotation[:2, 2]
-            length = float(np.linalg.norm(way))
-            back = -way / length if length > 0.5 else np.zeros(2)
-            found.setdefault(name, []).append(tool.translation[:2] + _BEFORE * back)
+            direction = tool.rotation[:2, 2]
+            length = float(np.linalg.norm(direction))
+            back = -direction / length if length > 0.5 else np.zeros(2)
+            found.setdefault(name, []).append(tool.translation[:2] + _STANDOFF * back)
     return found

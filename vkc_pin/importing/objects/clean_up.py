@@ -1,4 +1,4 @@
-"""Makes what a planner needs of what a file says: joints that move something, between limits, in metres, upright."""
+"""Prepares an imported description for planning: names, fixed links, limits, scale and axes."""
 
 from __future__ import annotations
 
@@ -34,62 +34,62 @@ __all__ = [
 ]
 
 Surfaces = Mapping[int, "trimesh.Trimesh"]
-"""The surfaces of parts in the frame of their link, by `id` of the part."""
-_OPEN = np.pi / 2.0  # [rad]: how far a hinge opens whose limits nobody states
-_HARDLY = 0.05  # [rad]: who meant degrees and wrote radians has hinges that turn by less
-_PULLED = 0.8  # of the depth of a drawer: how far it slides then
+"""Surfaces of parts in the frame of their link, by `id` of the part."""
+_OPEN = np.pi / 2.0  # [rad] opening angle of hinges without limits
+_TINY_RANGE = 0.05  # [rad] hinge ranges below this suggest a wrong unit
+_PULLED = 0.8  # travel of drawers without limits, relative to their depth
 _UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 
 
 def extract_subtree(description: Description, link: str) -> Description:
-    """Return a link and all that hangs on it as an object of its own.
+    """Return a link and its descendants as an object of their own.
 
     Raises:
-        UnknownNameError: There is no such link.
+        UnknownNameError: The link does not exist.
     """
     if link not in description.links:
         raise UnknownNameError("link", link, description.links, file=description.file, field="link")
-    kept = description.subtree(link)
-    links = {name: found for name, found in description.links.items() if name in kept}
+    subtree = description.subtree(link)
+    links = {name: item for name, item in description.links.items() if name in subtree}
     joints = {
         child: joint
         for child, joint in description.joints.items()
-        if child in kept and child != link
+        if child in subtree and child != link
     }
     return dataclasses.replace(description, links=links, joints=joints)
 
 
 def find_multiple_objects(description: Description) -> tuple[str, ...]:
-    """Return a note about a file that holds several things with joints of their own; none if it holds one.
+    """Return a note if a file holds several objects with joints of their own; else nothing.
 
-    They stand on a root without shapes, as of a whole scene; drawers that slide on one, all of
-    them, are one chest of drawers.
+    Several objects hang on a root without shapes, as in a scene file. If all of them are drawers
+    that slide on it, they are one chest of drawers.
     """
     joints, root = description.joints, description.root
-    hung = [child for child, joint in joints.items() if joint.parent == root]
+    children = [child for child, joint in joints.items() if joint.parent == root]
     counts = {
         link: sum(joints[child].kind != "fixed" for child in description.subtree(link))
-        for link in hung
+        for link in children
     }
-    things = {link: count for link, count in counts.items() if count}
+    objects = {link: count for link, count in counts.items() if count}
     if (
-        len(things) < 2
+        len(objects) < 2
         or description.links[root].solid
-        or all(joints[link].kind != "fixed" for link in things)
+        or all(joints[link].kind != "fixed" for link in objects)
     ):
         return ()
     listed = ", ".join(
-        f"'{link}' ({count} joint{'s' * (count != 1)})" for link, count in things.items()
+        f"'{link}' ({count} joint{'s' * (count != 1)})" for link, count in objects.items()
     )
     return (
-        f"several things hang on its root: {listed}; to import one of them, name it (link, --link)",
+        f"the file holds several objects: {listed}; to import only one, name it (link, --link)",
     )
 
 
 def choose_name(wanted: str, taken: set[str]) -> str:
     """Choose a name that scenes accept and that is not in `taken`, and add it to `taken`.
 
-    Characters that cannot be printed, ".", "/" and spaces become "_"; equal results are numbered.
+    Unprintable characters, ".", "/" and spaces become "_"; equal results are numbered.
     """
     plain = re.sub(r"[\s./]+", "_", wanted)
     stem = "".join(letter if letter.isprintable() else "_" for letter in plain).strip("_") or "part"
@@ -122,10 +122,10 @@ def rename_for_scenes(description: Description) -> Description:
 
 
 def merge_fixed_links(description: Description) -> Description:
-    """Return the same object with every link a body that moves: fixed links become part of what they are fixed to.
+    """Return the object with fixed links merged into their parents.
 
-    Links without any shape that nothing with a shape hangs on are left out, and noted. A joint with
-    nowhere to go becomes fixed.
+    Joints that move no shape are left out with their links, and noted. Joints with a single value
+    become fixed.
     """
     links, joints, notes = (
         dict(description.links),
@@ -136,7 +136,7 @@ def merge_fixed_links(description: Description) -> Description:
         below = description.subtree(child)
         if not any(links[name].solid for name in below if name in links):
             notes.append(
-                f"joint '{joints[child].name}' moves nothing that has a shape: left out with link '{child}'"
+                f"joint '{joints[child].name}' moves no shape: left out with link '{child}'"
             )
             for name in below:
                 links.pop(name, None)
@@ -151,25 +151,25 @@ def merge_fixed_links(description: Description) -> Description:
             joints[child] = dataclasses.replace(joint, placement=placement, limits=(0.0, 0.0))
     for child in list(joints):
         joint = joints[child]
-        stuck = joint.kind != "fixed" and joint.limits == (0.0, 0.0)
-        if stuck:
-            notes.append(f"joint '{joint.name}' has one value only: fixed")
-        if joint.kind == "fixed" or stuck:
-            above, gone = links[joint.parent], links.pop(child)
-            moved = (
-                _moved(gone, parts, joint.placement) for parts in (gone.visual, gone.collision)
+        is_single_valued = joint.kind != "fixed" and joint.limits == (0.0, 0.0)
+        if is_single_valued:
+            notes.append(f"joint '{joint.name}' has a single value: fixed")
+        if joint.kind == "fixed" or is_single_valued:
+            parent, removed = links[joint.parent], links.pop(child)
+            transformed = (
+                _transform_parts(removed, parts, joint.placement)
+                for parts in (removed.visual, removed.collision)
             )
-            visual, collision = moved
-            if bool(above.collision) != bool(
-                gone.collision
-            ):  # one of them collides as what it looks like
-                above, collision = (
-                    dataclasses.replace(above, collision=above.solid),
+            visual, collision = transformed
+            # If only one of them has collision shapes, the other collides with its visual ones.
+            if bool(parent.collision) != bool(removed.collision):
+                parent, collision = (
+                    dataclasses.replace(parent, collision=parent.solid),
                     collision or visual,
                 )
-            inertia = above.inertia + joint.placement.act(gone.inertia)
+            inertia = parent.inertia + joint.placement.act(removed.inertia)
             links[joint.parent] = Link(
-                above.name, (*above.visual, *visual), (*above.collision, *collision), inertia
+                parent.name, (*parent.visual, *visual), (*parent.collision, *collision), inertia
             )
             del joints[child]
             for name, other in joints.items():
@@ -181,7 +181,8 @@ def merge_fixed_links(description: Description) -> Description:
     return dataclasses.replace(description, links=links, joints=joints, notes=tuple(notes))
 
 
-def _moved(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Part, ...]:
+def _transform_parts(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Part, ...]:
+    """Return the parts of a link in a frame in which the link is at `placement`."""
     return tuple(
         dataclasses.replace(
             part, name=f"{link.name}_{part.name}".rstrip("_"), placement=placement * part.placement
@@ -191,7 +192,7 @@ def _moved(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Par
 
 
 def load_surfaces(description: Description) -> Surfaces:
-    """Return the surfaces of all shapes, those that are seen and those that collide."""
+    """Return the surfaces of all visual and collision shapes."""
     parts = [
         part for link in description.links.values() for part in (*link.visual, *link.collision)
     ]
@@ -201,29 +202,35 @@ def load_surfaces(description: Description) -> Surfaces:
 def compute_bounds(
     description: Description, meshes: Surfaces, values: Mapping[str, float] | None = None
 ) -> tuple[Floats, Floats]:
-    """Return the box around what collides, in the root's frame, [m], joints at `values` or at zero.
+    """Return the bounding box of the collision geometry in the root's frame [m].
+
+    Args:
+        description: The object.
+        meshes: Its surfaces.
+        values: Joint positions by name; others are at zero.
 
     Raises:
-        InputError: Nothing has a shape.
+        InputError: The object has no shapes.
     """
-    places = description.compute_placements(values)
+    placements = description.compute_placements(values)
     points = [
-        np.asarray(meshes[id(part)].vertices) @ places[name].rotation.T + places[name].translation
+        np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T
+        + placements[name].translation
         for name, link in description.links.items()
         for part in link.solid
     ]
     if not points:
         raise InputError(
-            "nothing in this file has a shape",
+            "the file has no shapes",
             file=description.file,
             expected="<collision> or <visual> elements",
         )
-    joined = np.vstack(points)
-    return joined.min(axis=0), joined.max(axis=0)
+    vertices = np.vstack(points)
+    return vertices.min(axis=0), vertices.max(axis=0)
 
 
 def find_closed_positions(description: Description) -> dict[str, float]:
-    """Return the values at which joints are closed, zero or the limit next to it, [rad] or [m]."""
+    """Return the closed positions of joints, zero or the nearest limit, [rad] or [m]."""
     return {
         joint.name: min(max(0.0, joint.limits[0]), joint.limits[1])
         for joint in description.joints.values()
@@ -232,17 +239,17 @@ def find_closed_positions(description: Description) -> dict[str, float]:
 
 
 def scale_object(description: Description, factor: float) -> Description:
-    """Return the object made larger by a factor: shapes, places of joints, and how far they slide; masses stay as stated."""
+    """Scale an object: shapes, joint placements and prismatic limits; masses stay as stated."""
     links = {}
     for name, link in description.links.items():
-        looks, solid = (
-            tuple(_scaled(part, factor) for part in parts)
+        visual, collision = (
+            tuple(_scale_part(part, factor) for part in parts)
             for parts in (link.visual, link.collision)
         )
         inertia = pin.Inertia(
             link.inertia.mass, factor * link.inertia.lever, factor**2 * link.inertia.inertia
         )
-        links[name] = Link(name, looks, solid, inertia)
+        links[name] = Link(name, visual, collision, inertia)
     joints = {}
     for child, joint in description.joints.items():
         limits = joint.limits
@@ -253,7 +260,7 @@ def scale_object(description: Description, factor: float) -> Description:
     return dataclasses.replace(description, links=links, joints=joints)
 
 
-def _scaled(part: Part, factor: float) -> Part:
+def _scale_part(part: Part, factor: float) -> Part:
     placement = pin.SE3(part.placement.rotation, factor * part.placement.translation)
     return dataclasses.replace(
         part, placement=placement, size=tuple(factor * size for size in part.size)
@@ -261,12 +268,12 @@ def _scaled(part: Part, factor: float) -> Part:
 
 
 def make_upright(description: Description, up: str) -> Description:
-    """Return the object turned so that its axis `up`, "y" or "z", points upwards."""
+    """Return the object rotated such that its axis `up`, "y" or "z", points upwards."""
     return move_root(description, pin.SE3(_UP[up], np.zeros(3)))
 
 
 def move_root(description: Description, placement: pin.SE3) -> Description:
-    """Return the object with its root's frame where the old one is at `placement`."""
+    """Return the object with its root's frame moved such that the old one is at `placement`."""
     links, root = dict(description.links), description.root
     links[root] = links[root].transform(placement)
     joints = {
@@ -279,44 +286,47 @@ def move_root(description: Description, placement: pin.SE3) -> Description:
 
 
 def add_missing_limits(description: Description, meshes: Surfaces) -> Description:
-    """Return the object with limits for hinges and slides that have none, each noted.
+    """Return the object with limits for joints that state none, each noted.
 
-    A hinge opens by a right angle, a drawer by most of its depth, in the direction that brings what
-    moves away from the middle of the object.
+    A hinge opens by a right angle, a drawer by most of its depth, in the direction that moves the
+    part away from the centre of the object.
     """
     joints, notes = dict(description.joints), list(description.notes)
-    places, (low, high) = description.compute_placements(), compute_bounds(description, meshes)
+    placements, (low, high) = description.compute_placements(), compute_bounds(description, meshes)
     for child, joint in description.joints.items():
-        if joint.kind == "revolute" and joint.limits is not None and np.ptp(joint.limits) < _HARDLY:
+        if (
+            joint.kind == "revolute"
+            and joint.limits is not None
+            and np.ptp(joint.limits) < _TINY_RANGE
+        ):
             degrees = float(np.degrees(np.ptp(joint.limits)))
             unit = "are its limits in another unit (MJCF: `angle` of <compiler>)?"
-            notes.append(f"joint '{joint.name}' turns by {degrees:.1g}° only: {unit}")
+            notes.append(f"joint '{joint.name}' has a range of only {degrees:.1g}°: {unit}")
         if joint.kind not in ("revolute", "prismatic") or joint.limits is not None:
             continue
         below = description.subtree(child)
         points = np.vstack(
             [
-                np.asarray(meshes[id(part)].vertices) @ places[name].rotation.T
-                + places[name].translation
+                np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T
+                + placements[name].translation
                 for name in below
                 for part in description.links[name].solid
             ]
         )
         centre, axis = (
             (points.min(axis=0) + points.max(axis=0)) / 2.0,
-            places[child].rotation @ joint.axis,
+            placements[child].rotation @ joint.axis,
         )
-        way = (
+        direction = (
             axis
             if joint.kind == "prismatic"
-            else np.cross(axis, centre - places[child].translation)
+            else np.cross(axis, centre - placements[child].translation)
         )
-        sign = 1.0 if way @ (centre - (low + high) / 2.0) >= 0.0 else -1.0
-        far = _OPEN if joint.kind == "revolute" else _PULLED * float(np.ptp(points @ axis))
-        limits = (0.0, far) if sign > 0.0 else (-far, 0.0)
+        sign = 1.0 if direction @ (centre - (low + high) / 2.0) >= 0.0 else -1.0
+        travel = _OPEN if joint.kind == "revolute" else _PULLED * float(np.ptp(points @ axis))
+        limits = (0.0, travel) if sign > 0.0 else (-travel, 0.0)
         joints[child] = dataclasses.replace(joint, limits=limits)
         unit = "rad" if joint.kind == "revolute" else "m"
-        notes.append(
-            f"joint '{joint.name}' states no limits: {limits[0]:.3g} to {limits[1]:.3g} {unit}, away from the middle"
-        )
+        chosen = f"{limits[0]:.3g} to {limits[1]:.3g} {unit}"
+        notes.append(f"joint '{joint.name}' states no limits: {chosen} assumed, away from centre")
     return dataclasses.replace(description, joints=joints, notes=tuple(notes))

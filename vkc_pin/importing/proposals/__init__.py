@@ -1,1 +1,1 @@
-"""Where a hand can take hold of an object: attachments proposed from the shapes of its links."""
+"""Proposes attachments for the joints of an object."""

@@ -1,4 +1,4 @@
-"""Whether an open hand has room where it takes hold of an object: its shapes against all shapes of the object."""
+"""Checks whether an open hand has clearance at a grasp of an object."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance, get_link_name
 
-__all__ = ["Blocked", "Fitting"]
+__all__ = ["HandClearance", "Obstruction"]
 
 
 @dataclass(frozen=True)
-class Blocked:
-    """Why a hand has no room.
+class Obstruction:
+    """Reason why a hand has no clearance.
 
     Attributes:
-        what: "fingers": the held link is too close to them; "others": another link is; "floor": it
-            would be below what the object stands on.
-        link: The object's link that is in the way.
+        what: "fingers": the grasped link is too close to them; "others": another link is; "floor":
+            the hand would be below the object's support.
+        link: The obstructing link of the object.
     """
 
     what: str
     link: str = ""
 
 
-class Fitting:
-    """An object at some joint values, and what a hand must keep from it.
+class HandClearance:
+    """Clearance between a hand and an object at some joint positions.
 
     Args:
         item: The object.
         hand: The hand.
-        dist_safe: What the hand keeps from the object [m],
-        grasp_clearance: but its touch links from the link that they hold [m].
+        dist_safe: Clearance between hand and object [m].
+        grasp_clearance: Clearance between the touch links and the grasped link [m].
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Fitting:
         self.floor = float(self._low[:, 2].min()) if len(self._shapes) else -np.inf
 
     def place(self, state: Floats) -> None:
-        """Put the object's joints at some values, shape (n,), [rad] or [m]."""
+        """Set the object's joint positions, shape (n,), [rad] or [m]."""
         self.state = np.array(state, float)
         pin.forwardKinematics(self.item.model, self._data, self.item.coordinates.q(self.state))
         self._at = [
@@ -67,43 +67,46 @@ class Fitting:
             for joint, shape in zip(self._joints, self._shapes, strict=True)
         ]
         corners = np.array(
-            [_world_box(box, where) for box, where in zip(self._boxes, self._at, strict=True)]
+            [_transform_box(box, where) for box, where in zip(self._boxes, self._at, strict=True)]
         ).reshape(-1, 2, 3)
         self._low, self._high = corners[:, 0], corners[:, 1]
 
     def joint(self, number: int) -> pin.SE3:
-        """Return the placement of a joint of the object's model in the frame of its base."""
+        """Return the placement of a joint of the object's model in its base frame."""
         return self._data.oMi[number]
 
-    def find_obstruction(self, tool: pin.SE3, held: str, *, more: float = 0.0) -> Blocked | None:
-        """Return why a hand at `tool`, in the frame of the object's base, has no room; None if it has.
+    def find_obstruction(
+        self, tool: pin.SE3, held: str, *, extra_clearance: float = 0.0
+    ) -> Obstruction | None:
+        """Return what obstructs a hand at `tool`, in the object's base frame; None if nothing does.
 
-        Args:
-            tool: Of the tool frame.
-            held: The link that it takes.
-            more: What it must keep beyond the least clearance from other links than this one [m].
+            Args:
+                tool: Placement of the tool frame.
+                held: The grasped link.
+            extra_clearance: Clearance in excess of the required one from other links [m].
         """
-        mine = self.links == held
+        is_held = self.links == held
         for (shape, where), box, touches in zip(
             self._hand, self._hand_boxes, self._touch, strict=True
         ):
             placed = tool * where
-            low, high = _world_box(box, placed)
+            low, high = _transform_box(box, placed)
             if low[2] < self.floor:
-                return Blocked("floor")
-            margins = np.where(mine & touches, self._close, self._safe + more)
+                return Obstruction("floor")
+            margins = np.where(is_held & touches, self._close, self._safe + extra_clearance)
             gaps = np.maximum(self._low - high, low - self._high).max(axis=1)
             for k in np.flatnonzero(gaps < margins).tolist():
                 if (
                     compute_shape_distance(shape, placed, self._shapes[k].geometry, self._at[k])
                     < margins[k]
                 ):
-                    return Blocked(
-                        "fingers" if mine[k] and touches else "others", str(self.links[k])
+                    return Obstruction(
+                        "fingers" if is_held[k] and touches else "others", str(self.links[k])
                     )
         return None
 
 
-def _world_box(box: tuple[Floats, Floats], where: pin.SE3) -> tuple[Floats, Floats]:
+def _transform_box(box: tuple[Floats, Floats], where: pin.SE3) -> tuple[Floats, Floats]:
+    """Return the lower and upper corner of a box, given by centre and half extents, in the world."""
     centre, extent = where.rotation @ box[0] + where.translation, np.abs(where.rotation) @ box[1]
     return centre - extent, centre + extent

@@ -1,4 +1,4 @@
-"""The hand of a robot as grasps see it: its open gripper's shapes in the tool frame, and how much fits between the fingers."""
+"""Describes a robot's open hand in its tool frame."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class Hand:
 
     Attributes:
         robot: The robot's name.
-        touch: Shapes of the links that may touch what is grasped, with their placements in the tool
+        touch: Shapes of the links that may touch a grasped object, with placements in the tool
             frame.
-        others: Those of the other links behind them that move with the tool.
-        opening: How wide a bar between the fingers may be, at the tool's origin along its x axis
+        others: Shapes of other links that move with the tool frame, with placements in it.
+        opening: Width of the widest bar between the fingers, at the tool's origin along its x axis
             [m].
-        tip: How far the fingers reach beyond the tool's origin, along its z axis [m].
-        width: How wide the fingers are, along the tool's y axis [m].
+        tip: Distance by which the fingers extend beyond the tool's origin along its z axis [m].
+        width: Width of the fingers along the tool's y axis [m].
     """
 
     robot: str
@@ -42,14 +42,14 @@ class Hand:
 
 
 def make_hand(robot: Robot) -> Hand:
-    """Return the hand of a robot, open as the robot's description has it.
+    """Return the open hand of a robot.
 
     Raises:
-        InputError: The description names no touch links, or they leave no room around the tool
-            frame's origin.
+        InputError: The robot has no touch links, or there is no room between them at the tool
+            frame.
     """
     if not robot.touch_links:
-        problem = f"the hand of '{robot.name}' is not known"
+        problem = f"the hand of '{robot.name}' is undefined"
         expected = "touch_links in a robot.yaml, such as `vkc-pin import-robot` writes"
         raise InputError(
             problem, file=robot.urdf, field="touch_links", expected=expected, got="none"
@@ -70,23 +70,26 @@ def make_hand(robot: Robot) -> Hand:
             touch.append(placed)
         elif frame.parentJoint in robot.model.supports[shape.parentJoint]:
             others.append(placed)
-    fingers, rest = tuple(list_placed_shapes(touch)), tuple(list_placed_shapes(others))
+    fingers, others_placed = tuple(list_placed_shapes(touch)), tuple(list_placed_shapes(others))
     opening = find_widest_bar(fingers)
     if opening < 2.0 * BAR_THICKNESS:
-        problem = f"there is no room between the fingers of '{robot.name}' at its tool frame '{robot.tool_frame}'"
-        expected = "an open hand around its origin, x the direction of closing"
+        problem = (
+            f"there is no room between the fingers of '{robot.name}' "
+            f"at its tool frame '{robot.tool_frame}'"
+        )
+        expected = "an open hand around its origin, with x as the closing direction"
         raise InputError(problem, file=robot.urdf, field="tool_frame", expected=expected)
-    beside = [
+    beyond = [
         box
         for geometry, where in fingers
         if (box := compute_world_box(geometry, where))[1][2] > 0.0
-    ]  # what reaches past the origin
-    ends = beside or [compute_world_box(geometry, where) for geometry, where in fingers]
+    ]  # shapes that extend beyond the origin
+    ends = beyond or [compute_world_box(geometry, where) for geometry, where in fingers]
     width = max(high[1] for _, high in ends) - min(low[1] for low, _ in ends)
     return Hand(
         robot.name,
         fingers,
-        rest,
+        others_placed,
         opening,
         max(0.0, float(max(high[2] for _, high in ends))),
         float(width),

@@ -1,4 +1,4 @@
-"""A picture of the attachments that are proposed for an object: the hand at each of them."""
+"""Plots the hand at each proposed attachment of an object."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 __all__ = ["plot_attachments"]
 
-_PANELS = 12  # at most
+_PANELS = 12  # largest number of panels
 _COLUMNS = 4
 _WIDTH = 3.2  # [inch] of a panel
-_FACET = 0.05  # [m]: edges of what is drawn, about
-_OPEN = 0.35  # of the way that the joint opens: how it is drawn
+_FACET = 0.05  # [m] approximate edge length of drawn triangles
+_OPEN = 0.35  # opening of the drawn joint, relative to how far it opens
 _LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
-_STILL, _MOVING, _HELD = (
+_STATIC_COLOUR, _MOVING_COLOUR, _HELD_COLOUR = (
     np.array([0.83, 0.83, 0.81]),
     np.array([0.93, 0.80, 0.62]),
     np.array([0.82, 0.29, 0.36]),
@@ -36,23 +36,25 @@ _STILL, _MOVING, _HELD = (
 
 
 def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Figure:
-    """Draw the hand at every proposed attachment, the joint that it opens a third of the way open; and what no hand can open.
+    """Draw the hand at every proposed attachment, and list the joints that no hand can open.
+
+    Each joint is drawn a third of the way open.
 
     Args:
-        proposals: What `propose_attachments` returned.
-        path: A file ending with .png, .svg or .pdf; None writes nothing.
+        proposals: Result of `propose_attachments`.
+        path: Output file (.png, .svg or .pdf); None writes nothing.
 
     Returns:
         The figure.
     """
     instance(proposals, Proposals, "proposals")
-    shown = proposals.found[:_PANELS]
-    panels = max(1, len(shown) + bool(proposals.because))
+    drawn = proposals.found[:_PANELS]
+    panels = max(1, len(drawn) + bool(proposals.because))
     columns = min(panels, _COLUMNS)
     rows = -(-panels // columns)
     with use_style():
         figure = new_figure(_WIDTH * columns, _WIDTH * rows + 0.3)
-        for number, proposal in enumerate(shown):
+        for number, proposal in enumerate(drawn):
             axes: Any = figure.add_subplot(rows, columns, number + 1, projection="3d")
             joint = list(proposal.opens)[-1]
             _draw(axes, proposals, proposal, joint)
@@ -60,15 +62,15 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
             axes.set_title(
                 f"{proposal.attachment.name}  {proposal.score:.2f}\n{opened}", fontsize=8
             )
-        if proposals.because or not shown:
+        if proposals.because or not drawn:
             words: Any = figure.add_subplot(rows, columns, panels)
             words.axis("off")
-            said = (
+            reasons = (
                 "\n\n".join(f"{joint}: {reason}" for joint, reason in proposals.because.items())
                 or "it has no joints"
             )
-            words.text(0.0, 1.0, "No hand can open\n\n" + said, va="top", wrap=True, fontsize=8)
-        more = len(proposals.found) - len(shown)
+            words.text(0.0, 1.0, "No hand can open\n\n" + reasons, va="top", wrap=True, fontsize=8)
+        more = len(proposals.found) - len(drawn)
         figure.suptitle(
             f"{proposals.object.name}, hand of {proposals.hand.robot}"
             + (f" ({more} more)" if more else ""),
@@ -78,7 +80,7 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
 
 
 def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> None:
-    """Draw the object with one attachment in the hand."""
+    """Draw the object with the hand at one attachment."""
     item, attachment = proposals.object, proposal.attachment
     state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
     for name, value in proposal.when.items():
@@ -89,17 +91,19 @@ def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> No
     pin.forwardKinematics(item.model, data, item.coordinates.q(state))
     moving, faces, colours = item.links_moved_by({joint}), list[Floats](), list[Floats]()
     for shape in item.collision.geometryObjects:
-        base = _MOVING if get_link_name(shape.name) in moving else _STILL
-        _add(faces, colours, shape.geometry, data.oMi[shape.parentJoint] * shape.placement, base)
+        base = _MOVING_COLOUR if get_link_name(shape.name) in moving else _STATIC_COLOUR
+        _add_shape(
+            faces, colours, shape.geometry, data.oMi[shape.parentJoint] * shape.placement, base
+        )
     tool = item.link_placement(attachment.link, state) * attachment.tool(
         np.zeros(len(attachment.freedoms))
     )
     for geometry, where in (*proposals.hand.touch, *proposals.hand.others):
-        _add(faces, colours, geometry, tool * where, np.array(_rgb(COLOURS[0])))
-    _show(axes, faces, colours, tool)
+        _add_shape(faces, colours, geometry, tool * where, np.array(_to_rgb(COLOURS[0])))
+    _add_triangles(axes, faces, colours, tool)
 
 
-def _add(
+def _add_shape(
     faces: list[Floats],
     colours: list[Floats],
     geometry: coal.CollisionGeometry,
@@ -109,9 +113,8 @@ def _add(
     import trimesh
 
     vertices, corners = triangulate(geometry)
-    if (
-        size := float(np.ptp(vertices, axis=0).max())
-    ) > _FACET:  # large triangles are drawn in the wrong order
+    # matplotlib would draw large triangles in the wrong order.
+    if (size := float(np.ptp(vertices, axis=0).max())) > _FACET:
         vertices, corners = trimesh.remesh.subdivide_to_size(
             vertices, corners, max(_FACET, size / 12.0), max_iter=20
         )
@@ -123,15 +126,16 @@ def _add(
     colours.append(np.clip(shade[:, None] * base, 0.0, 1.0))
 
 
-def _show(axes: Any, faces: Iterable[Floats], colours: Iterable[Floats], tool: pin.SE3) -> None:
-    """Put triangles into axes, seen from where the hand comes from."""
-    collection = importlib.import_module(
-        "mpl_toolkits.mplot3d.art3d"
-    ).Poly3DCollection  # it has no types
+def _add_triangles(
+    axes: Any, faces: Iterable[Floats], colours: Iterable[Floats], tool: pin.SE3
+) -> None:
+    """Add triangles to axes, viewed from the side of the hand."""
+    # The module has no type annotations.
+    collection = importlib.import_module("mpl_toolkits.mplot3d.art3d").Poly3DCollection
 
-    joined, shades = np.concatenate(list(faces)), np.concatenate(list(colours))
-    axes.add_collection3d(collection(joined, facecolors=shades, edgecolors="none", shade=False))
-    low, high = joined.reshape(-1, 3).min(axis=0), joined.reshape(-1, 3).max(axis=0)
+    triangles, shades = np.concatenate(list(faces)), np.concatenate(list(colours))
+    axes.add_collection3d(collection(triangles, facecolors=shades, edgecolors="none", shade=False))
+    low, high = triangles.reshape(-1, 3).min(axis=0), triangles.reshape(-1, 3).max(axis=0)
     middle, half = (low + high) / 2.0, float((high - low).max()) / 2.0
     for set_limits, centre in zip(
         (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True
@@ -144,7 +148,7 @@ def _show(axes: Any, faces: Iterable[Floats], colours: Iterable[Floats], tool: p
     axes.set_axis_off()
 
 
-def _rgb(colour: str) -> tuple[float, float, float]:
+def _to_rgb(colour: str) -> tuple[float, float, float]:
     from matplotlib.colors import to_rgb
 
     red, green, blue = to_rgb(colour)

@@ -1,4 +1,4 @@
-"""Cross-sections of convex pieces: how thick a piece is where fingers would close on it, and whether they would slip off."""
+"""Computes cross-sections of convex pieces, their thickness, and whether fingers would slip off."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from vkc_pin.world.models.shapes import get_link_name, triangulate
 
 __all__ = ["Piece", "Section"]
 
-# widths that differ by less are the same: then the frame's own axes are taken, as round bars have
-# any
-_ALIKE = 0.03
-_SLIP = np.radians(
-    20.0
-)  # between a finger and the face below it: what rubber on smooth paint holds (friction 0.36)
+# Relative difference up to which widths are equal. The frame's own axes are preferred then, as
+# round bars have no axes of their own.
+_EQUAL_WIDTH = 0.03
+# Largest angle between the closing direction and a face normal: rubber on smooth paint, friction
+# 0.36.
+_SLIP = np.radians(20.0)
 _SAME = 1e-9  # [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A plane cut of a convex piece.
+    """A planar cross-section of a convex piece.
 
     Attributes:
-        centre: The point of the plane that the other coordinates start from, in the frame of the
-            piece's joint, shape (3,) [m].
+        centre: Origin of the plane's coordinates, in the frame of the piece's joint, shape (3,)
+            [m].
         axes: Two directions that span the plane, shape (2, 3).
-        polygon: Corners of the cut in order, along the two axes, shape (n, 2) [m].
+        polygon: Vertices in order, in the plane's coordinates, shape (n, 2) [m].
     """
 
     centre: Floats
@@ -39,31 +39,30 @@ class Section:
     polygon: Floats
 
     def extent(self, direction: Floats) -> tuple[float, float]:
-        """Return from where to where the cut reaches along a unit direction in the plane, shape (2,) [m]."""
+        """Return the extent along a unit direction in the plane, shape (2,) [m]."""
         along = self.polygon @ direction
         return float(along.min()), float(along.max())
 
     def clip(self, direction: Floats, limit: float) -> Section | None:
-        """Return the part of the cut up to `limit` [m] along a unit direction, shape (2,); None if nothing is left."""
-        along, kept = self.polygon @ direction - limit, list[Floats]()
+        """Return the part up to `limit` [m] along a unit direction, shape (2,); None if empty."""
+        along, corners = self.polygon @ direction - limit, list[Floats]()
         for k, (here, there) in enumerate(zip(along, np.roll(along, -1), strict=True)):
             if here <= 0.0:
-                kept.append(self.polygon[k])
+                corners.append(self.polygon[k])
             if here * there < 0.0:
-                kept.append(
+                corners.append(
                     self.polygon[k]
                     + here / (here - there) * (self.polygon[(k + 1) % len(along)] - self.polygon[k])
                 )
-        return Section(self.centre, self.axes, np.array(kept)) if len(kept) > 2 else None
+        return Section(self.centre, self.axes, np.array(corners)) if len(corners) > 2 else None
 
     def is_graspable(self, closing: Floats) -> bool:
-        """Return whether fingers that close along a unit direction, shape (2,), meet faces that they do not slip off from."""
+        """Return whether fingers that close along a unit direction, shape (2,), do not slip."""
         edges = np.roll(self.polygon, -1, axis=0) - self.polygon
         lengths = np.linalg.norm(edges, axis=1)
         edges = edges[lengths > 1e-5] / lengths[lengths > 1e-5, None]
-        facing = (
-            np.column_stack([edges[:, 1], -edges[:, 0]]) @ closing
-        )  # outwards, if the corners go round to the left
+        # Outward normals, as the vertices are ordered counter-clockwise.
+        facing = np.column_stack([edges[:, 1], -edges[:, 0]]) @ closing
         return bool(
             len(facing) and facing.max() >= np.cos(_SLIP) and facing.min() <= -np.cos(_SLIP)
         )
@@ -79,8 +78,8 @@ class Piece:
 
     Attributes:
         link: Its link.
-        name: Its own name, `<link>_<k>`.
-        vertices: Corners in the frame of its joint, shape (n, 3) [m].
+        name: Its name, `<link>_<k>`.
+        vertices: Vertices in the frame of its joint, shape (n, 3) [m].
         faces: Triangles, shape (m, 3).
     """
 
@@ -91,36 +90,36 @@ class Piece:
 
     @classmethod
     def from_shape(cls, shape: pin.GeometryObject) -> Piece:
-        """Return the piece that a shape of an object is."""
+        """Return the piece of an object's shape."""
         vertices, faces = triangulate(shape.geometry)
         placed = vertices @ shape.placement.rotation.T + shape.placement.translation
         return cls(get_link_name(shape.name), str(shape.name), np.asarray(placed), faces)
 
     @cached_property
     def axes(self) -> Floats:
-        """Three perpendicular directions of a box around it, shape (3, 3), by rows: the thinnest last."""
+        """Perpendicular axes of a tight box, by rows, the thinnest last, shape (3, 3)."""
         corners = self.vertices[self.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1)
         normals = normals[lengths > 1e-12] / lengths[lengths > 1e-12, None]
         _, first = np.unique(normals.round(4), axis=0, return_index=True)
         normals = np.vstack([np.eye(3), normals[np.sort(first)]])
-        thin = self._narrowest(normals)
+        thin = self._find_narrowest(normals)
         across = normals - np.outer(normals @ thin, thin)
         lengths = np.linalg.norm(across, axis=1)
-        second = self._narrowest(across[lengths > 0.3] / lengths[lengths > 0.3, None])
+        second = self._find_narrowest(across[lengths > 0.3] / lengths[lengths > 0.3, None])
         return np.array([np.cross(second, thin), second, thin])
 
-    def _narrowest(self, directions: Floats) -> Floats:
-        """Return the first of some directions, shape (n, 3), along which it is about as thin as along any."""
+    def _find_narrowest(self, directions: Floats) -> Floats:
+        """Return the first direction, of shape (n, 3), along which the width is about minimal."""
         widths = np.ptp(self.vertices @ directions.T, axis=0)
         return np.asarray(
-            directions[int(np.argmax(widths <= (1.0 + _ALIKE) * widths.min() + _SAME))]
+            directions[int(np.argmax(widths <= (1.0 + _EQUAL_WIDTH) * widths.min() + _SAME))]
         )
 
     @cached_property
     def extents(self) -> Floats:
-        """From where to where it reaches along `axes`, shape (3, 2) [m]."""
+        """Lower and upper extent along each of `axes`, shape (3, 2) [m]."""
         along = self.vertices @ self.axes.T
         return np.column_stack([along.min(axis=0), along.max(axis=0)])
 
@@ -132,15 +131,15 @@ class Piece:
         return np.unique(pairs, axis=0)
 
     def cut(self, axis: int, at: float) -> Section | None:
-        """Return the cut across `axes[axis]` at `at` [m] along it; None where there is none."""
+        """Return the cross-section normal to `axes[axis]` at `at` [m]; None if there is none."""
         normal, plane = self.axes[axis], np.delete(self.axes, axis, axis=0)
         height = self.vertices @ normal - at
         first, second = height[self._edges].T
         cut = (first < 0.0) != (second < 0.0)
         if cut.sum() < 3:
             return None
-        ends, share = self._edges[cut], (first[cut] / (first[cut] - second[cut]))[:, None]
-        points = (1.0 - share) * self.vertices[ends[:, 0]] + share * self.vertices[ends[:, 1]]
+        ends, fraction = self._edges[cut], (first[cut] / (first[cut] - second[cut]))[:, None]
+        points = (1.0 - fraction) * self.vertices[ends[:, 0]] + fraction * self.vertices[ends[:, 1]]
         flat = points @ plane.T
         centre = (flat.min(axis=0) + flat.max(axis=0)) / 2.0
         flat -= centre

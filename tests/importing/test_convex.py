@@ -136,8 +136,8 @@ def test_a_mesh_that_was_cut_is_not_cut_again(
 ) -> None:
     """What is kept gives the same pieces to the last bit; other meshes and settings are cut on their own."""
     monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
-    cut, real = [], convex._cut
-    monkeypatch.setattr(convex, "_cut", lambda *rest: (cut.append(rest), real(*rest))[1])
+    cut, real = [], convex._cut_mesh
+    monkeypatch.setattr(convex, "_cut_mesh", lambda *rest: (cut.append(rest), real(*rest))[1])
     mesh = tray()
     first, again = decompose(mesh), decompose(mesh)
     assert len(cut) == 1
@@ -149,7 +149,7 @@ def test_a_mesh_that_was_cut_is_not_cut_again(
     wider.apply_scale((1.0, 1.0, 1.01))
     asked: list[float] = []
     monkeypatch.setattr(
-        convex, "_cut", lambda mesh, most, *_: (asked.append(most), [mesh.vertices])[1]
+        convex, "_cut_mesh", lambda mesh, most, *_: (asked.append(most), [mesh.vertices])[1]
     )
     for other, changed in (
         (wider, {}),

@@ -58,5 +58,5 @@ def test_a_line_names_few_of_the_joints_that_must_be_open(found: vkc.Proposals) 
 def test_the_report_says_what_opens_and_how_far(found: vkc.Proposals) -> None:
     lines = found.report().splitlines()
     assert lines[0] == "hinge, 0 to 1.5 rad"
-    assert "flap_bar (bar, called a handle): 20 mm thick, cylindrical" in lines[1]
+    assert "flap_bar (bar, named as a handle): 20 mm thick, cylindrical" in lines[1]
     assert "opens to 1.5 rad" in lines[1]

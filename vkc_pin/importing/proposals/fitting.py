@@ -80,9 +80,9 @@ class HandClearance:
     ) -> Obstruction | None:
         """Return what obstructs a hand at `tool`, in the object's base frame; None if nothing does.
 
-            Args:
-                tool: Placement of the tool frame.
-                held: The grasped link.
+        Args:
+            tool: Placement of the tool frame.
+            held: The grasped link.
             extra_clearance: Clearance in excess of the required one from other links [m].
         """
         is_held = self.links == held

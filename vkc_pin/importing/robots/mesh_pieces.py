@@ -1,4 +1,4 @@
-"""Gives a URDF meshes of its own: convex pieces where it collides, copies of what is seen."""
+"""Writes the meshes of a URDF into its folder: convex pieces and copies of visual meshes."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ from vkc_pin.world.files.urdf import UrdfFile, UrdfShape
 
 __all__ = ["Piece", "write_meshes"]
 
-_WHOLE = 0.02  # [m] between a hull and its mesh that matters nowhere on a robot,
-_MORE = 0.15  # nor does a hull that fills so much more than its mesh,
-_SHARE = 0.15  # nor does this share of the mesh's longest edge: fingers are small
-_MATERIAL = "mtllib "  # statement of an OBJ file that names its materials' file
+# Protrusion of a hull over its mesh that is acceptable on a robot [m], and relative to the longest
+# edge of the mesh, since fingers are small
+_MAX_ERROR, _MAX_RELATIVE_ERROR = 0.02, 0.15
+_MAX_OVERHEAD = 0.15  # acceptable excess volume of a hull, relative to its mesh
+_MATERIAL = "mtllib "  # statement of an OBJ file that names its material file
 
 
 @dataclass(frozen=True)
 class Piece:
-    """What became of a mesh.
+    """Decomposition of a collision mesh.
 
     Attributes:
-        link: The link that it belongs to.
-        mesh: The name of its file.
-        count: Into how many convex pieces it was cut.
-        overhead: How much more than it they fill.
-        hull: How much more its hull alone fills.
-        error: How far the pieces stand out over it [m].
+        link: Its link.
+        mesh: Name of its file.
+        count: Number of convex pieces.
+        overhead: Volume of the pieces in excess of the mesh, relative to it.
+        hull: Volume of the convex hull in excess of the mesh, relative to it.
+        error: Largest protrusion of the pieces over the mesh [m].
     """
 
     link: str
@@ -48,32 +49,31 @@ class Piece:
 def write_meshes(
     file: UrdfFile, folder: Path, *, most_pieces: int
 ) -> tuple[ElementTree.Element, list[Piece], list[str]]:
-    """Return a URDF whose meshes are in `folder`, what became of those that collide, and notes of what was left out.
+    """Write the meshes of a URDF into `folder`; return the URDF, the decompositions and notes.
 
-    Meshes that collide are written as convex pieces, `collision/<link>_<k>.stl`; those that are
-    seen are copied into `visual`. `choose_file_names` chooses the names.
+    Collision meshes are written as convex pieces, `collision/<link>_<k>.stl`; visual meshes are
+    copied into `visual`. `choose_file_names` chooses the names.
 
-    Links without anything to collide get what is seen of them; flat meshes, and visual ones that
-    cannot be read, are left out.
+    Links without collision shapes collide with their visual shapes. Flat collision meshes, and
+    visual meshes that cannot be read, are left out.
 
     Args:
         file: The URDF.
-        folder: Where to write.
-        most_pieces: The largest number of pieces of one mesh; 1 keeps hulls.
+        folder: Output folder.
+        most_pieces: Largest number of pieces of one mesh; 1 keeps hulls.
 
     Raises:
-        InputError: A mesh that collides cannot be read.
+        InputError: A collision mesh cannot be read.
     """
     root = copy.deepcopy(file.root)
     links = {link.get("name", ""): link for link in root.findall("link")}
     stems = dict(zip(links, choose_file_names(links), strict=True))
-    found, notes = list[Piece](), list[str]()
+    decompositions, notes = list[Piece](), list[str]()
     shapes: dict[str, list[UrdfShape]] = {}
     for shape in file.shapes("collision"):
         shapes.setdefault(shape.link, []).append(shape)
-    done: dict[
-        tuple[Path, tuple[float, ...]], tuple[Pieces, float]
-    ] = {}  # with the volume of the hull
+    # Pieces and hull volume by mesh file and scale
+    done: dict[tuple[Path, tuple[float, ...]], tuple[Pieces, float]] = {}
     for name, link in links.items():
         elements = link.findall("collision")
         written = 0
@@ -86,18 +86,20 @@ def write_meshes(
             try:
                 if key not in done:
                     mesh = load_mesh(shape.file, shape.size)
-                    error = min(_WHOLE, _SHARE * float(mesh.extents.max()))
-                    pieces = decompose(mesh, most_pieces=most_pieces, error=error, overhead=_MORE)
+                    error = min(_MAX_ERROR, _MAX_RELATIVE_ERROR * float(mesh.extents.max()))
+                    pieces = decompose(
+                        mesh, most_pieces=most_pieces, error=error, overhead=_MAX_OVERHEAD
+                    )
                     done[key] = pieces, float(compute_hull(mesh.vertices).volume)
             except InputError as error_:
                 if "flat" not in error_.problem:
                     raise
                 notes.append(
-                    f"{name}: {shape.file.name} is flat, and collides with nothing any more"
+                    f"{name}: {shape.file.name} is flat and was removed from the collision geometry"
                 )
                 continue
             pieces, hull = done[key]
-            found.append(
+            decompositions.append(
                 Piece(
                     name,
                     shape.file.name,
@@ -118,13 +120,13 @@ def write_meshes(
                 link.insert(place, piece)
                 place, written = place + 1, written + 1
     _copy_visual(file, links, folder, notes)
-    return root, found, notes
+    return root, decompositions, notes
 
 
 def _copy_visual(
     file: UrdfFile, links: dict[str, ElementTree.Element], folder: Path, notes: list[str]
 ) -> None:
-    shown: dict[Path, list[ElementTree.Element]] = {}
+    users: dict[Path, list[ElementTree.Element]] = {}
     missing = []
     for name, link in links.items():
         for element in link.findall("visual"):
@@ -138,18 +140,16 @@ def _copy_visual(
                 link.remove(element)
                 missing.append(name)
                 continue
-            shown.setdefault(path, []).append(mesh)
-    for path, copy_name in _copy_meshes(list(shown), folder / "visual").items():
-        for mesh in shown[path]:
+            users.setdefault(path, []).append(mesh)
+    for path, copy_name in _copy_meshes(list(users), folder / "visual").items():
+        for mesh in users[path]:
             mesh.set("filename", f"visual/{copy_name}")
     if missing:
-        notes.append(
-            f"what is seen of {', '.join(dict.fromkeys(missing))} is left out: its mesh cannot be read"
-        )
+        notes.append(f"left out unreadable visual meshes of {', '.join(dict.fromkeys(missing))}")
 
 
 def _copy_meshes(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
-    """Copy meshes, OBJ files with their materials, and return the names of the copies."""
+    """Copy meshes and the materials of OBJ files; return the names of the copies."""
     used = {path: _find_materials(path) for path in paths if path.suffix.lower() == ".obj"}
     materials = dict.fromkeys(file for files in used.values() for file in files)
     names = _name_copies([*paths, *materials])
@@ -164,7 +164,7 @@ def _copy_meshes(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
 
 
 def _name_copies(paths: Sequence[Path]) -> dict[Path, str]:
-    """Return a name in one folder for a copy of each file; extensions stay."""
+    """Choose distinct names for copies of files in one folder; extensions stay."""
     names = dict[Path, str]()
     for extension in dict.fromkeys(path.suffix.lower() for path in paths):
         same = [path for path in paths if path.suffix.lower() == extension]
@@ -174,13 +174,13 @@ def _name_copies(paths: Sequence[Path]) -> dict[Path, str]:
 
 
 def _find_materials(path: Path) -> list[Path]:
-    """Return the files of materials beside an OBJ file that it names."""
+    """Return the material files beside an OBJ file that it names."""
     named = [path.parent / name for line in _read_lines(path) if (name := _get_material(line))]
     return [file for file in named if file.is_file() and file.parent == path.parent]
 
 
 def _rename_materials(path: Path, names: Mapping[str, str]) -> None:
-    """Replace names of files of materials in an OBJ file."""
+    """Replace names of material files in an OBJ file."""
     lines = (
         f"{_MATERIAL}{names[name]}" if (name := _get_material(line)) in names else line
         for line in _read_lines(path)
@@ -189,7 +189,7 @@ def _rename_materials(path: Path, names: Mapping[str, str]) -> None:
 
 
 def _get_material(line: str) -> str:
-    """Return the file of materials that a line of an OBJ file names, or ""."""
+    """Return the material file that a line of an OBJ file names, or ""."""
     return line.removeprefix(_MATERIAL).strip() if line.startswith(_MATERIAL) else ""
 
 

@@ -1,4 +1,4 @@
-"""Finds where an arm rests: free of collision, in the middle of its joints' ranges, the hand not far from the base."""
+"""Finds a collision-free home configuration of an arm, near mid-range and close to the base."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ __all__ = [
 ]
 
 HOME_ROOM = 0.03
-"""Between links at home, and to the floor, if there can be so much [m]: more than the usual margin."""
+"""Desired clearance between links and to the floor at home [m], above the default margin."""
 
 _SAMPLES = 600
-_STEPS = 150  # of the search around the best sample
+_STEPS = 150  # steps of the local search around the best sample
 
 
 @dataclass(frozen=True, eq=False)
 class Home:
-    """Where an arm rests.
+    """Home configuration of an arm.
 
     Attributes:
-        positions: Of the planned joints, shape (n − 3,), [m] and [rad].
-        clearance: The least distance there between links that are kept apart, and to the floor [m].
-        how: Where it is from.
+        positions: Positions of the planned joints, shape (n − 3,), [m] and [rad].
+        clearance: Smallest distance between links and to the floor [m].
+        how: Origin of the configuration.
     """
 
     positions: Floats
@@ -46,7 +46,7 @@ class Home:
 
 
 class Clearances:
-    """Distances between the links of a robot, and of those that the arm moves to the floor.
+    """Distances between the links of a robot, and of the arm's links to the floor.
 
     Args:
         robot: The robot, with its collision pairs.
@@ -58,24 +58,28 @@ class Clearances:
         self._distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
         self.pairs = [(pair.first, pair.second) for pair in robot.collision.collisionPairs]
         self._pairs = np.array(self.pairs, np.int64).reshape(-1, 2)
-        self._carried = np.array([shape.parentJoint > 1 for shape in shapes])
+        self._is_moved = np.array([shape.parentJoint > 1 for shape in shapes])
         self._names = [robot.link_of(k) for k in range(len(shapes))]
 
     def place(self, arm: Floats) -> None:
-        """Put the arm at `arm`, shape (n − 3,), the base at the origin."""
+        """Set the arm's positions, shape (n − 3,), with the base at the origin."""
         self._distances.set_configuration(np.concatenate([np.zeros(3), arm]))
 
     def floor(self, *, moved: bool = True) -> list[tuple[str, float]]:
-        """Return link → how far above the floor it is [m], of those that the arm moves or of the others, the lowest first."""
+        """Return links with their height above the floor [m], the lowest first.
+
+        Args:
+            moved: Whether to return links that the arm moves, or the others.
+        """
         heights: dict[str, float] = {}
-        lowest = self._distances.compute_lowest_points()
-        for k in np.flatnonzero(self._carried == moved).tolist():
-            heights[self._names[k]] = min(float(lowest[k]), heights.get(self._names[k], np.inf))
+        compute_lowest_points = self._distances.compute_lowest_points()
+        for k in np.flatnonzero(self._is_moved == moved).tolist():
+            heights[self._names[k]] = min(float(compute_lowest_points[k]), heights.get(self._names[k], np.inf))
         return sorted(heights.items(), key=lambda item: item[1])
 
-    def least(self, worth: float = np.inf) -> float:
-        """Return the least distance compute_distance links and to the floor [m], looked at up to `score_grasp`."""
-        nearest = float(min(worth, self._distances.compute_lowest_points()[self._carried].min(initial=np.inf)))
+    def least(self, limit: float = np.inf) -> float:
+        """Return the smallest distance compute_distance links and to the floor [m], at most `limit`."""
+        nearest = float(min(limit, self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf)))
         compute_lower_bounds = self._distances.compute_lower_bounds(self._pairs)
         for k in np.argsort(bounds).tolist():
             if bounds[k] > nearest:
@@ -84,19 +88,19 @@ class Clearances:
         return nearest
 
     def links(self, below: float) -> list[tuple[str, str, float]]:
-        """Return pairs of links closer than `subtree` [m], the closest first."""
-        found: dict[tuple[str, str], float] = {}
+        """Return pairs of links closer than `below` [m] with their distance, the closest first."""
+        distances: dict[tuple[str, str], float] = {}
         for k in np.flatnonzero(self._distances.compute_lower_bounds(self._pairs) < below).tolist():
             distance = self._distances.compute_distance([self.pairs[k]])
             if distance < below:
                 names = (self._names[self.pairs[k][0]], self._names[self.pairs[k][1]])
-                found[names] = min(distance, found.get(names, np.inf))
+                distances[names] = min(distance, distances.get(names, np.inf))
         return sorted(
-            ((*names, distance) for names, distance in found.items()), key=lambda item: item[2]
+            ((*names, distance) for names, distance in distances.items()), key=lambda item: item[2]
         )
 
     def by_links(self) -> LinkDistances:
-        """Return distances of its pairs of links, where it is placed."""
+        """Return the distances of its pairs of links at the current positions."""
         groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
         for one, other in self.pairs:
             groups.setdefault((self._names[one], self._names[other]), []).append((one, other))
@@ -104,7 +108,10 @@ class Clearances:
 
 
 def find_arm_positions(robot: Robot, state: Mapping[str, float]) -> Floats:
-    """Return where an arm is in a state of its joints, turned by 2π or else moved to the nearest limits, shape (n − 3,)."""
+    """Return the arm's positions in a state, within limits, shape (n − 3,).
+
+    Angles are shifted by 2π, or else clamped.
+    """
     return np.array(
         [
             find_nearest_position(robot.model, joint, state[joint])
@@ -114,22 +121,22 @@ def find_arm_positions(robot: Robot, state: Mapping[str, float]) -> Floats:
 
 
 def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 0) -> Home:
-    """Return where the arm rests.
+    """Find a home configuration of the arm.
 
-    That is the first of the `named` configurations with room around it, else the best one of random
-    ones: with room first, then near the middle of the joints' ranges, with the hand above the base
-    rather than far out.
+    It is the first of the `named` configurations with sufficient clearance, else the best random
+    one: with clearance first, then near the centre of the joints' ranges, and with the hand above
+    the base rather than far from it.
 
     Args:
         robot: The robot, with its collision pairs.
-        named: Configurations to look at first, shape (n − 3,) each, with what to call them.
-        seed: Of the random numbers.
+        named: Descriptions and configurations to try first, shape (n − 3,) each.
+        seed: Random seed.
     """
-    look = Clearances(robot)
+    clearances = Clearances(robot)
     best = None
     for how, positions in named:
-        look.place(positions)
-        clearance = look.least()
+        clearances.place(positions)
+        clearance = clearances.least()
         if clearance >= HOME_ROOM:
             return Home(positions, clearance, how)
         if best is None or clearance > best.clearance:
@@ -139,9 +146,10 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
     middle, span = 0.5 * (low + high), np.maximum(high - low, 1e-9)
     frame, data = robot.model.getFrameId(robot.tool_frame), robot.model.createData()
 
-    def cost(arm: Floats) -> tuple[float, float]:
-        look.place(arm)
-        clearance = look.least(HOME_ROOM)
+    def compute_cost(arm: Floats) -> tuple[float, float]:
+        """Return the cost of a configuration, and its clearance [m]."""
+        clearances.place(arm)
+        clearance = clearances.least(HOME_ROOM)
         pin.framesForwardKinematics(
             robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
         )
@@ -152,46 +160,47 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
 
     trials = [middle, *rng.uniform(low, high, (_SAMPLES, len(low)))]
     value, clearance, chosen = min(
-        ((*cost(arm), k) for k, arm in enumerate(trials)), key=lambda item: item[0]
+        ((*compute_cost(arm), k) for k, arm in enumerate(trials)), key=lambda item: item[0]
     )
     arm = trials[chosen]
     for width in np.geomspace(0.2, 0.01, _STEPS):
         trial = np.clip(arm + width * span * rng.standard_normal(len(arm)), low, high)
-        new, gap = cost(trial)
+        new, gap = compute_cost(trial)
         if new < value:
             arm, value, clearance = trial, new, gap
     if best is not None and best.clearance >= clearance:
         return best
-    look.place(arm)
-    return Home(arm, look.least(), "searched for")
+    clearances.place(arm)
+    return Home(arm, clearances.least(), "found by search")
 
 
 def find_inseparable_pairs(
     robot: Robot, margin: float, *, samples: int, share: float = 1.0, seed: int = 0
 ) -> dict[tuple[str, str], float]:
-    """Return the pairs of links that no random configuration brings apart by `margin` [m], with the furthest that one does.
+    """Return pairs of links that no random configuration separates by `margin` [m].
 
     Args:
-        robot: The robot, with its collision pairs and its home, which is looked at as well.
+        robot: The robot, with its collision pairs and its home, which is checked as well.
         margin: A distance [m].
-        samples: How many configurations to look at.
-        share: Of these, so many have to leave a pair closer than the margin: less than 1 is for
-            pairs that are hardly ever apart.
-        seed: Of the random numbers.
+        samples: Number of random configurations.
+        share: Fraction of these in which a pair must be closer than the margin; values below 1 also
+            find pairs that are rarely separated.
+        seed: Random seed.
+
+    Returns:
+        The pairs with their largest distance [m].
     """
-    look, rng = Clearances(robot), np.random.default_rng(seed)
+    clearances, rng = Clearances(robot), np.random.default_rng(seed)
     low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
-    pairs = look.by_links()
-    furthest, apart = dict.fromkeys(pairs.links, -np.inf), dict.fromkeys(pairs.links, 0)
+    pairs = clearances.by_links()
+    furthest, separated = dict.fromkeys(pairs.links, -np.inf), dict.fromkeys(pairs.links, 0)
     for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
-        look.place(arm)
-        for k, (links, bound) in enumerate(
-            zip(pairs.links, pairs.compute_lower_bounds(), strict=True)
-        ):
+        clearances.set_configuration(arm)
+        for k, (links, bound) in enumerate(zip(pairs.links, pairs.compute_lower_bounds(), strict=True)):
             distance = float(bound) if bound > margin else pairs.compute_distance(k, margin)
             furthest[links] = max(furthest[links], distance)
-            apart[links] += distance >= margin
-        pairs.select([apart[links] <= (1.0 - share) * samples for links in pairs.links])
+            separated[links] += distance >= margin
+        pairs.select([separated[links] <= (1.0 - share) * samples for links in pairs.links])
         if not pairs.links:
             break
     return {links: furthest[links] for links in pairs.links}
@@ -200,17 +209,18 @@ def find_inseparable_pairs(
 def measure_floor_heights(
     robot: Robot, *, samples: int = 200, seed: int = 0
 ) -> tuple[float, float]:
-    """Return how high above the floor [m] the lowest of what drives along is, and how high the arm's links can be.
+    """Return the height of the lowest base link [m], and the height that all arm links can reach.
 
-    The latter is that of the link that can be least high: a shoulder at the floor never leaves it.
+    The latter is the smallest of the arm links' largest heights: a shoulder at the floor never
+    leaves it.
     """
-    look, rng = Clearances(robot), np.random.default_rng(seed)
-    look.place(robot.home)
-    still = [height for link, height in look.floor(moved=False)]
+    clearances, rng = Clearances(robot), np.random.default_rng(seed)
+    clearances.place(robot.home)
+    base_heights = [height for link, height in clearances.floor(moved=False)]
     low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
     best: dict[str, float] = {}
     for arm in rng.uniform(low, high, (samples, len(low))):
-        look.place(arm)
-        for link, height in look.floor():
+        clearances.place(arm)
+        for link, height in clearances.floor():
             best[link] = max(height, best.get(link, -np.inf))
-    return min(still, default=0.0), min(best.values(), default=np.inf)
+    return min(base_heights, default=0.0), min(best.values(), default=np.inf)

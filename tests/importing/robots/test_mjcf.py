@@ -100,12 +100,12 @@ def test_what_mujoco_does_not_take_is_named(tmp_path: Path) -> None:
         (
             "wrong.xml",
             "<mujoco><worldbody><body><joint type='hinge' axis='0 0 0'/></body></worldbody></mujoco>",
-            "MuJoCo does not",
+            "MuJoCo cannot",
         ),
         (
             "still.xml",
             "<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>",
-            "nothing moves here",
+            "the file has no joints",
         ),
     ):
         path = tmp_path / name
@@ -144,7 +144,7 @@ def same(one: str, other: str, more: str = "") -> str:
         (
             (same("j1", "j0", 'polycoef="0 1 0.5 0 0"'),),
             {"j1": "j0"},
-            "j1 follows j0 along a curve",
+            "j1 follows j0 by a nonlinear function",
         ),
         ((same("j1", "j0", 'active="false"'),), {}, ""),
     ],

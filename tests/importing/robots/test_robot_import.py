@@ -103,7 +103,7 @@ def test_a_gripper_that_does_not_open_as_guessed_is_locked_and_told(tmp_path: Pa
     assert made.robot.gripper is None
     assert "gripper" not in said
     assert "finger_a_joint: 0.04" in said
-    assert "the fingers stand still: the gripper does not open" in str(made)
+    assert "the fingers are locked: the gripper does not open" in str(made)
 
 
 def test_home_has_room(imported: vkc.ImportedRobot) -> None:
@@ -187,7 +187,7 @@ def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(
     target.mkdir()
     (target / "notes.txt").write_text("dear", encoding="utf-8")
     for force in (False, True):
-        with pytest.raises(vkc.InputError, match="something already"):
+        with pytest.raises(vkc.InputError, match="already exists"):
             vkc.import_robot(file, target, force=force)
     assert [path.name for path in target.iterdir()] == ["notes.txt"]
     (target / "notes.txt").unlink()
@@ -248,7 +248,7 @@ def test_a_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
         )
         said = yaml.safe_load((made.folder / "robot.yaml").read_text())
         assert said.get("couplings", {}) == (FOLLOWERS if told else {})
-        assert ("out_2, out_3, out_4 slide along with out_1, as a telescope" in str(made)) == told
+        assert ("out_2, out_3, out_4 follow out_1 as a telescope" in str(made)) == told
         assert set(said["home"]) == {*made.robot.coordinates.names[3:]}
 
 

@@ -107,7 +107,7 @@ def write_object(
     write_description(
         yaml,
         urdf.name,
-        [item.description() for item in proposals.found],
+        [proposal.description() for proposal in proposals.found],
         about=about,
         free=item.free,
     )

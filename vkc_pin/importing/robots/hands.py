@@ -190,7 +190,7 @@ class _HandAnalysis:
         return first, [finger for k, finger in enumerate(fingers) if k not in chosen]
 
     def _measure_reach(self, finger: Body) -> float:
-        """Return how far a finger reaches from its joint [m]; 0 without a shape."""
+        """Return the largest distance of a finger's points from its joint [m]; 0 without shapes."""
         points = self._find_points(finger, {})
         return (
             float(np.linalg.norm(points - self._find_base(finger), axis=1).max())
@@ -206,7 +206,10 @@ class _HandAnalysis:
         )
 
     def _find_fingertip(self, finger: Body, positions: Mapping[str, float]) -> Floats:
-        """Return the points of a finger's last body that are furthest from its first joint, in the palm's frame."""
+        """Return the points of a finger's last body that are furthest from its first joint.
+
+        They are in the palm's frame.
+        """
         points = self._find_points(_find_last_body(finger, self._points), positions, alone=True)
         far = np.linalg.norm(points - self._find_base(finger), axis=1)
         return points[far >= far.max() - max(_TIP, _SHARE * (far.max() - far.min()))]

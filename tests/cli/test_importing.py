@@ -115,7 +115,7 @@ def test_a_folder_here_comes_before_a_name(
     command = ["import-object", "box.sdf", "--robot", "panda", "--most", "1"]
     assert commands.run(command) == commands.EXIT_MISUSE
     said = capsys.readouterr().err
-    assert "panda.urdf: touch_links: the hand of 'panda' is not known" in said
+    assert "panda.urdf: touch_links: the hand of 'panda' is undefined" in said
     assert "import-robot" in said
     write_gripper(tmp_path / "panda")
     assert commands.run(command) == 0
@@ -141,7 +141,7 @@ def test_import_home_writes_a_scene_and_reports(
     ]
     assert commands.run(command) == 0
     said = capsys.readouterr().out
-    assert "5 obstacles, 1 with joints, 1 to carry" in said
+    assert "5 obstacles, 1 articulated objects, 1 free objects" in said
     assert said.endswith(f"wrote {tmp_path / 'out' / 'scene.yaml'}\n")
     assert commands.run(command) == commands.EXIT_MISUSE
     assert "--force" in capsys.readouterr().err

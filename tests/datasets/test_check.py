@@ -53,7 +53,7 @@ def test_a_scene_in_which_something_is_in_the_way(copy: Path) -> None:
     """The check builds the scenes from the files: it does not believe what planning saw."""
     import json
 
-    from vkc_pin.datasets.episode import scene_name
+    from vkc_pin.datasets.episode import compute_scene_name
 
     episode = next(Dataset.open(copy).episodes())
     middle = episode.trajectory.at(episode.trajectory.times[-1] / 2.0)
@@ -65,9 +65,9 @@ def test_a_scene_in_which_something_is_in_the_way(copy: Path) -> None:
         "position": [float(middle[0]), float(middle[1]), 0.5],
     }
     document["obstacles"].append(box)
-    (copy / "scenes" / f"{scene_name(document)}.json").write_text(json.dumps(document))
+    (copy / "scenes" / f"{compute_scene_name(document)}.json").write_text(json.dumps(document))
     with h5py.File(shard(copy), "r+") as file:
-        file["data/demo_0"].attrs["scene"] = scene_name(document)
+        file["data/demo_0"].attrs["scene"] = compute_scene_name(document)
     found = check_dataset(copy)
     assert list(found.refused) == [episode.number]
     assert "block" in found.refused[episode.number]

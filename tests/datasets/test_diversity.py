@@ -5,7 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.datasets.diversity import NEAR, Seen, homotopy, spread, way
+from vkc_pin.datasets.diversity import (
+    NEAR,
+    DuplicateFinder,
+    compute_coverage,
+    compute_winding_numbers,
+    sample_coarse_trajectory,
+)
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -43,17 +49,17 @@ def scene() -> Scene:
 
 def test_which_way_round(scene: Scene) -> None:
     right, left = along((-2, -0.1), (0, -1), (2, -0.1)), along((-2, -0.1), (0, 1), (2, -0.1))
-    assert homotopy(scene, right) == {}  # as the straight line goes
-    assert homotopy(scene, left) == {"post": -1}  # clockwise round it
+    assert compute_winding_numbers(scene, right) == {}  # as the straight line goes
+    assert compute_winding_numbers(scene, left) == {"post": -1}  # clockwise round it
     round_it = along((-2, -0.1), (0, -1), (2, 0), (0, 1), (-2, 0), (0, -1), (2, -0.1))
-    assert homotopy(scene, round_it) == {"post": 1}
+    assert compute_winding_numbers(scene, round_it) == {"post": 1}
 
 
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(0.5, 3)), min_size=1, max_size=6))
 def test_paths_on_one_side_are_of_one_class(
     scene: Scene, points: list[tuple[float, float]]
 ) -> None:
-    assert homotopy(scene, along((-2.0, 0.5), *points, (2.0, 0.5))) == {}
+    assert compute_winding_numbers(scene, along((-2.0, 0.5), *points, (2.0, 0.5))) == {}
 
 
 def record(number: int, motion: Trajectory, **changes: object) -> dict[str, object]:
@@ -63,21 +69,21 @@ def record(number: int, motion: Trajectory, **changes: object) -> dict[str, obje
         "task": "t",
         "object": "o",
         "goal": 1.0,
-        "way": way(motion),
+        "way": sample_coarse_trajectory(motion),
         **changes,
     }
 
 
 def test_near_duplicates() -> None:
-    seen, straight = Seen(), along((0, 0), (1, 0), (2, 0))
-    assert seen.twin(record(3, straight)) is None
-    assert seen.twin(record(5, along((0, 0), (1, 0.9 * NEAR), (2, 0)))) == 3
-    assert seen.twin(record(6, along((0, 0), (1, 2.0 * NEAR), (2, 0)))) is None
-    assert seen.twin(record(7, straight, scene="another")) is None
-    assert seen.twin(record(8, straight, object="another")) is None
+    seen, straight = DuplicateFinder(), along((0, 0), (1, 0), (2, 0))
+    assert seen.find_duplicate(record(3, straight)) is None
+    assert seen.find_duplicate(record(5, along((0, 0), (1, 0.9 * NEAR), (2, 0)))) == 3
+    assert seen.find_duplicate(record(6, along((0, 0), (1, 2.0 * NEAR), (2, 0)))) is None
+    assert seen.find_duplicate(record(7, straight, scene="another")) is None
+    assert seen.find_duplicate(record(8, straight, object="another")) is None
 
 
 def test_spread() -> None:
-    assert spread([], 0.0, 1.0) == 0.0
-    assert spread([0.05, 0.06, 0.95, 1.0], 0.0, 1.0) == 0.2
-    assert spread(np.linspace(0, 1, 50).tolist(), 0.0, 1.0) == 1.0
+    assert compute_coverage([], 0.0, 1.0) == 0.0
+    assert compute_coverage([0.05, 0.06, 0.95, 1.0], 0.0, 1.0) == 0.2
+    assert compute_coverage(np.linspace(0, 1, 50).tolist(), 0.0, 1.0) == 1.0

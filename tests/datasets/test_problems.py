@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.datasets import SMALL
 
-from vkc_pin.datasets.problems import NoProblemError, problem
-from vkc_pin.datasets.recipes.recipe import load_recipe, robot_name
+from vkc_pin.datasets.problems import NoProblemError, sample_problem
+from vkc_pin.datasets.recipes.recipe import get_robot_name, load_recipe
 from vkc_pin.planning.planner import Planner
 from vkc_pin.world.scene.scene import START_CLEARANCE
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, step_to_dict
@@ -16,7 +16,7 @@ PLANNER = Planner()
 
 
 def drawn(number: int, **changes: Any) -> Any:
-    return problem(load_recipe({**SMALL, **changes}), number, {}, PLANNER)
+    return sample_problem(load_recipe({**SMALL, **changes}), number, {}, PLANNER)
 
 
 def said(found: Any) -> Any:
@@ -120,4 +120,4 @@ def test_nothing_is_left() -> None:
     ],
 )
 def test_what_robots_are_called(name: str, called: str) -> None:
-    assert robot_name(name) == called
+    assert get_robot_name(name) == called

@@ -13,7 +13,7 @@ from pathlib import Path
 from tests.oracle.judge import Verdict, judge
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.episode import Episode
-from vkc_pin.datasets.formats.hdf5 import episodes_of
+from vkc_pin.datasets.formats.hdf5 import read_episodes
 from vkc_pin.planning.plan import Plan
 
 __all__ = ["judged_dataset", "saved"]
@@ -62,7 +62,7 @@ def _shard(folder: Path, shard: Path) -> list[Verdict]:
 
 def _verdicts(folder: Path, shard: Path) -> Iterator[Verdict]:
     with tempfile.TemporaryDirectory() as work:
-        for episode in episodes_of(shard, folder / "scenes"):
+        for episode in read_episodes(shard, folder / "scenes"):
             verdict = judge(saved(episode, Path(work) / f"{episode.number:06d}.npz"))
             verdict.path.unlink()
             yield replace(verdict, path=Path(shard.parent.name) / verdict.path.name)

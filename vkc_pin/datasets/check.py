@@ -14,12 +14,16 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.diversity import Seen, homotopy, way
-from vkc_pin.datasets.episode import Episode, scene_name
-from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of
-from vkc_pin.datasets.problems import terms_of
+from vkc_pin.datasets.diversity import (
+    DuplicateFinder,
+    compute_winding_numbers,
+    sample_coarse_trajectory,
+)
+from vkc_pin.datasets.episode import Episode, compute_scene_name
+from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers
+from vkc_pin.datasets.problems import resolve_episode_terms
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
-from vkc_pin.datasets.statistics import statistics_page
+from vkc_pin.datasets.statistics import make_statistics_page
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.utils.arguments import whole
 from vkc_pin.utils.parallel.engine import Died, clustered, results
@@ -118,7 +122,7 @@ def check_dataset(
     )
     found: dict[int, tuple[list[dict[str, Any]], list[str]]] = {}
     with tqdm(total=len(shards), unit="shard", disable=not progress) as bar:
-        for key, result in results(checked_shard, tasks, jobs=jobs, dask=clustered()):
+        for key, result in results(check_shard, tasks, jobs=jobs, dask=clustered()):
             found[int(key)] = (
                 ([], [f"{shards[int(key)]}: {result.reason}"])
                 if isinstance(result, Died)
@@ -133,21 +137,21 @@ def check_dataset(
     chosen = np.random.default_rng(seed).permutation(len(records))[:_PICTURES]
     whole_ones = [shard for k, shard in enumerate(shards) if not found[k][1]]
     pictured = _named(dataset, whole_ones, {records[k]["number"] for k in chosen})
-    text = statistics_page(dataset.recipe, records, failures, pictured, refused, problems)
+    text = make_statistics_page(dataset.recipe, records, failures, pictured, refused, problems)
     write_atomically(target, text.encode())
     return DatasetCheck(
         dataset.folder, len(records), refused, tuple(problems), tuple(records), target
     )
 
 
-def checked_shard(
+def check_shard(
     task: tuple[str, str, Mapping[str, Any]],
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return what is known of the episodes of a shard, by its scenes' folder and its recipe, and what is wrong with the file."""
     shard, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2])
     records: list[dict[str, Any]] = []
     try:
-        for episode in episodes_of(shard, scenes):
+        for episode in read_episodes(shard, scenes):
             records.append(_looked_at(episode, recipe))
     except (VkcError, OSError) as error:
         return records, [f"{shard.name}: {error}"]
@@ -165,9 +169,9 @@ def _looked_at(episode: Episode, recipe: Recipe) -> dict[str, Any]:
         said = [str(violation) for violation in report.violations] + report.contradictions(
             episode.claimed
         )
-        if episode.terms != terms_of(recipe, scene, about):
+        if episode.terms != resolve_episode_terms(recipe, scene, about):
             said.append("its own terms are not those of the recipe")
-        refused, winding = "; ".join(said[:3]), homotopy(scene, motion)
+        refused, winding = "; ".join(said[:3]), compute_winding_numbers(scene, motion)
         start = scene.start
     except VkcError as error:
         refused = str(error)
@@ -175,9 +179,9 @@ def _looked_at(episode: Episode, recipe: Recipe) -> dict[str, Any]:
         **{key: value for key, value in about.items() if key != "metrics"},
         **about.get("metrics", {}),
         "number": episode.number,
-        "scene": scene_name(episode.document),
+        "scene": compute_scene_name(episode.document),
         "start": np.asarray(start).round(4).tolist(),
-        "way": way(motion),
+        "way": sample_coarse_trajectory(motion),
         "winding": sorted(winding.items()),
         "refused": refused,
     }
@@ -189,9 +193,9 @@ def _together(dataset: Dataset, records: list[dict[str, Any]]) -> Iterator[str]:
     yield from (
         f"episode {number} is there {count} times" for number, count in counts.items() if count > 1
     )
-    seen = Seen()
+    seen = DuplicateFinder()
     for record in sorted(records, key=lambda record: int(record["number"])):
-        twin = seen.twin(record)
+        twin = seen.find_duplicate(record)
         if twin is not None and twin != record["number"]:
             yield f"episode {record['number']} is nearly the same as {twin}"
     table = {int(row["number"]) for row in _table(dataset.folder / "episodes.csv")}
@@ -211,8 +215,8 @@ def _table(path: Path) -> list[dict[str, str]]:
 
 def _named(dataset: Dataset, shards: Iterable[Path], numbers: set[int]) -> list[Episode]:
     """Return the episodes of some numbers, reading only the shards that have them."""
-    shards = (shard for shard in shards if numbers & set(numbers_of(shard)))
+    shards = (shard for shard in shards if numbers & set(read_numbers(shard)))
     every = itertools.chain.from_iterable(
-        episodes_of(shard, dataset.folder / "scenes") for shard in shards
+        read_episodes(shard, dataset.folder / "scenes") for shard in shards
     )
     return [episode for episode in every if episode.number in numbers]

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.datasets.diversity import Seen
-from vkc_pin.datasets.episode import Episode, work_file
-from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
+from vkc_pin.datasets.diversity import DuplicateFinder
+from vkc_pin.datasets.episode import Episode, get_work_file
+from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, write_shard
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.resources import file_path
@@ -84,7 +84,7 @@ class Dataset:
 
     def numbers(self) -> list[int]:
         """Return the numbers of all episodes, shard after shard."""
-        return [number for shard in self.shards for number in numbers_of(shard)]
+        return [number for shard in self.shards for number in read_numbers(shard)]
 
     def episodes(self) -> Iterator[Episode]:
         """Yield all episodes, shard after shard, read one at a time.
@@ -93,7 +93,7 @@ class Dataset:
             InputError: A file is damaged.
         """
         for shard in self.shards:
-            yield from episodes_of(shard, self.folder / "scenes")
+            yield from read_episodes(shard, self.folder / "scenes")
 
 
 class Register:
@@ -113,7 +113,7 @@ class Register:
         self.failures: list[Mapping[str, Any]] = []
         self._shards: dict[Path, list[int]] = {}  # folder of a robot's shards → its episodes
         self._early: dict[int, Mapping[str, Any]] = {}
-        self._next, self._seen = 0, Seen()
+        self._next, self._seen = 0, DuplicateFinder()
 
     @property
     def full(self) -> bool:
@@ -136,7 +136,7 @@ class Register:
         if not record["success"]:
             self.failures.append(_row(record))
             return
-        twin = self._seen.twin(record)
+        twin = self._seen.find_duplicate(record)
         if twin is not None:
             reason = f"nearly the same motion as that of episode {twin}"
             self.failures.append(_row({**record, "status": "duplicate", "reason": reason}))
@@ -161,8 +161,8 @@ class Register:
         """Write shard `k` of a folder, unless it exists; delete the work files of a full one."""
         numbers = self._shards[folder][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
         path = folder / f"shard-{k:05d}.hdf5"
-        files = [work_file(self.dataset.folder, number) for number in numbers]
-        there = numbers_of(path) if path.is_file() else []
+        files = [get_work_file(self.dataset.folder, number) for number in numbers]
+        there = read_numbers(path) if path.is_file() else []
         if there != numbers:
             # What somebody has removed of the files may be in the shard that is replaced.
             parts = [

@@ -11,7 +11,13 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["NEAR", "Seen", "homotopy", "spread", "way"]
+__all__ = [
+    "NEAR",
+    "DuplicateFinder",
+    "compute_coverage",
+    "compute_winding_numbers",
+    "sample_coarse_trajectory",
+]
 
 NEAR = 0.02
 """Two motions that are nowhere further apart than this in any coordinate, at equal shares of their time, are near-duplicates
@@ -20,19 +26,19 @@ _MOMENTS = 9  # at which motions are compared
 _GROUND = 1.6  # [m] what begins above that is nothing to drive around
 
 
-def way(trajectory: Trajectory) -> list[list[float]]:
+def sample_coarse_trajectory(trajectory: Trajectory) -> list[list[float]]:
     """Return where robot and objects are at equal shares of a motion's time, to the millimetre, as plain data."""
     times = np.linspace(trajectory.times[0], trajectory.times[-1], _MOMENTS)
     return [[float(value) for value in row] for row in trajectory.at(times).round(3)]
 
 
-class Seen:
+class DuplicateFinder:
     """What is in a dataset already, to tell what is nearly the same."""
 
     def __init__(self) -> None:
         self._ways: dict[Hashable, list[tuple[int, Floats]]] = {}
 
-    def twin(self, record: Mapping[str, Any]) -> int | None:
+    def find_duplicate(self, record: Mapping[str, Any]) -> int | None:
         """Return the number of an episode that is nearly the same as that of a record, None if there is none; note it then."""
         own = np.array(record["way"], float)
         goal = record.get("goal")
@@ -47,7 +53,7 @@ class Seen:
         return None
 
 
-def homotopy(scene: Scene, trajectory: Trajectory) -> dict[str, int]:
+def compute_winding_numbers(scene: Scene, trajectory: Trajectory) -> dict[str, int]:
     """Return around which things the base's path winds otherwise than the straight line from its start to its end.
 
     Two paths with the same ends can be deformed into each other, as far as winding tells, if this
@@ -94,7 +100,7 @@ def _posts(scene: Scene) -> dict[str, Floats]:
     return found
 
 
-def spread(values: Sequence[float], low: float, high: float, cells: int = 10) -> float:
+def compute_coverage(values: Sequence[float], low: float, high: float, cells: int = 10) -> float:
     """Return the share of equal cells of an interval in which there is a value."""
     if high <= low or not len(values):
         return 0.0

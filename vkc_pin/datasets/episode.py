@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.datasets.diversity import way
-from vkc_pin.datasets.problems import NoProblemError, problem
+from vkc_pin.datasets.diversity import sample_coarse_trajectory
+from vkc_pin.datasets.problems import NoProblemError, sample_problem
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
@@ -39,14 +39,14 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 __all__ = [
     "Episode",
     "Made",
-    "attempt",
-    "attempts",
-    "made_of",
-    "moments",
-    "packed",
-    "scene_name",
-    "unpacked",
-    "work_file",
+    "compute_scene_name",
+    "get_work_file",
+    "make_episode",
+    "pack",
+    "run_attempt",
+    "run_attempts",
+    "sample_times",
+    "unpack",
 ]
 
 _PLANNER = {"entries": 512, "megabytes": 96.0}
@@ -126,13 +126,13 @@ Made = tuple[dict[str, Any], bytes]
 """The record of an attempt, as in the journal, and the episode packed, empty if it became none."""
 
 
-def attempts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> list[Made]:
-    """Make episodes of a recipe, as plain data, by their numbers; with what to load for which robot. See `attempt`."""
+def run_attempts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> list[Made]:
+    """Make episodes of a recipe, as plain data, by their numbers; with what to load for which robot. See `run_attempt`."""
     said, numbers, robots = task
-    return [attempt(said, number, robots) for number in numbers]
+    return [run_attempt(said, number, robots) for number in numbers]
 
 
-def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> Made:
+def run_attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> Made:
     """Make one episode; an exception becomes a failure on record."""
     began, worked = time.perf_counter(), time.process_time()
     record: dict[str, Any] = {"number": number, "success": False}
@@ -143,7 +143,7 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
             warnings.simplefilter(
                 "ignore"
             )  # what is said of a robot would be said again of every episode
-            asked = problem(recipe, number, robots, _planner())
+            asked = sample_problem(recipe, number, robots, _planner())
             record |= {**asked.about, "setup_time": round(time.perf_counter() - began, 4)}
             found = plan(
                 asked.scene,
@@ -162,11 +162,11 @@ def attempt(said: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> 
                 record |= _physics(executed)
                 if executed.ok and recipe.cameras:
                     images = render_images(
-                        executed, recipe.cameras, moments(found.trajectory, recipe.fields.rate)
+                        executed, recipe.cameras, sample_times(found.trajectory, recipe.fields.rate)
                     ).to_bytes()
             if record["success"]:
                 about = asked.about | {"metrics": _metrics(found)}
-                data, more = packed(number, about, found, images)
+                data, more = pack(number, about, found, images)
                 record |= more
     except NoProblemError as error:
         record |= {"status": "no problem", "reason": str(error)}
@@ -220,7 +220,7 @@ def _physics(executed: SimulationResult) -> dict[str, Any]:
     }
 
 
-def moments(motion: Trajectory, rate: float) -> Floats:
+def sample_times(motion: Trajectory, rate: float) -> Floats:
     """Return when a motion is sampled at a rate [Hz], from its start to its end, shape (N,) [s]."""
     count = int(np.ceil((motion.times[-1] - motion.times[0]) * rate)) + 1
     return np.minimum(motion.times[0] + np.arange(count) / rate, motion.times[-1])
@@ -240,15 +240,15 @@ def _metrics(found: Plan) -> dict[str, float]:
     return {name: float(found.metrics[name]) for name in names if np.isfinite(found.metrics[name])}
 
 
-def scene_name(document: Mapping[str, Any]) -> str:
+def compute_scene_name(document: Mapping[str, Any]) -> str:
     """Return the name of a scene's description, which depends on what it says alone."""
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
-def packed(
+def pack(
     number: int, about: Mapping[str, Any], found: Plan, images: bytes = b""
 ) -> tuple[bytes, dict[str, Any]]:
-    """Return a plan as bytes that `unpacked` reads, and what the journal says of it: scene, start, way and metrics.
+    """Return a plan as bytes that `unpack` reads, and what the journal says of it: scene, start, way and metrics.
 
     Args:
         number: Of the episode.
@@ -288,12 +288,12 @@ def packed(
         buffer, allow_pickle=False, about=np.array(json.dumps(data)), **arrays, **seen
     )
     more = {
-        "scene": scene_name(document),
+        "scene": compute_scene_name(document),
         "start": np.asarray(found.scene.start).round(4).tolist(),
         "end": found.trajectory.positions[-1][:2].round(4).tolist(),
         "waypoints": len(found.trajectory.times),
         **{name: round(value, 5) for name, value in _metrics(found).items() if name != "effort"},
-        "way": way(found.trajectory),
+        "way": sample_coarse_trajectory(found.trajectory),
     }
     return buffer.getvalue(), more
 
@@ -307,12 +307,12 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def unpacked(data: bytes, robots: Path | None = None) -> Episode:
-    """Return the episode that `packed` made bytes of; `robots` is the folder of the dataset's robots."""
+def unpack(data: bytes, robots: Path | None = None) -> Episode:
+    """Return the episode that `pack` made bytes of; `robots` is the folder of the dataset's robots."""
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     about, seen = json.loads(str(arrays.pop("about"))), arrays.pop("images", None)
-    found = made_of(
+    found = make_episode(
         about, {name: np.asarray(values, float) for name, values in arrays.items()}, robots
     )
     return (
@@ -322,10 +322,10 @@ def unpacked(data: bytes, robots: Path | None = None) -> Episode:
     )
 
 
-def made_of(
+def make_episode(
     data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path | None = None
 ) -> Episode:
-    """Return an episode of its description and its arrays; see `packed`.
+    """Return an episode of its description and its arrays; see `pack`.
 
     Raises:
         InputError: Something is missing from them or does not fit.
@@ -362,6 +362,6 @@ def made_of(
         ) from error
 
 
-def work_file(out: Path, number: int) -> Path:
+def get_work_file(out: Path, number: int) -> Path:
     """Return where an episode is kept until it is in a shard."""
     return out / "work" / f"{number:08d}.hdf5"

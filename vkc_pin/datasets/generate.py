@@ -16,14 +16,14 @@ import yaml
 from tqdm import tqdm
 
 from vkc_pin.datasets.dataset import Dataset, Register
-from vkc_pin.datasets.episode import Made, work_file
+from vkc_pin.datasets.episode import Made, get_work_file
 from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
-from vkc_pin.datasets.formats.card import card
-from vkc_pin.datasets.formats.parts import parts
+from vkc_pin.datasets.formats.card import make_card
+from vkc_pin.datasets.formats.parts import make_parts
 from vkc_pin.datasets.recipes.recipe import CAMERAS, Recipe, load_recipe
-from vkc_pin.datasets.recipes.terms import as_entries
-from vkc_pin.datasets.robots import check_frames, ready_robots
+from vkc_pin.datasets.recipes.terms import make_entries
+from vkc_pin.datasets.robots import check_frames, prepare_robots
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.utils.arguments import flag, whole
@@ -100,11 +100,11 @@ def generate(
     made = load_recipe(recipe, variants=variants, simulate=simulate)
     if flag(cameras, "cameras") and not made.fields.cameras:
         made = load_recipe(made, cameras=CAMERAS)
-    if own := as_entries(terms):
+    if own := make_entries(terms):
         made = load_recipe(made, terms=[*made.document["terms"], *own])
-    hdf5.needed()
+    hdf5.require_h5py()
     if flag(lerobot, "lerobot"):
-        lerobot_layout.needed(made.fields.rate)
+        lerobot_layout.require_pyarrow(made.fields.rate)
     if made.fields.simulate:
         import_mujoco()
     check_frames(made)
@@ -179,7 +179,7 @@ def _lost(dataset: Dataset, journal: Journal, there: Set[int]) -> list[str]:
     good = [
         key for key in journal.lines if int(key) not in there and _kept(journal, key)["success"]
     ]
-    return [key for key in good if not work_file(dataset.folder, int(key)).is_file()]
+    return [key for key in good if not get_work_file(dataset.folder, int(key)).is_file()]
 
 
 def _run(
@@ -194,7 +194,7 @@ def _run(
     document, fields = dataset.recipe.document, dataset.recipe.fields
     clock, most = _Clock(), max(_LEAST, _PATIENCE * register.wanted)
     size, again = fields.rooms.episodes * fields.variants, deque[int]()
-    robots = ready_robots(dataset.recipe, dataset.folder / "robots")
+    robots = prepare_robots(dataset.recipe, dataset.folder / "robots")
 
     def tasks() -> Iterator[tuple[str, Any]]:
         clock.start()  # processes are there now
@@ -218,7 +218,7 @@ def _run(
         disable=not progress,
     )
     found = results(
-        parts,
+        make_parts,
         tasks(),
         jobs=jobs,
         scheduler=scheduler,
@@ -285,7 +285,7 @@ def _keep(
 ) -> None:
     """Write an attempt down: first the episode, then the line that says that it is there."""
     if data:
-        write_atomically(work_file(dataset.folder, record["number"]), data)
+        write_atomically(get_work_file(dataset.folder, record["number"]), data)
     clock.attempted(record)
     memory: dict[str, Any] = {
         name: record.pop(name) for name in ("memory_mb", "resident_mb", "process") if name in record
@@ -311,7 +311,8 @@ def _describe(dataset: Dataset, register: Register) -> None:
         "recipe": yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True),
     }
     write_atomically(
-        dataset.folder / "README.md", card(about, register.accepted, register.failures).encode()
+        dataset.folder / "README.md",
+        make_card(about, register.accepted, register.failures).encode(),
     )
 
 
@@ -321,7 +322,7 @@ def _as_lerobot(dataset: Dataset) -> None:
         own = (
             episode
             for shard in sorted(shards.glob("*.hdf5"))
-            for episode in hdf5.episodes_of(shard, dataset.folder / "scenes")
+            for episode in hdf5.read_episodes(shard, dataset.folder / "scenes")
         )
         first = next(own)
         with warnings.catch_warnings():

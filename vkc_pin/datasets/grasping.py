@@ -17,13 +17,13 @@ from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
 from vkc_pin.world.task.terms import Term, trace_terms
 
-__all__ = ["grasped"]
+__all__ = ["find_grasping_start"]
 
 _BATCH = 48  # random configurations that inverse kinematics brings to the grasp at once
 _DRAWS = 6  # batches before there is none
 
 
-def grasped(
+def find_grasping_start(
     scene: Scene,
     step: Actuate,
     rng: np.random.Generator,

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.datasets.grasping import grasped
-from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe, robot_name
-from vkc_pin.datasets.recipes.terms import meant
+from vkc_pin.datasets.grasping import find_grasping_start
+from vkc_pin.datasets.recipes.recipe import Recipe, get_robot_name, load_recipe
+from vkc_pin.datasets.recipes.terms import resolve_terms
 from vkc_pin.errors import VkcError
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner
@@ -26,7 +26,7 @@ from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 from vkc_pin.world.task.terms import Term
 
-__all__ = ["NoProblemError", "Problem", "problem", "terms_of"]
+__all__ = ["NoProblemError", "Problem", "resolve_episode_terms", "sample_problem"]
 
 _KEPT = 48  # rooms that a process keeps
 _STARTS = 300  # places that are tried for the robot
@@ -70,7 +70,9 @@ class _Place:
     layout: Layout | None
 
 
-def problem(recipe: Recipe, number: int, robots: Mapping[str, str], planner: Planner) -> Problem:
+def sample_problem(
+    recipe: Recipe, number: int, robots: Mapping[str, str], planner: Planner
+) -> Problem:
     """Return what episode `number` of a recipe asks for; the same in every run.
 
     Args:
@@ -105,19 +107,29 @@ def problem(recipe: Recipe, number: int, robots: Mapping[str, str], planner: Pla
             entry.height,
         )
         robot = entry.name
-    about: dict[str, Any] = {"task": task, "robot": robot_name(robot), "room": place.scene.name}
+    about: dict[str, Any] = {"task": task, "robot": get_robot_name(robot), "room": place.scene.name}
     scene, steps, more = (_fetch if task == "fetch-place" else _open)(
         recipe, place, rng, task == "given-open", planner
     )
     about |= {**more, "variant": variant}
     return Problem(
-        number, scene, steps, recipe.options, variant, about, terms_of(recipe, scene, about)
+        number,
+        scene,
+        steps,
+        recipe.options,
+        variant,
+        about,
+        resolve_episode_terms(recipe, scene, about),
     )
 
 
-def terms_of(recipe: Recipe, scene: Scene, about: Mapping[str, Any]) -> tuple[Term, ...]:
+def resolve_episode_terms(
+    recipe: Recipe, scene: Scene, about: Mapping[str, Any]
+) -> tuple[Term, ...]:
     """Return what the motion of an episode about something must keep to; see `Episode.about`."""
-    return meant(recipe.terms_of(about["task"]), scene, about["object"], about["attachment"])
+    return resolve_terms(
+        recipe.select_terms(about["task"]), scene, about["object"], about["attachment"]
+    )
 
 
 _scene = functools.lru_cache(maxsize=_KEPT)(load_scene)
@@ -159,7 +171,7 @@ def _place(said: str, room: int, robot: str, height: float | None) -> _Place:
             scene = Scene.from_document(document, scene.folder)
         return _Place(scene, layout)
     except VkcError as error:
-        raise NoProblemError(f"room {room} for {robot_name(robot)}: {error}") from error
+        raise NoProblemError(f"room {room} for {get_robot_name(robot)}: {error}") from error
 
 
 def _open(
@@ -188,8 +200,8 @@ def _open(
     step = Actuate(name, step.joints, attachment)
     ((joint, goal),) = step.joints.items()
     if given:
-        terms = meant(recipe.terms_of("given-open"), scene, name, attachment)
-        found = grasped(scene, step, rng, recipe.options, planner, terms)
+        terms = resolve_terms(recipe.select_terms("given-open"), scene, name, attachment)
+        found = find_grasping_start(scene, step, rng, recipe.options, planner, terms)
         if found is None:
             raise NoProblemError(f"no free grasp of {name}.{attachment} in {scene.name} was found")
         scene = found

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from vkc_pin.datasets.recipes.recipe import Recipe, robot_name
+from vkc_pin.datasets.recipes.recipe import Recipe, get_robot_name
 from vkc_pin.datasets.recipes.terms import check_robot
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.simulation.cameras.mount import check_frame
@@ -18,7 +18,7 @@ from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 from vkc_pin.world.scene.scene import load_scene
 
-__all__ = ["check_frames", "ready_robots"]
+__all__ = ["check_frames", "prepare_robots"]
 
 # configurations for pairs that need no check, as of robots that are loaded without an SRDF
 _SAMPLES = 1000
@@ -48,7 +48,7 @@ def check_frames(recipe: Recipe) -> None:
             check_robot(robot, recipe.terms)
 
 
-def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
+def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     """Return name in the recipe → path of what to load, for the robots that are imported or given by path.
 
     Args:
@@ -64,7 +64,7 @@ def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is guessed is in the robot's folder
         for entry in () if recipe.fields.scenes else recipe.fields.robots:
-            made = folder / check_name(robot_name(entry.name), "robots")
+            made = folder / check_name(get_robot_name(entry.name), "robots")
             if not (made / "robot.yaml").is_file():
                 if not load_robot(entry.name).touch_links:
                     import_robot(find_robot(entry.name), made, samples=_SAMPLES)

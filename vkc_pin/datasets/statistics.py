@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.datasets.diversity import spread
+from vkc_pin.datasets.diversity import compute_coverage
 from vkc_pin.datasets.episode import Episode
 from vkc_pin.datasets.recipes.recipe import Recipe
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, use_style
@@ -21,7 +21,7 @@ from vkc_pin.world.trajectory.world_model import World
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["statistics_page"]
+__all__ = ["make_statistics_page"]
 
 _STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:70em;padding:0 1em;color:#222}"
@@ -34,7 +34,7 @@ _LISTED = 15  # rows of a table
 _CELLS = 10  # of every interval, whose share with an episode is the coverage
 
 
-def statistics_page(
+def make_statistics_page(
     recipe: Recipe,
     records: Sequence[Mapping[str, Any]],
     failures: Sequence[Mapping[str, str]],
@@ -131,7 +131,7 @@ def _coverage(recipe: Recipe, records: Sequence[Mapping[str, Any]]) -> str:
     rows = [
         [
             "headings of the base at the start, in 10 equal sectors",
-            f"{100.0 * spread(headings, 0.0, 2.0 * np.pi, _CELLS):.0f} %",
+            f"{100.0 * compute_coverage(headings, 0.0, 2.0 * np.pi, _CELLS):.0f} %",
         ],
         ["cells of 0.5 m on the floor that something starts in", str(len(cells))],
         ["rooms", str(len({record["room"] for record in records}))],

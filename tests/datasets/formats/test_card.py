@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import yaml
 
-from vkc_pin.datasets.formats.card import card
+from vkc_pin.datasets.formats.card import make_card
 
 
 def test_what_a_card_says() -> None:
@@ -23,7 +23,7 @@ def test_what_a_card_says() -> None:
         "duration": 1800.0,
     }
     failed = {"status": "infeasible", "reason": "the wall is in the way"}
-    text = card(about, [one, {**one, "scene": "t"}], [failed, failed])
+    text = make_card(about, [one, {**one, "scene": "t"}], [failed, failed])
     _, head, body = text.split("---\n", 2)
     assert yaml.safe_load(head)["license"] == "cc-by-4.0"
     assert yaml.safe_load(head)["size_categories"] == ["n<1K"]

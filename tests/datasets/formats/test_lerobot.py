@@ -11,8 +11,8 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.formats.lerobot import sentence
-from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.formats.lerobot import describe_task
+from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.datasets.generate import generate
 from vkc_pin.errors import InputError
 
@@ -61,7 +61,7 @@ def test_frames_are_the_samples(made: Dataset, root: Path) -> None:
     state = np.array(table["observation.state"].to_pylist())
     first = 0
     for number, episode in enumerate(made.episodes()):
-        found = sampled(episode, episode.scene().robot, said["fps"])
+        found = sample_episode(episode, episode.scene().robot, said["fps"])
         count = len(found["time"])
         own = slice(first, first + count)
         assert set(table["episode_index"].to_pylist()[own]) == {number}
@@ -97,7 +97,7 @@ def test_episodes_and_tasks(made: Dataset, root: Path) -> None:
     tasks = pq.read_table(root / "meta/tasks.parquet").to_pydict()
     texts = dict(zip(tasks["task"], tasks["task_index"], strict=True))
     assert [row["tasks"] for row in rows] == [
-        [sentence(episode.about)] for episode in made.episodes()
+        [describe_task(episode.about)] for episode in made.episodes()
     ]
     assert sorted(texts.values()) == list(range(len(texts)))
 
@@ -131,7 +131,7 @@ def test_lerobot_reads_it(made: Dataset, root: Path, monkeypatch: pytest.MonkeyP
     assert (found.num_episodes, found.fps, found.meta.robot_type) == (4, 10, "husky_ur5e")
     row = 0
     for number, episode in enumerate(made.episodes()):
-        own = sampled(episode, episode.scene().robot, found.fps)
+        own = sample_episode(episode, episode.scene().robot, found.fps)
         state = np.hstack([own[name] for name in ("base_pose", "arm_position", "gripper")])
         for k in range(len(state)):
             frame = found[row]
@@ -140,7 +140,7 @@ def test_lerobot_reads_it(made: Dataset, root: Path, monkeypatch: pytest.MonkeyP
                 int(frame["frame_index"]),
                 int(frame["index"]),
             ) == (number, k, row)
-            assert frame["task"] == sentence(episode.about)
+            assert frame["task"] == describe_task(episode.about)
             assert np.allclose(frame["observation.state"], state[k], atol=1e-6)
             assert np.allclose(frame["action"], own["actions"][k], atol=1e-6)
             row += 1
@@ -161,7 +161,7 @@ def test_lerobot_reads_ahead(root: Path, made: Dataset, monkeypatch: pytest.Monk
         "vkc_pin/small", root=root, episodes=[1], delta_timestamps={"action": [0.0, 0.1, 0.2]}
     )
     episode = list(made.episodes())[1]
-    actions = sampled(episode, episode.scene().robot, 10)["actions"]
+    actions = sample_episode(episode, episode.scene().robot, 10)["actions"]
     assert len(found) == len(actions)
     assert np.allclose(found[0]["action"], actions[:3], atol=1e-6)
     assert np.asarray(found[len(actions) - 1]["action_is_pad"]).tolist() == [False, True, True]

@@ -17,7 +17,7 @@ import vkc_pin as vkc
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
-from vkc_pin.datasets.problems import terms_of
+from vkc_pin.datasets.problems import resolve_episode_terms
 from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.datasets.recipes.terms import KeepOutSchema, SpeedSchema, TracedSchema, UprightSchema
 from vkc_pin.errors import InputError, UnknownNameError
@@ -156,7 +156,7 @@ def test_tasks_have_those_of_their_own(made: Dataset) -> None:
     )
     episode = next(made.episodes())
     found = [
-        terms_of(own, episode.scene(), {**episode.about, "task": task})
+        resolve_episode_terms(own, episode.scene(), {**episode.about, "task": task})
         for task in ("given-open", "drive-open")
     ]
     assert [len(terms) for terms in found] == [0, 1]

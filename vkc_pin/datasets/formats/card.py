@@ -8,12 +8,12 @@ from typing import Any
 
 import yaml
 
-__all__ = ["card"]
+__all__ = ["make_card"]
 
 _ROWS = 12  # of reasons
 
 
-def card(
+def make_card(
     about: Mapping[str, Any],
     records: Sequence[Mapping[str, Any]],
     failures: Sequence[Mapping[str, Any]],

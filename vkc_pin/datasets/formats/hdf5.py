@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.datasets.episode import Episode, made_of, scene_name
-from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.episode import Episode, compute_scene_name, make_episode
+from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.errors import InputError
 from vkc_pin.simulation.cameras.images import Images
 from vkc_pin.utils.arrays import Floats, Ints
@@ -33,7 +33,7 @@ from vkc_pin.world.task.terms import term_to_dict
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["episodes_of", "needed", "numbers_of", "part", "write_shard"]
+__all__ = ["make_part", "read_episodes", "read_numbers", "require_h5py", "write_shard"]
 
 _OBSERVED = (
     *("base_pose", "base_velocity", "arm_position", "arm_velocity"),
@@ -43,7 +43,7 @@ _ENVIRONMENT = "vkc_pin"
 _HELD_OUT = 10  # every so many an episode is in mask/valid, the others are in mask/train
 
 
-def needed() -> Any:
+def require_h5py() -> Any:
     """Return h5py.
 
     Raises:
@@ -60,10 +60,10 @@ def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> 
 
     Args:
         path: The file.
-        parts: For each episode, in order, a file of `part`, or a shard, and its place in there.
+        parts: For each episode, in order, a file of `make_part`, or a shard, and its place in there.
         scenes: The folder of the dataset's scenes, to which those of the parts are added.
     """
-    h5py = needed()
+    h5py = require_h5py()
     buffer = io.BytesIO()
     masks: dict[str, list[str]] = {"train": [], "valid": []}
     total = 0
@@ -88,7 +88,7 @@ def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> 
     return write_atomically(path, buffer.getvalue())
 
 
-def part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes:
+def make_part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes:
     """Return an episode as a file of its own, with its scene, of which `write_shard` makes part of a shard.
 
     Args:
@@ -97,7 +97,7 @@ def part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes:
         rate: Samples a second.
         recipe: The digest of what it was made of.
     """
-    h5py = needed()
+    h5py = require_h5py()
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="latest") as file:
         data = file.create_group("data")
@@ -125,7 +125,7 @@ def _keep_scene(found: h5py.File, path: Path) -> None:
 
 def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> None:
     """Write one episode."""
-    found, motion = sampled(episode, robot, rate), episode.trajectory.to_dict()
+    found, motion = sample_episode(episode, robot, rate), episode.trajectory.to_dict()
     count = len(found["time"])
     for name in _OBSERVED:
         _array(group, f"obs/{name}", found[name], np.float32)
@@ -156,7 +156,7 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> No
         report[name] = _finite(report[name])
     group.attrs["num_samples"] = count
     group.attrs["number"] = episode.number
-    group.attrs["scene"] = scene_name(episode.document)
+    group.attrs["scene"] = compute_scene_name(episode.document)
     group.attrs["task"] = str(episode.about["task"])
     said: dict[str, Any] = {
         "about": dict(episode.about),
@@ -198,7 +198,7 @@ def _finite(values: Any) -> Any:
     return float(values) if np.isfinite(values) else None
 
 
-def numbers_of(path: Path) -> list[int]:
+def read_numbers(path: Path) -> list[int]:
     """Return the numbers of a shard's episodes, in order.
 
     Raises:
@@ -208,7 +208,7 @@ def numbers_of(path: Path) -> list[int]:
         return [int(file["data"][f"demo_{k}"].attrs["number"]) for k in range(len(file["data"]))]
 
 
-def episodes_of(path: Path, scenes: Path) -> Iterator[Episode]:
+def read_episodes(path: Path, scenes: Path) -> Iterator[Episode]:
     """Yield the episodes of a shard, in order.
 
     Args:
@@ -238,7 +238,7 @@ def episodes_of(path: Path, scenes: Path) -> Iterator[Episode]:
                 raise InputError(
                     "not a shard of episodes", file=path, field=f"demo_{k}", got=str(error)
                 ) from error
-            episode = made_of(
+            episode = make_episode(
                 {**said, "options": options, "number": number, "scene": documents[name]},
                 arrays,
                 scenes.parent / "robots",
@@ -272,18 +272,18 @@ def _images(path: Path, k: int) -> Images:
 def _document(scenes: Path, name: str) -> Any:
     file = scenes / f"{name}.json"
     document = parse_json(read_text(file, "scene"), file)
-    if scene_name(document) != name:
+    if compute_scene_name(document) != name:
         raise InputError(
             "this scene is not what its name says",
             file=file,
             expected=name,
-            got=scene_name(document),
+            got=compute_scene_name(document),
         )
     return document
 
 
 def _opened(path: Path) -> Any:
-    h5py = needed()
+    h5py = require_h5py()
     try:
         return h5py.File(path, "r")
     except OSError as error:

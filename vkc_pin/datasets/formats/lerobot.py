@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.datasets.episode import Episode
-from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import optional_package
 from vkc_pin.world.files.writing import folder_at_once
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["VERSION", "needed", "sentence", "write_lerobot"]
+__all__ = ["VERSION", "describe_task", "require_pyarrow", "write_lerobot"]
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -44,7 +44,7 @@ _KINDS = {
 _STATE = ("base_pose", "arm_position", "gripper")
 
 
-def needed(rate: float) -> Any:
+def require_pyarrow(rate: float) -> Any:
     """Return pyarrow, if frames can be written at a rate [Hz].
 
     Raises:
@@ -61,7 +61,7 @@ def needed(rate: float) -> Any:
     return optional_package("pyarrow", "data", what="LeRobot's layout", field="lerobot")
 
 
-def sentence(about: Mapping[str, Any]) -> str:
+def describe_task(about: Mapping[str, Any]) -> str:
     """Return what an episode does, in words, as policies that take language are told it."""
     thing = str(about["kind"]).replace("_", " ")
     return (
@@ -85,7 +85,7 @@ def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: f
         robot: Theirs.
         rate: Frames a second, a whole number.
     """
-    arrow = needed(rate)
+    arrow = require_pyarrow(rate)
     with folder_at_once(path, force=True) as folder:
         writer = _Writer(arrow, folder, robot, rate)
         for episode in episodes:
@@ -125,9 +125,9 @@ class _Writer:
 
     def add(self, episode: Episode) -> None:
         """Add an episode."""
-        found = sampled(episode, self.robot, self.rate)
+        found = sample_episode(episode, self.robot, self.rate)
         count, number = len(found["time"]), len(self.rows)
-        task = self.tasks.setdefault(sentence(episode.about), len(self.tasks))
+        task = self.tasks.setdefault(describe_task(episode.about), len(self.tasks))
         columns: dict[str, Any] = {
             "observation.state": np.hstack([found[name] for name in _STATE]).astype(np.float32),
             "observation.velocity": np.hstack(
@@ -167,7 +167,7 @@ class _Writer:
         self.rows.append(
             {
                 "episode_index": number,
-                "tasks": [sentence(episode.about)],
+                "tasks": [describe_task(episode.about)],
                 "length": count,
                 "data/chunk_index": self.files // _CHUNK,
                 "data/file_index": self.files % _CHUNK,

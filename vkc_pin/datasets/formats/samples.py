@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.datasets.episode import Episode, moments
+from vkc_pin.datasets.episode import Episode, sample_times
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["sampled"]
+__all__ = ["sample_episode"]
 
 
-def sampled(episode: Episode, robot: Robot, rate: float) -> Mapping[str, Floats]:
+def sample_episode(episode: Episode, robot: Robot, rate: float) -> Mapping[str, Floats]:
     """Return what is observed and told at every moment, each of shape (N, k).
 
     Args:
@@ -31,7 +31,7 @@ def sampled(episode: Episode, robot: Robot, rate: float) -> Mapping[str, Floats]
         base, arm and gripper are at the next moment (N, n + 1).
     """
     motion = episode.trajectory
-    times = moments(motion, rate)
+    times = sample_times(motion, rate)
     positions, velocities, size = motion.at(times), motion.velocity(times), motion.robot_size
     phase = np.clip(
         np.searchsorted(motion.times[[p.last for p in motion.phases]], times),

@@ -47,8 +47,8 @@ __all__ = [
     "RobotEntry",
     "RoomsSchema",
     "StartSchema",
+    "get_robot_name",
     "load_recipe",
-    "robot_name",
 ]
 
 TASKS = ("given-open", "drive-open", "fetch-place")
@@ -212,7 +212,7 @@ class Recipe:
         """Its own constraints and costs, in order: what every motion keeps to, about frames by words; see `terms`."""
         return trace_terms_without_scene([entry.term() for entry in self.fields.terms])
 
-    def terms_of(self, task: str) -> tuple[Term, ...]:
+    def select_terms(self, task: str) -> tuple[Term, ...]:
         """Return those of its terms that a task has to keep to."""
         entries = zip(self.terms, self.fields.terms, strict=True)
         return tuple(term for term, entry in entries if not entry.tasks or task in entry.tasks)
@@ -301,7 +301,7 @@ def _options(document: Document, given: Mapping[str, Any]) -> Options:
         ) from error
 
 
-def robot_name(name: str) -> str:
+def get_robot_name(name: str) -> str:
     """Return what a robot is called in a dataset: its name, or that of its file or folder."""
     path = Path(name)
     return (
@@ -329,7 +329,7 @@ def _robots(
             entry.model_copy(update={"name": str(path)}) if _is_path(entry.name) else entry
         )
         name = robots[-1].name
-        if found.setdefault(robot_name(name), name) != name:
+        if found.setdefault(get_robot_name(name), name) != name:
             raise document.error(
                 ("robots", k),
                 "two robots of one name",

@@ -31,10 +31,10 @@ __all__ = [
     "TermSchema",
     "TracedSchema",
     "UprightSchema",
-    "as_entries",
     "check_entries",
     "check_robot",
-    "meant",
+    "make_entries",
+    "resolve_terms",
 ]
 
 OBJECT = "object"
@@ -142,7 +142,7 @@ TermSchema = Annotated[
 Entry = UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema
 
 
-def as_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
+def make_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
     """Return terms as entries of a recipe: plain data.
 
     Raises:
@@ -195,7 +195,9 @@ def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
             known(coordinate, robot.coordinates.names, f"coordinate of {robot.name}", where)
 
 
-def meant(terms: Sequence[Term], scene: Scene, name: str, attachment: str) -> tuple[Term, ...]:
+def resolve_terms(
+    terms: Sequence[Term], scene: Scene, name: str, attachment: str
+) -> tuple[Term, ...]:
     """Return terms about what is there.
 
     Args:

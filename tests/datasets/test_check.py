@@ -79,7 +79,7 @@ def test_an_episode_that_is_there_twice(copy: Path) -> None:
         del file["data/demo_3"]
         file.copy("data/demo_1", "data/demo_3")
     found = check_dataset(copy)
-    assert f"episode {numbers[1]} is there 2 times" in found.problems
+    assert f"episode {numbers[1]} occurs 2 times" in found.problems
     assert any("episodes.csv" in problem for problem in found.problems)
 
 
@@ -111,7 +111,7 @@ def test_other_processes_find_the_same(copy: Path) -> None:
 
 
 def test_no_dataset(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no dataset"):
+    with pytest.raises(InputError, match="the folder holds no dataset"):
         check_dataset(tmp_path)
 
 

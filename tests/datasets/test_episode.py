@@ -76,7 +76,7 @@ def test_an_exception_is_a_failure_on_record(monkeypatch: pytest.MonkeyPatch) ->
     def broken(*args: object) -> None:
         raise ZeroDivisionError("nothing to divide by")
 
-    monkeypatch.setattr(module, "problem", broken)
+    monkeypatch.setattr(module, "sample_problem", broken)
     record, data = run_attempt(DOCUMENT, 3, {})
     assert (record["success"], record["status"], data) == (False, "error", b"")
     assert record["reason"] == "ZeroDivisionError: nothing to divide by"

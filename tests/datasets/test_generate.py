@@ -130,7 +130,7 @@ def test_how_many(tmp_path: Path, episodes: Any, field: str) -> None:
 def test_nothing_is_written_into_what_is_something_else(made: Dataset, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.tex").write_text("x")
-    with pytest.raises(InputError, match="something else in this folder"):
+    with pytest.raises(InputError, match="the folder holds other files"):
         generate(SMALL, 1, tmp_path / "mine")
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
     with pytest.raises(InputError, match="run otherwise") as caught:
@@ -142,8 +142,8 @@ def test_nothing_is_written_into_what_is_something_else(made: Dataset, tmp_path:
 
 
 def test_hopeless_recipes_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_LEAST", 4)
-    with pytest.raises(VkcError, match=r"4 attempts gave 0 episodes of 1.*no free start"):
+    monkeypatch.setattr(module, "_MIN_ATTEMPTS", 4)
+    with pytest.raises(VkcError, match=r"4 attempts gave 0 of 1 episodes.*no free start"):
         generate(
             {**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}},
             1,

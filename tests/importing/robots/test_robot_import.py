@@ -219,7 +219,7 @@ def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(
     ("text", "said"),
     [
         ("<sdf/>", r"expected <robot> \(URDF or xacro\) or <mujoco> \(MJCF\), got <sdf>"),
-        ("<robot name='x'><link name='a'/></robot>", "this robot has no shapes"),
+        ("<robot name='x'><link name='a'/></robot>", "the robot has no shapes"),
         ("not xml", "not valid XML"),
     ],
 )

@@ -19,7 +19,7 @@ from vkc_pin.benchmarks.robot_object_matrix.pairs import (
     kind_of,
     pair,
 )
-from vkc_pin.planning.diagnosis.diagnosis import Blocked
+from vkc_pin.planning.diagnosis.diagnosis import BlockedGoal
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.furniture.catalogue import KINDS
 from vkc_pin.world.files.resources import folder
@@ -112,11 +112,13 @@ def test_what_is_reached_shut_but_not_open_is_not_taken_first(
     looked: list[str] = []
     real = pairs.diagnose_goals
 
-    def diagnose_goals(problem: TrajectoryProblem, seed: int) -> list[Blocked]:
+    def diagnose_goals(problem: TrajectoryProblem, seed: int) -> list[BlockedGoal]:
         (hold,) = problem.task.holds
         looked.append(hold.attachment)
         return (
-            [Blocked("move it.lid: out of reach", 0.3)] if len(looked) == 1 else real(problem, seed)
+            [BlockedGoal("move it.lid: out of reach", 0.3)]
+            if len(looked) == 1
+            else real(problem, seed)
         )
 
     monkeypatch.setattr(pairs, "diagnose_goals", diagnose_goals)
@@ -127,7 +129,9 @@ def test_what_is_reached_shut_but_not_open_is_not_taken_first(
     assert list(found.scene.objects["it"].object.attachments)[:2] == [second, first], (
         "it is left to planning, after the other"
     )
-    monkeypatch.setattr(pairs, "diagnose_goals", lambda *_: [Blocked("move it.lid: out of reach", 0.3)])
+    monkeypatch.setattr(
+        pairs, "diagnose_goals", lambda *_: [BlockedGoal("move it.lid: out of reach", 0.3)]
+    )
     nowhere = pair(husky, "husky_ur5e", "chest_0")
     assert (nowhere.step, nowhere.because.split("; ")[0]) == (
         None,

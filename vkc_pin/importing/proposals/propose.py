@@ -337,7 +337,7 @@ class _Search:
             between = (
                 f"the fingers, {1e3 * hand.opening:.0f} mm apart, with {clear:.0f} mm on both sides"
             )
-            return f"no part of it fits between {between}{thinnest}"
+            return f"nothing of it fits between {between}{thinnest}"
         reasons = []
         for blocked, count in rejected[:3]:
             least = 1e3 * (self.close if blocked.what == "fingers" else self.safe)

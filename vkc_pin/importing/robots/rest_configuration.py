@@ -72,15 +72,17 @@ class Clearances:
             moved: Whether to return links that the arm moves, or the others.
         """
         heights: dict[str, float] = {}
-        compute_lowest_points = self._distances.compute_lowest_points()
+        lowest = self._distances.compute_lowest_points()
         for k in np.flatnonzero(self._is_moved == moved).tolist():
-            heights[self._names[k]] = min(float(compute_lowest_points[k]), heights.get(self._names[k], np.inf))
+            heights[self._names[k]] = min(float(lowest[k]), heights.get(self._names[k], np.inf))
         return sorted(heights.items(), key=lambda item: item[1])
 
     def least(self, limit: float = np.inf) -> float:
-        """Return the smallest distance compute_distance links and to the floor [m], at most `limit`."""
-        nearest = float(min(limit, self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf)))
-        compute_lower_bounds = self._distances.compute_lower_bounds(self._pairs)
+        """Return the smallest distance between links and to the floor [m], at most `limit`."""
+        nearest = float(
+            min(limit, self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf))
+        )
+        bounds = self._distances.compute_lower_bounds(self._pairs)
         for k in np.argsort(bounds).tolist():
             if bounds[k] > nearest:
                 break
@@ -195,8 +197,10 @@ def find_inseparable_pairs(
     pairs = clearances.by_links()
     furthest, separated = dict.fromkeys(pairs.links, -np.inf), dict.fromkeys(pairs.links, 0)
     for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
-        clearances.set_configuration(arm)
-        for k, (links, bound) in enumerate(zip(pairs.links, pairs.compute_lower_bounds(), strict=True)):
+        clearances.place(arm)
+        for k, (links, bound) in enumerate(
+            zip(pairs.links, pairs.compute_lower_bounds(), strict=True)
+        ):
             distance = float(bound) if bound > margin else pairs.compute_distance(k, margin)
             furthest[links] = max(furthest[links], distance)
             separated[links] += distance >= margin

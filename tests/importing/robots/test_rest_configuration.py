@@ -49,7 +49,7 @@ def test_the_first_state_with_room_is_home(robot: vkc.Robot) -> None:
 def test_home_is_searched_for_where_none_is_named(robot: vkc.Robot) -> None:
     home = find_home(robot, [("folded", np.array([0.0, 1.9, 1.9, 0.0, 0.0]))], seed=1)
     again = find_home(robot, [], seed=1)
-    assert home.how == "searched for"
+    assert home.how == "found by search"
     np.testing.assert_array_equal(home.positions, again.positions)
     look = Clearances(robot)
     look.place(home.positions)

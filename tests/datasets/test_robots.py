@@ -19,11 +19,11 @@ def test_a_robot_without_a_hand_is_imported_once(
 ) -> None:
     pytest.importorskip("coacd")
     recipe = load_recipe({**SMALL, "robots": ["husky_ur5e", {"name": "panda", "height": 0.5}]})
-    found = robots.ready_robots(recipe, tmp_path)
+    found = robots.prepare_robots(recipe, tmp_path)
     assert list(found) == ["panda"]  # the other one says what its hand is
     assert load_robot(found["panda"]).touch_links
     monkeypatch.setattr(robots, "import_robot", None)
-    assert robots.ready_robots(recipe, tmp_path) == found
+    assert robots.prepare_robots(recipe, tmp_path) == found
 
 
 @pytest.mark.parametrize("given", ["robot.yaml", "husky_ur5e.urdf"])

@@ -65,9 +65,9 @@ def write_csv(
     a phase says what it is, empty where it rests. A waypoint between two phases is in the earlier
     one. Numbers have as many digits as it takes to read back the very same.
 
-    A motion that has a curve has a line a knot, with the same coordinates' velocities, `base_x
-    velocity [m/s]` and so on, after their positions, and then `waypoint`, 1 for a knot that is one
-    and 0 for the others.
+    A trajectory with a curve has one line per knot. After the positions come the velocities of the
+    same coordinates (`base_x velocity [m/s]` and so on), and then `waypoint`: 1 for a knot that is
+    a waypoint, else 0.
 
     Args:
         motion: What to write.

@@ -15,6 +15,7 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores, gap
+from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
@@ -81,7 +82,7 @@ def picture(
 
 def attachments() -> None:
     """Write the picture of proposed attachments."""
-    vkc.plotting.plot_attachments(
+    plot_attachments(
         vkc.propose_attachments(vkc.load_object("dishwasher"), most=2), IMAGES / "attachments.png"
     )
 

@@ -41,7 +41,7 @@ def _base() -> tuple[dict[str, Any], dict[str, Any]]:
         motion(),
         report,
         "rejected",
-        planned.metrics,
+        planned.statistics,
         history=planned.history,
         terms=trace_terms(scene(), terms),
     )

@@ -151,7 +151,7 @@ def test_the_first_opening_is_there_from_the_start() -> None:
     assert rests([0, 1, 2, 3, 4, 5, 6], [span(0, 3, opening=0.05), span(3, 6, opening=0.05)]) == []
 
 
-GRIPPER = SimpleNamespace(resting=0.08)
+GRIPPER = SimpleNamespace(rest_opening=0.08)
 
 
 def told(

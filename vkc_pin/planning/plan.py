@@ -229,7 +229,7 @@ class Plan:
             "trajectory": self.trajectory.to_dict(),
             "validation": self.validation.to_dict(),
             "status": self.status,
-            "metrics": self.metrics,
+            "metrics": {**self.metrics, **_measure(self)},
             "seed": self.seed,
             "initialization": self.initialization,
             "history": [dict(row) for row in self.history],

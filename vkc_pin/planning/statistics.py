@@ -29,6 +29,7 @@ class PlanningStatistics:
         ipopt_time: Time inside Ipopt [s].
         retiming_time: Time for retiming [s].
         validation_time: Time for validation [s].
+        following_time: Time in which the arm of a baseline follows the base [s].
     """
 
     planning_time: float = 0.0
@@ -42,6 +43,7 @@ class PlanningStatistics:
     ipopt_time: float = 0.0
     retiming_time: float = 0.0
     validation_time: float = 0.0
+    following_time: float = 0.0
 
     def __add__(self, other: PlanningStatistics) -> PlanningStatistics:
         mine, theirs = vars(self), vars(other)
@@ -55,6 +57,8 @@ class PlanningStatistics:
     def to_metrics(self) -> dict[str, float]:
         """Return the statistics under the names that records of benchmarks have."""
         times = {f"time_{stage}": float(getattr(self, f"{stage}_time")) for stage in STAGES}
+        if self.following_time:
+            times["time_following"] = self.following_time
         counts = {
             "iterations": float(self.iterations),
             "rounds": float(self.rounds),
@@ -70,7 +74,8 @@ class PlanningStatistics:
     @classmethod
     def from_metrics(cls, metrics: Mapping[str, float]) -> PlanningStatistics:
         """Return the statistics that `to_metrics` wrote; names that are missing count as 0."""
-        times = {f"{stage}_time": float(metrics.get(f"time_{stage}", 0.0)) for stage in STAGES}
+        stages = (*STAGES, "following")
+        times = {f"{stage}_time": float(metrics.get(f"time_{stage}", 0.0)) for stage in stages}
         return cls(
             planning_time=float(metrics.get("planning_time", 0.0)),
             build_time=float(metrics.get("build_time", 0.0)),

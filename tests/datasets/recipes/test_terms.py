@@ -133,7 +133,7 @@ def test_terms_that_are_not_the_recipe_s_are_noticed(copy: Path) -> None:
     number = said(copy, lambda words: words.pop("terms"))
     found = check_dataset(copy)
     assert list(found.refused) == [number]
-    assert "terms are not those of the recipe" in found.refused[number]
+    assert "terms differ from those of the recipe" in found.refused[number]
 
 
 def test_they_are_part_of_what_determines_episodes(made: Dataset) -> None:

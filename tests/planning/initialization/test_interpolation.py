@@ -401,7 +401,7 @@ def test_extension_limit_is_halved_after_failures(
     monkeypatch.setattr(joining, "connect", connect)
     for number, phase in enumerate([0, 0, 1, 0, 0, 0, 0, 0]):
         monkeypatch.setattr(ways.routes, "find_guide_path", lambda *_: np.zeros((2, 3)))
-        for name in ("folded_arm", "nearest_folded_arm"):
+        for name in ("get_folded_arm", "find_nearest_folded_arm"):
             monkeypatch.setattr(ways.routes, name, lambda *_: p.start[3:ROBOT])
         way = ways.find_path(phase, p.start, at(p, GOAL), 5, turns=True, reaches=True)
         assert (way is not None) == (number == 5)

@@ -494,8 +494,8 @@ def test_compiled_trees_reject_invalid_arguments() -> None:
         lambda: one._trees.run(rows[:, 1:], rows, 1),
         lambda: one._trees.run(rows, rows, 1),
         lambda: one._trees.run(rows[:1], rows[:0], 1),
-        lambda: one._trees.compute_free_share(rows[:1]),
-        lambda: one._trees.compute_free_share(rows[:, :3]),
+        lambda: one._trees.along(rows[:1]),
+        lambda: one._trees.along(rows[:, :3]),
         lambda: one._trees.evened(rows[:0], 0, 0.0),
     ):
         with pytest.raises(ValueError, match=r"robot's coordinates|one configuration|two ends"):

@@ -29,6 +29,7 @@ docs: $(VENV)/docs.stamp
 
 lint: $(VENV)/test.stamp
 	$(BIN)/ruff check
+	$(BIN)/ruff format --check --quiet
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
@@ -51,7 +52,7 @@ $(VENV)/created.stamp:
 has_headers = import pathlib, sys, sysconfig; sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())
 
 # The package is installed from this checkout: Python files are used as they stand, so only these need it again.
-COMPILED := $(wildcard vkc_pin/*/*.cpp vkc_pin/*/*.hpp)
+COMPILED := $(wildcard vkc_pin/*/*/*.cpp vkc_pin/*/*/*.hpp)
 $(VENV)/installed.stamp: pyproject.toml CMakeLists.txt $(COMPILED) | $(VENV)/created.stamp
 	@echo "Installing vkc-pin and what it needs into $(VENV); compiling takes a minute or two"
 	$(PIP) install --editable .

@@ -1,7 +1,7 @@
 """How the site is built: `make docs`, or `sphinx-build -W -c docs . out/site` in the checkout.
 
-The source folder is the checkout itself, so that links from page to page, to notebooks and to files are the same on the site as
-in the repository.
+The source folder is the checkout itself, so that links from page to page, to notebooks and to files
+are the same on the site as in the repository.
 """
 
 import sys
@@ -16,12 +16,36 @@ author = "the authors of vkc_pin"
 copyright = "2026, the authors of vkc_pin"
 version = release = __version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "svg_math", "vkc_site"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+    "svg_math",
+    "vkc_site",
+]
 root_doc = "docs/index"
-include_patterns = ["docs/**", "notebooks/*.ipynb", "CHANGELOG.md", "robots/husky_ur5e/README.md", "tools/README.md"]
-exclude_patterns = ["docs/_*", "**/.ipynb_checkpoints", ".*", "out", "build", "dist", "tests", "vkc_pin", "scenes"]
+include_patterns = [
+    "docs/**",
+    "notebooks/*.ipynb",
+    "CHANGELOG.md",
+    "robots/husky_ur5e/README.md",
+    "tools/README.md",
+]
+exclude_patterns = [
+    "docs/_*",
+    "**/.ipynb_checkpoints",
+    ".*",
+    "out",
+    "build",
+    "dist",
+    "tests",
+    "vkc_pin",
+    "scenes",
+]
 nitpicky = True
-# Names of other packages have no pages here; single backticks in docstrings are code first, and links where they happen to lead.
+# Names of other packages have no pages here; single backticks in docstrings are code first, and
+# links where they happen to lead.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!vkc_pin\.).*|.*<locals>.*"),
     ("py:class", r"vkc_pin\.[\w.]+\.(_\w+|[A-Z]|\w+Schema|Annotated)"),

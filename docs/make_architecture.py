@@ -1,7 +1,7 @@
 """Draws docs/images/architecture.svg from the package's imports: `python docs/make_architecture.py`. Needs nothing but Python.
 
-Rows are the layers of the import contract in pyproject.toml. An arrow leads from a wing to one that it imports, unless others
-lead there too. What is open to all has no arrows.
+Rows are the layers of the import contract in pyproject.toml. An arrow leads from a package to one
+that it imports, unless others lead there too. Packages that all others import have no arrows.
 """
 
 from __future__ import annotations
@@ -15,96 +15,119 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "vkc_pin"
 FILE = ROOT / "docs" / "images" / "architecture.svg"
-OPEN_TO_ALL = {"arrays", "budget", "cache", "compiled", "errors", "kept", "notebook", "options"}
-CHECKING = {"validation"}
-# Where wings stand, from the left: so that arrows find their way between them. Others share their row.
-COLUMNS = {
-    **dict.fromkeys(("cli", "benchmarks", "baselines", "planning", "solver", "motion", "scene", "models", "files"), 2),
-    **{"seeds": 0, "driving": 0, "program": 1, "chain": 1, "task": 1, "cpin": 1},
-    **{"visualization": 3, "validation": 3, "plotting": 4, "options": 3, "distances": 3, "importing": 4},
+FOUNDATION = {"errors", "utils", "options"}  # imported by all others
+CHECKS = {"validation"}
+COLUMN = {
+    "validation": 1,
+    "procedural": -1,
+    "importing": -1,
+    "simulation": 1,
+    "datasets": 1,
+    "baselines": -1,
 }
-WIDTH, COLUMN, ROW, MARGIN = 1100, 200, 88, 46  # [pixels], as are all lengths here
-BOX_WIDTH, BOX_HEIGHT, CHARACTERS = 186, 60, 30
-ROOM = 12  # between an arrow and boxes that it passes
+WIDTH, SPACING, ROW, MARGIN = 860, 250, 88, 46  # [pixels], as are all lengths here
+BOX_WIDTH, BOX_HEIGHT, CHARACTERS = 216, 60, 36
+GAP = 12  # between an arrow and boxes that it passes
 
 
 def layers() -> list[list[str]]:
-    """Return the layers of the import contract, top first, each with its wings."""
+    """Return the layers of the import contract, top first, each with its packages."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    (contract,) = (one for one in settings["tool"]["importlinter"]["contracts"] if one["type"] == "layers")
+    contracts = settings["tool"]["importlinter"]["contracts"]
+    (contract,) = (
+        one for one in contracts if one["type"] == "layers" and one["containers"] == ["vkc_pin"]
+    )
     return [[name.strip() for name in line.split("|")] for line in contract["layers"]]
 
 
-def imported() -> dict[str, set[str]]:
-    """Return wing → wings that it imports, inside functions and for type checkers too."""
+def find_imports() -> dict[str, set[str]]:
+    """Return package → packages that its modules import at the top; imports inside functions may lead up."""
     known = {name for layer in layers() for name in layer}
     found: dict[str, set[str]] = {name: set() for name in known}
     for file in PACKAGE.rglob("*.py"):
-        wing = file.relative_to(PACKAGE).with_suffix("").parts[0]
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if wing in known and isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "vkc_pin":
+        package = file.relative_to(PACKAGE).with_suffix("").parts[0]
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if (
+                package in known
+                and isinstance(node, ast.ImportFrom)
+                and (node.module or "").split(".")[0] == "vkc_pin"
+            ):
                 inside = (node.module or "").split(".")[1:2] or [alias.name for alias in node.names]
-                found[wing].update(known.intersection(inside) - {wing})
+                found[package].update(known.intersection(inside) - {package})
     return found
 
 
-def arrows() -> list[tuple[str, str]]:
-    """Return the imports between wings without those that also lead there through another wing."""
-    graph = {wing: others - OPEN_TO_ALL for wing, others in imported().items() if wing not in OPEN_TO_ALL}
+def find_arrows() -> list[tuple[str, str]]:
+    """Return the imports between packages, without those that also lead there through another package."""
+    imports = find_imports().items()
+    graph = {
+        package: others - FOUNDATION for package, others in imports if package not in FOUNDATION
+    }
 
-    def below(wing: str) -> set[str]:
-        return graph[wing].union(*(below(other) for other in graph[wing]))
+    def below(package: str) -> set[str]:
+        return graph[package].union(*(below(other) for other in graph[package]))
 
     return [
-        (one, other) for one in sorted(graph) for other in sorted(graph[one]) if not any(other in below(w) for w in graph[one])
+        (one, other)
+        for one in sorted(graph)
+        for other in sorted(graph[one])
+        if not any(other in below(between) for between in graph[one])
     ]
 
 
-def summary(wing: str) -> list[str]:
-    """Return the first sentence of a wing's docstring in two lines, or what of it comes before ";", ":" or ","."""
-    file = PACKAGE / wing / "__init__.py"
-    text = ast.get_docstring(ast.parse((file if file.is_file() else PACKAGE / f"{wing}.py").read_text(encoding="utf-8"))) or ""
+def summarize(package: str) -> list[str]:
+    """Return the first sentence of a package's docstring in two lines, shortened at a colon or comma if necessary."""
+    file = PACKAGE / package / "__init__.py"
+    source = (file if file.is_file() else PACKAGE / f"{package}.py").read_text(encoding="utf-8")
+    text = (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
     for end in (". ", "; ", ": ", ", "):
-        text = text.splitlines()[0].split(end)[0].rstrip(".")
+        text = text.split(end)[0].rstrip(".")
         lines = textwrap.wrap(text, CHARACTERS)
         if len(lines) <= 2:
             return lines
-    raise ValueError(f"the docstring of vkc_pin.{wing} begins with too long a sentence")
+    raise ValueError(f"the docstring of vkc_pin.{package} begins with too long a sentence")
 
 
-def places(rows: list[list[str]]) -> dict[str, tuple[float, float]]:
-    """Return the centre of every wing's box."""
+def place_boxes(rows: list[list[str]]) -> dict[str, tuple[float, float]]:
+    """Return the centre of each package's box."""
     found = {}
     for number, row in enumerate(rows):
-        for k, wing in enumerate(row):
-            column = COLUMNS.get(wing, 2 + k - (len(row) - 1) / 2)
-            found[wing] = WIDTH / 2 + (column - 2) * COLUMN, MARGIN + number * ROW
+        for k, package in enumerate(row):
+            column = COLUMN.get(package, k - (len(row) - 1) / 2)
+            found[package] = WIDTH / 2 + column * SPACING, MARGIN + number * ROW
     return found
 
 
-def arrow(one: tuple[float, float], other: tuple[float, float], boxes: list[tuple[float, float]]) -> str:
-    """Return a line from box to box that passes those between them where there is room."""
+def draw_arrow(
+    one: tuple[float, float], other: tuple[float, float], boxes: list[tuple[float, float]]
+) -> str:
+    """Return a line from box to box that passes between the boxes of the rows in between."""
     (x0, y0), (x1, y1) = one, other
     between = [x for x, y in boxes if y0 < y < y1]
-    free = [x for x in range(WIDTH) if all(abs(x - box) > BOX_WIDTH / 2 + ROOM for box in between)]
+    free = [x for x in range(WIDTH) if all(abs(x - box) > BOX_WIDTH / 2 + GAP for box in between)]
     lane = min(free, key=lambda x: (abs(x - x0) + abs(x - x1), abs(x - x1)))
     top, bottom, gap = y0 + BOX_HEIGHT / 2, y1 - BOX_HEIGHT / 2 - 4, ROW - BOX_HEIGHT - 4
-    bends = [(x0, lane, top, top + gap), (lane, x1, bottom - gap, bottom)] if between else [(x0, x1, top, bottom)]
+    bends = (
+        [(x0, lane, top, top + gap), (lane, x1, bottom - gap, bottom)]
+        if between
+        else [(x0, x1, top, bottom)]
+    )
     line = f"M{x0:.0f} {top:.0f}"
     for left, right, begin, end in bends:
         line += f" L{left:.0f} {begin:.0f} C{left:.0f} {end:.0f} {right:.0f} {begin:.0f} {right:.0f} {end:.0f}"
     return f'<path d="{line}"/>'
 
 
-def box(wing: str, x: float, y: float) -> str:
-    """Return a box with a wing's name and what it is for."""
-    kind = "check" if wing in CHECKING else "open" if wing in OPEN_TO_ALL else "own"
-    lines = summary(wing)
+def draw_box(package: str, x: float, y: float) -> str:
+    """Return a box with the name and the summary of a package."""
+    kind = "check" if package in CHECKS else "open" if package in FOUNDATION else "own"
+    lines = summarize(package)
     first = y - 14 if len(lines) > 1 else y - 8
     corner = f'x="{x - BOX_WIDTH / 2:.0f}" y="{y - BOX_HEIGHT / 2:.0f}" width="{BOX_WIDTH}" height="{BOX_HEIGHT}"'
-    texts = [f'<text x="{x:.0f}" y="{first + 4:.0f}" class="name">{wing}</text>']
+    texts = [f'<text x="{x:.0f}" y="{first + 4:.0f}" class="name">{package}</text>']
     texts += [
-        f'<text x="{x:.0f}" y="{first + 20 + 14 * k:.0f}" class="more">{escape(text)}</text>' for k, text in enumerate(lines)
+        f'<text x="{x:.0f}" y="{first + 20 + 14 * k:.0f}" class="more">{escape(text)}</text>'
+        for k, text in enumerate(lines)
     ]
     return "\n".join([f'<rect {corner} rx="7" class="{kind}"/>', *texts])
 
@@ -112,7 +135,7 @@ def box(wing: str, x: float, y: float) -> str:
 def main() -> str:
     """Return the picture."""
     rows = layers()
-    centres = places(rows)
+    centres = place_boxes(rows)
     boxes = list(centres.values())
     height = 2 * MARGIN + ROW * (len(rows) - 1)
     style = (
@@ -128,8 +151,8 @@ def main() -> str:
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}">',
         f'<style>{style}</style><defs>{tip}</defs><rect width="{WIDTH}" height="{height}" rx="10" fill="#fbfcfd"/>',
-        *(arrow(centres[one], centres[other], boxes) for one, other in arrows()),
-        *(box(wing, *centre) for wing, centre in centres.items()),
+        *(draw_arrow(centres[one], centres[other], boxes) for one, other in find_arrows()),
+        *(draw_box(package, *centre) for package, centre in centres.items()),
         "</svg>",
     ]
     return "\n".join(parts) + "\n"

@@ -1,7 +1,8 @@
 """Makes docs/images/gallery.png: robots with things that were not made for them, at the end of plans that open these.
 
-Usage: make_gallery.py [FOLDER]: where imported robots and plans are kept, and not made again (default: out/gallery).
-The pictures are drawn here, point by point, as they need no more than shades: dozens of them in a browser take long.
+Usage: make_gallery.py [FOLDER]: where imported robots and plans are kept, and not made again
+(default: out/gallery). The pictures are drawn here, point by point, as they need no more than
+shades: dozens of them in a browser take long.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ import pinocchio as pin
 from PIL import Image
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.anything.given import parsed, ready_robot
-from vkc_pin.benchmarks.anything.pairs import pair
 from vkc_pin.benchmarks.harness.limits import LIMITS
-from vkc_pin.motion.world import World
-from vkc_pin.plotting.style import new_figure, save_figure, styled
-from vkc_pin.visualization.room import drawn_parts
+from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_robot
+from vkc_pin.benchmarks.robot_object_matrix.pairs import pair
+from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
+from vkc_pin.visualization.room import load_drawn_parts
+from vkc_pin.world.trajectory.world_model import World
 
 ROOT = Path(__file__).parent.parent
 ROBOTS = {"husky_ur5e": "Husky, UR5e", "tiago_pro": "TIAGo Pro", "pr2": "PR2", "panda": "Panda"}
@@ -29,10 +30,19 @@ OBJECTS = {
     **{"dishwasher_0": "dishwasher", "microwave_0": "microwave", "chest_0": "chest"},
 }
 STARTS = 5  # random ones: the first from which it is opened is shown
-SIDE, FINER, COLOURS = 180, 2, 160  # [pixels] of a picture in the grid; in each of these so many; of the palette
+SIDE, FINER, COLOURS = (
+    180,
+    2,
+    160,
+)  # [pixels] of a picture in the grid; in each of these so many; of the palette
 AWAY = np.array([-0.85, -0.85, 0.62])  # from what is looked at to the camera, before it is scaled
 FIELD = 0.62  # half of what is seen, at 1 m
-PIECE, NEAR = 0.4, 1.0  # [m] longest edges of triangles that are drawn or left out whole; how far before the camera they are
+PIECE, NEAR = (
+    0.4,
+    1.0,
+    # [m] longest edges of triangles that are drawn or left out whole; how far before the camera they
+    # are
+)
 DOTS, PARTS = (
     (0.7, 1.5),
     (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256),
@@ -50,7 +60,9 @@ def opened(robot: str, file: str, thing: str, folder: Path) -> vkc.Plan:
     if found.scene is None or found.step is None:
         raise SystemExit(f"{robot} opens no {thing}: {found.because}")
     for number in range(STARTS):
-        plan = vkc.plan(found.scene.sample_start(np.random.default_rng([7, 0, number])), [found.step], **LIMITS)
+        plan = vkc.plan(
+            found.scene.sample_start(np.random.default_rng([7, 0, number])), [found.step], **LIMITS
+        )
         if plan.success:
             kept.parent.mkdir(parents=True, exist_ok=True)
             plan.save(kept)
@@ -64,9 +76,11 @@ def triangles_of(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     data = world.model.createData()
     pin.forwardKinematics(world.model, data, world.coordinates.q(world.start))
     for shape in world.visual.geometryObjects:
-        for solid, colour in drawn_parts(shape):
+        for solid, colour in load_drawn_parts(shape):
             placed = data.oMi[shape.parentJoint] * shape.placement
-            corners = (solid.vertices @ placed.rotation.T + placed.translation)[solid.faces.astype(int)]
+            corners = (solid.vertices @ placed.rotation.T + placed.translation)[
+                solid.faces.astype(int)
+            ]
             while True:
                 edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
                 large = edges.max(axis=1) > PIECE
@@ -74,7 +88,10 @@ def triangles_of(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
                     break
                 a, b, c = (corners[large, k] for k in range(3))
                 ab, bc, ca = (a + b) / 2.0, (b + c) / 2.0, (c + a) / 2.0
-                four = [np.stack(one, axis=1) for one in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+                four = [
+                    np.stack(one, axis=1)
+                    for one in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+                ]
                 corners = np.concatenate([corners[~large], *four])
             yield corners, np.tile(np.array(colour[:3]), (len(corners), 1))
 
@@ -86,7 +103,11 @@ class Camera:
         ahead = (target - position) / np.linalg.norm(target - position)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
-        self.axes, self.position, self.size = np.array([right, np.cross(ahead, right), ahead]), position, size
+        self.axes, self.position, self.size = (
+            np.array([right, np.cross(ahead, right), ahead]),
+            position,
+            size,
+        )
 
     def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return columns and rows in the picture, shape (..., 2), and the distances along the view [m]."""
@@ -97,16 +118,24 @@ class Camera:
     def on_floor(self) -> np.ndarray:
         """Return for every pixel how far along the view the floor is [m], shape (size, size); infinite above the horizon."""
         along = (np.arange(self.size) + 0.5) / self.size * 2.0 - 1.0
-        down = -(self.axes[0, 2] * along[None] * FIELD + self.axes[1, 2] * along[:, None] * FIELD + self.axes[2, 2])
+        down = -(
+            self.axes[0, 2] * along[None] * FIELD
+            + self.axes[1, 2] * along[:, None] * FIELD
+            + self.axes[2, 2]
+        )
         return np.where(down > 1e-6, self.position[2] / np.maximum(down, 1e-6), np.inf)
 
 
-def dotted(corners: np.ndarray, pixels: np.ndarray, apart: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def dotted(
+    corners: np.ndarray, pixels: np.ndarray, apart: float
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield which triangles points belong to, and the points, shape (k, 3), no further `apart` in the picture [pixels]."""
     longest = np.linalg.norm(pixels - np.roll(pixels, -1, axis=1), axis=2).max(axis=1)
     parts = np.array(PARTS)[np.searchsorted(PARTS[:-1], longest / apart)]
     for count in np.unique(parts):
-        first, second = (grid.ravel() for grid in np.meshgrid(np.arange(count + 1), np.arange(count + 1)))
+        first, second = (
+            grid.ravel() for grid in np.meshgrid(np.arange(count + 1), np.arange(count + 1))
+        )
         inside = first + second <= count
         u, v = first[inside] / count, second[inside] / count
         own = np.flatnonzero(parts == count)
@@ -119,7 +148,9 @@ def drawn(scene: vkc.Scene) -> Image.Image:
     tool, base = scene.tool_placement().translation, scene.start[:2]
     target = np.array([*(0.5 * (tool[:2] + base)), 0.72])
     size = SIDE * FINER
-    camera = Camera(target, target + AWAY * (1.15 + 0.5 * float(np.linalg.norm(tool[:2] - base))), size)
+    camera = Camera(
+        target, target + AWAY * (1.15 + 0.5 * float(np.linalg.norm(tool[:2] - base))), size
+    )
     floor = camera.on_floor()
     depth, dark = floor.ravel().copy(), np.zeros(size * size, bool)
     image = np.where(np.isfinite(depth)[:, None], FLOOR, SKY)
@@ -131,7 +162,9 @@ def drawn(scene: vkc.Scene) -> Image.Image:
         for own, shown, apart in ((corners, True, DOTS[0]), (fallen, False, DOTS[1])):
             pixels, ahead = camera.seen(own)
             visible = (
-                (ahead.min(axis=1) > NEAR) & (pixels.max(axis=1) > 0.0).all(axis=1) & (pixels.min(axis=1) < size).all(axis=1)
+                (ahead.min(axis=1) > NEAR)
+                & (pixels.max(axis=1) > 0.0).all(axis=1)
+                & (pixels.min(axis=1) < size).all(axis=1)
             )
             numbers = np.flatnonzero(visible)
             for which, points in dotted(own[numbers], pixels[numbers], apart):
@@ -142,7 +175,9 @@ def drawn(scene: vkc.Scene) -> Image.Image:
                 if not shown:
                     dark[at] = True
                     continue
-                order = np.argsort(-away, kind="stable")  # of several on one pixel the nearest is written last
+                order = np.argsort(
+                    -away, kind="stable"
+                )  # of several on one pixel the nearest is written last
                 at, which, away = at[order], which[order], away[order]
                 nearer = away < depth[at] + 1e-9
                 depth[at[nearer]], image[at[nearer]] = away[nearer], shades[which[nearer]]
@@ -154,11 +189,16 @@ def drawn(scene: vkc.Scene) -> Image.Image:
 def main() -> int:
     """Make it."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "out" / "gallery"
-    ready = {one.called: ready_robot(one, folder / "robots") for one in parsed(list(ROBOTS), "robots", ())}
+    ready = {
+        one.called: ready_robot(one, folder / "robots")
+        for one in parsed(list(ROBOTS), "robots", ())
+    }
     target = ROOT / "docs" / "images" / "gallery.png"
-    with styled():
+    with use_style():
         figure = new_figure(2.0 * len(OBJECTS) + 0.3, 2.0 * len(ROBOTS) + 0.3)
-        axes = figure.subplots(len(ROBOTS), len(OBJECTS), gridspec_kw={"wspace": 0.02, "hspace": 0.02})
+        axes = figure.subplots(
+            len(ROBOTS), len(OBJECTS), gridspec_kw={"wspace": 0.02, "hspace": 0.02}
+        )
         for row, (robot, file) in enumerate(ready.items()):
             for column, (thing, name) in enumerate(OBJECTS.items()):
                 axis = axes[row, column]

@@ -11,44 +11,60 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
-from vkc_pin.models.shapes import triangles
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.seeds import held, joining
-from vkc_pin.seeds.knots import depth
+from vkc_pin.planning.initialization import constrained_rrt as held
+from vkc_pin.planning.initialization import interpolation as joining
+from vkc_pin.planning.initialization.keyframes import compute_shortfall
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
+from vkc_pin.world.models.shapes import triangulate
+from vkc_pin.world.scene.obstacles import FLOOR
 
 EVERY = 6  # of the waypoints that are drawn
 
 
 def main() -> int:
     """Write a picture of a narrow door on its way shut, from above: straight between knots, and as trees lead the robot."""
-    scene = chores.cluttered_home().with_state("door", {"hinge": 1.52}).with_start(base=(1.2, 2.6, -1.57))
+    scene = (
+        chores.cluttered_home()
+        .with_state("door", {"hinge": 1.52})
+        .with_start(base=(1.2, 2.6, -1.57))
+    )
     seen: list[tuple[TrajectoryProblem, list[np.ndarray]]] = []
-    search = joining.RrtPaths.held
+    search = joining.RrtPaths.find_constrained_path
 
-    def kept(paths: joining.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray) -> np.ndarray | None:
-        path, knots = search(paths, phase, through, straight), paths.knots
+    def kept(
+        paths: joining.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray
+    ) -> np.ndarray | None:
+        path, sampler = search(paths, phase, through, straight), paths.sampler
         if path is not None:
-            own = held._Search(knots, phase, len(straight))
-            closed, _ = own.close(straight, np.arange(own.begin + 1.0, own.end + 1.0))
-            seen.append((knots.problem, [closed, path]))
+            own = held._Search(sampler, phase, len(straight))
+            closed, _ = own.project(straight, np.arange(own.begin + 1.0, own.end + 1.0))
+            seen.append((sampler.problem, [closed, path]))
         return path
 
-    joining.RrtPaths.held = kept
+    joining.RrtPaths.find_constrained_path = kept
     step = vkc.Actuate("door", {"hinge": 0.0}, "handle_free")
     plan = vkc.plan(scene, [step], options=chores.CHORES["cluttered"].options, initialization="rrt")
-    joining.RrtPaths.held = search
+    joining.RrtPaths.find_constrained_path = search
     sys.stdout.write(plan.report() + "\n")
     problem, ways = seen[-1]
     phase = len(problem.task.phases) - 1
-    with styled():
+    with use_style():
         figure = new_figure(8.0, 3.9)
-        for number, (way, title) in enumerate(zip(ways, ("straight between knots", "as trees lead it"), strict=True)):
+        for number, (way, title) in enumerate(
+            zip(ways, ("straight between knots", "as trees lead it"), strict=True)
+        ):
             axes = figure.add_subplot(1, 2, number + 1)
-            short = depth(problem, way, problem.contacts.inside(phase), reach=0.0) - problem.options.dist_safe
+            short = (
+                compute_shortfall(problem, way, problem.contacts.inside(phase), reach=0.0)
+                - problem.options.dist_safe
+            )
             draw_held(axes, problem, way, int(np.argmax(short)) if short.max() > 0.0 else None)
-            overlap = f"{1e3 * short.max():.0f} mm inside at most" if short.max() > 0.0 else "nothing overlaps"
+            overlap = (
+                f"{1e3 * short.max():.0f} mm inside at most"
+                if short.max() > 0.0
+                else "nothing overlaps"
+            )
             axes.set_title(f"{title}: {overlap}")
         save_figure(figure, Path(__file__).parent / "images" / "held.png")
     return 0
@@ -63,19 +79,29 @@ def draw_held(axes: Any, problem: TrajectoryProblem, way: np.ndarray, worst: int
     rotations, translations = problem.chain.joint_placements(way)
     shown = [*range(0, len(way), EVERY), *([] if worst is None else [worst])]
     for shape, label in zip(part.shapes, part.labels, strict=True):
-        points = triangles(shape.geometry)[0]
+        points = triangulate(shape.geometry)[0]
         for k in shown if shape.parentJoint else [0]:
-            placed = pin.SE3(rotations[k, shape.parentJoint], translations[k, shape.parentJoint]) * shape.placement
+            placed = (
+                pin.SE3(rotations[k, shape.parentJoint], translations[k, shape.parentJoint])
+                * shape.placement
+            )
             at = points @ placed.rotation.T + placed.translation
             arm = 1 < shape.parentJoint < 8
-            if label == FLOOR or (not arm and not 0.5 < at[:, 2].min() + 0.5 * np.ptp(at[:, 2]) < 1.5):
+            if label == FLOOR or (
+                not arm and not 0.5 < at[:, 2].min() + 0.5 * np.ptp(at[:, 2]) < 1.5
+            ):
                 continue
             outline = at[ConvexHull(at[:, :2]).vertices, :2]
             if shape.parentJoint == 0:
                 axes.fill(*outline.T, facecolor="0.75", edgecolor="0.5", linewidth=0.5)
             elif arm or label.startswith("door"):
                 colour = COLOURS[1] if k == worst else COLOURS[0] if arm else "0.4"
-                axes.fill(*outline.T, facecolor=(*to_rgb(colour), 0.12), edgecolor=colour, linewidth=1.0 if k == worst else 0.6)
+                axes.fill(
+                    *outline.T,
+                    facecolor=(*to_rgb(colour), 0.12),
+                    edgecolor=colour,
+                    linewidth=1.0 if k == worst else 0.6,
+                )
     axes.set(xlim=(0.9, 2.3), ylim=(0.45, 2.05), aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
 

@@ -1,6 +1,7 @@
 """Makes docs/images and docs/animations: plans the door, the use of a stick, a chore and a gap, looks at them, and at scenes.
 
-Needs Chromium. Usage: make_images.py [DOOR [STICK [CHORE [GAP]]]]: saved plans (.npz) to show instead of planning them.
+Needs Chromium. Usage: make_images.py [DOOR [STICK [CHORE [GAP]]]]: saved plans (.npz) to show
+instead of planning them.
 """
 
 from __future__ import annotations
@@ -14,14 +15,15 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores, gap
-from vkc_pin.models.shapes import triangles
-from vkc_pin.motion.dynamics.torques import Torques
-from vkc_pin.motion.world import World
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.plotting.top_view import draw_top_view
-from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
+from vkc_pin.visualization.plots.top_view import draw_top_view
+from vkc_pin.world.models.shapes import triangulate
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.world_model import World
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -46,7 +48,12 @@ FURNITURE = {  # kinds, and the seeds of those that are shown
     **{"oven": 1, "microwave": 0, "chest": 0, "faucet": 1, "valve": 2},
 }
 TASKS = (5, 49, 40, 54)  # a door, a refrigerator, a chest, an oven
-OPENED = {"door": ("hinge", 1.0), "drawer": ("slide", 0.22), "dishwasher": ("rack", 0.5), "refrigerator": ("hinge", 1.4)}
+OPENED = {
+    "door": ("hinge", 1.0),
+    "drawer": ("slide", 0.22),
+    "dishwasher": ("rack", 0.5),
+    "refrigerator": ("hinge", 1.4),
+}
 
 sys.path.insert(0, str(ROOT / "tests"))
 from helpers.browser import screenshot  # noqa: E402
@@ -60,15 +67,24 @@ def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:
     drawing.choose_viewpoint = lambda *_: (np.array(target), np.array(position))  # type: ignore[assignment]
 
 
-def picture(shown: vkc.Plan | vkc.Scene, name: str, size: tuple[int, int], time: float | None = None) -> None:
+def picture(
+    shown: vkc.Plan | vkc.Scene, name: str, size: tuple[int, int], time: float | None = None
+) -> None:
     """Write the picture of a plan at `time` [s], or of a scene."""
     with tempfile.TemporaryDirectory() as folder:
-        screenshot(visualization.to_html(shown, Path(folder) / "page.html"), IMAGES / f"{name}.png", time=time, size=size)
+        screenshot(
+            visualization.to_html(shown, Path(folder) / "page.html"),
+            IMAGES / f"{name}.png",
+            time=time,
+            size=size,
+        )
 
 
 def attachments() -> None:
     """Write the picture of proposed attachments."""
-    vkc.plotting.plot_attachments(vkc.propose_attachments(vkc.load_object("dishwasher"), most=2), IMAGES / "attachments.png")
+    plot_attachments(
+        vkc.propose_attachments(vkc.load_object("dishwasher"), most=2), IMAGES / "attachments.png"
+    )
 
 
 def plots(plan: vkc.Plan, prefix: str, *names: str) -> None:
@@ -76,7 +92,9 @@ def plots(plan: vkc.Plan, prefix: str, *names: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         plan.plot(folder)
         for name in names:
-            (IMAGES / f"{prefix}_{name}.png").write_bytes((Path(folder) / f"{name}.png").read_bytes())
+            (IMAGES / f"{prefix}_{name}.png").write_bytes(
+                (Path(folder) / f"{name}.png").read_bytes()
+            )
 
 
 def home_pictures() -> None:
@@ -98,8 +116,11 @@ def cluttered_picture() -> None:
 
 def room_picture() -> None:
     """Write random rooms from above, with little and with much in them."""
-    rooms = [vkc.random_room(number, clutter=clutter) for number, clutter in ((3, 0.2), (1, 0.5), (2, 0.9))]
-    with styled():
+    rooms = [
+        vkc.random_room(number, clutter=clutter)
+        for number, clutter in ((3, 0.2), (1, 0.5), (2, 0.9))
+    ]
+    with use_style():
         figure = new_figure(12.0, 4.4)
         for own, room in zip(figure.subfigures(1, len(rooms)), rooms, strict=True):
             draw_top_view(own, World(room), None)
@@ -111,28 +132,42 @@ def furniture_picture() -> None:
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     light = np.array([-0.6, -0.35, 0.72])
-    with styled():
+    with use_style():
         figure = new_figure(12.0, 5.6)
         for place, (kind, seed) in enumerate(FURNITURE.items(), start=1):
             thing = vkc.load_object(vkc.random_object(kind, seed))
             state = np.array(
-                [0.0 if name == "knob" else 0.5 * high for name, high in zip(thing.coordinates.names, thing.upper, strict=True)]
+                [
+                    0.0 if name == "knob" else 0.5 * high
+                    for name, high in zip(thing.coordinates.names, thing.upper, strict=True)
+                ]
             )
-            shapes = standing_geometry(vkc.PlacedObject(kind, thing, pin.SE3.Identity(), state), visual=True)
+            shapes = make_world_shapes(
+                vkc.PlacedObject(kind, thing, pin.SE3.Identity(), state), visual=True
+            )
             faces, colours = list[np.ndarray](), list[np.ndarray]()
             for shape in shapes:
-                points, corners = triangles(shape.geometry)
+                points, corners = triangulate(shape.geometry)
                 points = points @ shape.placement.rotation.T + shape.placement.translation
                 for face in points[corners]:
                     normal = np.cross(face[1] - face[0], face[2] - face[0])
                     size = np.linalg.norm(normal)
                     shade = 0.55 + 0.45 * abs(float(normal @ light)) / size if size > 0.0 else 1.0
                     faces += finer(face)
-                    colours += [np.append(shade * shape.meshColor[:3], 1.0)] * (len(faces) - len(colours))
+                    colours += [np.append(shade * shape.meshColor[:3], 1.0)] * (
+                        len(faces) - len(colours)
+                    )
             axes = figure.add_subplot(2, 5, place, projection="3d", computed_zorder=False)
-            axes.add_collection3d(Poly3DCollection(np.array(faces), facecolors=colours, edgecolors=colours, linewidths=0.2))
+            axes.add_collection3d(
+                Poly3DCollection(
+                    np.array(faces), facecolors=colours, edgecolors=colours, linewidths=0.2
+                )
+            )
             corners = np.array(faces).reshape(-1, 3)
-            middle, half = (corners.max(axis=0) + corners.min(axis=0)) / 2, np.ptp(corners, axis=0).max() / 2
+            middle, half = (
+                (corners.max(axis=0) + corners.min(axis=0)) / 2,
+                np.ptp(corners, axis=0).max() / 2,
+            )
             for axis, value in zip("xyz", middle, strict=True):
                 getattr(axes, f"set_{axis}lim")(value - half, value + half)
             axes.view_init(elev=22, azim=-145)
@@ -155,7 +190,7 @@ def finer(face: np.ndarray, longest: float = 0.06) -> list[np.ndarray]:
 
 def task_picture() -> None:
     """Write tasks in random rooms from above, with the motions that were planned for them."""
-    with styled():
+    with use_style():
         figure = new_figure(12.0, 8.4)
         for own, seed in zip(figure.subfigures(2, 2).ravel(), TASKS, strict=True):
             room, steps = vkc.random_task(seed)
@@ -177,7 +212,7 @@ def import_picture() -> None:
         scene = vkc.import_home(file, Path(folder) / "out").scene
         plan = vkc.plan(scene, [vkc.Actuate("refrigerator_body", {"refrigerator_hinge": 0.94})])
         sys.stdout.write(plan.report() + "\n")
-        with styled():
+        with use_style():
             figure = new_figure(8.0, 6.6)
             draw_top_view(figure, World(scene), plan.trajectory)
             save_figure(figure, IMAGES / "import_home.png")
@@ -200,25 +235,38 @@ def gap_picture(through: vkc.Plan) -> None:
 def tray_picture() -> None:
     """Write a picture of a tray on its way."""
     look(*TRAY)
-    picture(vkc.plan(vkc.load_scene("tray"), [vkc.Place("tray", [-0.3, -1.96, 0.7])]), "tray", SMALL, CARRIED)
+    picture(
+        vkc.plan(vkc.load_scene("tray"), [vkc.Place("tray", [-0.3, -1.96, 0.7])]),
+        "tray",
+        SMALL,
+        CARRIED,
+    )
 
 
 def push_picture() -> None:
     """Write a picture of a door that is pushed shut."""
     look(*PUSHED)
     scene = vkc.load_scene("door").with_state("door", {"hinge": -1.2})
-    picture(vkc.plan(scene, [vkc.Actuate("door", {"hinge": 0.0}, "push")]), "pushing", SMALL, PUSHING)
+    picture(
+        vkc.plan(scene, [vkc.Actuate("door", {"hinge": 0.0}, "push")]), "pushing", SMALL, PUSHING
+    )
 
 
 def bases_picture() -> None:
     """Write a picture of the door from above, opened by a robot that drives as a tank, and by one that is steered."""
-    scene, shown = vkc.load_scene("door"), ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8})
-    with styled():
+    scene, shown = (
+        vkc.load_scene("door"),
+        ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8}),
+    )
+    with use_style():
         figure = new_figure(11.0, 3.5)
         parts = figure.subfigures(1, 2)
         for part, robot in zip(parts, shown, strict=True):
             document = {**scene.document, "robot": {"name": "husky_ur5e", **robot}}
-            plan = vkc.plan(vkc.Scene.from_document(document, scene.folder), [vkc.Actuate("door", {"hinge": 1.2})])
+            plan = vkc.plan(
+                vkc.Scene.from_document(document, scene.folder),
+                [vkc.Actuate("door", {"hinge": 1.2})],
+            )
             sys.stdout.write(plan.report() + "\n")
             draw_top_view(part, World(plan.scene), plan.trajectory)
         save_figure(figure, IMAGES / "bases.png")
@@ -228,31 +276,42 @@ def opening_picture() -> None:
     """Write a picture of fingers between two cheeks, from above: fully open, and as far as the attachment says."""
     from scipy.spatial import ConvexHull
 
-    with tempfile.TemporaryDirectory() as folder, styled():
+    with tempfile.TemporaryDirectory() as folder, use_style():
         scene = between_cheeks(write_gripper(Path(folder)), opening=FINGERS)
         plan = vkc.plan(scene, [vkc.Grasp("drawer")])
         sys.stdout.write(plan.report() + "\n")
         world, figure = World(scene), new_figure(8.0, 3.4)
-        row = world.positions(plan.trajectory)[-1]
+        row = world.compute_positions(plan.trajectory)[-1]
         first = world.coordinates.index("finger_a_joint")
         for number, opening in enumerate((None, FINGERS)):
-            row[first : first + 2] = scene.robot.gripper.positions(opening)
+            row[first : first + 2] = scene.robot.gripper.compute_positions(opening)
             data = world.model.createData()
             pin.forwardKinematics(world.model, data, world.coordinates.q(row))
             axes = figure.add_subplot(1, 2, number + 1)
             for shape, label in zip(world.shapes, world.collision_labels, strict=True):
                 if label == "floor" or label.startswith(("body", "arm_1", "arm_2", "arm_3")):
                     continue
-                points = triangles(shape.geometry)[0]
+                points = triangulate(shape.geometry)[0]
                 placed = data.oMi[shape.parentJoint] * shape.placement
                 outline = (points @ placed.rotation.T + placed.translation)[:, :2]
                 outline = outline[ConvexHull(outline).vertices]
-                colour = "0.75" if label in scene.obstacle_labels else COLOURS[label.startswith("drawer")]
-                axes.fill(-outline[:, 1], outline[:, 0], facecolor=colour, edgecolor="0.25", linewidth=0.8)
-            wide = scene.robot.gripper.resting if opening is None else opening
+                colour = (
+                    "0.75"
+                    if label in scene.obstacle_labels
+                    else COLOURS[label.startswith("drawer")]
+                )
+                axes.fill(
+                    -outline[:, 1], outline[:, 0], facecolor=colour, edgecolor="0.25", linewidth=0.8
+                )
+            wide = scene.robot.gripper.rest_opening if opening is None else opening
             axes.set_title("fully open" if opening is None else f"opening: {opening:g}")
             finger, cheek = -wide / 2.0 - 0.01, -0.06  # outer and inner face [m]
-            axes.annotate("", (cheek, 1.15), (finger, 1.15), arrowprops={"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0})
+            axes.annotate(
+                "",
+                (cheek, 1.15),
+                (finger, 1.15),
+                arrowprops={"arrowstyle": "<->", "shrinkA": 0, "shrinkB": 0},
+            )
             axes.text(-0.045, 1.208, f"{1e3 * (finger - cheek):.0f} mm", ha="right", fontsize=9)
             axes.set(xlim=(-0.13, 0.13), ylim=(1.0, 1.24), aspect="equal", xlabel="m")
         save_figure(figure, IMAGES / "opening.png")
@@ -262,14 +321,21 @@ def torque_picture() -> None:
     """Write what the motors do while a door with a closer is opened, against what they have, over time."""
     scenes = vkc.load_scene("door"), closer(damping=400.0, stiffness=5.0, springref=-2.0)
     plans = [vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2}, "handle")]) for scene in scenes]
-    with styled():
+    with use_style():
         figure = new_figure(9.0, 3.4)
         panels = figure.subplots(1, 2, sharey=True)
-        for axes, plan, title in zip(panels, plans, ("as it is", "with a closer that damps by 400 N·m·s/rad"), strict=True):
+        for axes, plan, title in zip(
+            panels, plans, ("as it is", "with a closer that damps by 400 N·m·s/rad"), strict=True
+        ):
             times, _ = plan.trajectory.sample(200.0)
-            torques, limits = Torques(plan.scene, plan.trajectory), plan.scene.robot.efforts.limits[3:]
+            torques, limits = (
+                Torques(plan.scene, plan.trajectory),
+                plan.scene.robot.efforts.limits[3:],
+            )
             shares = 100.0 * torques.along(times)[:, 3:] / limits
-            for name, column, limit in zip(plan.scene.robot.coordinates.names[3:], shares.T, limits, strict=True):
+            for name, column, limit in zip(
+                plan.scene.robot.coordinates.names[3:], shares.T, limits, strict=True
+            ):
                 axes.plot(times, column, label=f"{name.removesuffix('_joint')}, {limit:g} N·m")
             for edge in (-100.0, 100.0):
                 axes.axhline(edge, color="0.3", linestyle="--", linewidth=1.0)
@@ -283,10 +349,18 @@ def main() -> int:
     """Write the pictures; return 1 if there is no motion to show."""
     saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
     use = [vkc.Grasp("stick"), vkc.Touch("stick.tip", (-1, 3.897, 0.1))]
-    door = saved[0] if saved else vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
-    stick = saved[1] if len(saved) > 1 else vkc.plan(vkc.load_scene("init_3"), use, initialization="astar")
+    door = (
+        saved[0]
+        if saved
+        else vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
+    )
+    stick = (
+        saved[1]
+        if len(saved) > 1
+        else vkc.plan(vkc.load_scene("init_3"), use, initialization="astar")
+    )
     home = vkc.load_scene("household")
-    chore = saved[2] if len(saved) > 2 else vkc.plan_chore(home, chores.home(home))
+    chore = saved[2] if len(saved) > 2 else vkc.plan(home, chores.home(home), window=2)
     through = saved[3] if len(saved) > 3 else vkc.plan(gap.started(0, SHOWN), [vkc.Reach(gap.POSE)])
     for plan in (door, stick, chore, through):
         sys.stdout.write(plan.report() + "\n")

@@ -1,14 +1,16 @@
 """Writes the tables of experiments in README.md and docs anew, from the results on record: `python docs/make_tables.py`.
 
-In a page, what stands between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` is of docs/results/NAME.json: each table is
-replaced by the one of the experiment's own report that has the same columns, and lines that begin like one of `LINES` by the
-report's. Each line of versions and machine says from which commit the trials are.
+In a page, what stands between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` is of
+docs/results/NAME.json: each table is replaced by the one of the experiment's own report that has
+the same columns, and lines that begin like one of `LINES` by the report's. Each line of versions
+and machine says from which commit the trials are.
 
-In a sentence, what stands between `<!-- figure: NAME WHAT FIELD=VALUE ... -->` and `<!-- / -->` is one figure of the trials of
-docs/results/NAME.json whose fields are as said, see `FIGURES`. It keeps as many decimals as it has.
+In a sentence, what stands between `<!-- figure: NAME WHAT FIELD=VALUE ... -->` and `<!-- / -->` is
+one figure of the trials of docs/results/NAME.json whose fields are as said, see `FIGURES`. It keeps
+as many decimals as it has.
 
-Figures that are on no record stand between `<!-- measured: COMMIT DATE -->` and `<!-- /measured -->`; docs/evidence.md lists
-them. Other sentences are written by hand.
+Figures that are on no record stand between `<!-- measured: COMMIT DATE -->` and `<!-- /measured
+-->`; docs/evidence.md lists them. Other sentences are written by hand.
 """
 
 from __future__ import annotations
@@ -36,7 +38,13 @@ LINES = ("Measured on", "Mean ± standard deviation; median. Trials in which all
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 DOOR = ("door_seed_0", "door_seed_1")
 TASKS = ("reach", "push", "push blind", "whole")
-PARTS = {"initialization": "seeds", "coal": "coal", "casadi": "CasADi", "ipopt": "Ipopt", "validation": "validation"}
+PARTS = {
+    "initialization": "seeds",
+    "coal": "coal",
+    "casadi": "CasADi",
+    "ipopt": "Ipopt",
+    "validation": "validation",
+}
 # What is done, its record, and the fields of its trials that tell it.
 STATUS: list[tuple[str, str, dict[str, str]]] = [
     ("reach a pose", "door_seed_0", {"task": "reach"}),
@@ -65,13 +73,19 @@ RECORDS: list[dict[str, Any]] = yaml.safe_load((DOCS / "records.yaml").read_text
 
 def result(name: str) -> dict[str, Any]:
     """Return what is on record in docs/results/NAME.json."""
-    found: dict[str, Any] = json.loads((DOCS / "results" / f"{name}.json").read_text(encoding="utf-8"))
+    found: dict[str, Any] = json.loads(
+        (DOCS / "results" / f"{name}.json").read_text(encoding="utf-8")
+    )
     return found
 
 
 def of(trials: Iterable[Mapping[str, Any]], wanted: Mapping[str, str]) -> list[Mapping[str, Any]]:
     """Return the trials whose fields are as `wanted`."""
-    return [trial for trial in trials if all(str(trial.get(key)) == value for key, value in wanted.items())]
+    return [
+        trial
+        for trial in trials
+        if all(str(trial.get(key)) == value for key, value in wanted.items())
+    ]
 
 
 def status() -> str:
@@ -80,10 +94,14 @@ def status() -> str:
     for text, name, wanted in STATUS:
         own = of(result(name)["trials"], wanted)
         waypoints = {trial["waypoints"] for trial in own}
-        count = f"{min(waypoints)}" if len(waypoints) == 1 else f"{min(waypoints)} to {max(waypoints)}"
+        count = (
+            f"{min(waypoints)}" if len(waypoints) == 1 else f"{min(waypoints)} to {max(waypoints)}"
+        )
         median, late = distribution(own, "planning_time")
         rows.append([text, count, good(own), f"{median:.2f} s", f"{late:.2f} s"])
-    return markdown(["task", "waypoints", "success", "planning time, median", "95th percentile"], rows)
+    return markdown(
+        ["task", "waypoints", "success", "planning time, median", "95th percentile"], rows
+    )
 
 
 def door() -> str:
@@ -93,17 +111,29 @@ def door() -> str:
         for found in results:
             own = of(found["trials"], {"task": task})
             times = [f"{value:.3f}" for value in distribution(own, "planning_time")]
-            efforts = [f"{distribution(own, field)[0]:.2f}" for field in ("base_effort", "arm_effort")]
+            efforts = [
+                f"{distribution(own, field)[0]:.2f}" for field in ("base_effort", "arm_effort")
+            ]
             built = f"{max(trial['build_time'] for trial in own):.2f}"
             rows.append([task, str(found["meta"]["seed"]), good(own), *times, *efforts, built])
         own = of(results[0]["trials"], {"task": task})
         split = [f"{distribution(own, f'time_{part}')[0]:.3f}" for part in PARTS]
         parts.append([task, *split, f"{distribution(own, 'iterations')[0]:.0f}"])
-    head = ["task", "seed", "success", "planning time, median [s]", "95th percentile [s]", "base effort [m]", "arm effort [rad]"]
+    head = [
+        "task",
+        "seed",
+        "success",
+        "planning time, median [s]",
+        "95th percentile [s]",
+        "base effort [m]",
+        "arm effort [rad]",
+    ]
     split = ["task", *(f"{name} [s]" for name in PARTS.values()), "Ipopt iterations"]
     most = max(found["meta"]["peak_memory_mb"] for found in results)
     about = f"{foot(results[0]['meta'])} Peak memory {most:.0f} MB."
-    return "\n\n".join([markdown([*head, "build, at most [s]"], rows), markdown(split, parts), about])
+    return "\n\n".join(
+        [markdown([*head, "build, at most [s]"], rows), markdown(split, parts), about]
+    )
 
 
 def drawn(name: str) -> str:
@@ -115,14 +145,24 @@ def drawn(name: str) -> str:
     for kind in sorted({trial["kind"] for trial in trials}):
         own = of(trials, {"kind": kind})
         counts = [str(len(of(own, {"status": status}))) for status in statuses]
-        rows.append([kind, good(own), *counts, *(f"{value:.2f}" for value in distribution(own, "planning_time"))])
+        rows.append(
+            [
+                kind,
+                good(own),
+                *counts,
+                *(f"{value:.2f}" for value in distribution(own, "planning_time")),
+            ]
+        )
     agreed = []
     for success, said in ((True, "success"), (False, "failure")):
         own = [bool(trial["oracle"]) for trial in trials if trial["success"] == success]
         agreed.append([said, str(own.count(False)), str(own.count(True))])
     return "\n\n".join(
         [
-            markdown(["problems in", "success", *statuses, "time, median [s]", "95th percentile [s]"], rows),
+            markdown(
+                ["problems in", "success", *statuses, "time, median [s]", "95th percentile [s]"],
+                rows,
+            ),
             markdown(["by its own word", "the oracle finds nothing", "it finds something"], agreed),
             foot(about),
         ]
@@ -136,7 +176,13 @@ def good(trials: Sequence[Mapping[str, Any]]) -> str:
 
 def commits(trials: Iterable[Mapping[str, Any]]) -> str:
     """Return which commits trials are of; "none" for records that do not say."""
-    return ", ".join(f"`{commit}`" for commit in sorted({trial["commit"] for trial in trials if trial.get("commit")})) or "none"
+    return (
+        ", ".join(
+            f"`{commit}`"
+            for commit in sorted({trial["commit"] for trial in trials if trial.get("commit")})
+        )
+        or "none"
+    )
 
 
 def evidence() -> str:
@@ -147,25 +193,52 @@ def evidence() -> str:
         found = result(name)
         about, trials = found["meta"], found["trials"]
         sessions = about.get("sessions", ())
-        jobs = ", ".join(f"{number} at a time" for number in sorted({session["jobs"] for session in sessions}))
+        jobs = ", ".join(
+            f"{number} at a time" for number in sorted({session["jobs"] for session in sessions})
+        )
         minutes = sum(session["seconds"] for session in sessions) / 60.0
         timed = sum(session["trials"] for session in sessions)
         if not sessions:  # of the door, whose record has no sessions
-            minutes, jobs = sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0, "planning alone"
+            minutes, jobs = (
+                sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0,
+                "planning alone",
+            )
         for option in entry.get("options", ()):
             values = about[option] if isinstance(about[option], list) else [str(about[option])]
-            command += f" --{option} {shlex.join(value for value in values if value != 'unchanged')}"
-        file = f"--json out/{name}.json" if "door" in name or name == "timing" else f"--out out/{name}"
+            command += (
+                f" --{option} {shlex.join(value for value in values if value != 'unchanged')}"
+            )
+        file = (
+            f"--json out/{name}.json" if "door" in name or name == "timing" else f"--out out/{name}"
+        )
         whole = f"`{'' if command.startswith('python') else 'vkc-pin bench '}{command} {file}`"
-        rows.append([f"[{entry['claim']}]({entry['page']})", whole, f"[{name}](results/{name}.json)", commits(trials)])
-        part = f", {timed} of them" if timed not in (0, len(trials)) and "robots" not in entry.get("options", ()) else ""
+        rows.append(
+            [
+                f"[{entry['claim']}]({entry['page']})",
+                whole,
+                f"[{name}](results/{name}.json)",
+                commits(trials),
+            ]
+        )
+        part = (
+            f", {timed} of them"
+            if timed not in (0, len(trials)) and "robots" not in entry.get("options", ())
+            else ""
+        )
         rows[-1] += [f"{len(trials)}", f"{minutes:.1f} min, {jobs}{part}"]
     for page in PAGES:
-        for commit, date in dict.fromkeys(re.findall(r"<!-- measured: (\w+) ([\d-]+) -->", page.read_text(encoding="utf-8"))):
+        for commit, date in dict.fromkeys(
+            re.findall(r"<!-- measured: (\w+) ([\d-]+) -->", page.read_text(encoding="utf-8"))
+        ):
             where = "../README.md" if page.name == "README.md" else page.name
             rest.append([f"[{page.name}]({where})", f"`{commit}`", date])
     head = ["claim", "command", "record", "commit", "trials", "took here"]
-    return "\n\n".join([markdown(head, rows, text=4), markdown(["page", "at or after commit", "date"], rest, text=3)])
+    return "\n\n".join(
+        [
+            markdown(head, rows, text=4),
+            markdown(["page", "at or after commit", "date"], rest, text=3),
+        ]
+    )
 
 
 FIGURES: dict[str, Callable[[Sequence[Mapping[str, Any]], str], float | str]] = {
@@ -179,11 +252,14 @@ FIGURES: dict[str, Callable[[Sequence[Mapping[str, Any]], str], float | str]] = 
     "late": lambda trials, field: distribution(trials, field)[1],
     "most": lambda trials, field: max(float(trial[field]) for trial in trials),
     "least": lambda trials, field: min(float(trial[field]) for trial in trials),
-    "percent": lambda trials, field: 100.0 * sum(bool(trial.get(field)) for trial in trials) / len(trials),
+    "percent": lambda trials, field: (
+        100.0 * sum(bool(trial.get(field)) for trial in trials) / len(trials)
+    ),
     "slowdown": lambda trials, field: _slowdown(trials, field),
 }
 """What may be asked of trials, of a field of theirs after a colon. The 95th percentile is `late`; `steady` counts starts of which
-every trial succeeds; `slowdown:1000` is the median, over the starts, of the ratio of times among so many obstacles and 30."""
+every trial succeeds; `slowdown:1000` is the median, over the starts, of the ratio of times among so
+many obstacles and 30."""
 
 
 def _steady(trials: Sequence[Mapping[str, Any]]) -> str:
@@ -196,14 +272,19 @@ def _steady(trials: Sequence[Mapping[str, Any]]) -> str:
 
 def _slowdown(trials: Sequence[Mapping[str, Any]], count: str) -> float:
     base = {trial["number"]: trial["planning_time"] for trial in of(trials, {"obstacles": "30"})}
-    return median(trial["planning_time"] / base[trial["number"]] for trial in of(trials, {"obstacles": count}))
+    return median(
+        trial["planning_time"] / base[trial["number"]] for trial in of(trials, {"obstacles": count})
+    )
 
 
 def figure(asked: str, before: str) -> str:
     """Return one figure, as `asked` for between its marks, with as many decimals as there were before."""
     name, what, *conditions = asked.split()
     what, _, field = what.partition(":")
-    trials = of(result(name)["trials"], dict(condition.replace("~", " ").split("=", 1) for condition in conditions))
+    trials = of(
+        result(name)["trials"],
+        dict(condition.replace("~", " ").split("=", 1) for condition in conditions),
+    )
     if not trials:
         raise ValueError(f"no trials of {asked}")
     value = FIGURES[what](trials, field)
@@ -223,7 +304,9 @@ def reported(name: str) -> str:
     whose = next(entry["report"] for entry in RECORDS if entry["record"] == name)
     if whose.startswith("tests."):
         sys.path.insert(0, str(ROOT))
-    module = importlib.import_module(whose if whose.startswith("tests.") else f"vkc_pin.benchmarks.{whose}")
+    module = importlib.import_module(
+        whose if whose.startswith("tests.") else f"vkc_pin.benchmarks.{whose}"
+    )
     text: str = module.report(result(name))
     return text
 
@@ -251,14 +334,20 @@ def renewed(name: str, section: str) -> str:
         line = re.compile(rf"^{beginning}.*$", re.MULTILINE)
         own = line.search(report)
         if own is not None:
-            said = own[0] + (f" Commit {commits(trials_of(name))}." if beginning == "Measured on" else "")
+            said = own[0] + (
+                f" Commit {commits(trials_of(name))}." if beginning == "Measured on" else ""
+            )
             section = line.sub(said.replace("\\", r"\\"), section)
     return section
 
 
 def trials_of(name: str) -> list[Mapping[str, Any]]:
     """Return the trials that a section is about."""
-    return [trial for record in (DOOR if name == "door" else (name,)) for trial in result(record)["trials"]]
+    return [
+        trial
+        for record in (DOOR if name == "door" else (name,))
+        for trial in result(record)["trials"]
+    ]
 
 
 def filled(text: str) -> str:

@@ -1,7 +1,7 @@
 """Draws docs/images/tradeoff.png from docs/results/tradeoff.json: `python docs/make_tradeoff.py`.
 
-That is the record of `vkc-pin bench ablation` with other weights of the base. A point is the mean way of base and arm over the
-problems that succeed at every weight.
+That is the record of `vkc-pin bench ablation` with other weights of the base. A point is the mean
+way of base and arm over the problems that succeed at every weight.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.options import Options
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 
 DOCS = Path(__file__).resolve().parent
 FIELD = "velocity_weight_base"
@@ -32,21 +32,37 @@ def points(trials: Sequence[Mapping[str, Any]]) -> list[tuple[float, float, floa
     found = {(weight(trial["method"]), trial["number"]): trial for trial in trials}
     weights, numbers = (sorted({key[k] for key in found}) for k in (0, 1))
     whole = [number for number in numbers if all(found[w, number]["success"] for w in weights)]
-    mean = {field: [np.mean([found[w, n][field] for n in whole]) for w in weights] for field in ("base_effort", "arm_effort")}
-    return [(w, float(base), float(arm), len(whole)) for w, base, arm in zip(weights, *mean.values(), strict=True)]
+    mean = {
+        field: [np.mean([found[w, n][field] for n in whole]) for w in weights]
+        for field in ("base_effort", "arm_effort")
+    }
+    return [
+        (w, float(base), float(arm), len(whole))
+        for w, base, arm in zip(weights, *mean.values(), strict=True)
+    ]
 
 
 def main() -> None:
     """Draw the curve, and print its points as a table."""
-    drawn = points(json.loads((DOCS / "results" / "tradeoff.json").read_text(encoding="utf-8"))["trials"])
-    with styled():
+    drawn = points(
+        json.loads((DOCS / "results" / "tradeoff.json").read_text(encoding="utf-8"))["trials"]
+    )
+    with use_style():
         figure = new_figure(5.6, 3.8)
         axes = figure.subplots()
-        axes.plot([base for _, base, *_ in drawn], [arm for _, _, arm, _ in drawn], "o-", color=COLOURS[0])
+        axes.plot(
+            [base for _, base, *_ in drawn], [arm for _, _, arm, _ in drawn], "o-", color=COLOURS[0]
+        )
         for w, base, arm, _ in drawn:
             usual = " (usual)" if w == getattr(Options(), FIELD) else ""
             rate = np.sqrt(w / Options().velocity_weight_arm)
-            axes.annotate(f"{rate:.3g} rad/m{usual}", (base, arm), (6, 4), textcoords="offset points", fontsize=8)
+            axes.annotate(
+                f"{rate:.3g} rad/m{usual}",
+                (base, arm),
+                (6, 4),
+                textcoords="offset points",
+                fontsize=8,
+            )
         axes.margins(x=0.25)
         axes.set_xlabel("way of the base, mean [m]")
         axes.set_ylabel("way of the arm, mean [rad]")

@@ -13,12 +13,14 @@ from hypothesis import settings
 
 import vkc_pin as vkc
 
-# The same examples every time, so that what passed goes on passing; HYPOTHESIS_PROFILE=random looks for new ones.
+# The same examples every time, so that what passed goes on passing; HYPOTHESIS_PROFILE=random looks
+# for new ones.
 settings.register_profile("repeatable", derandomize=True)
 settings.register_profile("random", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
-# Nothing is compiled in the background and nothing is written to the user's home; tests of that name folders of their own.
+# Nothing is compiled in the background and nothing is written to the user's home; tests of that
+# name folders of their own.
 os.environ["VKC_PIN_CACHE"] = "off"
 
 
@@ -29,13 +31,18 @@ OPINIONS: dict[str, dict[str, Any]] = {}  # of the processes that tests run in
 
 
 @pytest.fixture(autouse=True)
-def second_opinion(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def second_opinion(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[None]:
     """Fail where the oracle finds something wrong with a motion that the test's planner was content with."""
     yield
     if request.node.get_closest_marker("made_up"):
         OPINION.forget()
     if wrong := OPINION.verdicts(tmp_path_factory.getbasetemp()):
-        pytest.fail("\n".join(f"{verdict.path}: {found}" for verdict in wrong for found in verdict.found), pytrace=False)
+        pytest.fail(
+            "\n".join(f"{verdict.path}: {found}" for verdict in wrong for found in verdict.found),
+            pytrace=False,
+        )
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -54,9 +61,16 @@ def pytest_testnodedown(node: Any) -> None:
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Say how much the oracle has judged, and what it could not."""
-    planned, judged, seconds = (sum(counts[name] for counts in OPINIONS.values()) for name in ("planned", "judged", "seconds"))
-    terminalreporter.write_line(f"oracle: {planned} motions planned, {judged} different ones judged in {seconds:.1f} s")
-    for reason, count in Counter(reason for counts in OPINIONS.values() for reason in counts["unjudged"]).items():
+    planned, judged, seconds = (
+        sum(counts[name] for counts in OPINIONS.values())
+        for name in ("planned", "judged", "seconds")
+    )
+    terminalreporter.write_line(
+        f"oracle: {planned} motions planned, {judged} different ones judged in {seconds:.1f} s"
+    )
+    for reason, count in Counter(
+        reason for counts in OPINIONS.values() for reason in counts["unjudged"]
+    ).items():
         terminalreporter.write_line(f"oracle: {count} not judged: {reason}")
 
 

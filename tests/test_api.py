@@ -16,22 +16,43 @@ import vkc_pin as vkc
 ROOT = Path(__file__).resolve().parent.parent
 # Compiled, and a process of its own.
 COMPILED = tuple(
-    f"vkc_pin.{name}" for name in ("cpin._cpin", "distances._distances", "driving._driving", "seeds._trees", "solver._kkt")
+    f"vkc_pin.{name}"
+    for name in (
+        "planning.kinematics._cpin",
+        "world.collision._distances",
+        "planning.base_paths._driving",
+        "planning.initialization._trees",
+        "planning.solver._kkt",
+    )
 )
 SCRIPTS = (*COMPILED, "vkc_pin.visualization.server", "vkc_pin.cli.__main__")
-MODULES = [name for _, name, _ in pkgutil.walk_packages(vkc.__path__, "vkc_pin.") if name not in SCRIPTS]
-BARE = set(vars(types.ModuleType("bare"))) | {"__builtins__", "__cached__", "__file__", "__path__", "annotations"}
+MODULES = [
+    name for _, name, _ in pkgutil.walk_packages(vkc.__path__, "vkc_pin.") if name not in SCRIPTS
+]
+BARE = set(vars(types.ModuleType("bare"))) | {
+    "__builtins__",
+    "__cached__",
+    "__file__",
+    "__path__",
+    "annotations",
+}
 
 
 def _submodules(name: str) -> set[str]:
-    return {other.rpartition(".")[2] for other in (*MODULES, *SCRIPTS) if other.rpartition(".")[0] == name}
+    return {
+        other.rpartition(".")[2]
+        for other in (*MODULES, *SCRIPTS)
+        if other.rpartition(".")[0] == name
+    }
 
 
 @pytest.mark.parametrize("name", ["vkc_pin", *MODULES])
 def test_every_module_lists_its_public_names(name: str) -> None:
     module = importlib.import_module(name)
     assert module.__doc__
-    if Path(str(module.__file__)).name == "__init__.py" and set(vars(module)) <= BARE | _submodules(name):
+    if Path(str(module.__file__)).name == "__init__.py" and set(vars(module)) <= BARE | _submodules(
+        name
+    ):
         return  # a folder that has nothing of its own
     assert sorted(set(module.__all__)) == sorted(module.__all__)
     for public in module.__all__:
@@ -49,21 +70,44 @@ def test_every_public_name_is_documented() -> None:
 
 @pytest.mark.parametrize("name", ["plan", "build", "load_robot"])
 def test_options_are_keyword_only(name: str) -> None:
-    positional = [p for p in inspect.signature(getattr(vkc, name)).parameters.values() if p.kind is not p.KEYWORD_ONLY]
+    positional = [
+        p
+        for p in inspect.signature(getattr(vkc, name)).parameters.values()
+        if p.kind is not p.KEYWORD_ONLY
+    ]
     assert len(positional) <= 2
 
 
 def test_the_package_loads_what_is_asked_for_and_nothing_else() -> None:
-    heavy = ("casadi", "coal", "pinocchio", "pydantic", "trimesh", "meshcat", "matplotlib", "scipy", "tqdm")
+    heavy = (
+        "casadi",
+        "coal",
+        "pinocchio",
+        "pydantic",
+        "trimesh",
+        "meshcat",
+        "matplotlib",
+        "scipy",
+        "tqdm",
+    )
     loaded = f"[m for m in {heavy} if m in sys.modules]"
     code = f"import sys, vkc_pin as vkc; print({loaded}); vkc.VkcError; print({loaded}); vkc.plan; print({loaded})"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
     assert done.stdout.splitlines() == ["[]", "[]", "['casadi', 'coal', 'pinocchio', 'pydantic']"]
 
 
 def test_the_stub_lists_what_the_package_gives() -> None:
     tree = ast.parse((ROOT / "vkc_pin/__init__.pyi").read_text(encoding="utf-8"))
-    listed = next(ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign))
+    listed = next(
+        ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign)
+    )
     assert sorted(listed) == sorted(vkc.__all__)
     assert set(dir(vkc)) == set(listed) - {"__version__"}
     names: dict[str, object] = {}

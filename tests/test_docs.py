@@ -20,12 +20,19 @@ import yaml
 
 import vkc_pin as vkc
 from vkc_pin.cli.commands import make_parser
-from vkc_pin.files.documents import Document, check
-from vkc_pin.models.dynamics.resistance import ObjectJointSchema
-from vkc_pin.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
-from vkc_pin.models.robot_schema import BaseSchema, RobotSchema
-from vkc_pin.scene.scene_schema import COLOURS, ObstacleSchema, PlacedObjectSchema, SceneRobotSchema, SceneSchema, StartSchema
 from vkc_pin.validation.report import Violation
+from vkc_pin.world.files.documents import Document, check
+from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema
+from vkc_pin.world.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
+from vkc_pin.world.models.robot_schema import BaseSchema, RobotSchema
+from vkc_pin.world.scene.scene_schema import (
+    COLOURS,
+    ObstacleSchema,
+    PlacedObjectSchema,
+    SceneRobotSchema,
+    SceneSchema,
+    StartSchema,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -36,15 +43,25 @@ def read(name: str) -> str:
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    return re.findall(
+        rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
 
 
-LONG = ("chores", "initialization", "own_terms", "robots", "tutorial")  # pages whose code plans much
+LONG = (
+    "chores",
+    "initialization",
+    "own_terms",
+    "robots",
+    "tutorial",
+)  # pages whose code plans much
 
 
 def snippets() -> list[object]:
     return [
-        pytest.param(code, id=f"{page.stem}-{number}", marks=[pytest.mark.long] if page.stem in LONG else [])
+        pytest.param(
+            code, id=f"{page.stem}-{number}", marks=[pytest.mark.long] if page.stem in LONG else []
+        )
         for page in PAGES
         for number, code in enumerate(blocks(page, "python"))
     ]
@@ -76,7 +93,11 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
         loaded = vkc.load_scene(tmp_path / "room.yaml")
         assert (list(loaded.objects), len(loaded.allowed)) == (objects, allowed)
     described, rim, narrow, push, closer, rollers, whole = blocks(ROOT / "docs/objects.md", "yaml")
-    for text, urdf in ((rim, "bowl.urdf"), *((own, "drawer.urdf") for own in (narrow, push, rollers)), (closer, "door.urdf")):
+    for text, urdf in (
+        (rim, "bowl.urdf"),
+        *((own, "drawer.urdf") for own in (narrow, push, rollers)),
+        (closer, "door.urdf"),
+    ):
         assert check(Document(yaml.safe_load(text)), ObjectSchema).urdf == urdf
     (tmp_path / "hatch.yaml").write_text(whole, encoding="utf-8")
     assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"
@@ -86,12 +107,16 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
     assert [coupling.joint for coupling in followed.values()] == ["joint_arm_l3"] * 3
     rolls = check(Document(yaml.safe_load(wheels)), RobotSchema).base
     assert rolls.wheels is not None
-    assert (round(rolls.wheels.rim, 3), rolls.turning_radius) == (1.0, 1.2)
+    assert (round(rolls.wheels.rim_speed, 3), rolls.turning_radius) == (1.0, 1.2)
     assert check(Document(yaml.safe_load(robot)), RobotSchema).tool_frame == "tool"
 
 
 def test_every_field_is_documented() -> None:
-    scenes, objects, robots = read("docs/scenes.md"), read("docs/objects.md"), read("docs/robots.md")
+    scenes, objects, robots = (
+        read("docs/scenes.md"),
+        read("docs/objects.md"),
+        read("docs/robots.md"),
+    )
     kinds = ObstacleSchema.__origin__.__args__  # type: ignore[attr-defined]
     for text, schemas in (
         (scenes, (SceneSchema, SceneRobotSchema, StartSchema, PlacedObjectSchema, *kinds)),
@@ -99,7 +124,9 @@ def test_every_field_is_documented() -> None:
         (robots, (RobotSchema,)),
     ):
         for schema in schemas:
-            missing = [field for field in schema.model_fields if not re.search(rf"`{field}\b", text)]
+            missing = [
+                field for field in schema.model_fields if not re.search(rf"`{field}\b", text)
+            ]
             assert not missing, (schema.__name__, missing)
     assert [field for field in BaseSchema.model_fields if f"`base.{field}`" not in robots] == []
     assert [colour for colour in COLOURS if not re.search(rf"\b{colour}\b", scenes)] == []
@@ -111,11 +138,18 @@ def test_every_option_of_load_robot_is_documented() -> None:
 
 
 def test_every_constraint_and_status_is_explained() -> None:
-    names = re.findall(r'"(\w+)"', (Violation.__doc__ or "").split("constraint:")[1].split("subject:")[0])
-    statuses = re.findall(r'"([\w ]+)"', (vkc.Plan.__doc__ or "").split("status:")[1].split("metrics:")[0])
+    names = re.findall(
+        r'"(\w+)"', (Violation.__doc__ or "").split("constraint:")[1].split("subject:")[0]
+    )
+    statuses = re.findall(
+        r'"([\w ]+)"', (vkc.Plan.__doc__ or "").split("status:")[1].split("metrics:")[0]
+    )
     assert len(names) >= 12
     assert len(statuses) >= 6
-    for page, words in (("docs/reading_failures.md", [*names, *statuses]), ("docs/formulation.md", names)):
+    for page, words in (
+        ("docs/reading_failures.md", [*names, *statuses]),
+        ("docs/formulation.md", names),
+    ):
         assert [word for word in words if f"`{word}`" not in read(page)] == [], page
 
 
@@ -124,7 +158,9 @@ def commands() -> dict[str, argparse.ArgumentParser]:
     found: dict[str, argparse.ArgumentParser] = {}
 
     def collect(parser: argparse.ArgumentParser, prefix: str) -> None:
-        inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+        inner = [
+            action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+        ]
         for action in inner:
             for name, child in action.choices.items():
                 collect(child, f"{prefix} {name}".strip())
@@ -139,18 +175,30 @@ def test_every_command_and_option_is_documented() -> None:
     text = read("docs/cli.md")
     for name, parser in commands().items():
         section = text.split(f"## vkc-pin {name}")[1].split("\n## ")[0]
-        options = {option for action in parser._actions for option in action.option_strings} - {"-h", "--help"}
+        options = {option for action in parser._actions for option in action.option_strings} - {
+            "-h",
+            "--help",
+        }
         assert [option for option in options if option not in section] == [], name
 
 
 def test_shell_commands_are_understood() -> None:
-    lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines() if line.startswith("vkc-pin")]
+    lines = [
+        line
+        for page in PAGES
+        for block in blocks(page, "sh")
+        for line in block.splitlines()
+        if line.startswith("vkc-pin")
+    ]
     assert len(lines) >= 8
     for line in lines:
         words = line.partition("#")[0].split()[1:]
         assert callable(make_parser().parse_args(words).run), line
     targets = set(re.findall(r"^(\w+):", read("Makefile"), re.MULTILINE))
-    assert set(re.findall(r"^make (\w+)", "\n".join(blocks(ROOT / "README.md", "sh")), re.MULTILINE)) <= targets
+    assert (
+        set(re.findall(r"^make (\w+)", "\n".join(blocks(ROOT / "README.md", "sh")), re.MULTILINE))
+        <= targets
+    )
 
 
 def test_help_of_every_command() -> None:
@@ -173,40 +221,65 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert file.exists(), f"{page.name}: {target}"
         if anchor:
             titles = re.findall(r"^#+ (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
-            assert anchor in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, target
+            assert anchor in {
+                re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles
+            }, target
 
 
 def listed(page: str) -> list[str]:
     """Return what the lists of a page name, some of it with wildcards."""
     blocks = re.findall(r"```{toctree}\n(.*?)```", read(page), re.DOTALL)
-    return [line for block in blocks for line in block.splitlines() if line and not line.startswith(":")]
+    return [
+        line for block in blocks for line in block.splitlines() if line and not line.startswith(":")
+    ]
 
 
 def test_every_page_is_in_the_contents() -> None:
     for folder, contents, few in (("docs", "_contents", 15), ("docs/api", "index", 6)):
         names = listed(f"{folder}/{contents}.md")
-        pages = [page.stem for page in (ROOT / folder).glob("*.md") if page.stem not in ("index", contents)]
+        pages = [
+            page.stem
+            for page in (ROOT / folder).glob("*.md")
+            if page.stem not in ("index", contents)
+        ]
         assert len(pages) >= few
         assert [page for page in pages if not any(fnmatch(page, name) for name in names)] == []
-        assert [name for name in names if "*" not in name and not (ROOT / folder / f"{name}.md").resolve().is_file()] == []
+        assert [
+            name
+            for name in names
+            if "*" not in name and not (ROOT / folder / f"{name}.md").resolve().is_file()
+        ] == []
 
 
 def documented(directive: str) -> set[str]:
     """Return what the pages of the reference document by this directive, "auto*" for all of them but modules."""
     pages = (page.read_text(encoding="utf-8") for page in (ROOT / "docs/api").glob("*.md"))
-    found = [pair for page in pages for pair in re.findall(r"^\.\. (auto\w+):: vkc_pin\.(\S+)", page, re.MULTILINE)]
-    return {name for kind, name in found if fnmatch(kind, directive) and (kind == "automodule") == (directive == "automodule")}
+    found = [
+        pair
+        for page in pages
+        for pair in re.findall(r"^\.\. (auto\w+):: vkc_pin\.(\S+)", page, re.MULTILINE)
+    ]
+    return {
+        name
+        for kind, name in found
+        if fnmatch(kind, directive) and (kind == "automodule") == (directive == "automodule")
+    }
 
 
 def test_every_public_name_is_in_the_reference() -> None:
-    assert documented("auto*") == {name for name in vkc.__all__ if not inspect.ismodule(getattr(vkc, name))}
+    assert documented("auto*") == {
+        name for name in vkc.__all__ if not inspect.ismodule(getattr(vkc, name))
+    }
 
 
 def test_every_module_is_in_the_reference_once() -> None:
     pages = runpy.run_path(str(ROOT / "docs/_ext/api_pages.py"))
-    text = "".join(pages["page"](wing, files) for wing, files in pages["wings"]().items())
+    text = "".join(pages["page"](package, files) for package, files in pages["packages"]().items())
     found = re.findall(r"^\.\. automodule:: (\S+)", text, re.MULTILINE)
-    there = {".".join(file.relative_to(ROOT).with_suffix("").parts) for file in (ROOT / "vkc_pin").rglob("*.py")}
+    there = {
+        ".".join(file.relative_to(ROOT).with_suffix("").parts)
+        for file in (ROOT / "vkc_pin").rglob("*.py")
+    }
     assert len(found) == len(set(found))
     there.remove("vkc_pin.cli.__main__")  # importing that is running it
     assert set(found) == {name.removesuffix(".__init__") for name in there} - {"vkc_pin"}
@@ -214,7 +287,10 @@ def test_every_module_is_in_the_reference_once() -> None:
 
 
 def test_citation_is_of_this_version() -> None:
-    found, project = yaml.safe_load(read("CITATION.cff")), tomllib.loads(read("pyproject.toml"))["project"]
+    found, project = (
+        yaml.safe_load(read("CITATION.cff")),
+        tomllib.loads(read("pyproject.toml"))["project"],
+    )
     assert (found["version"], found["license"]) == (project["version"], project["license"])
 
 
@@ -236,10 +312,16 @@ def test_every_record_has_a_claim_and_the_command_that_makes_it_again() -> None:
     own = [name for name, command in rows.items() if not command.startswith("python")]
     commands = re.findall(r"`(vkc-pin bench [^`]+)`", read("docs/evidence.md"))[: len(own)]
     for name, line in zip(own, commands, strict=True):
-        about, given = script["result"](name)["meta"], make_parser().parse_args(shlex.split(line)[1:])
+        about, given = (
+            script["result"](name)["meta"],
+            make_parser().parse_args(shlex.split(line)[1:]),
+        )
         assert line.endswith(f"out/{name}.json" if name.startswith("door") else f"out/{name}")
         assert given.seed == about["seed"], name
-        counts = {key: getattr(given, key, None) for key in ("starts", "goals", "problems", "trials", "seeds")}
+        counts = {
+            key: getattr(given, key, None)
+            for key in ("starts", "goals", "problems", "trials", "seeds")
+        }
         for key, value in counts.items():
             told = about.get("starts" if key == "trials" and "starts" in about else key)
             if value is not None and isinstance(told, int):
@@ -253,7 +335,9 @@ def test_figures_in_sentences_come_from_records_or_say_when_they_were_measured()
     for page in PAGES:
         if page.name == "decisions.md":
             continue
-        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        text = re.sub(
+            r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
+        )
         assert re.findall(claims, re.sub(marks, "", text, flags=re.DOTALL)) == [], page.name
         assert text.count("<!-- measured: ") == text.count("<!-- /measured -->"), page.name
         assert text.count("<!-- figure: ") == text.count("<!-- / -->"), page.name
@@ -293,7 +377,12 @@ class Links(HTMLParser):
         self.ids.add(given.get("id", ""))
         if tag == "a" and "href" in given:
             self.links.add(given["href"])
-        elif tag == "link" and given.get("rel") not in ("stylesheet", "preload", "icon", "modulepreload"):
+        elif tag == "link" and given.get("rel") not in (
+            "stylesheet",
+            "preload",
+            "icon",
+            "modulepreload",
+        ):
             return
         elif tag in ("script", "img", "iframe", "link", "source", "video"):
             self.loaded.add(given.get("src", given.get("href", "")))
@@ -302,7 +391,9 @@ class Links(HTMLParser):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of the site, built with warnings as errors."""
-    pytest.importorskip("sphinx", reason="the documentation is built with Sphinx: pip install '.[docs]'")
+    pytest.importorskip(
+        "sphinx", reason="the documentation is built with Sphinx: pip install '.[docs]'"
+    )
     folder = tmp_path_factory.mktemp("site")
     command = [
         sys.executable,
@@ -318,7 +409,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ".",
         str(folder / "html"),
     ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return folder / "html"
 
@@ -326,25 +419,35 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.long
 @pytest.mark.timeout(600)
 def test_site(site: Path) -> None:
-    pages = {page.resolve(): Links(page) for page in site.rglob("*.html") if page.parent.name != "animations"}
+    pages = {
+        page.resolve(): Links(page)
+        for page in site.rglob("*.html")
+        if page.parent.name != "animations"
+    }
     assert len(pages) >= 40
     for page, found in pages.items():
         for target in found.loaded:
             assert not urlsplit(target).netloc, f"{page.name} loads {target}"
         for target in found.links | found.loaded:
             parts = urlsplit(target)
-            if parts.scheme in ("http", "https", "data", "mailto") or not (parts.path or parts.fragment):
+            if parts.scheme in ("http", "https", "data", "mailto") or not (
+                parts.path or parts.fragment
+            ):
                 continue
             file = (page.parent / unquote(parts.path)).resolve() if parts.path else page
             assert file.is_file(), f"{page.name} leads to {target}"
             if parts.fragment and file in pages:
                 assert unquote(parts.fragment) in pages[file].ids, f"{page.name} leads to {target}"
     for sheet in site.rglob("*.css"):
-        assert not re.search(r"url\(['\"]?(https?:)?//", sheet.read_text(encoding="utf-8")), sheet.name
+        assert not re.search(r"url\(['\"]?(https?:)?//", sheet.read_text(encoding="utf-8")), (
+            sheet.name
+        )
     start = (site / "docs/index.html").read_text(encoding="utf-8")
     assert "animations/door.html" in start
     assert (site / "docs/animations/door.html").stat().st_size > 100_000
     formulas = (site / "docs/formulation.html").read_text(encoding="utf-8")
     assert formulas.count('<svg class="formula"') > 100
-    reference = "".join(page.read_text(encoding="utf-8") for page in (site / "docs/api").glob("*.html"))
+    reference = "".join(
+        page.read_text(encoding="utf-8") for page in (site / "docs/api").glob("*.html")
+    )
     assert [name for name in documented("auto*") if f'id="vkc_pin.{name}"' not in reference] == []

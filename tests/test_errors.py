@@ -25,8 +25,13 @@ def test_text_of_an_error(given: dict[str, object], text: str) -> None:
 
 
 def test_the_name_that_was_meant() -> None:
-    error = UnknownNameError("link", "wrst", ["base", "wrist", "hand"], file="r.yaml", line=2, field="tool")
-    assert str(error) == "r.yaml:2: tool: there is no link 'wrst'; did you mean 'wrist'? There are: base, wrist, hand"
+    error = UnknownNameError(
+        "link", "wrst", ["base", "wrist", "hand"], file="r.yaml", line=2, field="tool"
+    )
+    assert (
+        str(error)
+        == "r.yaml:2: tool: there is no link 'wrst'; did you mean 'wrist'? There are: base, wrist, hand"
+    )
     assert (error.nearest, error.choices) == ("wrist", ("base", "wrist", "hand"))
     assert str(UnknownNameError("link", "xyz", [])) == "there is no link 'xyz'; there are: none"
     many = UnknownNameError("link", "xyz", [f"l{k}" for k in range(20)])
@@ -39,7 +44,9 @@ def test_messages_are_short_whatever_came() -> None:
     long, deep = "x" * 100_000, []  # type: ignore[var-annotated]
     deep.append(deep)
     for value in (long, [long] * 1000, 10**5000, deep, dict.fromkeys(range(1000), long)):
-        assert len(str(InputError("wrong", field=long, file=long, expected=value, got=value))) < 3000
+        assert (
+            len(str(InputError("wrong", field=long, file=long, expected=value, got=value))) < 3000
+        )
         assert len(shown(value)) < 3000
     assert len(str(UnknownNameError(long, long, [long, "door"], field="it"))) < 3000
     assert (shown([1, 2.5, "door"]), shown(10**30)) == ("[1, 2.5, 'door']", str(10**30))

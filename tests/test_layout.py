@@ -13,8 +13,16 @@ def test_every_module_has_its_tests() -> None:
     """docs/contributing.md lists the modules that are tested through others, with files that there are, and the reason."""
     page = (ROOT / "docs" / "contributing.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([\w/]+)` \| (.+?) \| (.+?) \|$", page, re.MULTILINE)
-    modules = {file.relative_to(PACKAGE).with_suffix("") for file in PACKAGE.rglob("*.py") if file.name != "__init__.py"}
-    missing = {str(name) for name in modules if not (ROOT / "tests" / name.parent / f"test_{name.name}.py").is_file()}
+    modules = {
+        file.relative_to(PACKAGE).with_suffix("")
+        for file in PACKAGE.rglob("*.py")
+        if file.name != "__init__.py"
+    }
+    missing = {
+        str(name)
+        for name in modules
+        if not (ROOT / "tests" / name.parent / f"test_{name.name}.py").is_file()
+    }
     assert missing == {name for name, _, _ in rows}
     for _, files, why in rows:
         named = re.findall(r"`([\w/]+\.py)`", files)

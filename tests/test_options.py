@@ -41,7 +41,9 @@ def test_accelerations_may_grow_at_once() -> None:
 WRONG = [(name, value) for name in REAL for value in (-1.0, np.nan, np.inf, True, "0.1", None)]
 
 
-@pytest.mark.parametrize(("name", "value"), [*WRONG, *((name, 0.0) for name in REAL if name != "jerk_time")])
+@pytest.mark.parametrize(
+    ("name", "value"), [*WRONG, *((name, 0.0) for name in REAL if name != "jerk_time")]
+)
 def test_real_numbers(name: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         Options(**{name: value})
@@ -96,4 +98,9 @@ def test_effort_is_one_of_two() -> None:
 def test_the_paper_minimises_squares_with_equal_weights() -> None:
     paper = Options.paper(dt=0.5, velocity_weight_base=2.0)
     assert (paper.effort, paper.dt, paper.velocity_weight_base) == ("squares", 0.5, 2.0)
-    assert paper.velocity_weight_heading == paper.velocity_weight_arm == paper.velocity_weight_object == 1.0
+    assert (
+        paper.velocity_weight_heading
+        == paper.velocity_weight_arm
+        == paper.velocity_weight_object
+        == 1.0
+    )

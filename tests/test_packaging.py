@@ -34,7 +34,9 @@ def modules() -> list[str]:
 @pytest.mark.parametrize("name", modules())
 def test_every_public_name_imports(name: str) -> None:
     module = importlib.import_module(name)
-    assert [public for public in getattr(module, "__all__", ()) if not hasattr(module, public)] == []
+    assert [
+        public for public in getattr(module, "__all__", ()) if not hasattr(module, public)
+    ] == []
 
 
 def test_command_is_declared_and_exists() -> None:
@@ -78,13 +80,26 @@ def test_wheel_carries_robots_and_scenes(tmp_path: Path) -> None:
     """Robots, scenes and `py.typed` are in the wheel (built without the compiled modules: they take a minute)."""
     settings = {f"cmake.define.VKC_PIN_BUILD_{module}": "OFF" for module in ("CPIN", "DISTANCES")}
     code = f"from scikit_build_core.build import build_wheel; build_wheel({str(tmp_path)!r}, {settings})"
-    done = subprocess.run([sys.executable, "-c", code], cwd=CHECKOUT, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert "vkc_pin/py.typed" in names
     for kind in ("robots", "scenes"):
-        files = {p.relative_to(CHECKOUT) for p in (CHECKOUT / kind).rglob("*") if p.is_file() and "__pycache__" not in p.parts}
+        files = {
+            p.relative_to(CHECKOUT)
+            for p in (CHECKOUT / kind).rglob("*")
+            if p.is_file() and "__pycache__" not in p.parts
+        }
         assert files
         assert {f"vkc_pin/{path.as_posix()}" for path in files} <= names
-    assert not [name for name in names if name.startswith("tests/") or name.endswith((".cpp", ".hpp"))]
+    assert not [
+        name for name in names if name.startswith("tests/") or name.endswith((".cpp", ".hpp"))
+    ]

@@ -14,7 +14,9 @@ from scipy.spatial import ConvexHull, QhullError
 __all__ = ["cut", "solid_volume"]
 
 
-def cut(mesh: trimesh.Trimesh, pieces: int, *, axis: ArrayLike, steps: int = 24) -> list[NDArray[np.float64]]:
+def cut(
+    mesh: trimesh.Trimesh, pieces: int, *, axis: ArrayLike, steps: int = 24
+) -> list[NDArray[np.float64]]:
     """Cut `mesh` by `pieces` − 1 planes across `axis` so that the volume of the pieces' hulls is smallest.
 
     Args:
@@ -24,7 +26,8 @@ def cut(mesh: trimesh.Trimesh, pieces: int, *, axis: ArrayLike, steps: int = 24)
         steps: Number of places along the mesh where a plane may lie.
 
     Returns:
-        For each piece its points, shape (n, 3), the corners of the cut included: the pieces' hulls contain the mesh.
+        For each piece its points, shape (n, 3), the corners of the cut included: the pieces' hulls
+        contain the mesh.
     """
     direction = np.asarray(axis, float) / np.linalg.norm(np.asarray(axis, float))
     if pieces == 1:
@@ -44,11 +47,14 @@ def cut(mesh: trimesh.Trimesh, pieces: int, *, axis: ArrayLike, steps: int = 24)
 def solid_volume(meshes: Sequence[trimesh.Trimesh], *, pitch: float = 0.001) -> float:
     """Return the volume [m³] of the solid whose skin `meshes` are.
 
-    A maker's mesh is an open skin with loose screws: it has no volume of its own. So cells of width `pitch` are counted
-    that have skin on both sides along at least two of the three axes, and half of those that the skin itself fills.
+    A maker's mesh is an open skin with loose screws: it has no volume of its own. So cells of width
+    `pitch` are counted that have skin on both sides along at least two of the three axes, and half
+    of those that the skin itself fills.
     """
     low = np.min([mesh.bounds[0] for mesh in meshes], axis=0) - 2.0 * pitch
-    size = np.ceil((np.max([mesh.bounds[1] for mesh in meshes], axis=0) - low) / pitch).astype(int) + 3
+    size = (
+        np.ceil((np.max([mesh.bounds[1] for mesh in meshes], axis=0) - low) / pitch).astype(int) + 3
+    )
     skin = np.zeros(size, bool)
     for mesh in meshes:
         points = mesh.subdivide_to_size(0.7 * pitch, max_iter=20).vertices
@@ -62,7 +68,9 @@ def solid_volume(meshes: Sequence[trimesh.Trimesh], *, pitch: float = 0.001) -> 
     return float((inside.sum() + 0.5 * skin.sum()) * pitch**3)
 
 
-def _slab(mesh: trimesh.Trimesh, direction: NDArray[Any], low: float, high: float) -> NDArray[np.float64]:
+def _slab(
+    mesh: trimesh.Trimesh, direction: NDArray[Any], low: float, high: float
+) -> NDArray[np.float64]:
     """Return the points of `mesh` between two planes, with those where its edges cross them."""
     vertices, edges = np.asarray(mesh.vertices), np.asarray(mesh.edges_unique)
     along = vertices @ direction
@@ -71,7 +79,9 @@ def _slab(mesh: trimesh.Trimesh, direction: NDArray[Any], low: float, high: floa
     for place in (low, high):
         crossing = (start - place) * (end - place) < 0.0
         share = ((place - start[crossing]) / (end[crossing] - start[crossing]))[:, None]
-        parts.append(vertices[edges[crossing, 0]] * (1.0 - share) + vertices[edges[crossing, 1]] * share)
+        parts.append(
+            vertices[edges[crossing, 0]] * (1.0 - share) + vertices[edges[crossing, 1]] * share
+        )
     return np.vstack(parts)
 
 

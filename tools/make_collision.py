@@ -2,9 +2,9 @@
 
 Usage: python tools/make_collision.py robots/husky_ur5e [LINK ...]
 
-A planner's time grows with the number of pieces and their corners. So each link is cut by parallel planes into as few slabs as
-wanted, at the places where the hulls' volume becomes smallest, and the hull of each slab is replaced by a polytope of few
-corners that still contains it.
+A planner's time grows with the number of pieces and their corners. So each link is cut by parallel
+planes into as few slabs as wanted, at the places where the hulls' volume becomes smallest, and the
+hull of each slab is replaced by a polytope of few corners that still contains it.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import trimesh
 from cutting import cut, solid_volume
 from numpy.typing import NDArray
 
-from vkc_pin.files.hulls import outer_hull
-from vkc_pin.files.urdf import UrdfFile, read_urdf
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.models.robot_schema import python_packages, read_robot
+from vkc_pin.world.files.hulls import outer_hull
+from vkc_pin.world.files.urdf import UrdfFile, read_urdf
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.models.robot_schema import find_python_packages, read_robot
 
 CORNERS = 40  # of a piece, at most
 
@@ -35,9 +35,14 @@ class Link(NamedTuple):
     pitch: float = 0.001  # [m]
 
 
-# A finger's tip is a piece of its own: the hull of a whole finger would reach far into the opening between the pads.
+# A finger's tip is a piece of its own: the hull of a whole finger would reach far into the opening
+# between the pads.
 _FINGER = Link(groups=((0, 1, 2), (3, 4)))
-_BODY, _LEFT_WHEELS, _RIGHT_WHEELS = (0, 1, 2, 5, 6, 7, 8, 9, 10, 11), (3, 12, 14, 16, 18), (4, 13, 15, 17, 19)
+_BODY, _LEFT_WHEELS, _RIGHT_WHEELS = (
+    (0, 1, 2, 5, 6, 7, 8, 9, 10, 11),
+    (3, 12, 14, 16, 18),
+    (4, 13, 15, 17, 19),
+)
 ROBOTS = {
     "husky_ur5e": {
         "ur_base_link_inertia": Link(),
@@ -57,7 +62,9 @@ ROBOTS = {
 
 def main() -> None:
     """Write the files and print one row of the table per link."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("robot", type=Path, help=f"folder of a robot: {', '.join(ROBOTS)}")
     parser.add_argument("links", nargs="*", metavar="LINK", help="only these links")
     given = parser.parse_args()
@@ -68,19 +75,34 @@ def main() -> None:
     if unknown := [link for link in given.links if link not in links]:
         parser.error(f"there are no settings for link '{unknown[0]}'")
     settings, document = read_robot(folder / "robot.yaml")
-    file = read_urdf(folder / settings.urdf, python_packages(settings.packages, document))
-    print("| link | pieces | corners | solid [l] | pieces' volume [l] | overhead |\n| --- | --- | --- | --- | --- | --- |")
+    file = read_urdf(folder / settings.urdf, find_python_packages(settings.packages, document))
+    print(
+        "| link | pieces | corners | solid [l] | pieces' volume [l] | overhead |\n| --- | --- | --- | --- | --- | --- |"
+    )
     for link in given.links or links:
         meshes = visual_meshes(file, link)
         pieces = convex_pieces(meshes, links[link])
-        named = sum(f"package://{folder.name}/collision/{link}_" in line for line in file.text.splitlines())
+        named = sum(
+            f"package://{folder.name}/collision/{link}_" in line for line in file.text.splitlines()
+        )
         if named != len(pieces):
             raise SystemExit(f"{file.path.name} names {named} pieces of {link}, not {len(pieces)}")
         for k, piece in enumerate(pieces):
-            write_atomically(folder / "collision" / f"{link}_{k}.stl", piece.export(file_type="stl"))
-        solid, union = solid_volume(meshes, pitch=links[link].pitch), solid_volume(pieces, pitch=0.002)
-        corners, excess = ", ".join(str(len(piece.vertices)) for piece in pieces), 100 * (union / solid - 1)
-        print(f"| `{link}` | {len(pieces)} | {corners} | {1e3 * solid:.3f} | {1e3 * union:.3f} | {excess:.0f} % |", flush=True)
+            write_atomically(
+                folder / "collision" / f"{link}_{k}.stl", piece.export(file_type="stl")
+            )
+        solid, union = (
+            solid_volume(meshes, pitch=links[link].pitch),
+            solid_volume(pieces, pitch=0.002),
+        )
+        corners, excess = (
+            ", ".join(str(len(piece.vertices)) for piece in pieces),
+            100 * (union / solid - 1),
+        )
+        print(
+            f"| `{link}` | {len(pieces)} | {corners} | {1e3 * solid:.3f} | {1e3 * union:.3f} | {excess:.0f} % |",
+            flush=True,
+        )
 
 
 def visual_meshes(file: UrdfFile, link: str) -> list[trimesh.Trimesh]:

@@ -1,21 +1,30 @@
 """Whole-body planning for mobile manipulators on virtual kinematic chains.
 
-What is public is listed in `__init__.pyi` and loaded when it is first asked for (as SPEC 1 of Scientific Python has it), so
-that `import vkc_pin` costs little in a process that needs a part of it, and type checkers see everything.
+What is public is listed in `__init__.pyi` and loaded when it is first asked for (as SPEC 1 of
+Scientific Python has it), so that `import vkc_pin` costs little in a process that needs a part of
+it, and type checkers see everything.
 """
 
 from typing import Any
 
 import lazy_loader
 
-from vkc_pin import notebook
+from vkc_pin.utils import notebook
 
-_public, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__all__.append("__version__")
-notebook.cards_from("vkc_pin.plotting.cards")
+_public, _names, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ += ["__version__", "cpin"]
+notebook.cards_from("vkc_pin.visualization.plots.notebook_cards")
+
+
+def __dir__() -> list[str]:
+    return [*_names(), "cpin"]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "cpin":  # the public name of the kinematics
+        from vkc_pin.planning import kinematics
+
+        return globals().setdefault(name, kinematics)
     if name != "__version__":
         return _public(name)
     from importlib.metadata import PackageNotFoundError, version  # takes longer than all the rest

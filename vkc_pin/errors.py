@@ -1,4 +1,4 @@
-"""The exceptions of the package; all of them derive from `VkcError` and carry data, not only text."""
+"""Exceptions of the package. All derive from `VkcError` and carry data, not only text."""
 
 from __future__ import annotations
 
@@ -41,7 +41,9 @@ def _told(value: object) -> str:
 
 def nearest_name(name: str, choices: Iterable[str]) -> str | None:
     """Return the choice that resembles `name` most, or None if none does."""
-    matches = difflib.get_close_matches(_short(name, _NAME), [str(c) for c in choices], n=1, cutoff=0.5)
+    matches = difflib.get_close_matches(
+        _short(name, _NAME), [str(c) for c in choices], n=1, cutoff=0.5
+    )
     return matches[0] if matches else None
 
 
@@ -80,8 +82,14 @@ class InputError(VkcError, ValueError):
         named = None if file is None else _short(str(file))
         where = "" if named is None else f"{named}:{line}: " if line is not None else f"{named}: "
         what = problem if field is None else f"{_short(field)}: {problem}"
-        details = [f"{label} {_told(value)}" for label, value in (("expected", expected), ("got", got)) if value is not None]
-        super().__init__(_short(where + what, 6 * _LONGEST) + (f" ({', '.join(details)})" if details else ""))
+        details = [
+            f"{label} {_told(value)}"
+            for label, value in (("expected", expected), ("got", got))
+            if value is not None
+        ]
+        super().__init__(
+            _short(where + what, 6 * _LONGEST) + (f" ({', '.join(details)})" if details else "")
+        )
 
 
 class UnknownNameError(InputError):
@@ -99,7 +107,14 @@ class UnknownNameError(InputError):
     ) -> None:
         self.kind, self.name, self.choices = kind, name, tuple(str(c) for c in choices)
         self.nearest = nearest_name(name, self.choices)
-        listed = ", ".join(_short(choice, _NAME) for choice in self.choices[:12]) + (", ..." if len(self.choices) > 12 else "")
+        listed = ", ".join(_short(choice, _NAME) for choice in self.choices[:12]) + (
+            ", ..." if len(self.choices) > 12 else ""
+        )
         hint = f"; did you mean '{self.nearest}'?" if self.nearest else ""
         problem = f"there is no {kind} '{_short(name, _NAME)}'{hint} There are: {listed or 'none'}"
-        super().__init__(problem if hint else problem.replace(" There are", "; there are", 1), file=file, line=line, field=field)
+        super().__init__(
+            problem if hint else problem.replace(" There are", "; there are", 1),
+            file=file,
+            line=line,
+            field=field,
+        )

@@ -1,12 +1,12 @@
-"""Everything about a plan that can be chosen, with its unit and default."""
+"""Options of planning, each with its unit and default."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from vkc_pin.arguments import number, whole
 from vkc_pin.errors import InputError, shown
+from vkc_pin.utils.arguments import number, whole
 
 __all__ = ["Options"]
 
@@ -31,20 +31,26 @@ class Options:
 
     Attributes:
         dt: Least time between two waypoints [s]; motions that are too long for it take more.
-        grasp_time: How long the robot stands still at a grasp or release, for the gripper to close or open [s].
-        jerk_time: Least time in which an acceleration grows from none to its limit [s]: jerks are limited to that limit over
-            this, and accelerations do not jump. 0: they may.
-        reach_waypoints: Segments of a phase that drives or reaches, with or without something in the hand.
+        grasp_time: How long the robot stands still at a grasp or release, for the gripper to close
+            or open [s].
+        jerk_time: Least time in which an acceleration grows from none to its limit [s]: jerks are
+            limited to that limit over this, and accelerations do not jump. 0: they may.
+        reach_waypoints: Segments of a phase that drives or reaches, with or without something in
+            the hand.
         turn_waypoints: Segments of a phase in which a latch is released.
         move_waypoints: Segments of a phase in which a held object is moved.
         dist_safe: Clearance to keep at the waypoints [m].
-        self_distance: The same between links of the robot; those that cannot get so far apart keep half of what they can [m].
-        grasp_clearance: Clearance of the gripper's touch links to an object near its grasp, where the attachment states none [m].
+        self_distance: The same between links of the robot; those that cannot get so far apart keep
+            half of what they can [m].
+        grasp_clearance: Clearance of the gripper's touch links to an object near its grasp, where
+            the attachment states none [m].
         effort: What is minimised: "length", of the way, or "squares", eq. 1.
-        velocity_weight_base: W_vel of eq. 1 for the base's place, and for every joint that slides [1/m²].
+        velocity_weight_base: W_vel of eq. 1 for the base's place, and for every joint that slides
+            [1/m²].
         velocity_weight_heading: W_vel for its heading [1/rad²].
         velocity_weight_arm: W_vel for the arm's joints that turn [1/rad²].
-        velocity_weight_object: W_vel for those of objects and for virtual joints that turn [1/rad²].
+        velocity_weight_object: W_vel for those of objects and for virtual joints that turn
+            [1/rad²].
         acceleration_weight: W_acc of eq. 1, as a multiple of W_vel [s²].
         approach: Length of the straight way on which a hand comes to what it grasps [m].
         approach_time: How long it takes, at `dt` a waypoint [s].
@@ -57,7 +63,8 @@ class Options:
         max_outer: Rounds of the witness-plane loop.
         max_iterations: Ipopt iterations in one round.
         penalty: First weight of the exact ℓ1 penalty on clearance slack; it is adapted.
-        max_restarts: How many different seeds are tried; in a chore, how often a motion is searched for.
+        max_restarts: How many different seeds are tried; in a chore, how often a motion is searched
+            for.
     """
 
     dt: float = 0.25
@@ -94,15 +101,24 @@ class Options:
             field = f"Options.{item.name}"
             if item.type == "str":
                 if not isinstance(value, str) or value not in EFFORTS:
-                    raise InputError("unknown", field=field, expected=" or ".join(map(repr, EFFORTS)), got=shown(value))
+                    raise InputError(
+                        "unknown",
+                        field=field,
+                        expected=" or ".join(map(repr, EFFORTS)),
+                        got=shown(value),
+                    )
                 object.__setattr__(self, item.name, str(value))
             elif item.type == "int":
-                value = whole(value, field, low=1, high=_MOST[item.name])  # NumPy's own integers do not go into JSON
+                value = whole(
+                    value, field, low=1, high=_MOST[item.name]
+                )  # NumPy's own integers do not go into JSON
                 object.__setattr__(self, item.name, value)
             else:
                 low, high = _RANGES.get(item.name, (_SMALLEST, _LARGEST))
                 expected = f"a {'positive ' if low else ''}finite number, from {low:g} to {high:g}"
-                object.__setattr__(self, item.name, number(value, field, expected, low=low, high=high))
+                object.__setattr__(
+                    self, item.name, number(value, field, expected, low=low, high=high)
+                )
 
     @classmethod
     def paper(cls, **changes: Any) -> Self:
@@ -111,7 +127,9 @@ class Options:
         Args:
             **changes: Other fields.
         """
-        weights = dict.fromkeys((item.name for item in fields(cls) if item.name.startswith("velocity_weight")), 1.0)
+        weights = dict.fromkeys(
+            (item.name for item in fields(cls) if item.name.startswith("velocity_weight")), 1.0
+        )
         return cls(**{"effort": "squares", **weights, **changes})
 
     @property

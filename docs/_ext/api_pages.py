@@ -1,4 +1,4 @@
-"""Writes the reference's pages on the package's wings, docs/api/wings/*.md, from the package itself when the site is built."""
+"""Writes the reference pages of all packages, docs/api/packages/*.md, from their modules when the site is built."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGE, FOLDER = ROOT / "vkc_pin", ROOT / "docs" / "api" / "wings"
+PACKAGE, FOLDER = ROOT / "vkc_pin", ROOT / "docs" / "api" / "packages"
 
 
-def wings() -> dict[str, dict[str, Path]]:
-    """Return wing → full name → file of its modules, itself first; "package" stands for the modules beside the wings."""
+def packages() -> dict[str, dict[str, Path]]:
+    """Return package → full name → file of its modules, itself first; "package" stands for the top-level modules."""
     found: dict[str, dict[str, Path]] = {}
-    for file in sorted(PACKAGE.rglob("*.py"), key=lambda file: (file.parent, file.name != "__init__.py", file.name)):
+    for file in sorted(
+        PACKAGE.rglob("*.py"), key=lambda file: (file.parent, file.name != "__init__.py", file.name)
+    ):
         parts = file.relative_to(ROOT).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__init__")
         if name != "vkc_pin" and file.name != "__main__.py":  # importing that is running it
@@ -21,16 +23,20 @@ def wings() -> dict[str, dict[str, Path]]:
 
 
 def taken(file: Path) -> dict[str, list[str]]:
-    """Return module → names that a wing's `__init__.py` takes from it: they are documented as the wing's own."""
+    """Return module → names that a package's `__init__.py` imports from it: they are documented as the package's own."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
-    return {node.module: [a.name for a in node.names] for node in tree.body if isinstance(node, ast.ImportFrom) and node.module}
+    return {
+        node.module: [a.name for a in node.names]
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom) and node.module
+    }
 
 
-def page(wing: str, files: dict[str, Path]) -> str:
-    """Return a wing's page."""
-    own = f"vkc_pin.{wing}"
+def page(package: str, files: dict[str, Path]) -> str:
+    """Return the page of a package."""
+    own = f"vkc_pin.{package}"
     faces = taken(files[own]) if own in files else {}
-    title = "Beside the wings" if wing == "package" else f"`{wing}`"
+    title = "Top-level modules" if package == "package" else f"`{package}`"
     blocks = [f"# {title}\n"]
     for name in files:
         left_out = f"   :exclude-members: {', '.join(faces[name])}\n" if name in faces else ""
@@ -40,9 +46,11 @@ def page(wing: str, files: dict[str, Path]) -> str:
 
 
 def write() -> None:
-    """Write a page for every wing, if it is not as it should be, and delete those of wings that are no more."""
+    """Write a page for every package whose page is missing or stale, and delete those of removed packages."""
     FOLDER.mkdir(exist_ok=True)
-    pages = {FOLDER / f"{wing}.md": page(wing, files) for wing, files in wings().items()}
+    pages = {
+        FOLDER / f"{package}.md": page(package, files) for package, files in packages().items()
+    }
     for file in set(FOLDER.glob("*.md")) - set(pages):
         file.unlink()
     for file, text in pages.items():

@@ -12,7 +12,9 @@ from docutils import nodes
 from sphinx.application import Sphinx
 
 SIZE = 16.0  # of the font a formula is drawn with [pixels]
-SCALE = 1.08 / SIZE  # to the font around it [em]: its small letters are then as high as those of the text
+SCALE = (
+    1.08 / SIZE
+)  # to the font around it [em]: its small letters are then as high as those of the text
 
 
 @cache
@@ -42,6 +44,8 @@ def displayed_formula(self: Any, node: nodes.math_block) -> None:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Tell Sphinx about the renderer `svg`."""
-    ziamath.config.svg2 = False  # every picture brings its own glyphs: those of several would have the same names
+    ziamath.config.svg2 = (
+        False  # every picture brings its own glyphs: those of several would have the same names
+    )
     app.add_html_math_renderer("svg", (inline_formula, None), (displayed_formula, None))
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

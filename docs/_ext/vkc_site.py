@@ -33,27 +33,41 @@ def read(app: Sphinx, name: str, source: list[str]) -> None:
         return
     if name == START:
         lines = (ROOT / "docs" / "_contents.md").read_text(encoding="utf-8").splitlines()
-        there = (line for line in lines if not line.endswith("*") or list((ROOT / "docs").glob(f"{line}.*")))
+        there = (
+            line
+            for line in lines
+            if not line.endswith("*") or list((ROOT / "docs").glob(f"{line}.*"))
+        )
         source[0] += "\n" + "\n".join(there)
     source[0] = re.sub(
         r"<!-- film: (\w+) -->\n!\[([^\]]*)\]\([^)]*\)",
         r'<iframe class="film" src="animations/\1.html" title="\2"></iframe>',
         source[0],
     )
-    source[0] = re.sub(r"\[(\w+)\.md\]\((\1\.md[^)]*)\)", r"[](\2)", source[0])  # the page's title instead of its file's name
+    source[0] = re.sub(
+        r"\[(\w+)\.md\]\((\1\.md[^)]*)\)", r"[](\2)", source[0]
+    )  # the page's title instead of its file's name
     source[0] = re.sub(r"\[([^\]]*)\]\((animations/\w+\.html)\)", r'<a href="\2">\1</a>', source[0])
 
 
 def generate(app: Sphinx) -> None:
-    """Write the reference's pages on the wings, before it is looked which files there are."""
+    """Write the reference pages of the packages before the source files are listed."""
     api_pages.write()
 
 
-def outdated(app: Sphinx, env: BuildEnvironment, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
+def outdated(
+    app: Sphinx, env: BuildEnvironment, added: set[str], changed: set[str], removed: set[str]
+) -> list[str]:
     """Return the notebooks that have been run since they were read: their outputs are not in the repository."""
-    notebooks = [name for name in env.found_docs if name.startswith("notebooks/") and name in env.all_docs]
+    notebooks = [
+        name for name in env.found_docs if name.startswith("notebooks/") and name in env.all_docs
+    ]
     files = {name: EXECUTED / f"{Path(name).name}.ipynb" for name in notebooks}
-    return [name for name, file in files.items() if file.is_file() and file.stat().st_mtime > env.all_docs[name] / 1e6]
+    return [
+        name
+        for name, file in files.items()
+        if file.is_file() and file.stat().st_mtime > env.all_docs[name] / 1e6
+    ]
 
 
 def films(app: Sphinx, problem: Exception | None) -> None:
@@ -91,7 +105,9 @@ def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: 
     return True if public else None
 
 
-def resolve(app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Node) -> nodes.Node | None:
+def resolve(
+    app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Node
+) -> nodes.Node | None:
     """Find own names by their last part: a class is documented as `vkc_pin.Plan` and lives in `vkc_pin.planning.plan`."""
     if node.get("refdomain") != "py":
         return None
@@ -101,13 +117,18 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, con
     last = target.rpartition(".")[2]
     known = env.domains.python_domain.objects
     found = [
-        name for name in known if name.rpartition(".")[2] == last and known[name].objtype in ("class", "function", "exception")
+        name
+        for name in known
+        if name.rpartition(".")[2] == last
+        and known[name].objtype in ("class", "function", "exception")
     ]
     public = [name for name in found if name == f"vkc_pin.{last}"] or found
     if len(public) != 1:
         return None
     entry = known[public[0]]
-    return make_refnode(app.builder, str(node["refdoc"]), entry.docname, entry.node_id, content, public[0])
+    return make_refnode(
+        app.builder, str(node["refdoc"]), entry.docname, entry.node_id, content, public[0]
+    )
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

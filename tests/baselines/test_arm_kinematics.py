@@ -12,8 +12,8 @@ from helpers.small_problems import door_scene, program_of
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.postures import base_poses
-from vkc_pin.program.merit import TOLERANCE
-from vkc_pin.seeds.knots import Knots
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
+from vkc_pin.planning.nlp.merit import TOLERANCE
 
 SLIDE = {"slide": 0.3}
 EXACT = np.sqrt(3.0) * TOLERANCE  # [m] and [rad]: it holds for each coordinate
@@ -21,8 +21,10 @@ STILL = 0.0
 
 
 def built(attachment: str = "handle") -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
-    problem = program_of(holding(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
-    return problem, ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    problem = program_of(
+        holding(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT
+    )
+    return problem, ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0)))
 
 
 @cache
@@ -36,7 +38,7 @@ def test_the_hand_is_at_the_handle(waypoint: int, seed: int) -> None:
     """From arms that are anywhere near, the base a little elsewhere: nothing but the arm moves."""
     problem, arm = shared()
     rng = np.random.default_rng(seed)
-    seeds = arm.knots.objects[waypoint - 1].copy()
+    seeds = arm.knots.object_motion[waypoint - 1].copy()
     seeds[:3] += rng.uniform(-0.05, 0.05, 3)
     seeds[3:9] += rng.normal(0.0, 0.3, 6)
     given = seeds.copy()
@@ -65,7 +67,7 @@ def test_a_grasp_with_a_freedom_is_solved_for_too() -> None:
     assert arm.columns.tolist() == [3, 4, 5, 6, 7, 8, tilt]
     tilts = []
     for waypoint in (2, 5, 8):
-        z, closed = arm.solve(arm.knots.objects[waypoint - 1], waypoint)
+        z, closed = arm.solve(arm.knots.object_motion[waypoint - 1], waypoint)
         assert closed
         assert off(problem.scene, z, handle(z[slide], tilt=z[tilt])) <= EXACT
         tilts.append(z[tilt])
@@ -77,14 +79,17 @@ def test_the_columns_of_a_robot_with_a_door() -> None:
     """Hinge and knob are the object's, not the arm's."""
     scene = door_scene()
     rows = base_poses(
-        reach := program_of(scene, [vkc.Grasp("door")], options=SHORT), reach.segments, reach.start, np.random.default_rng(0)
+        reach := program_of(scene, [vkc.Grasp("door")], options=SHORT),
+        reach.segments,
+        reach.start,
+        np.random.default_rng(0),
     )
     held = scene.with_start(base=rows[0, :3], arm=rows[0, 3:9]).with_held({"door": "handle"})
     problem = program_of(held, [vkc.Actuate("door", {"hinge": 0.3})], options=SHORT)
-    arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    arm = ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0)))
     assert arm.columns.tolist() == [3, 4, 5, 6, 7, 8]
     knob, hinge = problem.chain.index("door.knob"), problem.chain.index("door.hinge")
-    wanted = arm.knots.objects[4]
+    wanted = arm.knots.object_motion[4]
     z, closed = arm.solve(wanted, 5)
     assert closed
     np.testing.assert_allclose(z[[knob, hinge]], wanted[[knob, hinge]], rtol=0.0, atol=STILL)
@@ -96,7 +101,7 @@ def test_the_columns_of_a_robot_with_a_door() -> None:
 def test_where_nothing_is_held_there_is_nothing_to_solve() -> None:
     """Only from where the hand comes straight to the handle does it have to be somewhere."""
     problem = program_of(drawer_scene(), [vkc.Grasp("drawer")])
-    arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    arm = ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0)))
     z, closed = arm.solve(problem.start, 1)
     assert closed
     np.testing.assert_array_equal(z, problem.start)
@@ -135,7 +140,7 @@ def test_a_start_outside_its_limits_by_rounding() -> None:
 def test_out_of_reach() -> None:
     scene = open_scene()
     problem = program_of(holding(scene), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
-    arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    arm = ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0)))
     away = problem.start.copy()
     away[0] -= 1.5
     z, closed = arm.solve(away, 4)
@@ -147,10 +152,10 @@ def test_out_of_reach() -> None:
 @pytest.mark.parametrize("waypoint", [1, 4, 8])
 def test_nothing_but_the_arm_moves(waypoint: int) -> None:
     problem = program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
-    arm = ArmKinematics(problem, Knots(problem, np.random.default_rng(0)))
+    arm = ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0)))
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        given = arm.knots.objects[waypoint - 1].copy()
+        given = arm.knots.object_motion[waypoint - 1].copy()
         given[:3] += rng.uniform(-0.05, 0.05, 3)
         given[3:9] += rng.normal(0.0, 0.3, 6)
         z, _ = arm.solve(given, waypoint)

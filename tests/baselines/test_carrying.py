@@ -19,19 +19,32 @@ from vkc_pin.baselines import postures as poses
 from vkc_pin.baselines.attempt import Attempt
 from vkc_pin.baselines.following import FailedError
 from vkc_pin.baselines.postures import postures
-from vkc_pin.motion.world import World
-from vkc_pin.seeds.routes import Routes
+from vkc_pin.planning.initialization.base_routes import BaseRoutes
+from vkc_pin.world.trajectory.world_model import World
 
 OPTIONS = vkc.Options(reach_waypoints=20, move_waypoints=15)
-CUP, THERE = (1.5, 0.1, 0.501), (-0.2, 1.7, 0.701)  # on a table before the robot, and on one to its left
+CUP, THERE = (
+    (1.5, 0.1, 0.501),
+    (-0.2, 1.7, 0.701),
+)  # on a table before the robot, and on one to its left
 CARRY = vkc.Place("cup", THERE)
-CARRIED = ["go to", "reach cup.side", "go to", "go to", "place cup", "let go"]  # drive, reach, draw back, drive, put down
+CARRIED = [
+    "go to",
+    "reach cup.side",
+    "go to",
+    "go to",
+    "place cup",
+    "let go",
+]  # drive, reach, draw back, drive, put down
 PULL = vkc.Actuate("drawer", {"slide": 0.15})
 
 
 def room(*more: dict[str, Any], arm: np.ndarray | None = None) -> vkc.Scene:
     """Return a hall with two tables, and a cup on one of them."""
-    tables = [box("table", [0.6, 0.8, 0.02], [1.7, 0.1, 0.49]), box("other", [0.8, 0.6, 0.02], [-0.2, 1.9, 0.69])]
+    tables = [
+        box("table", [0.6, 0.8, 0.02], [1.7, 0.1, 0.49]),
+        box("other", [0.8, 0.6, 0.02], [-0.2, 1.9, 0.69]),
+    ]
     scene = hall(obstacles=[*tables, *more])
     cup = {"name": "cup", "type": "cup", "position": list(CUP), "yaw": 0.4}
     scene = vkc.Scene.from_document({**scene.document, "objects": [cup]}, scene.folder)
@@ -59,16 +72,19 @@ def names(found: vkc.Plan) -> list[str]:
 def rows(found: vkc.Plan, phase: int) -> np.ndarray:
     """Return the waypoints of a phase, the robot's columns."""
     span = found.trajectory.phases[phase]
-    return np.array(found.trajectory.positions[span.first : span.last + 1, : found.trajectory.robot_size])
+    return np.array(
+        found.trajectory.positions[span.first : span.last + 1, : found.trajectory.robot_size]
+    )
 
 
 def stands(found: vkc.Plan, waypoint: int, name: str = "cup") -> pin.SE3:
     """Return where an object is at a waypoint, by validation's own tree."""
     world = World(found.scene)
-    return world.placement(name, world.positions(found.trajectory)[waypoint])
+    return world.get_placement(name, world.compute_positions(found.trajectory)[waypoint])
 
 
-# --- carrying ----------------------------------------------------------------------------------------------------------
+# --- carrying
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_cup_is_carried_from_table_to_table() -> None:
@@ -76,7 +92,12 @@ def test_a_cup_is_carried_from_table_to_table() -> None:
     assert found.success, found.report()
     assert vkc.validate(found.scene, found.steps, found.trajectory, found.options).ok
     assert names(found) == CARRIED
-    assert [dict(phase.held) for phase in found.trajectory.phases] == [{}, {}, *[{"cup": "side"}] * 3, {}]
+    assert [dict(phase.held) for phase in found.trajectory.phases] == [
+        {},
+        {},
+        *[{"cup": "side"}] * 3,
+        {},
+    ]
     end = stands(found, -1)
     np.testing.assert_allclose(end.translation, THERE, atol=1e-3)
     assert end.rotation[2, 2] > np.cos(1e-3), "it stands upright"
@@ -105,7 +126,9 @@ def only(monkeypatch: pytest.MonkeyPatch, index: int) -> None:
     monkeypatch.setattr(attempt, "postures", lambda problem: list(postures(problem))[index:][:1])
 
 
-def test_with_the_arm_at_home_the_cup_is_turned_over_and_stands_upright_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_the_arm_at_home_the_cup_is_turned_over_and_stands_upright_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """As it stood before the plan; not as the hand has turned it when it is put down."""
     only(monkeypatch, -2)
     found = plan(room(), CARRY)
@@ -120,11 +143,16 @@ def test_what_is_held_at_the_start_is_carried_on() -> None:
     before = carried()
     span = before.trajectory.phases[3]
     row = before.trajectory.positions[span.first]
-    at = [float(row[before.trajectory.names.index(f"cup.side_{name}")]) for name in ("slide", "turn")]
+    at = [
+        float(row[before.trajectory.names.index(f"cup.side_{name}")]) for name in ("slide", "turn")
+    ]
     scene = room().with_start(base=row[:3], arm=row[3:9])
     attachment = scene.objects["cup"].object.attachments["side"]
     values = dict(zip(("slide", "turn"), at, strict=True))
-    held = scene.with_held({"cup": "side"}, at={"cup": [values[name.removeprefix("side_")] for name in attachment.coordinates]})
+    held = scene.with_held(
+        {"cup": "side"},
+        at={"cup": [values[name.removeprefix("side_")] for name in attachment.coordinates]},
+    )
     found = plan(held, CARRY)
     assert found.success, found.report()
     assert names(found) == ["go to", "place cup", "let go"]
@@ -138,7 +166,9 @@ def test_no_room_to_put_it_down(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "goal" in {v.constraint for v in found.validation.violations}
 
 
-def test_where_one_way_to_hold_the_arm_leads_nowhere_the_next_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_one_way_to_hold_the_arm_leads_nowhere_the_next_is_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """From where the hand has closed, and what was done with the first is forgotten."""
     drive, driven = Attempt._drive, list[np.ndarray]()
 
@@ -158,7 +188,8 @@ def test_where_one_way_to_hold_the_arm_leads_nowhere_the_next_is_tried(monkeypat
     np.testing.assert_allclose(driven[3][:3], driven[1][:3], atol=1e-9)
 
 
-# --- driving on --------------------------------------------------------------------------------------------------------
+# --- driving on
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_it_drives_on_when_the_drawer_is_open() -> None:
@@ -193,7 +224,8 @@ def test_no_way_there() -> None:
     assert np.ptp(found.trajectory.positions[:, :3], axis=0).max() == 0.0, "it stands at its start"
 
 
-# --- how the arm is held -----------------------------------------------------------------------------------------------
+# --- how the arm is held
+# -----------------------------------------------------------------------------------------------
 
 
 def stay(scene: vkc.Scene) -> vkc.TrajectoryProblem:
@@ -202,7 +234,7 @@ def stay(scene: vkc.Scene) -> vkc.TrajectoryProblem:
 
 def folded(scene: vkc.Scene) -> np.ndarray:
     """Return the arm of the second baseline posture of an arm at home: as narrow as it becomes."""
-    return Routes(stay(scene)).folded_arm(0)
+    return BaseRoutes(stay(scene)).get_folded_arm(0)
 
 
 def test_an_arm_at_home_stays_there_or_is_folded() -> None:
@@ -239,4 +271,6 @@ def test_what_was_taken_is_lifted_first() -> None:
     lifted = found.trajectory.positions[found.trajectory.phases[2].last]
     assert np.abs(lifted[:3] - row[:3]).max() < 1e-9
     low, high = (stands(found, found.trajectory.phases[k].last) for k in (1, 2))
-    np.testing.assert_allclose(high.translation - low.translation, [0.0, 0.0, vkc.Options().approach], atol=2e-3)
+    np.testing.assert_allclose(
+        high.translation - low.translation, [0.0, 0.0, vkc.Options().approach], atol=2e-3
+    )

@@ -13,8 +13,8 @@ import vkc_pin as vkc
 from vkc_pin.baselines import following as module
 from vkc_pin.baselines.following import SEEDS, Followed, follow
 from vkc_pin.baselines.refining import CLEAR
-from vkc_pin.program.merit import TOLERANCE
-from vkc_pin.seeds.knots import Knots, smooth
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
+from vkc_pin.planning.nlp.merit import TOLERANCE
 
 STILL = 0.0
 ROUNDING = 1e-6  # [m]
@@ -36,7 +36,9 @@ def base(problem: vkc.TrajectoryProblem, *change: float) -> np.ndarray:
     return np.asarray(problem.start[:3] + share * np.array(change or (0.0, 0.0, 0.0)))
 
 
-def followed(problem: vkc.TrajectoryProblem, way: np.ndarray, *, refine: bool = False, seed: int = 0) -> Followed:
+def followed(
+    problem: vkc.TrajectoryProblem, way: np.ndarray, *, refine: bool = False, seed: int = 0
+) -> Followed:
     return follow(problem, way, np.random.default_rng(seed), refine=refine)
 
 
@@ -47,7 +49,9 @@ def check(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> None:
         tilt = row[slide - 1] if len(row) == 11 else 0.0
         assert off(problem.scene, row, handle(row[slide], tilt=tilt)) < CLOSED
         assert spare(problem.scene, row, slide=row[slide], held=True) >= -CLEAR - ROUNDING
-        assert np.all((row >= problem.lower.min(axis=0) - STILL) & (row <= problem.upper.max(axis=0) + STILL))
+        assert np.all(
+            (row >= problem.lower.min(axis=0) - STILL) & (row <= problem.upper.max(axis=0) + STILL)
+        )
 
 
 @pytest.mark.parametrize("refine", [False, True], ids=["B1", "B2"])
@@ -59,8 +63,10 @@ def test_it_follows_to_the_end(change: Sequence[float], refine: bool) -> None:
     assert (found.cause, found.share) == ("", 1.0)
     check(problem, found.z)
     np.testing.assert_allclose(found.z[:, :3], way, rtol=0.0, atol=STILL)
-    np.testing.assert_allclose(found.z[:, -1], GOAL * smooth(8), rtol=0.0, atol=STILL)
-    assert np.abs(np.diff(problem.waypoints(found.z)[:, 3:9], axis=0)).max() < 0.6, "from the waypoint before"
+    np.testing.assert_allclose(found.z[:, -1], GOAL * sample_smoothstep(8), rtol=0.0, atol=STILL)
+    assert np.abs(np.diff(problem.waypoints(found.z)[:, 3:9], axis=0)).max() < 0.6, (
+        "from the waypoint before"
+    )
 
 
 def test_every_arm_is_looked_for_from_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +84,7 @@ def test_every_arm_is_looked_for_from_the_one_before(monkeypatch: pytest.MonkeyP
     rows = np.array([z for z, _ in given])
     np.testing.assert_array_equal(rows[:, 3:9], problem.waypoints(found.z)[:-1, 3:9])
     np.testing.assert_array_equal(rows[:, :3], way)
-    np.testing.assert_allclose(rows[:, 9], GOAL * smooth(8))
+    np.testing.assert_allclose(rows[:, 9], GOAL * sample_smoothstep(8))
 
 
 def test_the_same_numbers_give_the_same_motion() -> None:
@@ -126,7 +132,9 @@ def test_collision(refine: bool, least: float) -> None:
     np.testing.assert_array_equal(found.z[done:], np.tile(wrong, (8 - done, 1)))
 
 
-def test_where_the_arm_as_it_was_collides_other_arms_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_arm_as_it_was_collides_other_arms_are_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problem = pulling(0.92)
     found = followed(problem, base(problem))
     assert (found.cause, found.share) == ("", 1.0)
@@ -139,7 +147,7 @@ def test_where_the_arm_as_it_was_collides_other_arms_are_tried(monkeypatch: pyte
 
 def test_b2_moves_the_object_off_its_time_law_b1_does_not() -> None:
     problem = pulling(0.94, "handle_free")
-    law = GOAL * smooth(8)
+    law = GOAL * sample_smoothstep(8)
     plain, refined = (followed(problem, base(problem), refine=refine) for refine in (False, True))
     assert (plain.cause, refined.cause) == ("", "")
     check(problem, plain.z)
@@ -150,7 +158,8 @@ def test_b2_moves_the_object_off_its_time_law_b1_does_not() -> None:
     np.testing.assert_allclose(refined.z[:, :3], base(problem), rtol=0.0, atol=STILL)
 
 
-# --- which of the candidates is taken ----------------------------------------------------------------------------------
+# --- which of the candidates is taken
+# ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -158,10 +167,26 @@ def test_b2_moves_the_object_off_its_time_law_b1_does_not() -> None:
     [
         ((5.0, ""), [(1.0, "")], (5.0, "")),  # what the waypoint before leads to, if it is any good
         ((0.0, "collision"), [(3.0, ""), (1.0, ""), (2.0, "")], (1.0, "")),
-        ((3.0, "collision"), [(2.0, "no inverse kinematics"), (4.0, "collision")], (3.0, "collision")),
-        ((1.0, "no inverse kinematics"), [(4.0, "collision"), (5.0, "collision")], (4.0, "collision")),
-        ((2.0, "no inverse kinematics"), [(3.0, "no inverse kinematics")], (2.0, "no inverse kinematics")),
-        ((3.0, "no inverse kinematics"), [(-2.0, "no inverse kinematics")], (-2.0, "no inverse kinematics")),
+        (
+            (3.0, "collision"),
+            [(2.0, "no inverse kinematics"), (4.0, "collision")],
+            (3.0, "collision"),
+        ),
+        (
+            (1.0, "no inverse kinematics"),
+            [(4.0, "collision"), (5.0, "collision")],
+            (4.0, "collision"),
+        ),
+        (
+            (2.0, "no inverse kinematics"),
+            [(3.0, "no inverse kinematics")],
+            (2.0, "no inverse kinematics"),
+        ),
+        (
+            (3.0, "no inverse kinematics"),
+            [(-2.0, "no inverse kinematics")],
+            (-2.0, "no inverse kinematics"),
+        ),
         ((0.0, "collision"), [], (0.0, "collision")),
     ],
 )
@@ -172,7 +197,7 @@ def test_the_nearest_of_the_best_kind_is_taken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem = pulling()
-    arm = module._Arm(problem, Knots(problem, np.random.default_rng(0)), refine=False)
+    arm = module._Arm(problem, KeyframeSampler(problem, np.random.default_rng(0)), refine=False)
     answers = iter([first, *others])
 
     def candidate(z: np.ndarray, waypoint: int) -> tuple[np.ndarray, str]:
@@ -189,22 +214,27 @@ def test_the_nearest_of_the_best_kind_is_taken(
 def test_random_arms_are_within_limits_and_nothing_else_changes() -> None:
     problem = pulling(attachment="handle_free")
     problem.chain.upper[5] = problem.start[5] + 0.05
-    arm = module._Arm(problem, Knots(problem, np.random.default_rng(0)), refine=False)
+    arm = module._Arm(problem, KeyframeSampler(problem, np.random.default_rng(0)), refine=False)
     seeds = np.vstack([arm._seeds(problem.start) for _ in range(10)])
     assert len(seeds) == 10 * SEEDS
     assert np.all((seeds >= problem.chain.lower) & (seeds <= problem.chain.upper))
-    np.testing.assert_array_equal(seeds[:, [0, 1, 2, 10]], np.tile(problem.start[[0, 1, 2, 10]], (len(seeds), 1)))
+    np.testing.assert_array_equal(
+        seeds[:, [0, 1, 2, 10]], np.tile(problem.start[[0, 1, 2, 10]], (len(seeds), 1))
+    )
     apart = np.abs(seeds - problem.start)[:, 3:10]
     assert apart.max(axis=0)[:6].min() > 1.0
     assert apart.max(axis=0)[6] > 0.3, "the hand tilts about the bar"
     # Half of them are near where the arm is, the others anywhere.
-    near, anywhere = (apart.reshape(10, SEEDS, 7)[:, part].mean() for part in (slice(SEEDS // 2), slice(SEEDS // 2, None)))
+    near, anywhere = (
+        apart.reshape(10, SEEDS, 7)[:, part].mean()
+        for part in (slice(SEEDS // 2), slice(SEEDS // 2, None))
+    )
     assert near < 0.7 * anywhere
 
 
 def test_what_falls_short_by_rounding_is_no_collision(monkeypatch: pytest.MonkeyPatch) -> None:
     """Refinement ends on the margin, a hair to one side of it or the other."""
     problem = program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
-    arm = module._Arm(problem, Knots(problem, np.random.default_rng(0)), refine=True)
+    arm = module._Arm(problem, KeyframeSampler(problem, np.random.default_rng(0)), refine=True)
     monkeypatch.setattr(arm.knots, "depth", lambda z, waypoint: np.full(len(z), 1e-7))
     assert arm._candidate(problem.start, 1)[1] == ""

@@ -16,29 +16,40 @@ from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
 from vkc_pin.baselines.paths import BasePaths, headings
-from vkc_pin.driving.path import shortest_path
-from vkc_pin.models.shapes import placed_shapes
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.placed import standing_geometry
+from vkc_pin.planning.base_paths.base_path import shortest_path
+from vkc_pin.world.models.shapes import list_placed_shapes
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import make_world_shapes
 
 START, BESIDE = np.array([-1.5, 1.5, 0.0]), np.array([0.5, 1.0, 0.8])
 AISLE = np.array([1.0, -1.4, 0.0])  # behind the post
-POST: dict[str, Any] = {"name": "post", "type": "box", "size": [0.2, 0.2, 1.0], "position": [-0.3, -0.1, 0.5]}
+POST: dict[str, Any] = {
+    "name": "post",
+    "type": "box",
+    "size": [0.2, 0.2, 1.0],
+    "position": [-0.3, -0.1, 0.5],
+}
 
 
 def base_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BasePaths:
-    return BasePaths(program_of(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT))
+    return BasePaths(
+        program_of(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT)
+    )
 
 
 def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)) -> float:
     """Return the least distance of the base from obstacles and objects on straight lines between poses [m], asked of coal."""
-    base = [(s.geometry, s.placement) for s in scene.robot.collision.geometryObjects if s.parentJoint == 1]
+    base = [
+        (s.geometry, s.placement)
+        for s in scene.robot.collision.geometryObjects
+        if s.parentJoint == 1
+    ]
     labels = zip(scene.obstacle_labels, scene.obstacles, strict=True)
     still = [shape for label, shape in labels if label != FLOOR]
     for name, placed in scene.objects.items():
-        still += standing_geometry(placed) if name not in without else []
+        still += make_world_shapes(placed) if name not in without else []
     rows = np.vstack([between(a, b, length=0.05, angle=0.1) for a, b in itertools.pairwise(poses)])
-    return min(distance(base, placed_shapes(still), row.tolist()) for row in rows)
+    return min(distance(base, list_placed_shapes(still), row.tolist()) for row in rows)
 
 
 def test_straight_where_that_is_free() -> None:
@@ -70,12 +81,18 @@ def test_around_what_stands_there() -> None:
     "walls",
     [
         [([0.1, 4.6, 1.0], [0.0, 0.0, 0.5])],  # from side to side
-        [([2.4, 0.1, 1.0], [-1.4, 0.6, 0.5]), ([0.1, 4.0, 1.0], [-0.2, 1.5, 0.5])],  # round the start
+        [
+            ([2.4, 0.1, 1.0], [-1.4, 0.6, 0.5]),
+            ([0.1, 4.0, 1.0], [-0.2, 1.5, 0.5]),
+        ],  # round the start
     ],
     ids=["a wall across", "walled in"],
 )
 def test_no_path(walls: list[tuple[list[float], list[float]]]) -> None:
-    boxes = [{"name": f"wall_{k}", "type": "box", "size": size, "position": at} for k, (size, at) in enumerate(walls)]
+    boxes = [
+        {"name": f"wall_{k}", "type": "box", "size": size, "position": at}
+        for k, (size, at) in enumerate(walls)
+    ]
     scene = open_scene(*boxes)
     assert room_of(scene, np.array([START, START])) > MARGIN
     assert room_of(scene, np.array([AISLE, AISLE])) > MARGIN
@@ -121,22 +138,31 @@ def test_the_door_that_it_opens_is_not_in_its_way() -> None:
     path = found.path(before, after, 10)
     assert path is not None
     np.testing.assert_allclose(path[:, 1:], np.tile(before[1:], (10, 1)), atol=1e-12)
-    assert not found.grid.clear(2.55, -0.5, 0.0)
+    assert not found.grid.is_pose_free(2.55, -0.5, 0.0)
 
 
 def test_what_stands_still_of_the_object_it_holds_is_in_its_way() -> None:
     """The drawer's case does not move with the drawer."""
-    scene = changed(open_scene(), objects=[{**drawer_scene().document["objects"][0], "position": [-0.4, 0.0, 0.0]}])
+    scene = changed(
+        open_scene(),
+        objects=[{**drawer_scene().document["objects"][0], "position": [-0.4, 0.0, 0.0]}],
+    )
     before, after = np.array([-0.1, -1.7, np.pi / 2]), np.array([-0.1, 1.7, np.pi / 2])
     path = base_paths(scene).path(before, after, 80)
     assert path is not None
     assert room_of(scene, np.vstack([before, path]), without=()) >= MARGIN - 0.02
 
 
-# --- with the arm as it is ---------------------------------------------------------------------------------------------
+# --- with the arm as it is
+# ---------------------------------------------------------------------------------------------
 
 
-SHELF: dict[str, Any] = {"name": "shelf", "type": "box", "size": [0.3, 1.0, 0.1], "position": [-0.4, 0.65, 1.0]}  # over the base
+SHELF: dict[str, Any] = {
+    "name": "shelf",
+    "type": "box",
+    "size": [0.3, 1.0, 0.1],
+    "position": [-0.4, 0.65, 1.0],
+}  # over the base
 ASIDE = np.array([-1.5, -1.57, 0.0, 0.0, 0.0, 0.0])  # the arm stretched out upwards
 
 
@@ -149,22 +175,28 @@ def test_the_arm_counts_if_it_is_to() -> None:
     goal = np.array([0.5, 0.6, 0.0])
     bare = BasePaths(problem).path(START, goal, 80)
     assert bare is not None
-    np.testing.assert_allclose(np.diff(bare[:, 0]) * 0.9 / 2.0, -np.diff(bare[:, 1]), atol=1e-9)  # straight below the shelf
+    np.testing.assert_allclose(
+        np.diff(bare[:, 0]) * 0.9 / 2.0, -np.diff(bare[:, 1]), atol=1e-9
+    )  # straight below the shelf
     whole = BasePaths(problem, whole=True)
-    assert not all(whole.grid.clear(*pose) for pose in bare)
+    assert not all(whole.grid.is_pose_free(*pose) for pose in bare)
     path = whole.path(START, goal, 80)
     assert path is not None
     np.testing.assert_array_equal(path[-1, :2], goal[:2])
     z = np.tile(problem.start, (len(path), 1))
     z[:, :3] = path
     contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=MARGIN)
-    assert contacts.violation() < 0.01 + BLINK, "but for the corners that are cut between two waypoints"
+    assert contacts.compute_violation() < 0.01 + BLINK, (
+        "but for the corners that are cut between two waypoints"
+    )
 
 
 def test_what_is_held_counts_with_the_arm() -> None:
     scene = room(objects=["stick"])
     held = scene.with_held({"stick": "grip"})
-    shapes = [len(BasePaths(to(one, 1.0, 1.0), whole=True).grid.base.shapes) for one in (scene, held)]
+    shapes = [
+        len(BasePaths(to(one, 1.0, 1.0), whole=True).grid.base.shapes) for one in (scene, held)
+    ]
     assert shapes[1] == shapes[0] + len(scene.objects["stick"].object.collision.geometryObjects)
 
 
@@ -189,7 +221,12 @@ def test_the_seed_has_the_arm_at_rest() -> None:
     assert seed.z.shape == (problem.segments, problem.chain.size)
     np.testing.assert_array_equal(seed.z[:, 3:], np.tile(problem.start[3:], (problem.segments, 1)))
     np.testing.assert_allclose(seed.z[-1, :2], AISLE[:2], atol=1e-12)
-    wall: dict[str, Any] = {"name": "wall", "type": "box", "size": [0.1, 4.6, 1.0], "position": [0.0, 0.0, 0.5]}
+    wall: dict[str, Any] = {
+        "name": "wall",
+        "type": "box",
+        "size": [0.1, 4.6, 1.0],
+        "position": [0.0, 0.0, 0.5],
+    }
     problem = to(open_scene(wall), *AISLE[:2].tolist())
     assert list(BasePaths(problem, whole=True).seeds(problem, goals)) == []
 
@@ -197,7 +234,9 @@ def test_the_seed_has_the_arm_at_rest() -> None:
 def test_through_a_gate_that_is_hardly_wider_than_the_base() -> None:
     """0.73 m wide for 0.67 m: there is no path on a grid whose cells are larger than what is left."""
     walls = [box(str(side), [0.2, 6.0, 1.5], [0.0, 0.09 + 3.365 * side, 0.75]) for side in (1, -1)]
-    narrow = hall(obstacles=walls).with_start(arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0]))  # the arm folded
+    narrow = hall(obstacles=walls).with_start(
+        arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0])
+    )  # the arm folded
     found, goal = BasePaths(to(narrow, 1.5, 0.5, 0.0), whole=True), np.array([1.5, 0.5, 0.0])
     assert shortest_path(found.grid, START.tolist(), goal[None]) is None
     path = found.path(START, goal, 80)

@@ -13,7 +13,7 @@ from helpers.small_problems import program_of
 import vkc_pin as vkc
 from vkc_pin.baselines import postures as module
 from vkc_pin.baselines.postures import base_poses
-from vkc_pin.seeds.knots import SCATTER, Knots
+from vkc_pin.planning.initialization.keyframes import SAMPLE_COUNT, KeyframeSampler
 
 
 def reaching(scene: vkc.Scene, attachment: str = "handle") -> vkc.TrajectoryProblem:
@@ -25,16 +25,25 @@ def pulling() -> vkc.TrajectoryProblem:
     return program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
 
 
-def found(problem: vkc.TrajectoryProblem, waypoint: int | None = None, *, seed: int = 0, near: Any = None) -> np.ndarray:
+def found(
+    problem: vkc.TrajectoryProblem, waypoint: int | None = None, *, seed: int = 0, near: Any = None
+) -> np.ndarray:
     near = problem.start if near is None else near
-    return base_poses(problem, problem.segments if waypoint is None else waypoint, near, np.random.default_rng(seed))
+    return base_poses(
+        problem,
+        problem.segments if waypoint is None else waypoint,
+        near,
+        np.random.default_rng(seed),
+    )
 
 
 def far(rows: np.ndarray, near: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """Return how far rows are from `near`: a metre of the base counts as what moves the hand by a metre."""
     lever = 0.3249  # [m/rad] of this arm
     counts = [1.0 / lever if name in ("base_x", "base_y") else 1.0 for name in names]
-    return np.array([sum(c * abs(a - b) for c, a, b in zip(counts, row, near, strict=True)) for row in rows])
+    return np.array(
+        [sum(c * abs(a - b) for c, a, b in zip(counts, row, near, strict=True)) for row in rows]
+    )
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -101,17 +110,21 @@ def behind_a_board() -> vkc.Scene:
     return with_boxes(drawer_scene(), board=([0.02, 1.0, 1.2], [1.7, 0.0, 0.6]))
 
 
-@pytest.mark.parametrize("scene", [out_of_reach(), behind_a_board()], ids=["out of reach", "always in collision"])
+@pytest.mark.parametrize(
+    "scene", [out_of_reach(), behind_a_board()], ids=["out of reach", "always in collision"]
+)
 def test_nothing_is_reached(scene: vkc.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """And so many seeds are tried as are allowed, rounded up to whole lots."""
     problem, lots = reaching(scene), []
-    knot = Knots.knot
+    knot = KeyframeSampler.sample
 
-    def counted(self: Knots, before: np.ndarray, waypoint: int, how: str) -> tuple[np.ndarray, np.ndarray]:
+    def counted(
+        self: KeyframeSampler, before: np.ndarray, waypoint: int, how: str
+    ) -> tuple[np.ndarray, np.ndarray]:
         lots.append((len(before), how))
         return knot(self, before, waypoint, how)
 
-    monkeypatch.setattr(module, "TRIES", 5 * SCATTER + 1)
-    monkeypatch.setattr(Knots, "knot", counted)
+    monkeypatch.setattr(module, "TRIES", 5 * SAMPLE_COUNT + 1)
+    monkeypatch.setattr(KeyframeSampler, "sample", counted)
     assert found(problem).shape == (0, problem.chain.size)
-    assert lots == [(SCATTER, "scatter")] * 6
+    assert lots == [(SAMPLE_COUNT, "scatter")] * 6

@@ -16,8 +16,8 @@ from vkc_pin.baselines import refining as module
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
 from vkc_pin.baselines.postures import base_poses
 from vkc_pin.baselines.refining import CLEAR, refined
-from vkc_pin.program.merit import TOLERANCE
-from vkc_pin.seeds.knots import Knots
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
+from vkc_pin.planning.nlp.merit import TOLERANCE
 
 HALF, ROUNDING = 4, 1e-6  # a waypoint; [m]
 TILT, SLIDE = -2, -1  # columns
@@ -29,16 +29,27 @@ class Pulling:
     def __init__(self, bottom: float, *, waypoint: int = HALF) -> None:
         scene = holding(attachment="handle_free")
         self.scene = with_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, bottom + 0.05]))
-        self.problem = program_of(self.scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
-        self.knots = Knots(self.problem, np.random.default_rng(0))
+        self.problem = program_of(
+            self.scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT
+        )
+        self.knots = KeyframeSampler(self.problem, np.random.default_rng(0))
         arm = ArmKinematics(self.problem, self.knots)
         self.columns, self.waypoint = arm.columns, waypoint
-        self.z, closed = arm.solve(self.knots.objects[waypoint - 1], waypoint)
+        self.z, closed = arm.solve(self.knots.object_motion[waypoint - 1], waypoint)
         assert closed
 
-    def refined(self, z: np.ndarray | None = None, wanted: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
+    def refined(
+        self, z: np.ndarray | None = None, wanted: np.ndarray | None = None
+    ) -> tuple[np.ndarray, bool]:
         start, near = self.z if z is None else z, self.z if wanted is None else wanted
-        return refined(self.problem, self.knots, start, wanted=near, waypoint=self.waypoint, columns=self.columns)
+        return refined(
+            self.problem,
+            self.knots,
+            start,
+            wanted=near,
+            waypoint=self.waypoint,
+            columns=self.columns,
+        )
 
     def spare(self, z: np.ndarray) -> float:
         return spare(self.scene, z, slide=z[SLIDE], held=True)
@@ -63,7 +74,10 @@ def test_out_of_collision(bottom: float) -> None:
     assert pulling.off(z) < np.sqrt(3.0) * TOLERANCE
     np.testing.assert_array_equal(z[:3], given[:3])
     np.testing.assert_array_equal(pulling.z, given)
-    assert np.all((z >= pulling.problem.lower[HALF - 1] - ROUNDING) & (z <= pulling.problem.upper[HALF - 1] + ROUNDING))
+    assert np.all(
+        (z >= pulling.problem.lower[HALF - 1] - ROUNDING)
+        & (z <= pulling.problem.upper[HALF - 1] + ROUNDING)
+    )
     assert z[SLIDE] != given[SLIDE], "the drawer gives way, too"
     assert abs(z[SLIDE] - given[SLIDE]) < 0.02
 
@@ -136,8 +150,10 @@ def test_out_of_reach() -> None:
 
 def test_where_nothing_must_hold() -> None:
     problem = program_of(drawer_scene(), [vkc.Grasp("drawer")])
-    knots = Knots(problem, np.random.default_rng(0))
-    z, closed = refined(problem, knots, problem.start, wanted=problem.start, waypoint=1, columns=np.arange(3, 9))
+    knots = KeyframeSampler(problem, np.random.default_rng(0))
+    z, closed = refined(
+        problem, knots, problem.start, wanted=problem.start, waypoint=1, columns=np.arange(3, 9)
+    )
     assert closed
     np.testing.assert_array_equal(z, problem.start)
 
@@ -156,7 +172,10 @@ def test_gradients_are_those_of_coals_distances(held: bool) -> None:
         z = base_poses(problem, waypoint, problem.start, rng)[:6]
     z[:, :9] += rng.normal(0.0, 0.05, (len(z), 9))
     contacts = problem.contacts.evaluate(z, np.full(len(z), waypoint), reach=0.12)
-    chain, geometry = problem.chain, all_pairs(problem.contacts.phases[problem.contacts.phase_of(waypoint)])
+    chain, geometry = (
+        problem.chain,
+        all_pairs(problem.contacts.phases[problem.contacts.find_phase(waypoint)]),
+    )
     data, shapes = chain.model.createData(), pin.GeometryData(geometry)
     request = coal.DistanceRequest()
     request.gjk_tolerance = 1e-8
@@ -164,18 +183,21 @@ def test_gradients_are_those_of_coals_distances(held: bool) -> None:
     def distances(at: np.ndarray) -> np.ndarray:
         found = np.empty(len(contacts.distance))
         for row in range(len(at)):
-            pin.updateGeometryPlacements(chain.model, data, geometry, shapes, chain.coordinates.q(at[row]))
+            pin.updateGeometryPlacements(
+                chain.model, data, geometry, shapes, chain.coordinates.q(at[row])
+            )
             for k in np.flatnonzero(contacts.waypoint == row):
                 one, other = (geometry.geometryObjects[int(i)].geometry for i in contacts.pair[k])
                 where, there = (
-                    coal.Transform3s(shapes.oMg[int(i)].rotation, shapes.oMg[int(i)].translation) for i in contacts.pair[k]
+                    coal.Transform3s(shapes.oMg[int(i)].rotation, shapes.oMg[int(i)].translation)
+                    for i in contacts.pair[k]
                 )
                 found[k] = coal.distance(one, where, other, there, request, coal.DistanceResult())
         return found
 
     apart = distances(z)
     np.testing.assert_allclose(contacts.distance, apart, atol=1e-6)
-    gradients = problem.contacts.gradients(z, contacts)
+    gradients = problem.contacts.compute_gradients(z, contacts)
     assert gradients.shape == (len(apart), chain.size)
     assert len(apart) > 40
     numeric = np.empty_like(gradients)

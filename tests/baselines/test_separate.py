@@ -26,8 +26,8 @@ from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.following import Followed, follow
 from vkc_pin.baselines.paths import BasePaths
 from vkc_pin.benchmarks.household import TASKS
-from vkc_pin.planning.outcome import TIMES
-from vkc_pin.solver.to_trajectory import as_trajectory
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
+from vkc_pin.planning.statistics import STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 PULL = vkc.Actuate("drawer", {"slide": 0.3})
@@ -41,7 +41,9 @@ def open_drawer(method: str) -> vkc.Plan:
 
 @cache
 def open_door(method: str) -> vkc.Plan:
-    return plan_separately(door_scene(), [vkc.Actuate("door", {"hinge": 0.3})], method=method, retries=1)
+    return plan_separately(
+        door_scene(), [vkc.Actuate("door", {"hinge": 0.3})], method=method, retries=1
+    )
 
 
 PLANS = {"drawer": open_drawer, "door": open_door}
@@ -50,7 +52,9 @@ PLANS = {"drawer": open_drawer, "door": open_door}
 def rows(plan: vkc.Plan, phase: int) -> np.ndarray:
     """Return the waypoints of a phase, the robot's columns, without the wait for the hand at its beginning."""
     span = plan.trajectory.phases[phase]
-    return np.array(plan.trajectory.positions[span.first : span.last + 1, : plan.trajectory.robot_size])
+    return np.array(
+        plan.trajectory.positions[span.first : span.last + 1, : plan.trajectory.robot_size]
+    )
 
 
 def limited(monkeypatch: pytest.MonkeyPatch, *, tries: int = 1000, stands: int = 1) -> None:
@@ -67,7 +71,8 @@ def failed(scene: vkc.Scene, **arguments: Any) -> vkc.Plan:
     return plan
 
 
-# --- where they must succeed -------------------------------------------------------------------------------------------
+# --- where they must succeed
+# -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", BASELINES)
@@ -91,15 +96,19 @@ def test_efforts_are_the_trajectorys(task: str, method: str) -> None:
     plan = PLANS[task](method)
     m, motion = plan.metrics, plan.trajectory
     change = np.diff(motion(np.linspace(motion.times[0], motion.times[-1], 50_001)), axis=0)
-    assert m["base_effort"] == pytest.approx(sum(np.hypot(x, y) for x, y in change[:, :2]), rel=1e-3)
-    assert m["base_effort_l1"] == pytest.approx(np.abs(change[:, 0]).sum() + np.abs(change[:, 1]).sum(), rel=1e-3)
+    assert m["base_effort"] == pytest.approx(
+        sum(np.hypot(x, y) for x, y in change[:, :2]), rel=1e-3
+    )
+    assert m["base_effort_l1"] == pytest.approx(
+        np.abs(change[:, 0]).sum() + np.abs(change[:, 1]).sum(), rel=1e-3
+    )
     assert m["arm_effort"] == pytest.approx(np.abs(change[:, 3:9]).sum(), rel=1e-3)
     assert m["duration"] == plan.trajectory.times[-1]
     assert m["clearance"] == plan.validation.clearance
     assert m["closure_error"] == plan.validation.closure_error
     assert m["rounds"] == 1.0
     assert m["iterations"] > 0.0
-    parts = sum(m[f"time_{part}"] for part in (*TIMES, "following"))
+    parts = sum(m[f"time_{part}"] for part in (*STAGES, "following"))
     assert 0.0 < parts <= m["planning_time"]
     assert m["build_time"] >= 0.0
 
@@ -113,16 +122,25 @@ def test_base_and_arm_move_one_after_the_other(task: str, method: str) -> None:
     assert reach.name == f"reach {task}.handle"
     assert [dict(phase.held) for phase in holds] == [{task: "handle"}] * len(holds)
     assert len(holds) == {"drawer": 1, "door": 2}[task]  # the door's knob is turned before
-    np.testing.assert_array_equal(rows(plan, 0)[:, 3:], np.tile(plan.scene.start[3:], (len(rows(plan, 0)), 1)))
-    np.testing.assert_array_equal(rows(plan, 1)[:, :3], np.tile(rows(plan, 0)[-1, :3], (len(rows(plan, 1)), 1)))
+    np.testing.assert_array_equal(
+        rows(plan, 0)[:, 3:], np.tile(plan.scene.start[3:], (len(rows(plan, 0)), 1))
+    )
+    np.testing.assert_array_equal(
+        rows(plan, 1)[:, :3], np.tile(rows(plan, 0)[-1, :3], (len(rows(plan, 1)), 1))
+    )
     assert np.ptp(rows(plan, 0)[:, 0]) > 0.3
     assert np.ptp(rows(plan, 1)[:, 3:], axis=0).max() > 0.3
     if task == "door":
-        assert np.ptp(rows(plan, 2)[:, :3], axis=0).max() < 1e-5, "it stands while the latch is released"
+        assert np.ptp(rows(plan, 2)[:, :3], axis=0).max() < 1e-5, (
+            "it stands while the latch is released"
+        )
         assert np.ptp(plan.trajectory.column("door.knob")[holds[0].first : holds[0].last]) > 0.3
     # The object's joints run to their goals in finer steps.
     moved = holds[-1].last - holds[-1].first
-    assert moved in (FINER * plan.options.move_waypoints, FINER * plan.options.move_waypoints + 1)  # and the hand's wait
+    assert moved in (
+        FINER * plan.options.move_waypoints,
+        FINER * plan.options.move_waypoints + 1,
+    )  # and the hand's wait
 
 
 def test_b1_moves_the_drawer_by_its_time_law_and_the_hand_stays_on_the_bar() -> None:
@@ -145,13 +163,17 @@ def test_a_differential_base() -> None:
 
 
 def digest(plan: vkc.Plan) -> str:
-    return hashlib.sha256(plan.trajectory.positions.tobytes() + plan.trajectory.times.tobytes()).hexdigest()
+    return hashlib.sha256(
+        plan.trajectory.positions.tobytes() + plan.trajectory.times.tobytes()
+    ).hexdigest()
 
 
 @pytest.mark.parametrize("method", BASELINES)
 def test_the_same_seed_gives_the_same_motion(method: str) -> None:
     again = plan_separately(drawer_scene(), [PULL], method=method, retries=1)
-    np.testing.assert_array_equal(again.trajectory.positions, open_drawer(method).trajectory.positions)
+    np.testing.assert_array_equal(
+        again.trajectory.positions, open_drawer(method).trajectory.positions
+    )
 
 
 def test_the_same_seed_gives_the_same_motion_in_two_processes() -> None:
@@ -166,24 +188,35 @@ def test_the_same_seed_gives_the_same_motion_in_two_processes() -> None:
     for hash_seed in ("7", "8"):
         environment = {**os.environ, "PYTHONHASHSEED": hash_seed}
         other = subprocess.run(
-            [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120, env=environment
+            [sys.executable, "-c", code],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+            env=environment,
         )
         outputs.add(tuple(other.stdout.split()[-2:]))
     assert len(outputs) == 1
 
 
-# --- where they must fail ----------------------------------------------------------------------------------------------
+# --- where they must fail
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", BASELINES)
 def test_an_aisle_too_narrow_to_stand_in(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """No base fits before the drawer, and over the counters the arm is too short."""
     limited(monkeypatch)
-    plan = failed(with_boxes(drawer_scene(), counter_2=([0.9, 4.4, 1.2], [1.0, 0.0, 0.6])), method=method)
+    plan = failed(
+        with_boxes(drawer_scene(), counter_2=([0.9, 4.4, 1.2], [1.0, 0.0, 0.6])), method=method
+    )
     assert plan.status == "no base pose"
     assert [phase.name for phase in plan.trajectory.phases] == ["stand"]
     assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0, "it stands at its start"
-    assert [(v.constraint, v.subject) for v in plan.validation.violations] == [("goal", "drawer.slide")]
+    assert [(v.constraint, v.subject) for v in plan.validation.violations] == [
+        ("goal", "drawer.slide")
+    ]
 
 
 @pytest.mark.parametrize("method", BASELINES)
@@ -191,7 +224,11 @@ def test_the_same_failure_every_time(method: str, monkeypatch: pytest.MonkeyPatc
     limited(monkeypatch)
     scene = with_boxes(drawer_scene(), board=([0.02, 1.0, 1.2], [1.7, 0.0, 0.6]))
     first, second = (failed(scene, method=method, retries=2) for _ in range(2))
-    assert (first.status, first.metrics["rounds"]) == (second.status, second.metrics["rounds"]) == ("no base pose", 2.0)
+    assert (
+        (first.status, first.metrics["rounds"])
+        == (second.status, second.metrics["rounds"])
+        == ("no base pose", 2.0)
+    )
     np.testing.assert_array_equal(first.trajectory.positions, second.trajectory.positions)
 
 
@@ -206,14 +243,21 @@ def test_no_room_for_the_drawer_when_it_is_open(monkeypatch: pytest.MonkeyPatch)
     kinds = {v.constraint for v in plan.validation.violations}
     assert "goal" in kinds
     # A motion that ends before the grasp has no leave to be as close to the tray as a grasp is.
-    assert all(v.subject.endswith("drawer.tray") for v in plan.validation.violations if v.constraint == "clearance")
+    assert all(
+        v.subject.endswith("drawer.tray")
+        for v in plan.validation.violations
+        if v.constraint == "clearance"
+    )
     assert kinds <= {"goal", "clearance"}
 
 
 def test_the_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
     """The handle is behind two shelves: there are configurations, but the solver finds no way to them."""
     limited(monkeypatch)
-    shelves = {name: ([0.1, 0.8, 0.02], [1.6, 0.0, 0.755 + z]) for name, z in (("above", 0.15), ("below", -0.15))}
+    shelves = {
+        name: ([0.1, 0.8, 0.02], [1.6, 0.0, 0.755 + z])
+        for name, z in (("above", 0.15), ("below", -0.15))
+    }
     options = dataclasses.replace(OPTIONS, max_restarts=1, max_iterations=20)
     plan = failed(with_boxes(open_scene(), **shelves), options=options)
     assert plan.status == "arm does not reach"
@@ -236,7 +280,9 @@ def test_no_way_for_the_base_while_the_drawer_moves(monkeypatch: pytest.MonkeyPa
     ],
     ids=["too fast", "closure"],
 )
-def test_how_it_follows_is_checked(spoil: tuple[int, Any], cause: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_how_it_follows_is_checked(
+    spoil: tuple[int, Any], cause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def spoilt(*arguments: Any, **keywords: Any) -> Followed:
         found = follow(*arguments, **keywords)
         found.z[:, spoil[0]] += spoil[1](np.arange(1, len(found.z) + 1) / len(found.z))
@@ -246,13 +292,17 @@ def test_how_it_follows_is_checked(spoil: tuple[int, Any], cause: str, monkeypat
     monkeypatch.setattr(attempt, "_ENDS", 2)
     plan = failed(open_scene())
     assert plan.status == cause
-    assert plan.trajectory.phases[-1].name == "move drawer.slide", "what there is of it can be looked at"
+    assert plan.trajectory.phases[-1].name == "move drawer.slide", (
+        "what there is of it can be looked at"
+    )
     wanted = {"too fast": {"velocity", "acceleration"}, "closure": {"slide", "closure"}}[cause]
     assert wanted & {v.constraint for v in plan.validation.violations}
 
 
 def test_of_several_ends_the_one_that_came_furthest_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = iter([("collision", 0.4), ("no inverse kinematics", 0.7), ("collision", 0.7), ("", 1.0)])
+    answers = iter(
+        [("collision", 0.4), ("no inverse kinematics", 0.7), ("collision", 0.7), ("", 1.0)]
+    )
     seen = []
 
     def spoilt(*arguments: Any, **keywords: Any) -> Followed:
@@ -270,7 +320,9 @@ def test_of_several_ends_the_one_that_came_furthest_counts(monkeypatch: pytest.M
     assert np.ptp(seen, axis=0).max() > 0.05, "each goes to another place"
 
 
-def test_where_the_arm_does_not_reach_the_next_place_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_arm_does_not_reach_the_next_place_is_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """From where all began; the same place again here, at which it does."""
     reach, free = attempt.Attempt._reach, attempt.Attempt._free
     bases: list[np.ndarray] = []
@@ -285,7 +337,11 @@ def test_where_the_arm_does_not_reach_the_next_place_is_tried(monkeypatch: pytes
     monkeypatch.setattr(attempt.Attempt, "_free", lambda self, poses: free(self, poses)[[0, 0]])
     plan = plan_separately(open_scene(), [PULL], options=OPTIONS, retries=1)
     assert plan.success, plan.report()
-    assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle", "move drawer.slide"]
+    assert [phase.name for phase in plan.trajectory.phases] == [
+        "go to",
+        "reach drawer.handle",
+        "move drawer.slide",
+    ]
     assert len(bases) == 2
     np.testing.assert_allclose(rows(plan, 0)[-1, :3], bases[1], atol=1e-9)
 
@@ -307,10 +363,13 @@ def test_of_several_places_the_one_that_came_furthest_counts(
 
     def done(self: attempt.Attempt, steps: Any, cause: str, works: bool) -> None:
         problem = self._problem(steps)
-        z = problem.start + np.arange(1, problem.segments + 1)[:, None] * np.eye(problem.chain.size)[0] * 1e-3
+        z = (
+            problem.start
+            + np.arange(1, problem.segments + 1)[:, None] * np.eye(problem.chain.size)[0] * 1e-3
+        )
         dt = problem.timing_for(z).dt
         if not works:
-            raise attempt.FailedError(cause, as_trajectory(problem, z, dt))
+            raise attempt.FailedError(cause, make_trajectory(problem, z, dt))
         self._take(problem, z, dt)
 
     def driven(self: attempt.Attempt, pose: np.ndarray) -> None:
@@ -320,17 +379,22 @@ def test_of_several_places_the_one_that_came_furthest_counts(
         done(self, steps, "arm does not reach", next(reach) == "d")
 
     every = attempt.postures
-    monkeypatch.setattr(attempt, "postures", lambda problem: list(every(problem))[:1])  # the arm as it is
+    monkeypatch.setattr(
+        attempt, "postures", lambda problem: list(every(problem))[:1]
+    )  # the arm as it is
     monkeypatch.setattr(attempt, "_STANDS", 3)
     monkeypatch.setattr(attempt.Attempt, "_drive", driven)
     monkeypatch.setattr(attempt.Attempt, "_reach", reached)
     plan = failed(open_scene())
     assert plan.status == status
-    assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"][:phases]
+    assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"][
+        :phases
+    ]
     np.testing.assert_allclose(plan.trajectory.positions[0, :9], plan.scene.start, atol=1e-12)
 
 
-# --- tries, time and Ctrl-C --------------------------------------------------------------------------------------------
+# --- tries, time and Ctrl-C
+# --------------------------------------------------------------------------------------------
 
 
 class Tries:
@@ -345,7 +409,7 @@ class Tries:
 
     def __call__(self, scene: vkc.Scene, options: vkc.Options, **keywords: Any) -> Any:
         self.seeds.append(list(keywords["seed"]))
-        times = dict.fromkeys([*TIMES, "following"], 1.0)
+        times = dict.fromkeys([*STAGES, "following"], 1.0)
         return SimpleNamespace(run=self.run, times=times, build_time=0.0, iterations=10)
 
     def run(self, steps: Any) -> tuple[vkc.Trajectory, float, str]:
@@ -353,10 +417,16 @@ class Tries:
         # Which try it comes from can be seen at the first waypoint.
         positions = np.array(self.trajectory.positions)
         positions[0, 0] = len(self.seeds)
-        return dataclasses.replace(self.trajectory, positions=positions, curve=None), came, self.status
+        return (
+            dataclasses.replace(self.trajectory, positions=positions, curve=None),
+            came,
+            self.status,
+        )
 
     def validate(self, *_: Any) -> vkc.Report:
-        wrong = vkc.Violation("goal", "drawer.slide", waypoint=0, time=0.0, amount=1.0, unit="m", detail="")
+        wrong = vkc.Violation(
+            "goal", "drawer.slide", waypoint=0, time=0.0, amount=1.0, unit="m", detail=""
+        )
         return vkc.Report(() if self.status == "fine" else (wrong,))
 
 
@@ -365,13 +435,19 @@ class Tries:
     [
         ([("fine", np.inf), ("fine", np.inf)], 1, "success"),
         ([("collision", 2.4), ("", np.inf), ("fine", np.inf)], 3, "success"),
-        ([("collision", 2.4), ("no base path", 1.0), ("too fast", 2.5), ("collision", 2.5)], 3, "too fast"),
+        (
+            [("collision", 2.4), ("no base path", 1.0), ("too fast", 2.5), ("collision", 2.5)],
+            3,
+            "too fast",
+        ),
         ([("", np.inf), ("collision", 2.9), ("", np.inf), ("no base pose", 0.0)], 1, "rejected"),
         ([("no base pose", 0.0)] * 4, 1, "no base pose"),
     ],
 )
 @pytest.mark.made_up
-def test_tries(answers: list[tuple[str, float]], taken: int, status: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tries(
+    answers: list[tuple[str, float]], taken: int, status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Up to the first that validation accepts; of failures, the one that came furthest."""
     tries = Tries(monkeypatch, *answers)
     plan = plan_separately(drawer_scene(), [PULL], method="B2", seed=3, retries=4)
@@ -385,7 +461,9 @@ def test_tries(answers: list[tuple[str, float]], taken: int, status: str, monkey
     assert plan.metrics["time_following"] == last
 
 
-def test_a_real_try_that_fails_is_followed_by_one_with_other_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_real_try_that_fails_is_followed_by_one_with_other_random_numbers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Nothing is replaced here: what the tries lead to, and what validation says of them, is written down on the way."""
     seeds, ends = list[list[int]](), list[tuple[vkc.Trajectory, float, str]]()
 
@@ -440,11 +518,16 @@ def test_ctrl_c_ends_it(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = failed(open_scene(), retries=3)
     assert plan.status == "interrupted"
     assert calls == [stage]
-    before = {"solve": ["stand"], "base_poses": ["stand"], "follow": ["go to", "reach drawer.handle"]}[stage]
+    before = {
+        "solve": ["stand"],
+        "base_poses": ["stand"],
+        "follow": ["go to", "reach drawer.handle"],
+    }[stage]
     assert [phase.name for phase in plan.trajectory.phases] == before
 
 
-# --- misuse ------------------------------------------------------------------------------------------------------------
+# --- misuse
+# ------------------------------------------------------------------------------------------------------------
 
 
 MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
@@ -452,12 +535,28 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
     "method in small letters": ({"method": "b2"}, "method", "did you mean 'B2'"),
     "no tries": ({"retries": 0}, "retries", "at least 1"),
     "half a try": ({"retries": 1.5}, "retries", "1.5"),
-    "another step": ({"steps": [PULL, vkc.Release()]}, "steps[1]", "expected Actuate, Place, GoTo or Reach"),
-    "a grasp": ({"steps": [vkc.Grasp("drawer")]}, "steps[0]", "expected Actuate, Place, GoTo or Reach"),
+    "another step": (
+        {"steps": [PULL, vkc.Release()]},
+        "steps[1]",
+        "expected Actuate, Place, GoTo or Reach",
+    ),
+    "a grasp": (
+        {"steps": [vkc.Grasp("drawer")]},
+        "steps[0]",
+        "expected Actuate, Place, GoTo or Reach",
+    ),
     "no steps": ({"steps": []}, "steps", "at least one step"),
     "one step alone": ({"steps": PULL}, "steps", "a list of steps"),
-    "unknown object": ({"steps": [vkc.Actuate("drawr", {"slide": 0.3})]}, "steps[0].object", "did you mean 'drawer'"),
-    "unknown joint": ({"steps": [PULL, vkc.Actuate("drawer", {"slid": 0.1})]}, "steps[1].joints", "did you mean 'slide'"),
+    "unknown object": (
+        {"steps": [vkc.Actuate("drawr", {"slide": 0.3})]},
+        "steps[0].object",
+        "did you mean 'drawer'",
+    ),
+    "unknown joint": (
+        {"steps": [PULL, vkc.Actuate("drawer", {"slid": 0.1})]},
+        "steps[1].joints",
+        "did you mean 'slide'",
+    ),
     "unknown attachment": (
         {"steps": [vkc.Actuate("drawer", {"slide": 0.3}, "handel")]},
         "steps[0].attachment",
@@ -497,7 +596,9 @@ def test_one_thing_after_another() -> None:
 
 def test_the_same_thing_twice() -> None:
     """It is in the hand already."""
-    plan = plan_separately(open_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS)
+    plan = plan_separately(
+        open_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS
+    )
     assert plan.success, plan.report()
     names = [phase.name for phase in plan.trajectory.phases]
     assert names == ["go to", "reach drawer.handle", "move drawer.slide", "move drawer.slide"]
@@ -542,7 +643,10 @@ def test_effort_ends_planning_at_the_same_place() -> None:
     whole = open_drawer("B1")
     used = int(whole.metrics["effort"])
     assert digest(plan_separately(drawer_scene(), [PULL], effort=used)) == digest(whole)
-    short = [plan_separately(drawer_scene(), [PULL], effort=2 * used // 3, planner=planner) for planner in (None, vkc.Planner())]
+    short = [
+        plan_separately(drawer_scene(), [PULL], effort=2 * used // 3, planner=planner)
+        for planner in (None, vkc.Planner())
+    ]
     assert [plan.status for plan in short] == ["effort spent"] * 2
     assert digest(short[0]) == digest(short[1])
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import fake_plan, with_metrics
 from helpers.markdown import cells
 from helpers.pages import clips, commands_of
 
@@ -22,17 +22,41 @@ from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
 from vkc_pin.benchmarks.harness.record import peaks
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.planning.outcome import spent
+from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.validation.report import Report, Violation
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 GOOD = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}
 """Method → the starts from which `solve` has it succeed."""
 BLAME = (
-    Violation("penetration", "forearm_link – door.panel", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"),
-    Violation("clearance", "base_link – block_left", waypoint=3, time=1.5, amount=0.01, unit="m", detail="10 mm too close"),
-    Violation("velocity", "elbow_joint", waypoint=11, time=5.0, amount=0.1, unit="rad/s", detail="0.1 rad/s too fast"),
+    Violation(
+        "penetration",
+        "forearm_link – door.panel",
+        waypoint=9,
+        time=4.0,
+        amount=0.03,
+        unit="m",
+        detail="overlap by 30 mm",
+    ),
+    Violation(
+        "clearance",
+        "base_link – block_left",
+        waypoint=3,
+        time=1.5,
+        amount=0.01,
+        unit="m",
+        detail="10 mm too close",
+    ),
+    Violation(
+        "velocity",
+        "elbow_joint",
+        waypoint=11,
+        time=5.0,
+        amount=0.1,
+        unit="rad/s",
+        detail="0.1 rad/s too fast",
+    ),
 )
 
 
@@ -49,7 +73,7 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     plan = fake_plan(scene)
     metrics = {
         **plan.trajectory.metrics(),
-        **spent(1.0 + number + k, 0.5, iterations=12, rounds=3),
+        **PlanningStatistics(1.0 + number + k, 0.5, 12, 3).to_metrics(),
         "base_effort": 4.0 + number - k,
         "arm_effort": 7.0,
         "clearance": np.inf,
@@ -57,7 +81,7 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     }
     validation = Report() if good else Report(BLAME, -0.03)
     status = "success" if good else "rejected" if method == "VKC" else "collision"
-    return dataclasses.replace(plan, metrics=metrics, status=status, validation=validation, seed=spec["seed"])
+    return with_metrics(plan, metrics, status=status, validation=validation, seed=spec["seed"])
 
 
 class Counting:
@@ -75,7 +99,14 @@ class Counting:
 
 
 def run(out: Path, **changes: Any) -> dict[str, Any]:
-    settings = {"trials": 3, "seed": 5, "tasks": ["door"], "solve": solve, "progress": False, **changes}
+    settings = {
+        "trials": 3,
+        "seed": 5,
+        "tasks": ["door"],
+        "solve": solve,
+        "progress": False,
+        **changes,
+    }
     return baselines.run(out=out, **settings)
 
 
@@ -102,19 +133,31 @@ def files(folder: Path) -> set[str]:
 
 def test_trials(result: dict[str, Any]) -> None:
     trials = result["trials"]
-    assert [(t["number"], t["method"]) for t in trials] == [(n, m) for n in range(3) for m in COMPARED_PLANNERS]
+    assert [(t["number"], t["method"]) for t in trials] == [
+        (n, m) for n in range(3) for m in COMPARED_PLANNERS
+    ]
     for t in trials:
         assert t["scene"] == "door"  # the task's name, not the scene's
         assert t["seed"] == 5 + t["number"]
         assert t["success"] == (t["number"] in GOOD[t["method"]])
         assert t["duration"] == pytest.approx(6.0)
     meta = result["meta"]
-    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["effort"]) == ("baselines", 5, 3, EFFORT)
+    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["effort"]) == (
+        "baselines",
+        5,
+        3,
+        EFFORT,
+    )
     assert (meta["tasks"], meta["methods"]) == (["door"], list(COMPARED_PLANNERS))
-    assert (meta["scenes"], meta["goals"]) == ({"door": "corridor_door"}, {"door": {"door.hinge": 1.5}})
+    assert (meta["scenes"], meta["goals"]) == (
+        {"door": "corridor_door"},
+        {"door": {"door.hinge": 1.5}},
+    )
 
 
-def test_starts_are_drawn_from_seed_and_task_and_the_same_for_all_methods(result: dict[str, Any]) -> None:
+def test_starts_are_drawn_from_seed_and_task_and_the_same_for_all_methods(
+    result: dict[str, Any],
+) -> None:
     for number in range(3):
         starts = {tuple(t["start"]) for t in result["trials"] if t["number"] == number}
         assert len(starts) == 1
@@ -122,9 +165,14 @@ def test_starts_are_drawn_from_seed_and_task_and_the_same_for_all_methods(result
     for k, (task, scene) in enumerate((("door", "corridor_door"), ("drawer", "aisle_drawer"))):
         rng, loaded = np.random.default_rng([5, k]), vkc.load_scene(scene)
         drawn[task] = [loaded.sample_start(rng).start[:3].tolist() for _ in range(2)]
-    specs = baselines.COMPARISON.specify(trials=2, seed=5, tasks=["door", "drawer"], methods=["B1", "VKC"])
+    specs = baselines.COMPARISON.specify(
+        trials=2, seed=5, tasks=["door", "drawer"], methods=["B1", "VKC"]
+    )
     assert [(s["scene"], s["method"], s["number"]) for s in specs] == [
-        (task, method, number) for task in ("door", "drawer") for method in ("B1", "VKC") for number in (0, 1)
+        (task, method, number)
+        for task in ("door", "drawer")
+        for method in ("B1", "VKC")
+        for number in (0, 1)
     ]
     assert all(s["base"] == drawn[s["scene"]][s["number"]] for s in specs)
     (alone,) = baselines.COMPARISON.specify(trials=1, seed=5, tasks=["drawer"], methods=["B2"])
@@ -135,7 +183,9 @@ def test_starts_are_drawn_from_seed_and_task_and_the_same_for_all_methods(result
 def test_the_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[Any, ...]] = []
     for name in ("plan", "plan_separately"):
-        monkeypatch.setattr(comparison, name, lambda scene, steps, **how: asked.append((scene, list(steps), how)))
+        monkeypatch.setattr(
+            comparison, name, lambda scene, steps, **how: asked.append((scene, list(steps), how))
+        )
     for task in TASKS:
         for method in COMPARED_PLANNERS:
             baselines.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
@@ -145,9 +195,13 @@ def test_the_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked == [("scene", [step], how) for step in (door, drawer) for how in hows]
 
 
-def test_baselines_in_other_numbers_of_waypoints_and_with_other_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_baselines_in_other_numbers_of_waypoints_and_with_other_budgets(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     asked: list[dict[str, Any]] = []
-    monkeypatch.setattr(comparison, "plan_separately", lambda scene, steps, **how: asked.append(how))
+    monkeypatch.setattr(
+        comparison, "plan_separately", lambda scene, steps, **how: asked.append(how)
+    )
     for method in ("B1", "B1x1", "B2x3"):
         baselines.plan_trial("scene", {"scene": "door", "method": method, "seed": 8, "effort": 7})  # type: ignore[arg-type]
     common = {**LIMITS, "effort": 7, "seed": 8}
@@ -162,16 +216,27 @@ def test_jobs_make_no_difference(tmp_path: Path, result: dict[str, Any]) -> None
     assert run(tmp_path, jobs=2)["trials"] == result["trials"]
 
 
-def test_going_on_after_ctrl_c_gives_the_same(tmp_path: Path, result: dict[str, Any], out: Path) -> None:
+def test_going_on_after_ctrl_c_gives_the_same(
+    tmp_path: Path, result: dict[str, Any], out: Path
+) -> None:
     first, second = Counting(4), Counting()
     with pytest.raises(KeyboardInterrupt, match="4 of 9 trials are done"):
         run(tmp_path, solve=first, save_failures=True)
     assert not (tmp_path / "table.md").exists()
-    assert files(tmp_path / "failures") == {"door_0000_B1.npz", "door_0001_B1.npz", "door_0000_B2.npz"}  # not what was stopped
+    assert files(tmp_path / "failures") == {
+        "door_0000_B1.npz",
+        "door_0001_B1.npz",
+        "door_0000_B2.npz",
+    }  # not what was stopped
     assert run(tmp_path, solve=second, save_failures=True)["trials"] == result["trials"]
     assert sorted(first.asked + second.asked[:5]) == [t["key"] for t in result["trials"]]
-    assert [key.split("/")[1] for key in second.asked[5:]] == ["0002"] * 3  # planned again to be shown
-    tables = [(folder / "table.md").read_text(encoding="utf-8").splitlines()[:-1] for folder in (tmp_path, out)]
+    assert [key.split("/")[1] for key in second.asked[5:]] == [
+        "0002"
+    ] * 3  # planned again to be shown
+    tables = [
+        (folder / "table.md").read_text(encoding="utf-8").splitlines()[:-1]
+        for folder in (tmp_path, out)
+    ]
     assert tables[0] == tables[1]  # the last line says how long it took
     again = Counting()
     run(tmp_path, solve=again, save_failures=True)
@@ -189,12 +254,20 @@ def test_peaks_against_numbers_by_hand() -> None:
         [3.0, 4.0, 0.0, 0.1, -2.0, 0.0],
         [4.0, 3.0, 0.0, 0.1, -2.6, 0.0],
     ]
-    motion = Trajectory(names, np.array([0.0, 1.0, 3.0, 3.5]), np.array(positions), (PhaseSpan("move", 0, 3),), 5)
-    # Velocities: shoulder 0.5, -0.2, 0; elbow 0, -1.5, -1.2. Steps over the shorter of two segments' times: shoulder 0.5 / 1,
-    # -0.7 / 1, 0.2 / 0.5, 0 / 0.5; elbow 0, -1.5 / 1, 0.3 / 0.5, 1.2 / 0.5.
+    motion = Trajectory(
+        names, np.array([0.0, 1.0, 3.0, 3.5]), np.array(positions), (PhaseSpan("move", 0, 3),), 5
+    )
+    # Velocities: shoulder 0.5, -0.2, 0; elbow 0, -1.5, -1.2. Steps over the shorter of two
+    # segments' times: shoulder 0.5 / 1, -0.7 / 1, 0.2 / 0.5, 0 / 0.5; elbow 0, -1.5 / 1, 0.3 / 0.5,
+    # 1.2 / 0.5.
     assert peaks(motion) == pytest.approx({"peak_velocity": 1.5, "peak_acceleration": 2.4})
     # Way: 5, 0 and √2; arm: 0.5, 0.4 and 0, and 0, 3 and 0.6.
-    expected = {"duration": 3.5, "base_effort": 5.0 + np.sqrt(2.0), "base_effort_l1": 9.0, "arm_effort": 4.5}
+    expected = {
+        "duration": 3.5,
+        "base_effort": 5.0 + np.sqrt(2.0),
+        "base_effort_l1": 9.0,
+        "arm_effort": 4.5,
+    }
     assert motion.metrics() == pytest.approx(expected)
 
 
@@ -212,10 +285,16 @@ def test_records_have_the_peaks_of_their_motions(result: dict[str, Any]) -> None
 
 def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> None:
     text = (out / "table.md").read_text(encoding="utf-8")
-    sections = {part.split("\n", 1)[0]: part.split("\n", 1)[1].strip() for part in text.split("## ")[1:]}
+    sections = {
+        part.split("\n", 1)[0]: part.split("\n", 1)[1].strip() for part in text.split("## ")[1:]
+    }
 
     def rows(title: str) -> list[list[str]]:
-        return cells("\n".join(line for line in sections[title].splitlines() if line.startswith("|")).replace("\\|", "/"))[1:]
+        return cells(
+            "\n".join(
+                line for line in sections[title].splitlines() if line.startswith("|")
+            ).replace("\\|", "/")
+        )[1:]
 
     assert rows("Success") == [
         ["door", "B1", "1 of 3", "33", "6–79", "0", "collision (penetration) 2"],
@@ -245,7 +324,13 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
     assert pairs[9] == ["door", "arm [rad]", "B2", "7.00", "7.00", "0 of 2"]
     own = rows("Efforts, peaks and durations over each method's own successes")
     assert own[0] == ["door", "n", "1", "2", "3"]
-    assert own[1] == ["door", "base [m]", "6.00 ± –; 6.00", "4.50 ± 0.71; 4.50", "3.00 ± 1.00; 3.00"]
+    assert own[1] == [
+        "door",
+        "base [m]",
+        "6.00 ± –; 6.00",
+        "4.50 ± 0.71; 4.50",
+        "3.00 ± 1.00; 3.00",
+    ]
     failed = rows("Failures")
     assert [row[1:4] + row[5:] for row in failed] == [
         ["0", "B1", "collision", "`failures/door_0000_B1.npz`"],
@@ -261,7 +346,12 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
 
 
 def test_errors_have_no_times_and_no_efforts(result: dict[str, Any]) -> None:
-    error = {"success": False, "status": "error", "failed_constraint": "error", "violations": ["ValueError: no"]}
+    error = {
+        "success": False,
+        "status": "error",
+        "failed_constraint": "error",
+        "violations": ["ValueError: no"],
+    }
     odd = {"key": "door/0003/B1", "scene": "door", "method": "B1", "number": 3, **error}
     text = report({**result, "trials": [*result["trials"], odd]}, {"door": "open it"}, title="Odd")
     assert text.startswith("# Odd\n\n`door`: open it. 3 random starts")
@@ -278,7 +368,10 @@ def test_without_vkc_there_is_nothing_to_compare_it_with(tmp_path: Path) -> None
     assert "0 of 1 (door)" in text
     assert "![Motions" not in text
     assert not (tmp_path / "door_joints.png").exists()
-    assert [row[1] for row in cells(text.split("## Success\n\n")[1].split("\n\n")[0])[1:]] == ["B1", "B2"]
+    assert [row[1] for row in cells(text.split("## Success\n\n")[1].split("\n\n")[0])[1:]] == [
+        "B1",
+        "B2",
+    ]
 
 
 # Failures and what is shown
@@ -289,7 +382,11 @@ def test_failures_are_saved(out: Path, result: dict[str, Any]) -> None:
     saved = vkc.Plan.load(out / "failures" / "door_0001_B1.npz")
     (trial,) = [t for t in result["trials"] if t["key"] == "door/0001/B1"]
     assert saved.claimed is not None
-    assert (saved.status, saved.seed, [str(v) for v in saved.claimed.violations]) == ("collision", 6, trial["violations"])
+    assert (saved.status, saved.seed, [str(v) for v in saved.claimed.violations]) == (
+        "collision",
+        6,
+        trial["violations"],
+    )
     np.testing.assert_allclose(saved.scene.start, trial["start"], atol=1e-8)
 
 
@@ -325,16 +422,26 @@ def test_view_shows_a_failure_with_the_offending_links_in_red(
     for path, clip in clips(commands_of(text)).items():
         for track in clip["tracks"]:
             if track["type"] == "color":
-                red[path] = [key["time"] for key in track["keys"] if key["value"][0] > 0.85 and key["value"][1] < 0.1]
+                red[path] = [
+                    key["time"]
+                    for key in track["keys"]
+                    if key["value"][0] > 0.85 and key["value"][1] < 0.1
+                ]
     found = vkc.Plan.load(file).validation.violations  # of the motion, not of the file
-    close = [violation for violation in found if violation.constraint in ("penetration", "clearance")]
+    close = [
+        violation for violation in found if violation.constraint in ("penetration", "clearance")
+    ]
     assert close
     for violation in close:
         assert f"{violation.constraint}: {violation.subject.partition(' ')[0]}" in text
         for link in violation.subject.split(" – "):
-            moments = [moments for path, moments in red.items() if f"/{link.rpartition('.')[2]}/" in path]
+            moments = [
+                moments for path, moments in red.items() if f"/{link.rpartition('.')[2]}/" in path
+            ]
             assert all(any(abs(t - violation.time) < 0.5 for t in one) for one in moments), link
-    links = {link.rpartition(".")[2] for violation in close for link in violation.subject.split(" – ")}
+    links = {
+        link.rpartition(".")[2] for violation in close for link in violation.subject.split(" – ")
+    }
     assert red
     assert all(any(f"/{link}/" in path for link in links) for path in red)
 
@@ -351,7 +458,11 @@ def test_view_shows_a_failure_with_the_offending_links_in_red(
     ],
 )
 def test_the_trial_that_is_shown(good: dict[str, set[int]], expected: int | None) -> None:
-    records = [{"scene": "door", "method": m, "number": n, "success": n in good[m]} for n in range(4) for m in COMPARED_PLANNERS]
+    records = [
+        {"scene": "door", "method": m, "number": n, "success": n in good[m]}
+        for n in range(4)
+        for m in COMPARED_PLANNERS
+    ]
     assert shown(records, COMPARED_PLANNERS) == expected
 
 
@@ -373,7 +484,9 @@ def test_other_settings_are_refused(out: Path) -> None:
 
 
 def test_misuse(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match=r"there is no task 'drawers'.*did you mean 'drawer'"):
+    with pytest.raises(
+        UnknownNameError, match=r"there is no task 'drawers'.*did you mean 'drawer'"
+    ):
         run(tmp_path, tasks=["drawers"])
     with pytest.raises(UnknownNameError, match=r"there is no method 'B3'.*B1"):
         run(tmp_path, methods=["B3"])
@@ -407,7 +520,9 @@ def test_misuse_on_the_command_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     asked: dict[str, Any] = {}
     real = baselines.run
 
@@ -416,14 +531,33 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         return real(**given, solve=solve)
 
     monkeypatch.setattr(baselines, "run", fake)
-    command = ["bench", "baselines", "--trials", "2", "--seed", "4", "--jobs", "1", "--out", str(tmp_path), "--quiet"]
+    command = [
+        "bench",
+        "baselines",
+        "--trials",
+        "2",
+        "--seed",
+        "4",
+        "--jobs",
+        "1",
+        "--out",
+        str(tmp_path),
+        "--quiet",
+    ]
     assert main([*command, "--tasks", "drawer", "--methods", "VKC", "B1", "--save-failures"]) == 0
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     said = capsys.readouterr().out
     assert said.startswith(table)
     assert str(tmp_path) in said.splitlines()[-1]
     assert asked == {
-        **{"trials": 2, "seed": 4, "jobs": 1, "out": str(tmp_path), "tasks": ["drawer"], "methods": ["VKC", "B1"]},
+        **{
+            "trials": 2,
+            "seed": 4,
+            "jobs": 1,
+            "out": str(tmp_path),
+            "tasks": ["drawer"],
+            "methods": ["VKC", "B1"],
+        },
         **{"save_failures": True, "progress": False},
     }
     assert files(tmp_path / "failures") == {"drawer_0000_B1.npz", "drawer_0001_B1.npz"}

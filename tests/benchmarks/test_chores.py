@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,37 +9,46 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.fake_plan import with_metrics
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
 from vkc_pin.benchmarks.harness import step_by_step as stepwise
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.models.shapes import clearance
-from vkc_pin.scene.neighbours import close_pairs
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.task.actions import actions_of, foresee
+from vkc_pin.world.models.shapes import compute_clearance
+from vkc_pin.world.scene.clearance_exemptions import find_close_pairs
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.task.actions import compile_each_step, group_into_actions
 
 
-@pytest.mark.parametrize(("name", "number", "actions"), [("home", 18, 10), ("fetch", 10, 6), ("cluttered", 18, 10)])
+@pytest.mark.parametrize(
+    ("name", "number", "actions"), [("home", 18, 10), ("fetch", 10, 6), ("cluttered", 18, 10)]
+)
 def test_chores_have_the_papers_steps(name: str, number: int, actions: int) -> None:
     chore = chores.CHORES[name]
     scene, listed = chore.scene(), chore.planned()
     assert len(listed) == number
-    assert len(actions_of(listed)) == actions
-    foresee(scene, listed, chore.options)  # none of them is impossible at its place
+    assert len(group_into_actions(listed)) == actions
+    compile_each_step(scene, listed, chore.options)  # none of them is impossible at its place
 
 
 def test_the_cluttered_home_is_the_home_and_more() -> None:
     home, full = vkc.load_scene("household"), chores.cluttered_home()
-    assert full.document["obstacles"][: len(home.document["obstacles"])] == list(home.document["obstacles"])
+    assert full.document["obstacles"][: len(home.document["obstacles"])] == list(
+        home.document["obstacles"]
+    )
     shapes = [len(placed.object.collision.geometryObjects) for placed in full.objects.values()]
     assert len(full.obstacles) + sum(shapes) > 500
 
 
 def gap(scene: vkc.Scene, first: str, second: str) -> float:
     """Return how far two links stand apart [m]."""
-    (pair,) = [pair for pair in close_pairs(scene, 0.02) if {pair.first, pair.second} == {first, second}]
+    (pair,) = [
+        pair
+        for pair in find_close_pairs(scene, 0.02)
+        if {pair.first, pair.second} == {first, second}
+    ]
     return pair.distance
 
 
@@ -61,9 +69,13 @@ def test_the_cluttered_home_is_as_tight_as_real_ones() -> None:
 @pytest.mark.parametrize(("carried", "other"), [("cold_cup", "bottle"), ("broom", "mop")])
 def test_what_is_carried_has_a_neighbour(carried: str, other: str) -> None:
     full = chores.cluttered_home()
-    shapes = [(shape.geometry, shape.placement) for shape in standing_geometry(full.objects[carried])]
+    shapes = [
+        (shape.geometry, shape.placement) for shape in make_world_shapes(full.objects[carried])
+    ]
     (index,) = [i for i, label in enumerate(full.obstacle_labels) if label == other]
-    assert clearance(shapes, [(full.obstacles[index].geometry, full.obstacles[index].placement)]) == pytest.approx(0.01, abs=1e-4)
+    assert compute_clearance(
+        shapes, [(full.obstacles[index].geometry, full.obstacles[index].placement)]
+    ) == pytest.approx(0.01, abs=1e-4)
 
 
 def test_one_step_less_is_noticed() -> None:
@@ -72,18 +84,20 @@ def test_one_step_less_is_noticed() -> None:
     steps = chores.home(scene)
     del steps[15]
     with pytest.raises(InputError, match=r"steps\[15\]"):
-        foresee(scene, steps, vkc.Options())
+        compile_each_step(scene, steps, vkc.Options())
 
 
 def stay(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """Return a plan whose success hangs on the number of the trial."""
     plan = vkc.plan(scene, [vkc.GoTo(*scene.start[:2])], seed=spec["seed"])
     status = "success" if spec["number"] else "not converged"
-    return dataclasses.replace(plan, status=status, metrics={**plan.metrics, "planning_time": 1.0 + spec["number"]})
+    return with_metrics(plan, {"planning_time": 1.0 + spec["number"]}, status=status)
 
 
 def test_every_trial_is_on_record(tmp_path: Path) -> None:
-    result = chores.run(trials=3, seed=4, out=tmp_path, chores=("fetch",), progress=False, solve=stay)
+    result = chores.run(
+        trials=3, seed=4, out=tmp_path, chores=("fetch",), progress=False, solve=stay
+    )
     assert [trial["number"] for trial in result["trials"]] == [0, 1, 2]
     assert [trial["success"] for trial in result["trials"]] == [False, True, True]
     assert len(result["meta"]["steps"]["fetch"]) == 10
@@ -103,12 +117,21 @@ def test_what_hangs_on_seeds_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def some(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
         return stay(scene, {**spec, "number": spec["seed"] - 4})
 
-    def two(scene: vkc.Scene, steps: list[vkc.Step], *, options: vkc.Options, seed: int) -> list[vkc.Plan]:
+    def two(
+        scene: vkc.Scene, steps: list[vkc.Step], *, options: vkc.Options, seed: int
+    ) -> list[vkc.Plan]:
         plans = [stay(scene, {"seed": seed, "number": number}) for number in (1, 0)]
-        return [dataclasses.replace(one, metrics={**one.metrics, "arm_effort": float(seed)}) for one in plans]
+        return [with_metrics(one, {**one.metrics, "arm_effort": float(seed)}) for one in plans]
 
     monkeypatch.setattr(stepwise, "step_by_step", two)
-    settings = {"trials": 1, "seed": 4, "seeds": 2, "step_by_step": True, "chores": ("fetch",), "progress": False}
+    settings = {
+        "trials": 1,
+        "seed": 4,
+        "seeds": 2,
+        "step_by_step": True,
+        "chores": ("fetch",),
+        "progress": False,
+    }
     result = chores.run(out=tmp_path, solve=some, **settings)
     assert [(one["seed"], one["method"], one["success"]) for one in result["trials"]] == [
         (4, "VKC", False),
@@ -141,7 +164,11 @@ def test_unknown_chores_are_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "joints", "things"),
     [
-        ("home", {"refrigerator": 0.0, "door": 0.0}, {"cold_cup": chores.DESK, "litter": chores.BIN}),
+        (
+            "home",
+            {"refrigerator": 0.0, "door": 0.0},
+            {"cold_cup": chores.DESK, "litter": chores.BIN},
+        ),
         ("fetch", {"cabinet": 0.0}, {"ball": chores.SHELF}),
     ],
 )
@@ -149,8 +176,12 @@ def test_every_chore_is_really_planned(
     name: str, joints: Mapping[str, float], things: Mapping[str, tuple[float, float, float]]
 ) -> None:
     """As the experiment asks for it, and looked at anew from what the plan has: steps, motion, and the scene at its end."""
-    scene, steps, options = chores.CHORES[name].scene(), chores.CHORES[name].planned(), chores.CHORES[name].options
-    plan = vkc.plan_chore(scene, steps, options=options, seed=7)
+    scene, steps, options = (
+        chores.CHORES[name].scene(),
+        chores.CHORES[name].planned(),
+        chores.CHORES[name].options,
+    )
+    plan = vkc.plan(scene, steps, options=options, seed=7, window=2)
     assert plan.success, plan.report()
     assert vkc.validate(scene, plan.steps, plan.trajectory, options).ok
     last = plan.end_scene()
@@ -163,7 +194,22 @@ def test_every_chore_is_really_planned(
 
 @pytest.mark.long
 def test_ten_steps_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "chores", "--trials", "1", "--chores", "fetch", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert (
+        main(
+            [
+                "bench",
+                "chores",
+                "--trials",
+                "1",
+                "--chores",
+                "fetch",
+                "--out",
+                str(tmp_path / "out"),
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     (trial,) = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))["trials"]
     assert trial["success"], trial["violations"]
     assert trial["planning_time"] < trial["wall_time"]

@@ -46,7 +46,9 @@ def test_the_robot_drives_through_the_gap_and_reaches_over_the_table() -> None:
     x, y, _ = plan.trajectory.positions[:, :3].T
     beside = np.abs(x) < 0.3  # at least as much of the way as the pillar is deep
     assert beside.any()
-    assert ((y > -2.0 + 0.335) & (y < -1.15 - 0.335))[beside].all(), "half of the robot's width from wall and pillar"
+    assert ((y > -2.0 + 0.335) & (y < -1.15 - 0.335))[beside].all(), (
+        "half of the robot's width from wall and pillar"
+    )
     end = plan.trajectory.positions[-1]
     tool = plan.scene.with_start(base=end[:3], arm=end[3:]).tool_placement()
     np.testing.assert_allclose(tool.translation, gap.POSE[:3], atol=2e-3)
@@ -65,9 +67,13 @@ def test_bench_gap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (record,) = result["trials"]
     assert record["success"] is True, record["violations"]
     assert record["first_seed"] is (record["solves"] == 1)
-    assert {"commit", "cpu_time", "objective", "iterations", "seed", "initialization"} <= set(record)
+    assert {"commit", "cpu_time", "objective", "iterations", "seed", "initialization"} <= set(
+        record
+    )
     np.testing.assert_allclose(record["start"], gap.started(0, 0).start, atol=1e-8)
-    assert record["base_effort"] > np.linalg.norm(np.array(gap.POSE[:2]) - record["start"][:2]) - 1.4  # less the arm's reach
+    assert (
+        record["base_effort"] > np.linalg.norm(np.array(gap.POSE[:2]) - record["start"][:2]) - 1.4
+    )  # less the arm's reach
     assert f"| {gap.SCENE} | 1 of 1 | {int(record['first_seed'])} of 1 |" in table
     assert main(command) == 0  # nothing is left to do
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import fake_plan, with_metrics
 from helpers.markdown import cells
 from helpers.small_problems import program_of
 
@@ -21,15 +20,31 @@ from vkc_pin.benchmarks import comparison, household
 from vkc_pin.benchmarks.comparison import placed
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
-from vkc_pin.benchmarks.household import COMPARED_PLANNERS, COMPARISON, PAPER, TABLE_TOP, TASKS, on_the_coffee_table, papers_home
+from vkc_pin.benchmarks.household import (
+    COMPARED_PLANNERS,
+    COMPARISON,
+    PAPER,
+    TABLE_TOP,
+    TASKS,
+    on_the_coffee_table,
+    papers_home,
+)
 from vkc_pin.cli import main
-from vkc_pin.models.shapes import clearance, placed_shapes
-from vkc_pin.scene.placed import standing_geometry
 from vkc_pin.validation.report import Report, Violation
+from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
+from vkc_pin.world.scene.placed_object import make_world_shapes
 
 GOOD = {("cup", "B1"): {0}, ("cup", "B2"): {0, 1}, ("door", "B2"): {1}}
 """(task, method) → the starts from which `solve` has it succeed; VKC always does."""
-BLAME = Violation("closure", "door.handle", waypoint=9, time=4.0, amount=0.09, unit="m", detail="the grasp drifts by 90 mm")
+BLAME = Violation(
+    "closure",
+    "door.handle",
+    waypoint=9,
+    time=4.0,
+    amount=0.09,
+    unit="m",
+    detail="the grasp drifts by 90 mm",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +56,10 @@ def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """A plan that nobody planned, in place of the task."""
     task, method, number = spec["scene"], spec["method"], spec["number"]
-    good, k = method == "VKC" or number in GOOD.get((task, method), ()), COMPARED_PLANNERS.index(method)
+    good, k = (
+        method == "VKC" or number in GOOD.get((task, method), ()),
+        COMPARED_PLANNERS.index(method),
+    )
     plan = fake_plan()
     metrics = {
         **plan.trajectory.metrics(),
@@ -56,8 +74,14 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     }
     validation = Report() if good else Report((BLAME,), -0.03)
     status = "success" if good else "no inverse kinematics"
-    return dataclasses.replace(
-        plan, scene=scene, metrics=metrics, status=status, validation=validation, seed=spec["seed"], steps=TASKS[task].steps
+    return with_metrics(
+        plan,
+        metrics,
+        scene=scene,
+        status=status,
+        validation=validation,
+        seed=spec["seed"],
+        steps=TASKS[task].steps,
     )
 
 
@@ -66,8 +90,12 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bench") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "_sources", lambda: "abc")
-        patch.setattr(comparison, "motions_chart", lambda plans, path, title: path.write_bytes(title.encode()))
-        household.run(trials=2, seed=3, tasks=["door", "cup"], out=folder, progress=False, solve=solve)
+        patch.setattr(
+            comparison, "motions_chart", lambda plans, path, title: path.write_bytes(title.encode())
+        )
+        household.run(
+            trials=2, seed=3, tasks=["door", "cup"], out=folder, progress=False, solve=solve
+        )
     return folder
 
 
@@ -76,13 +104,17 @@ def result(out: Path) -> dict[str, Any]:
     return json.loads((out / "results.json").read_text(encoding="utf-8"))
 
 
-# --- what is run -------------------------------------------------------------------------------------------------------
+# --- what is run
+# -------------------------------------------------------------------------------------------------------
 
 
 def test_the_tasks_are_the_papers() -> None:
     assert {name: task.steps for name, task in TASKS.items()} == {
         "cup": (vkc.Place("cup", (-0.6, -1.6, 0.751)),),
-        "door": (vkc.Actuate("door", {"hinge": 1.52}, attachment="handle_free"), vkc.GoTo(1.6, 2.5)),
+        "door": (
+            vkc.Actuate("door", {"hinge": 1.52}, attachment="handle_free"),
+            vkc.GoTo(1.6, 2.5),
+        ),
         "drawer": (vkc.Actuate("drawer", {"slide": 0.22}),),
         "dishwasher": (vkc.Actuate("dishwasher", {"rack": 0.5}),),
         "refrigerator": (vkc.Actuate("refrigerator", {"hinge": 1.57}),),
@@ -97,7 +129,9 @@ def test_the_tasks_are_the_papers() -> None:
 def test_every_method_is_asked_for_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[Any, ...]] = []
     for name in ("plan", "plan_separately"):
-        monkeypatch.setattr(comparison, name, lambda scene, steps, **how: asked.append((scene, steps, how)))
+        monkeypatch.setattr(
+            comparison, name, lambda scene, steps, **how: asked.append((scene, steps, how))
+        )
     for task in TASKS:
         for method in COMPARED_PLANNERS:
             household.plan_trial("scene", {"scene": task, "method": method, "seed": 8})  # type: ignore[arg-type]
@@ -114,20 +148,32 @@ def test_the_variant_has_the_numbers_of_the_papers_code() -> None:
         "cup": (vkc.Place("cup", (-0.6, -1.6, 1.11)),),
         "dishwasher": (vkc.Actuate("dishwasher", {"rack": 0.8}, attachment="other_side"),),
     }
-    upper = {name: dict(zip(o.object.coordinates.names, o.object.upper, strict=True)) for name, o in theirs.objects.items()}
-    was = {name: dict(zip(o.object.coordinates.names, o.object.upper, strict=True)) for name, o in ours.objects.items()}
+    upper = {
+        name: dict(zip(o.object.coordinates.names, o.object.upper, strict=True))
+        for name, o in theirs.objects.items()
+    }
+    was = {
+        name: dict(zip(o.object.coordinates.names, o.object.upper, strict=True))
+        for name, o in ours.objects.items()
+    }
     assert upper == {**was, "dishwasher": {**was["dishwasher"], "rack": 0.8}}
     there = theirs.with_placement("cup", pin.SE3(np.eye(3), np.array([-0.6, -1.6, 1.11])))
-    cup = placed_shapes(standing_geometry(there.objects["cup"]))
-    assert clearance(cup, placed_shapes(there.obstacles)) == pytest.approx(1e-3, abs=1e-6)
-    labels = [[label for label in scene.obstacle_labels if "dining_table" not in label] for scene in (ours, theirs)]
+    cup = list_placed_shapes(make_world_shapes(there.objects["cup"]))
+    assert compute_clearance(cup, list_placed_shapes(there.obstacles)) == pytest.approx(
+        1e-3, abs=1e-6
+    )
+    labels = [
+        [label for label in scene.obstacle_labels if "dining_table" not in label]
+        for scene in (ours, theirs)
+    ]
     assert labels[0] == labels[1]
     assert vkc.Scene.from_document(theirs.document, theirs.folder).document == theirs.document
 
 
 def test_the_variant_begins_where_the_experiment_does() -> None:
     plain, paper = (
-        which.specify(trials=2, seed=3, tasks=list(TASKS), methods=["VKC"], effort=7) for which in (COMPARISON, PAPER)
+        which.specify(trials=2, seed=3, tasks=list(TASKS), methods=["VKC"], effort=7)
+        for which in (COMPARISON, PAPER)
     )
     assert plain == paper
 
@@ -140,8 +186,16 @@ def test_the_variant_is_run_and_reported(tmp_path: Path, monkeypatch: pytest.Mon
         seen.append((spec["scene"], scene.name, float(scene.objects["dishwasher"].object.upper[1])))
         return solve(scene, spec)
 
-    monkeypatch.setattr(comparison, "motions_chart", lambda plans, path, title: path.write_bytes(title.encode()))
-    how: dict[str, Any] = {"trials": 1, "seed": 3, "methods": ["VKC"], "progress": False, "solve": look}
+    monkeypatch.setattr(
+        comparison, "motions_chart", lambda plans, path, title: path.write_bytes(title.encode())
+    )
+    how: dict[str, Any] = {
+        "trials": 1,
+        "seed": 3,
+        "methods": ["VKC"],
+        "progress": False,
+        "solve": look,
+    }
     result = household.run(variant="paper", out=tmp_path / "paper", **how)
     assert seen
     assert {(task, rack) for task, _, rack in seen} == {("cup", 0.8), ("dishwasher", 0.8)}
@@ -156,7 +210,9 @@ def test_the_variant_is_run_and_reported(tmp_path: Path, monkeypatch: pytest.Mon
     usual = household.run(out=tmp_path / "usual", tasks=["cup"], **how)
     assert household.report(usual).startswith("# Six tasks in a home\n")
     seen.clear()
-    household.run(variant="paper", out=tmp_path / "door", tasks=["door"], **how)  # which has no other numbers there
+    household.run(
+        variant="paper", out=tmp_path / "door", tasks=["door"], **how
+    )  # which has no other numbers there
     assert set(seen) == {("door", "household", 0.55)}
 
 
@@ -189,30 +245,47 @@ def test_every_task_is_really_planned(name: str, method: str) -> None:
 def test_the_cup_stands_wholly_on_the_coffee_table() -> None:
     scene, rng = vkc.load_scene("household"), np.random.default_rng(0)
     shapes = list(scene.obstacles)
-    table = [shape for shape, label in zip(shapes, scene.obstacle_labels, strict=True) if label == "coffee_table"]
+    table = [
+        shape
+        for shape, label in zip(shapes, scene.obstacle_labels, strict=True)
+        if label == "coffee_table"
+    ]
     plate = max(table, key=lambda shape: shape.placement.translation[2])
     assert isinstance(plate.geometry, coal.Box)
-    np.testing.assert_allclose(np.transpose(TABLE_TOP)[0], (plate.placement.translation - plate.geometry.halfSide)[:2])
-    np.testing.assert_allclose(np.transpose(TABLE_TOP)[1], (plate.placement.translation + plate.geometry.halfSide)[:2])
+    np.testing.assert_allclose(
+        np.transpose(TABLE_TOP)[0], (plate.placement.translation - plate.geometry.halfSide)[:2]
+    )
+    np.testing.assert_allclose(
+        np.transpose(TABLE_TOP)[1], (plate.placement.translation + plate.geometry.halfSide)[:2]
+    )
     others = [shape for shape in shapes if shape is not plate]
     poses = np.array([on_the_coffee_table(scene, rng)["cup"] for _ in range(300)])
     for pose in poses[:40]:
         there = scene.with_placement("cup", pin.SE3(pin.rpy.rpyToMatrix(*pose[3:]), pose[:3]))
-        cup = placed_shapes(standing_geometry(there.objects["cup"]))
+        cup = list_placed_shapes(make_world_shapes(there.objects["cup"]))
         off = np.abs(pose[:2] - plate.placement.translation[:2])
         assert np.all(off + 0.035 < plate.geometry.halfSide[:2]), "all of its foot"
-        assert clearance(cup, placed_shapes([plate])) == pytest.approx(1e-3, abs=1e-6), "it stands on the plate"
-        assert clearance(cup, placed_shapes(others), reach=0.1) > 0.02, "and in nothing"
+        assert compute_clearance(cup, list_placed_shapes([plate])) == pytest.approx(
+            1e-3, abs=1e-6
+        ), "it stands on the plate"
+        assert compute_clearance(cup, list_placed_shapes(others), reach=0.1) > 0.02, (
+            "and in nothing"
+        )
     assert np.ptp(poses[:, 0]) > 0.35
     assert np.ptp(poses[:, 1]) > 0.85
     assert np.ptp(poses[:, 5]) > 6.0
     assert not np.ptp(poses[:, 2:5], axis=0).any()
 
 
-def test_starts_and_places_are_drawn_from_seed_and_task_and_the_same_for_all_methods(result: dict[str, Any]) -> None:
+def test_starts_and_places_are_drawn_from_seed_and_task_and_the_same_for_all_methods(
+    result: dict[str, Any],
+) -> None:
     specs = COMPARISON.specify(trials=2, seed=3, tasks=list(TASKS), methods=["B1", "VKC"])
     assert [(s["scene"], s["method"], s["number"], s["seed"]) for s in specs] == [
-        (task, method, number, 3 + number) for task in TASKS for method in ("B1", "VKC") for number in (0, 1)
+        (task, method, number, 3 + number)
+        for task in TASKS
+        for method in ("B1", "VKC")
+        for number in (0, 1)
     ]
     rng, scene = np.random.default_rng([3, 0]), vkc.load_scene("household")
     for number in (0, 1):
@@ -235,7 +308,9 @@ def test_a_trial_is_planned_with_the_cup_where_it_was_drawn(tmp_path: Path) -> N
         seen.append((scene.objects["cup"].placement, scene.start[:3].tolist(), spec))
         return solve(scene, {**spec, "method": "VKC"})
 
-    household.run(trials=2, seed=0, tasks=["cup"], methods=["B1"], out=tmp_path, progress=False, solve=look)
+    household.run(
+        trials=2, seed=0, tasks=["cup"], methods=["B1"], out=tmp_path, progress=False, solve=look
+    )
     assert len(seen) >= 2
     for cup, base, spec in seen:
         np.testing.assert_allclose(cup.translation, spec["placed"]["cup"][:3])
@@ -249,23 +324,42 @@ def test_records(result: dict[str, Any]) -> None:
         f"{task}/{n:04d}/{m}" for task in ("cup", "door") for n in (0, 1) for m in COMPARED_PLANNERS
     ]
     for t in trials:
-        assert t["success"] == (t["method"] == "VKC" or t["number"] in GOOD.get((t["scene"], t["method"]), ()))
+        assert t["success"] == (
+            t["method"] == "VKC" or t["number"] in GOOD.get((t["scene"], t["method"]), ())
+        )
         assert t["seed"] == 3 + t["number"]
     meta = result["meta"]
-    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["tasks"]) == ("household", 3, 2, ["cup", "door"])
-    assert meta["goals"] == {"cup": {"cup": [-0.6, -1.6, 0.751]}, "door": {"door.hinge": 1.52, "base": [1.6, 2.5]}}
+    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["tasks"]) == (
+        "household",
+        3,
+        2,
+        ["cup", "door"],
+    )
+    assert meta["goals"] == {
+        "cup": {"cup": [-0.6, -1.6, 0.751]},
+        "door": {"door.hinge": 1.52, "base": [1.6, 2.5]},
+    }
 
 
-# --- what is shown -----------------------------------------------------------------------------------------------------
+# --- what is shown
+# -----------------------------------------------------------------------------------------------------
 
 
 def test_tables_against_numbers_by_hand(out: Path) -> None:
     text = (out / "table.md").read_text(encoding="utf-8")
-    assert text.startswith("# Six tasks in a home\n\n`cup`: carry a cup to the dining table and `door`: push a narrow door open")
-    sections = {part.split("\n", 1)[0]: part.split("\n", 1)[1].strip() for part in text.split("## ")[1:]}
+    assert text.startswith(
+        "# Six tasks in a home\n\n`cup`: carry a cup to the dining table and `door`: push a narrow door open"
+    )
+    sections = {
+        part.split("\n", 1)[0]: part.split("\n", 1)[1].strip() for part in text.split("## ")[1:]
+    }
 
     def rows(title: str) -> list[list[str]]:
-        return cells("\n".join(line for line in sections[title].splitlines() if line.startswith("|")).replace("\\|", "/"))[1:]
+        return cells(
+            "\n".join(
+                line for line in sections[title].splitlines() if line.startswith("|")
+            ).replace("\\|", "/")
+        )[1:]
 
     cause = "no inverse kinematics (closure)"
     assert rows("Success") == [
@@ -285,23 +379,38 @@ def test_tables_against_numbers_by_hand(out: Path) -> None:
     own = rows("Efforts, peaks and durations over each method's own successes")
     assert own[1] == ["cup", "base [m]", "5.00 ± –; 5.00", "4.50 ± 0.71; 4.50", "3.50 ± 0.71; 3.50"]
     assert own[10] == ["door", "arm [rad]", "–", "11.00 ± –; 11.00", "10.00 ± 1.41; 10.00"]
-    pictures = ("success", "base_effort", "arm_effort", "planning_time", "cup_joints", "door_joints")
+    pictures = (
+        "success",
+        "base_effort",
+        "arm_effort",
+        "planning_time",
+        "cup_joints",
+        "door_joints",
+    )
     assert [f"]({name}.png)" in text for name in pictures] == [True] * 6
     for name in pictures[:4]:
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
-    assert (out / "cup_joints.png").read_text(encoding="utf-8") == "Carry a cup to the dining table, trial 0"
+    assert (out / "cup_joints.png").read_text(
+        encoding="utf-8"
+    ) == "Carry a cup to the dining table, trial 0"
     assert (out / "door_joints.png").read_text(encoding="utf-8").endswith("trial 1")
 
 
-def test_charts_have_all_tasks_and_methods(tmp_path: Path, result: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_charts_have_all_tasks_and_methods(
+    tmp_path: Path, result: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     drawn: dict[str, tuple[Any, ...]] = {}
 
-    def chart(records: Any, path: Path, scenes: Mapping[str, str], methods: Any, **how: Any) -> None:
+    def chart(
+        records: Any, path: Path, scenes: Mapping[str, str], methods: Any, **how: Any
+    ) -> None:
         drawn[path.name] = (len(records), list(scenes), methods, how)
 
     monkeypatch.setattr(household, "success_chart", chart)
     monkeypatch.setattr(household, "means_chart", chart)
-    pictures = COMPARISON.draw(result["trials"], tmp_path, {"cup": "carry", "door": "push"}, COMPARED_PLANNERS)
+    pictures = COMPARISON.draw(
+        result["trials"], tmp_path, {"cup": "carry", "door": "push"}, COMPARED_PLANNERS
+    )
     assert [picture.split("](")[1] for picture in pictures] == [f"{name})" for name in drawn]
     assert all(case[:3] == (12, ["cup", "door"], COMPARED_PLANNERS) for case in drawn.values())
     assert {name: case[3].get("shared") for name, case in drawn.items()} == {
@@ -312,10 +421,13 @@ def test_charts_have_all_tasks_and_methods(tmp_path: Path, result: dict[str, Any
     }
 
 
-# --- the command -------------------------------------------------------------------------------------------------------
+# --- the command
+# -------------------------------------------------------------------------------------------------------
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     asked: dict[str, Any] = {}
     real = household.run
 
@@ -325,12 +437,31 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
     monkeypatch.setattr(household, "run", fake)
     monkeypatch.setattr(comparison, "motions_chart", lambda plans, path, title: None)
-    command = ["bench", "household", "--trials", "1", "--seed", "4", "--jobs", "1", "--out", str(tmp_path), "--quiet"]
+    command = [
+        "bench",
+        "household",
+        "--trials",
+        "1",
+        "--seed",
+        "4",
+        "--jobs",
+        "1",
+        "--out",
+        str(tmp_path),
+        "--quiet",
+    ]
     command += ["--tasks", "drawer", "--methods", "VKC", "B1", "--save-failures"]
     assert main(command) == 0
     assert capsys.readouterr().out.startswith((tmp_path / "table.md").read_text(encoding="utf-8"))
     assert asked == {
-        **{"trials": 1, "seed": 4, "jobs": 1, "out": str(tmp_path), "tasks": ["drawer"], "methods": ["VKC", "B1"]},
+        **{
+            "trials": 1,
+            "seed": 4,
+            "jobs": 1,
+            "out": str(tmp_path),
+            "tasks": ["drawer"],
+            "methods": ["VKC", "B1"],
+        },
         **{"save_failures": True, "progress": False},
     }
     assert [path.name for path in (tmp_path / "failures").iterdir()] == ["drawer_0000_B1.npz"]
@@ -354,7 +485,9 @@ def test_twenty_trials_unless_told_otherwise() -> None:
         (["--variant", "papers"], "there is no variant 'papers'"),
     ],
 )
-def test_misuse(more: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_misuse(
+    more: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["bench", "household", "--out", str(tmp_path / "out"), *more]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import fake_plan, with_metrics
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import initialization
@@ -19,7 +19,9 @@ from vkc_pin.benchmarks.initialization import COMPARED_INITIALIZATIONS, STEPWISE
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.report import Report, Violation
 
-BLAME = Violation("closure", "stick", waypoint=3, time=1.0, amount=0.01, unit="m", detail="10 mm off")
+BLAME = Violation(
+    "closure", "stick", waypoint=3, time=1.0, amount=0.01, unit="m", detail="10 mm off"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +33,9 @@ def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """A plan that nobody planned, in place of the task: "stationary" always fails, "interpolated" from odd starts."""
     method, number = spec["method"], spec["number"]
-    good = method in ("astar", "rrt", "auto", STEPWISE) or (method == "interpolated" and number % 2 == 0)
+    good = method in ("astar", "rrt", "auto", STEPWISE) or (
+        method == "interpolated" and number % 2 == 0
+    )
     times = ("initialization", "coal", "casadi", "ipopt", "validation")
     metrics = {
         "planning_time": 1.0 + number + 0.25 * COMPARED_INITIALIZATIONS.index(method)
@@ -49,16 +53,30 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     }
     status = "success" if good else "rejected"
     report = Report() if good else Report((BLAME,))
-    return dataclasses.replace(fake_plan(scene), metrics=metrics, status=status, validation=report, seed=spec["seed"])
+    return with_metrics(
+        fake_plan(scene), metrics, status=status, validation=report, seed=spec["seed"]
+    )
 
 
 def stopping(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """`solve`, stopped by Ctrl-C at start 2, the way the planner notes it."""
-    return dataclasses.replace(solve(scene, spec), status="interrupted") if spec["number"] == 2 else solve(scene, spec)
+    return (
+        dataclasses.replace(solve(scene, spec), status="interrupted")
+        if spec["number"] == 2
+        else solve(scene, spec)
+    )
 
 
 def run(out: Path, **changes: Any) -> dict[str, Any]:
-    settings = {"starts": 3, "repeats": 2, "seed": 5, "scenes": ["door"], "solve": solve, "progress": False, **changes}
+    settings = {
+        "starts": 3,
+        "repeats": 2,
+        "seed": 5,
+        "scenes": ["door"],
+        "solve": solve,
+        "progress": False,
+        **changes,
+    }
     return initialization.run(out=out, **settings)
 
 
@@ -80,24 +98,39 @@ def test_trials(result: dict[str, Any]) -> None:
     trials = result["trials"]
     asked = {(t["method"], t["number"], t["repeat"]) for t in trials}
     assert len(trials) == len(asked) == 3 * 2 * 5 + 3
-    assert {(n, r) for m, n, r in asked if m == "astar"} == {(n, r) for n in range(3) for r in range(2)}
+    assert {(n, r) for m, n, r in asked if m == "astar"} == {
+        (n, r) for n in range(3) for r in range(2)
+    }
     assert {(n, r) for m, n, r in asked if m == STEPWISE} == {(n, 0) for n in range(3)}
     for t in trials:
         assert (t["seed"], t["perturbation"]) == ((5, 0.0) if t["repeat"] == 0 else (6, 0.05))
         assert (t["scene"], t["clearance"]) == ("door", None)
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
     meta = result["meta"]
-    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["repeats"]) == ("initialization", 5, 3, 2)
+    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["repeats"]) == (
+        "initialization",
+        5,
+        3,
+        2,
+    )
     assert (meta["target"], meta["effort"]) == (list(TARGET), EFFORT)
     assert {"pin", "casadi", "coal", "numpy", "vkc-pin"} <= set(meta["versions"])
 
 
-def test_starts_are_the_same_for_all_methods_and_selections(result: dict[str, Any], tmp_path: Path) -> None:
-    starts = {number: {tuple(t["start"]) for t in result["trials"] if t["number"] == number} for number in range(3)}
+def test_starts_are_the_same_for_all_methods_and_selections(
+    result: dict[str, Any], tmp_path: Path
+) -> None:
+    starts = {
+        number: {tuple(t["start"]) for t in result["trials"] if t["number"] == number}
+        for number in range(3)
+    }
     assert [len(found) for found in starts.values()] == [1, 1, 1]
     assert len(set.union(*starts.values())) == 3
     fewer = run(tmp_path, starts=2, repeats=1, methods=["astar"])["trials"]
-    assert [t["method"] for t in fewer] == ["astar", "astar"]  # step after step is there to be compared with "auto"
+    assert [t["method"] for t in fewer] == [
+        "astar",
+        "astar",
+    ]  # step after step is there to be compared with "auto"
     assert [tuple(t["start"]) for t in fewer] == [*starts[0], *starts[1]]
 
 
@@ -106,8 +139,12 @@ def test_starts_are_drawn_from_seed_and_scene(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(initialization, "load_scene", lambda name: door)
 
     def bases(seed: int, *scenes: str) -> dict[str, list[list[float]]]:
-        specs = initialization.specify(starts=2, repeats=1, seed=seed, scenes=scenes, methods=["astar"])
-        return {scene: [spec["base"] for spec in specs if spec["scene"] == scene] for scene in scenes}
+        specs = initialization.specify(
+            starts=2, repeats=1, seed=seed, scenes=scenes, methods=["astar"]
+        )
+        return {
+            scene: [spec["base"] for spec in specs if spec["scene"] == scene] for scene in scenes
+        }
 
     found = bases(5, "init_1", "init_2")
     for number, scene in enumerate(found, start=1):
@@ -119,11 +156,15 @@ def test_starts_are_drawn_from_seed_and_scene(monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
-    monkeypatch.setattr(initialization, "plan", lambda scene, steps, **how: asked.append((scene, steps, how)))
+    monkeypatch.setattr(
+        initialization, "plan", lambda scene, steps, **how: asked.append((scene, steps, how))
+    )
     spec = {"seed": 8, "perturbation": 0.05}
     for method in ("stationary", "auto", STEPWISE):
         initialization.plan_trial("scene", {**spec, "method": method})  # type: ignore[arg-type]
-    assert all(scene == "scene" and how["effort"] == EFFORT and how["seed"] == 8 for scene, _, how in asked)
+    assert all(
+        scene == "scene" and how["effort"] == EFFORT and how["seed"] == 8 for scene, _, how in asked
+    )
     assert all(how["perturbation"] == 0.05 for _, _, how in asked)
     assert [(how["initialization"], how["joint"]) for _, _, how in asked] == [
         ("stationary", True),
@@ -137,11 +178,25 @@ def test_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> None:
     text = (out / "table.md").read_text(encoding="utf-8")
     assert text == initialization.report(result)
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("| door")]
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if line.startswith("| door")
+    ]
     assert rows[:6] == [
         # Starts 0, 1, 2, each twice: times 1, 1, 2, 2, 3, 3 and more; 95th percentile at 3.
         ["door", "stationary", "0 of 6", "2.00", "3.00", "–", "–", "0", "rejected (closure) 6"],
-        ["door", "interpolated", "4 of 6", "2.25", "3.25", "5.00", "7.00", "0", "rejected (closure) 2"],
+        [
+            "door",
+            "interpolated",
+            "4 of 6",
+            "2.25",
+            "3.25",
+            "5.00",
+            "7.00",
+            "0",
+            "rejected (closure) 2",
+        ],
         ["door", "astar", "6 of 6", "2.50", "3.50", "5.00", "7.00", "0", "none"],
         ["door", "rrt", "6 of 6", "2.75", "3.75", "5.00", "7.00", "0", "none"],
         ["door", "auto", "6 of 6", "3.00", "4.00", "5.00", "7.00", "0", "none"],
@@ -171,12 +226,17 @@ def test_chart_and_csv(out: Path, result: dict[str, Any]) -> None:
     ]
 
 
-def test_going_on_after_ctrl_c_gives_the_same_table(tmp_path: Path, result: dict[str, Any], out: Path) -> None:
+def test_going_on_after_ctrl_c_gives_the_same_table(
+    tmp_path: Path, result: dict[str, Any], out: Path
+) -> None:
     with pytest.raises(KeyboardInterrupt, match="22 of 33 trials are done"):
         run(tmp_path, solve=stopping)
     assert not (tmp_path / "table.md").exists()
     assert run(tmp_path)["trials"] == result["trials"]
-    tables = [(folder / "table.md").read_text(encoding="utf-8").splitlines()[:-1] for folder in (tmp_path, out)]
+    tables = [
+        (folder / "table.md").read_text(encoding="utf-8").splitlines()[:-1]
+        for folder in (tmp_path, out)
+    ]
     assert tables[0] == tables[1]  # the last line says how long it took
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import fake_plan, with_metrics
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import scale
@@ -19,7 +19,15 @@ from vkc_pin.cli import main
 from vkc_pin.errors import InputError
 from vkc_pin.validation.report import Report, Violation
 
-BLAME = Violation("penetration", "forearm_link – box_7", waypoint=3, time=1.0, amount=0.01, unit="m", detail="overlap by 10 mm")
+BLAME = Violation(
+    "penetration",
+    "forearm_link – box_7",
+    waypoint=3,
+    time=1.0,
+    amount=0.01,
+    unit="m",
+    detail="overlap by 10 mm",
+)
 TIMES = {"initialization": 0.3, "coal": 0.1, "casadi": 0.2, "ipopt": 0.15, "validation": 0.05}
 
 
@@ -30,7 +38,9 @@ def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def planned(monkeypatch: pytest.MonkeyPatch) -> list[tuple[vkc.Scene, list[vkc.Step], dict[str, Any]]]:
+def planned(
+    monkeypatch: pytest.MonkeyPatch,
+) -> list[tuple[vkc.Scene, list[vkc.Step], dict[str, Any]]]:
     """What was asked of the planner, which plans nothing here: it takes longer from every start, and fails among 300 from one."""
     asked: list[tuple[vkc.Scene, list[vkc.Step], dict[str, Any]]] = []
 
@@ -39,12 +49,23 @@ def planned(monkeypatch: pytest.MonkeyPatch) -> list[tuple[vkc.Scene, list[vkc.S
         count, number = len(scene.obstacle_names), (len(asked) - 2) // 4
         metrics = {
             **{f"time_{name}": value for name, value in TIMES.items()},
-            **{"planning_time": 1.0 + number + count / 1000.0, "iterations": 60.0 + number, "rounds": 4.0, "build_time": 0.0},
-            **{"base_effort": 2.0, "base_effort_l1": 2.5, "arm_effort": 7.0, "clearance": 0.02, "closure_error": 1e-7},
+            **{
+                "planning_time": 1.0 + number + count / 1000.0,
+                "iterations": 60.0 + number,
+                "rounds": 4.0,
+                "build_time": 0.0,
+            },
+            **{
+                "base_effort": 2.0,
+                "base_effort_l1": 2.5,
+                "arm_effort": 7.0,
+                "clearance": 0.02,
+                "closure_error": 1e-7,
+            },
         }
         status = "rejected" if count == 300 and number == 1 else "success"
         report = Report((BLAME,)) if status == "rejected" else Report()
-        return dataclasses.replace(fake_plan(scene), metrics=metrics, status=status, validation=report)
+        return with_metrics(fake_plan(scene), metrics, status=status, validation=report)
 
     monkeypatch.setattr(scale, "plan", plan)
     scale._warm.cache_clear()
@@ -58,25 +79,49 @@ def test_obstacles_are_the_same_and_more() -> None:
     assert many.document["obstacles"][:30] == some.document["obstacles"]
     assert many.start_clearance() == some.start_clearance()
     assert crowded(30, seed=1).document["obstacles"] != some.document["obstacles"]
-    assert {label for label in few.obstacle_labels if "wall" in label} >= {"wall_west", "wall_above_door", "hall_wall"}
+    assert {label for label in few.obstacle_labels if "wall" in label} >= {
+        "wall_west",
+        "wall_above_door",
+        "hall_wall",
+    }
 
 
 def test_from_every_start_all_numbers_take_turns() -> None:
     trials = scale.specify(starts=3, seed=4, counts=(30, 100))
-    assert [(t["number"], t["obstacles"]) for t in trials] == [(n, count) for n in range(3) for count in (30, 100)]
+    assert [(t["number"], t["obstacles"]) for t in trials] == [
+        (n, count) for n in range(3) for count in (30, 100)
+    ]
     assert [t["key"] for t in trials] == sorted(t["key"] for t in trials)
     bases = [t["base"] for t in trials]
     assert bases[::2] == bases[1::2]
     assert len({tuple(base) for base in bases}) == 3
-    more = scale.specify(starts=2, seed=4, counts=(10,))  # neither the numbers nor how many starts there are matter to a start
+    more = scale.specify(
+        starts=2, seed=4, counts=(10,)
+    )  # neither the numbers nor how many starts there are matter to a start
     assert [t["base"] for t in more] == bases[:4:2]
     assert scale.specify(starts=1, seed=5, counts=(10,))[0]["base"] != bases[0]
     for base in bases:
         assert crowded(1000).with_start(base=base).start_clearance() >= 0.03
 
 
-def test_trials_and_table(planned: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "scale", "--starts", "3", "--seed", "2", "--counts", "300", "10", "30", "100", "30", "--quiet"]
+def test_trials_and_table(
+    planned: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "bench",
+        "scale",
+        "--starts",
+        "3",
+        "--seed",
+        "2",
+        "--counts",
+        "300",
+        "10",
+        "30",
+        "100",
+        "30",
+        "--quiet",
+    ]
     assert main([*command, "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {
         *("results.json", "results.csv", "table.md", "scale.png", "trials.jsonl"),
@@ -91,16 +136,24 @@ def test_trials_and_table(planned: list[Any], tmp_path: Path, capsys: pytest.Cap
     assert (meta["of"], meta["counts"]) == ("obstacles", [10, 30, 100, 300])
     assert {"processor", "cores"} <= set(meta["machine"])
     assert {"pin", "coal", "casadi"} <= set(meta["versions"])
-    assert [(t["number"], t["obstacles"]) for t in trials] == [(n, count) for n in range(3) for count in (10, 30, 100, 300)]
+    assert [(t["number"], t["obstacles"]) for t in trials] == [
+        (n, count) for n in range(3) for count in (10, 30, 100, 300)
+    ]
     for (scene, _, _), t in zip(rest, trials, strict=True):
         assert (t["scene"], t["obstacles"]) == (f"door_{t['obstacles']}", len(scene.obstacle_names))
         np.testing.assert_allclose(t["start"], scene.start, atol=1e-9)
     with (tmp_path / "results.csv").open(encoding="utf-8", newline="") as stream:
-        assert [row["obstacles"] for row in csv.DictReader(stream)] == [str(t["obstacles"]) for t in trials]
+        assert [row["obstacles"] for row in csv.DictReader(stream)] == [
+            str(t["obstacles"]) for t in trials
+        ]
 
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if line.startswith("|")]
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in table.splitlines()
+        if line.startswith("|")
+    ]
     head, rows = rows[0], rows[2:]
     assert head[4] == "times that of 30"
     for count, good, row in zip((10, 30, 100, 300), (3, 3, 3, 2), rows, strict=True):
@@ -112,8 +165,23 @@ def test_trials_and_table(planned: list[Any], tmp_path: Path, capsys: pytest.Cap
     assert len(planned) == 13
 
 
-def test_segments_take_turns_too(planned: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "scale", "--starts", "2", "--of", "segments", "--counts", "160", "80", "--quiet", "--out", str(tmp_path)]
+def test_segments_take_turns_too(
+    planned: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "bench",
+        "scale",
+        "--starts",
+        "2",
+        "--of",
+        "segments",
+        "--counts",
+        "160",
+        "80",
+        "--quiet",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(command) == 0
     _, *rest = planned
     assert [how["options"] for _, _, how in rest] == [refined(80), refined(160)] * 2
@@ -134,7 +202,9 @@ def test_refined_options_divide_the_same_time() -> None:
         assert sum(phases[0]) == segments
         assert own.dt * segments == pytest.approx(usual.dt * sum(phases[1]))
         if segments >= 20:
-            np.testing.assert_allclose(np.array(phases[0]) / segments, np.array(phases[1]) / sum(phases[1]), atol=0.05)
+            np.testing.assert_allclose(
+                np.array(phases[0]) / segments, np.array(phases[1]) / sum(phases[1]), atol=0.05
+            )
     assert refined(76) == usual
 
 
@@ -168,5 +238,7 @@ def test_what_cannot_be_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     stopped = dataclasses.replace(fake_plan(crowded(10)), status="interrupted")
     monkeypatch.setattr(scale, "plan", lambda *_, **__: stopped)
     scale._warm.cache_clear()
-    with pytest.raises(KeyboardInterrupt, match="0 of 5 trials"):  # also by Ctrl-C before the first trial
+    with pytest.raises(
+        KeyboardInterrupt, match="0 of 5 trials"
+    ):  # also by Ctrl-C before the first trial
         scale.run(starts=1, seed=0, out=tmp_path, progress=False)

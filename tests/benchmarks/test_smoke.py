@@ -12,16 +12,41 @@ import pytest
 
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.cli import main
-from vkc_pin.motion.world import World
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.scene import load_scene
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import load_scene
+from vkc_pin.world.trajectory.world_model import World
 
 FIELDS = {
-    *("key", "scene", "method", "number", "repeat", "perturbation", "start", "seed", "success", "status", "planning_time"),
-    *("base_effort", "base_effort_l1", "arm_effort", "clearance", "closure_error", "iterations", "rounds", "effort", "waypoints"),
+    *(
+        "key",
+        "scene",
+        "method",
+        "number",
+        "repeat",
+        "perturbation",
+        "start",
+        "seed",
+        "success",
+        "status",
+        "planning_time",
+    ),
+    *(
+        "base_effort",
+        "base_effort_l1",
+        "arm_effort",
+        "clearance",
+        "closure_error",
+        "iterations",
+        "rounds",
+        "effort",
+        "waypoints",
+    ),
     *("initialization", "build_time", "failed_constraint", "violations"),
-    *(f"time_{part}" for part in ("initialization", "coal", "casadi", "ipopt", "retiming", "validation")),
+    *(
+        f"time_{part}"
+        for part in ("initialization", "coal", "casadi", "ipopt", "retiming", "validation")
+    ),
     "commit",
     "wall_time",
 }
@@ -31,17 +56,36 @@ def check(trial: dict[str, Any], method: str, number: int) -> None:
     """A record must agree with itself."""
     assert set(trial) == FIELDS
     assert trial["key"] == f"init_1/{number:04d}/000/{method}"
-    assert (trial["scene"], trial["method"], trial["number"], trial["repeat"]) == ("init_1", method, number, 0)
+    assert (trial["scene"], trial["method"], trial["number"], trial["repeat"]) == (
+        "init_1",
+        method,
+        number,
+        0,
+    )
     assert trial["success"] is True, (trial["status"], trial["violations"])
-    assert (trial["status"], trial["failed_constraint"], trial["violations"]) == ("success", None, [])
+    assert (trial["status"], trial["failed_constraint"], trial["violations"]) == (
+        "success",
+        None,
+        [],
+    )
     assert 0.0 <= trial["clearance"] < 0.02  # the stick is near the table and the cube
     assert 0.0 <= trial["closure_error"] <= 1e-3
     assert trial["base_effort"] <= trial["base_effort_l1"] <= np.sqrt(2.0) * trial["base_effort"]
     assert trial["arm_effort"] > 0.5
-    start, stick = np.array(trial["start"]), load_scene("init_1").objects["stick"].placement.translation
-    # From the start to within reach of the stick, and from there to within reach of the cube; the stick makes the arm longer.
+    start, stick = (
+        np.array(trial["start"]),
+        load_scene("init_1").objects["stick"].placement.translation,
+    )
+    # From the start to within reach of the stick, and from there to within reach of the cube; the
+    # stick makes the arm longer.
     reach = 1.4
-    farther = np.linalg.norm(start[:2] - stick[:2]) - reach + np.linalg.norm(stick[:2] - TARGET[:2]) - 2 * reach - 0.5
+    farther = (
+        np.linalg.norm(start[:2] - stick[:2])
+        - reach
+        + np.linalg.norm(stick[:2] - TARGET[:2])
+        - 2 * reach
+        - 0.5
+    )
     assert farther > 2.0
     assert trial["base_effort"] > farther
     parts = [trial[name] for name in trial if name.startswith("time_")]
@@ -51,7 +95,9 @@ def check(trial: dict[str, Any], method: str, number: int) -> None:
     assert trial["iterations"] >= trial["rounds"] >= 1
 
 
-def test_every_experiment_takes_a_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_experiment_takes_a_scheduler(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is asked for reaches the engine, before a trial is run."""
     asked = []
 
@@ -75,7 +121,15 @@ def test_every_experiment_takes_a_scheduler(tmp_path: Path, monkeypatch: pytest.
     ]
     for name in [*names, "random", "execution"]:
         pytest.importorskip("mujoco") if name == "execution" else None
-        command = ["bench", name, "--scheduler", "tcp://here:1", "--out", str(tmp_path / name), "--quiet"]
+        command = [
+            "bench",
+            name,
+            "--scheduler",
+            "tcp://here:1",
+            "--out",
+            str(tmp_path / name),
+            "--quiet",
+        ]
         assert main(command) == 130, name
     assert asked == ["tcp://here:1"] * 13
 
@@ -83,25 +137,60 @@ def test_every_experiment_takes_a_scheduler(tmp_path: Path, monkeypatch: pytest.
 def test_an_experiment_on_a_scheduler_of_somebody_else(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     command = ["bench", "gap", "--trials", "2", "--quiet", "--out"]
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
-        assert main([*command, str(tmp_path / "there"), "--scheduler", cluster.scheduler_address]) == 0
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+    ) as cluster:
+        assert (
+            main([*command, str(tmp_path / "there"), "--scheduler", cluster.scheduler_address]) == 0
+        )
     assert main([*command, str(tmp_path / "here")]) == 0
-    found = [json.loads((tmp_path / where / "results.json").read_text())["trials"] for where in ("there", "here")]
-    assert [[trial[name] for name in ("key", "success", "effort", "base_effort")] for trial in found[0]] == [
+    found = [
+        json.loads((tmp_path / where / "results.json").read_text())["trials"]
+        for where in ("there", "here")
+    ]
+    assert [
+        [trial[name] for name in ("key", "success", "effort", "base_effort")] for trial in found[0]
+    ] == [
         [trial[name] for name in ("key", "success", "effort", "base_effort")] for trial in found[1]
     ]
 
 
 def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "tmp"
-    command = ["bench", "initialization", "--starts", "2", "--scenes", "init_1", "--methods", "astar", "--jobs", "1", "--quiet"]
+    command = [
+        "bench",
+        "initialization",
+        "--starts",
+        "2",
+        "--scenes",
+        "init_1",
+        "--methods",
+        "astar",
+        "--jobs",
+        "1",
+        "--quiet",
+    ]
     assert main([*command, "--out", str(out)]) == 0
     said = capsys.readouterr()
-    assert {path.name for path in out.iterdir()} == {"results.json", "results.csv", "table.md", "success.png", "trials.jsonl"}
+    assert {path.name for path in out.iterdir()} == {
+        "results.json",
+        "results.csv",
+        "table.md",
+        "success.png",
+        "trials.jsonl",
+    }
 
     result = json.loads((out / "results.json").read_text(encoding="utf-8"))
-    assert (result["meta"]["scenes"], result["meta"]["methods"], result["meta"]["starts"]) == (["init_1"], ["astar"], 2)
-    assert sum(session["trials"] for session in result["meta"]["sessions"]) == len(result["trials"]) == 2
+    assert (result["meta"]["scenes"], result["meta"]["methods"], result["meta"]["starts"]) == (
+        ["init_1"],
+        ["astar"],
+        2,
+    )
+    assert (
+        sum(session["trials"] for session in result["meta"]["sessions"])
+        == len(result["trials"])
+        == 2
+    )
     for number, trial in enumerate(result["trials"]):
         check(trial, "astar", number)
         assert trial["initialization"].startswith("astar")
@@ -121,7 +210,10 @@ def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     (line,) = [line for line in table.splitlines() if line.startswith("| init_1")]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert cells[:3] == ["init_1: no obstacle", "astar", "2 of 2"]
-    medians = (np.median([trial[name] for trial in result["trials"]]) for name in ("planning_time", "base_effort", "arm_effort"))
+    medians = (
+        np.median([trial[name] for trial in result["trials"]])
+        for name in ("planning_time", "base_effort", "arm_effort")
+    )
     assert [cells[3], cells[5], cells[6]] == [f"{value:.2f}" for value in medians]
     assert cells[7:9] == ["0", "none"]
     assert "step after step" not in table  # that is compared with "auto" only
@@ -130,7 +222,10 @@ def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert len(picture) > 5000
 
     # The same command again has nothing left to do.
-    before = {name: (out / name).read_bytes() for name in ("trials.jsonl", "results.json", "results.csv", "table.md")}
+    before = {
+        name: (out / name).read_bytes()
+        for name in ("trials.jsonl", "results.json", "results.csv", "table.md")
+    }
     assert main([*command, "--out", str(out)]) == 0
     assert {name: (out / name).read_bytes() for name in before} == before
     # Another experiment in this folder is refused.
@@ -140,30 +235,67 @@ def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 @pytest.mark.long
 def test_auto_is_compared_with_step_after_step(tmp_path: Path) -> None:
-    command = ["bench", "initialization", "--starts", "1", "--scenes", "init_1", "--methods", "auto", "--jobs", "1", "--quiet"]
+    command = [
+        "bench",
+        "initialization",
+        "--starts",
+        "1",
+        "--scenes",
+        "init_1",
+        "--methods",
+        "auto",
+        "--jobs",
+        "1",
+        "--quiet",
+    ]
     assert main([*command, "--out", str(tmp_path)]) == 0
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
     assert [trial["method"] for trial in trials] == ["auto", "step after step"]
     for trial in trials:
         check(trial, trial["method"], 0)
     assert trials[0]["start"] == trials[1]["start"]
-    compared = (tmp_path / "table.md").read_text(encoding="utf-8").split("## One problem against step after step")[1]
+    compared = (
+        (tmp_path / "table.md")
+        .read_text(encoding="utf-8")
+        .split("## One problem against step after step")[1]
+    )
     for name, field in (("base [m]", "base_effort"), ("arm [rad]", "arm_effort")):
-        (line,) = [line for line in compared.splitlines() if line.startswith(f"| init_1: no obstacle | {name} |")]
+        (line,) = [
+            line
+            for line in compared.splitlines()
+            if line.startswith(f"| init_1: no obstacle | {name} |")
+        ]
         cells = [cell.strip() for cell in line.strip("|").split("|")]
-        assert [cell.split(" ")[0] for cell in cells[2:4]] == [f"{trial[field]:.2f}" for trial in trials]
+        assert [cell.split(" ")[0] for cell in cells[2:4]] == [
+            f"{trial[field]:.2f}" for trial in trials
+        ]
         assert cells[4] == f"{int(trials[0][field] < trials[1][field] - 1e-6)} of 1"
 
 
 @pytest.mark.long
 def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "baselines", "--trials", "2", "--tasks", "drawer", "--methods", "B1", "VKC", "--jobs", "1", "--quiet"]
+    command = [
+        "bench",
+        "baselines",
+        "--trials",
+        "2",
+        "--tasks",
+        "drawer",
+        "--methods",
+        "B1",
+        "VKC",
+        "--jobs",
+        "1",
+        "--quiet",
+    ]
     command += ["--save-failures", "--out", str(tmp_path)]
     assert main(command) == 0
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
-    assert [t["key"] for t in trials] == [f"drawer/{n:04d}/{method}" for n in (0, 1) for method in ("B1", "VKC")]
+    assert [t["key"] for t in trials] == [
+        f"drawer/{n:04d}/{method}" for n in (0, 1) for method in ("B1", "VKC")
+    ]
     for t in trials:
         own = {"peak_velocity", "peak_acceleration", "duration", "cold_time", "warm_time"} | (
             {"time_following"} if t["method"] == "B1" else set()
@@ -173,8 +305,13 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert t["success"] or t["method"] == "B1", t["violations"]
         assert (t["scene"], t["seed"]) == ("drawer", t["number"])
         assert 0.0 < sum(t[name] for name in t if name.startswith("time_")) <= t["planning_time"]
-        assert (tmp_path / f"failures/drawer_{t['number']:04d}_{t['method']}.npz").is_file() == (not t["success"])
-        assert f"| drawer | {t['method']} | {sum(o['success'] for o in trials if o['method'] == t['method'])} of 2 |" in table
+        assert (tmp_path / f"failures/drawer_{t['number']:04d}_{t['method']}.npz").is_file() == (
+            not t["success"]
+        )
+        assert (
+            f"| drawer | {t['method']} | {sum(o['success'] for o in trials if o['method'] == t['method'])} of 2 |"
+            in table
+        )
         if not t["success"]:
             continue
         assert t["base_effort"] <= t["base_effort_l1"] <= np.sqrt(2.0) * t["base_effort"]
@@ -188,7 +325,9 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # The motions in the picture are those of the trial.
     both = [n for n in (0, 1) if all(t["success"] for t in trials if t["number"] == n)]
     shown = {path.name: Plan.load(path) for path in (tmp_path / "shown").iterdir()} if both else {}
-    assert set(shown) == ({f"drawer_{both[0]:04d}_{method}.npz" for method in ("B1", "VKC")} if both else set())
+    assert set(shown) == (
+        {f"drawer_{both[0]:04d}_{method}.npz" for method in ("B1", "VKC")} if both else set()
+    )
     for t in trials:
         plan = shown.get(f"drawer_{t['number']:04d}_{t['method']}.npz")
         if plan is not None:
@@ -199,23 +338,44 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("drawer.png", "drawer_joints.png")[: 1 + bool(both)]:
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.suffix in (".json", ".jsonl", ".csv", ".md")}
+    before = {
+        path.name: path.read_bytes()
+        for path in tmp_path.iterdir()
+        if path.suffix in (".json", ".jsonl", ".csv", ".md")
+    }
     assert main(command) == 0  # nothing is left to do
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
 
 
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "scale", "--starts", "2", "--counts", "10", "40", "--jobs", "1", "--quiet", "--out", str(tmp_path)]
+    command = [
+        "bench",
+        "scale",
+        "--starts",
+        "2",
+        "--counts",
+        "10",
+        "40",
+        "--jobs",
+        "1",
+        "--quiet",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(command) == 0
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
-    assert [t["key"] for t in trials] == [f"{n:04d}/{count:06d}" for n in (0, 1) for count in (10, 40)]
+    assert [t["key"] for t in trials] == [
+        f"{n:04d}/{count:06d}" for n in (0, 1) for count in (10, 40)
+    ]
     for t in trials:
         assert set(t) == FIELDS - {"repeat", "perturbation", "wall_time"} | {"obstacles"}
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
         assert t["success"], t["violations"]
-        assert t["base_effort"] > 1.5 - t["start"][0]  # from the start to within reach of the door, which is at x = 2.5
+        assert (
+            t["base_effort"] > 1.5 - t["start"][0]
+        )  # from the start to within reach of the door, which is at x = 2.5
         assert 0.0 < sum(t[name] for name in t if name.startswith("time_")) <= t["planning_time"]
     assert trials[0]["start"] == trials[1]["start"] != trials[2]["start"] == trials[3]["start"]
     for count in (10, 40):
@@ -226,12 +386,27 @@ def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.long
 def test_household(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "household", "--trials", "1", "--tasks", "cup", "cabinet", "--methods", "B1", "VKC", "--jobs", "1"]
+    command = [
+        "bench",
+        "household",
+        "--trials",
+        "1",
+        "--tasks",
+        "cup",
+        "cabinet",
+        "--methods",
+        "B1",
+        "VKC",
+        "--jobs",
+        "1",
+    ]
     assert main([*command, "--quiet", "--out", str(tmp_path)]) == 0
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
-    assert [t["key"] for t in trials] == [f"{task}/0000/{method}" for task in ("cabinet", "cup") for method in ("B1", "VKC")]
+    assert [t["key"] for t in trials] == [
+        f"{task}/0000/{method}" for task in ("cabinet", "cup") for method in ("B1", "VKC")
+    ]
     for t in trials:
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
         assert t["success"] or t["method"] == "B1", t["violations"]
@@ -243,14 +418,23 @@ def test_household(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert validate(found.scene, found.steps, found.trajectory, found.options).ok
         if t["scene"] == "cup":
             world = World(found.scene)
-            at, *_, end = (world.placement("cup", row) for row in world.positions(found.trajectory))
+            at, *_, end = (
+                world.get_placement("cup", row) for row in world.compute_positions(found.trajectory)
+            )
             np.testing.assert_allclose(at.translation, t["placed"]["cup"][:3], atol=1e-6)
             np.testing.assert_allclose(end.translation, [-0.6, -1.6, 0.751], atol=2e-3)
             assert end.rotation[2, 2] > np.cos(2e-3)
         else:
             assert found.trajectory.column("cabinet.hinge")[-1] == pytest.approx(0.4, abs=5e-3)
         assert t["base_effort"] > 1.0
-    for name in ("success", "base_effort", "arm_effort", "planning_time", "cup_joints", "cabinet_joints"):
+    for name in (
+        "success",
+        "base_effort",
+        "arm_effort",
+        "planning_time",
+        "cup_joints",
+        "cabinet_joints",
+    ):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
         assert f"]({name}.png)" in table
 
@@ -260,7 +444,12 @@ def test_impossible(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
-    assert [t["kind"] for t in trials] == ["closed wall", "fence round the start", "fence round the goal", "gap too narrow"]
+    assert [t["kind"] for t in trials] == [
+        "closed wall",
+        "fence round the start",
+        "fence round the goal",
+        "gap too narrow",
+    ]
     for t in trials:
         assert (t["success"], t["explained"], t["proven"]) == (False, True, True)
         assert "proven: " in t["notes"][0]

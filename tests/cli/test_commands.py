@@ -20,10 +20,20 @@ from vkc_pin.benchmarks import door, initialization
 from vkc_pin.benchmarks.harness import record, runner
 from vkc_pin.cli import commands
 from vkc_pin.planning import planner
-from vkc_pin.planning.stepwise import all_at_once
+from vkc_pin.planning.sequential import plan_simultaneously
 
 ROOT = Path(__file__).resolve().parents[2]
-UNFINISHED = ["plan", "drawer", "--set", "drawer.slide=0.3", "--quiet", "--time-limit", "0.001", "--initialization", "stationary"]
+UNFINISHED = [
+    "plan",
+    "drawer",
+    "--set",
+    "drawer.slide=0.3",
+    "--quiet",
+    "--time-limit",
+    "0.001",
+    "--initialization",
+    "stationary",
+]
 
 
 class Run:
@@ -37,11 +47,29 @@ class Run:
 def planned(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The demo's command, with every output there is; into folders that do not exist yet."""
     folder = tmp_path_factory.mktemp("cli") / "new" / "out"
-    files = [part for kind in ("html", "save", "json", "plots") for part in (f"--{kind}", str(folder / NAMES[kind]))]
-    command = [sys.executable, "-m", "vkc_pin.cli", "plan", "door", "--set", "door.hinge=1.2", *files]
+    files = [
+        part
+        for kind in ("html", "save", "json", "plots")
+        for part in (f"--{kind}", str(folder / NAMES[kind]))
+    ]
+    command = [
+        sys.executable,
+        "-m",
+        "vkc_pin.cli",
+        "plan",
+        "door",
+        "--set",
+        "door.hinge=1.2",
+        *files,
+    ]
     path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     done = subprocess.run(
-        command, cwd=folder.parent.parent, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": path}
+        command,
+        cwd=folder.parent.parent,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "PYTHONPATH": path},
     )
     return Run(done.returncode, done.stdout, done.stderr, folder)
 
@@ -101,16 +129,22 @@ def test_check_of_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert "not reached" in capsys.readouterr().out
 
 
-def test_a_plan_has_no_picture_of_its_scene(planned: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_has_no_picture_of_its_scene(
+    planned: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["check", str(planned.folder / "door.npz"), "--plot", "door.png"]) == 2
     assert "--plot" in capsys.readouterr().err
 
 
-def test_check_finds_what_is_wrong(planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_finds_what_is_wrong(
+    planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     plan = vkc.Plan.load(planned.folder / "door.npz")
     positions = plan.trajectory.positions.copy()
     positions[5, 2] += 1.5
-    bent = dataclasses.replace(plan, trajectory=dataclasses.replace(plan.trajectory, positions=positions, curve=None))
+    bent = dataclasses.replace(
+        plan, trajectory=dataclasses.replace(plan.trajectory, positions=positions, curve=None)
+    )
     assert cli.main(["check", str(bent.save(tmp_path / "bent.npz"))]) == 1
     out = capsys.readouterr().out
     assert "velocity base_yaw" in out
@@ -118,7 +152,9 @@ def test_check_finds_what_is_wrong(planned: Run, tmp_path: Path, capsys: pytest.
     assert "the file says otherwise: every constraint holds" in out
 
 
-def test_view_writes_a_page(planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_view_writes_a_page(
+    planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for what, name in ((str(planned.folder / "door.npz"), "plan.html"), ("drawer", "scene.html")):
         page = tmp_path / name
         assert cli.main(["view", what, "--html", str(page)]) == 0
@@ -126,7 +162,9 @@ def test_view_writes_a_page(planned: Run, tmp_path: Path, capsys: pytest.Capture
         assert str(page) in capsys.readouterr().out
 
 
-def test_a_plan_that_fails_returns_1_and_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_that_fails_returns_1_and_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "late.json"
     assert cli.main([*UNFINISHED, "--json", str(path)]) == 1
     captured = capsys.readouterr()
@@ -138,7 +176,9 @@ def test_a_plan_that_fails_returns_1_and_is_written(tmp_path: Path, capsys: pyte
 
 
 def test_effort_ends_planning(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["plan", "drawer", "--set", "drawer.slide=0.3", "--effort", "500", "--quiet"]) == 1
+    assert (
+        cli.main(["plan", "drawer", "--set", "drawer.slide=0.3", "--effort", "500", "--quiet"]) == 1
+    )
     assert capsys.readouterr().out.startswith("drawer: FAILED, effort spent")
 
 
@@ -147,18 +187,33 @@ def test_effort_ends_planning(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["plan", "dor", "--set", "door.hinge=1"], ["dor", "did you mean 'door'"]),
         (["plan", "nowhere/door.yaml", "--set", "door.hinge=1"], ["nowhere/door.yaml"]),
-        (["plan", "door", "--set", "dor.hinge=1"], ["there is no object 'dor'", "did you mean 'door'"]),
+        (
+            ["plan", "door", "--set", "dor.hinge=1"],
+            ["there is no object 'dor'", "did you mean 'door'"],
+        ),
         (["plan", "door", "--set", "door.hing=1"], ["hing", "did you mean 'hinge'"]),
         (["plan", "door", "--set", "door.hinge"], ["--set", "OBJECT.JOINT=VALUE", "'door.hinge'"]),
         (["plan", "door", "--set", "hinge=1"], ["--set", "OBJECT.JOINT=VALUE"]),
-        (["plan", "door", "--set", "door.hinge=wide"], ["--set", "not a number", "'door.hinge=wide'"]),
+        (
+            ["plan", "door", "--set", "door.hinge=wide"],
+            ["--set", "not a number", "'door.hinge=wide'"],
+        ),
         (["plan", "door", "--set", "door.hinge=nan"], ["not finite"]),
         (["plan", "door", "--set", "=1"], ["--set"]),
         (["plan", "door"], ["--set"]),
-        (["plan", "door", "--set", "door.hinge=1", "--initialization", "stationry"], ["did you mean 'stationary'"]),
-        (["plan", "door", "--set", "door.hinge=1", "--time-limit", "-1"], ["time_limit", "more than 0"]),
+        (
+            ["plan", "door", "--set", "door.hinge=1", "--initialization", "stationry"],
+            ["did you mean 'stationary'"],
+        ),
+        (
+            ["plan", "door", "--set", "door.hinge=1", "--time-limit", "-1"],
+            ["time_limit", "more than 0"],
+        ),
         (["plan", "door", "--set", "door.hinge=1", "--effort", "0"], ["effort", "at least 1"]),
-        (["plan", "door", "--set", "door.hinge=1", "--time-limit", "soon"], ["--time-limit", "soon"]),
+        (
+            ["plan", "door", "--set", "door.hinge=1", "--time-limit", "soon"],
+            ["--time-limit", "soon"],
+        ),
         (["plan", "door", "--set", "door.hinge=1", "--seed", "-1"], ["--seed", "at least 0"]),
         (["check", "none.npz"], ["none.npz", "No such file"]),
         (["view", "none.npz"], ["none.npz", "No such file"]),
@@ -167,12 +222,27 @@ def test_effort_ends_planning(capsys: pytest.CaptureFixture[str]) -> None:
         (["bench", "dor"], ["dor"]),
         (["bench", "initialization"], ["--out"]),
         (["bench", "initialization", "--out", "o", "--starts", "0"], ["--starts", "at least 1"]),
-        (["bench", "initialization", "--out", "o", "--repeats", "none"], ["--repeats", "at least 1"]),
-        (["bench", "initialization", "--out", "o", "--jobs", "-2"], ["--jobs", "at least 1", "'-2'"]),
+        (
+            ["bench", "initialization", "--out", "o", "--repeats", "none"],
+            ["--repeats", "at least 1"],
+        ),
+        (
+            ["bench", "initialization", "--out", "o", "--jobs", "-2"],
+            ["--jobs", "at least 1", "'-2'"],
+        ),
         (["bench", "initialization", "--out", "o", "--seed", "x"], ["--seed", "at least 0"]),
-        (["bench", "initialization", "--out", "o", "--scenes", "init1"], ["there is no scene 'init1'", "did you mean 'init_1'"]),
-        (["bench", "initialization", "--out", "o", "--methods", "auto", "astra"], ["method 'astra'", "did you mean 'astar'"]),
-        (["bench", "scale", "--out", "o", "--counts", "30", "0"], ["--counts", "at least 1", "'0'"]),
+        (
+            ["bench", "initialization", "--out", "o", "--scenes", "init1"],
+            ["there is no scene 'init1'", "did you mean 'init_1'"],
+        ),
+        (
+            ["bench", "initialization", "--out", "o", "--methods", "auto", "astra"],
+            ["method 'astra'", "did you mean 'astar'"],
+        ),
+        (
+            ["bench", "scale", "--out", "o", "--counts", "30", "0"],
+            ["--counts", "at least 1", "'0'"],
+        ),
         (["srdf", "husky_ur5", "--output", "x.srdf"], ["husky_ur5e"]),
         (["srdf", "husky_ur5e"], ["--output"]),
         ([], ["COMMAND"]),
@@ -208,17 +278,27 @@ def test_a_scene_with_a_mistake_in_it(tmp_path: Path, capsys: pytest.CaptureFixt
         (["--json", "pipe"], ["--json: cannot write this", "got a pipe"]),
         (["--html", ""], ["--html: cannot write this"]),
         (["--plots", "file"], ["--plots: cannot write this", "Not a directory"]),
-        (["--plots", "picture.png"], ["--plots: this is the name of a picture", "expected a folder"]),
-        (["--save", "one", "--csv", "folder/../one"], ["--csv: this file is named twice", "another file than --save"]),
+        (
+            ["--plots", "picture.png"],
+            ["--plots: this is the name of a picture", "expected a folder"],
+        ),
+        (
+            ["--save", "one", "--csv", "folder/../one"],
+            ["--csv: this file is named twice", "another file than --save"],
+        ),
         (["--ros", "one", "--html", "one/page.html"], ["--html: a file cannot be a folder"]),
         (["--save", "one", "--plots", "one"], ["--plots: a file cannot be a folder"]),
     ],
 )
 def test_places_that_cannot_be_written(
-    options: list[str], texts: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    options: list[str],
+    texts: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """They are refused before there is anything to lose."""
-    monkeypatch.setattr(planner, "all_at_once", None)
+    monkeypatch.setattr(planner, "plan_simultaneously", None)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
@@ -229,12 +309,21 @@ def test_places_that_cannot_be_written(
 
 
 @pytest.mark.parametrize(
-    "command", [["export", "PLAN", "--json", "PLAN"], ["view", "PLAN", "--html", "PLAN"], ["srdf", "PLAN", "--output", "PLAN"]]
+    "command",
+    [
+        ["export", "PLAN", "--json", "PLAN"],
+        ["view", "PLAN", "--html", "PLAN"],
+        ["srdf", "PLAN", "--output", "PLAN"],
+    ],
 )
-def test_what_is_read_is_not_written_over(command: list[str], planned: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_read_is_not_written_over(
+    command: list[str], planned: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = planned.folder / "door.npz"
     before = file.read_bytes()
-    assert "this file is named twice" in failed(capsys, *[word.replace("PLAN", str(file)) for word in command])
+    assert "this file is named twice" in failed(
+        capsys, *[word.replace("PLAN", str(file)) for word in command]
+    )
     assert file.read_bytes() == before
 
 
@@ -245,11 +334,23 @@ def test_one_file_that_fails_is_not_all(
 
     def late(*arguments: Any) -> vkc.Plan:
         (tmp_path / "new").write_text("")
-        return all_at_once(*arguments)
+        return plan_simultaneously(*arguments)
 
-    monkeypatch.setattr(planner, "all_at_once", late)
-    files = {"save": tmp_path / "plan.npz", "json": tmp_path / "new" / "plan.json", "csv": tmp_path / "plan.csv"}
-    assert cli.main([*UNFINISHED, *(part for option, path in files.items() for part in (f"--{option}", str(path)))]) == 2
+    monkeypatch.setattr(planner, "plan_simultaneously", late)
+    files = {
+        "save": tmp_path / "plan.npz",
+        "json": tmp_path / "new" / "plan.json",
+        "csv": tmp_path / "plan.csv",
+    }
+    assert (
+        cli.main(
+            [
+                *UNFINISHED,
+                *(part for option, path in files.items() for part in (f"--{option}", str(path))),
+            ]
+        )
+        == 2
+    )
     captured = capsys.readouterr()
     assert captured.out.startswith("drawer: FAILED, time limit")
     assert captured.out.splitlines()[-2:] == [f"wrote {files['save']}", f"wrote {files['csv']}"]
@@ -259,24 +360,41 @@ def test_one_file_that_fails_is_not_all(
 
 def test_infeasible_is_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "plan.npz"
-    assert cli.main(["plan", "drawer", "--set", "drawer.slide=9", "--quiet", "--save", str(path)]) == 3
+    assert (
+        cli.main(["plan", "drawer", "--set", "drawer.slide=9", "--quiet", "--save", str(path)]) == 3
+    )
     assert capsys.readouterr().out.startswith("drawer: FAILED, infeasible")
     assert cli.main(["check", str(path)]) == 1
 
 
-def test_check_says_what_the_file_says_otherwise(planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_says_what_the_file_says_otherwise(
+    planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     plan = vkc.Plan.load(planned.folder / "door.npz")
     report = dataclasses.replace(plan.validation, clearance=plan.validation.clearance + 0.1)
-    assert cli.main(["check", str(dataclasses.replace(plan, validation=report).save(tmp_path / "better.npz"))]) == 1
+    assert (
+        cli.main(
+            [
+                "check",
+                str(dataclasses.replace(plan, validation=report).save(tmp_path / "better.npz")),
+            ]
+        )
+        == 1
+    )
     here = plan.validation.clearance
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("every constraint holds")
-    assert lines[1] == f"  the file says otherwise: clearance {here + 0.1:.6g} m instead of {here:.6g} m"
+    assert (
+        lines[1]
+        == f"  the file says otherwise: clearance {here + 0.1:.6g} m instead of {here:.6g} m"
+    )
     assert len(lines) == 2
 
 
 def test_settings() -> None:
-    steps = commands.parse_settings(["door.knob=0.5", "door.hinge=1.2", "drawer.slide=0.3", "door.hinge=0", "door.hinge = 1"])
+    steps = commands.parse_settings(
+        ["door.knob=0.5", "door.hinge=1.2", "drawer.slide=0.3", "door.hinge=0", "door.hinge = 1"]
+    )
     assert steps == [
         vkc.Actuate("door", {"knob": 0.5, "hinge": 1.2}),
         vkc.Actuate("drawer", {"slide": 0.3}),
@@ -306,7 +424,10 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_srdf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "husky.srdf"
-    assert cli.main(["srdf", "husky_ur5e", "--output", str(path), "--samples", "50", "--seed", "1"]) == 0
+    assert (
+        cli.main(["srdf", "husky_ur5e", "--output", str(path), "--samples", "50", "--seed", "1"])
+        == 0
+    )
     assert str(path) in capsys.readouterr().out
     assert "<disable_collisions" in path.read_text(encoding="utf-8")
 
@@ -314,7 +435,9 @@ def test_srdf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, dict[str, Any]]:
     path = tmp_path_factory.mktemp("bench") / "door.json"
-    code = cli.main(["bench", "door", "--trials", "1", "--seed", "3", "--quiet", "--json", str(path)])
+    code = cli.main(
+        ["bench", "door", "--trials", "1", "--seed", "3", "--quiet", "--json", str(path)]
+    )
     return code, json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_json)
 
 
@@ -359,8 +482,15 @@ def test_the_bench_table(bench: tuple[int, dict[str, Any]]) -> None:
     for task in {t["task"] for t in result["trials"]}:
         assert any(line.startswith(task) for line in text.splitlines())
     assert "peak memory" in text
-    sad = {**result["trials"][0], "success": False, "status": "rejected", "violations": ["goal base: elsewhere"]}
-    assert "start 0, reach: rejected; goal base: elsewhere" in door.table({**result, "trials": [sad]})
+    sad = {
+        **result["trials"][0],
+        "success": False,
+        "status": "rejected",
+        "violations": ["goal base: elsewhere"],
+    }
+    assert "start 0, reach: rejected; goal base: elsewhere" in door.table(
+        {**result, "trials": [sad]}
+    )
 
 
 @pytest.fixture
@@ -382,11 +512,27 @@ def experiment(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def test_bench_initialization(
-    experiment: dict[str, Any], door_plan: vkc.Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    experiment: dict[str, Any],
+    door_plan: vkc.Plan,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     experiment["plan"] = door_plan
     out = str(tmp_path / "out")
-    command = ["bench", "initialization", "--starts", "2", "--repeats", "3", "--seed", "4", "--jobs", "1", "--out", out]
+    command = [
+        "bench",
+        "initialization",
+        "--starts",
+        "2",
+        "--repeats",
+        "3",
+        "--seed",
+        "4",
+        "--jobs",
+        "1",
+        "--out",
+        out,
+    ]
     assert cli.main([*command, "--methods", "astar", "auto", "--quiet"]) == 0
     captured = capsys.readouterr()
     assert captured.err == ""
@@ -395,7 +541,10 @@ def test_bench_initialization(
     assert out in captured.out.splitlines()[-1]
     names = {"results.csv", "results.json", "success.png", "table.md", "trials.jsonl"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
-    given = {key: experiment[key] for key in ("starts", "repeats", "seed", "jobs", "out", "scenes", "methods", "progress")}
+    given = {
+        key: experiment[key]
+        for key in ("starts", "repeats", "seed", "jobs", "out", "scenes", "methods", "progress")
+    }
     assert given == {
         "starts": 2,
         "repeats": 3,
@@ -411,25 +560,46 @@ def test_bench_initialization(
     assert "methods ['astar', 'auto'], got" in said
 
 
-def test_ctrl_c_says_how_to_go_on(experiment: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_says_how_to_go_on(
+    experiment: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["bench", "initialization", "--out", "my results"]) == 130
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "2 of 6 trials are done and kept in out" in captured.err
     assert captured.err.splitlines()[-1] == "vkc-pin bench initialization --out 'my results'"
-    assert (experiment["starts"], experiment["repeats"], experiment["seed"], experiment["progress"]) == (50, 1, 0, True)
-    assert (experiment["scenes"], experiment["methods"]) == (initialization.SCENES, initialization.COMPARED_INITIALIZATIONS)
+    assert (
+        experiment["starts"],
+        experiment["repeats"],
+        experiment["seed"],
+        experiment["progress"],
+    ) == (50, 1, 0, True)
+    assert (experiment["scenes"], experiment["methods"]) == (
+        initialization.SCENES,
+        initialization.COMPARED_INITIALIZATIONS,
+    )
 
 
 def test_records_of_failures(door_plan: vkc.Plan) -> None:
     blame = vkc.Violation(
-        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+        "penetration",
+        "forearm_link – sofa",
+        waypoint=9,
+        time=4.0,
+        amount=0.03,
+        unit="m",
+        detail="overlap by 30 mm",
     )
     worse = dataclasses.replace(
-        door_plan, validation=vkc.Report((blame,)), status="rejected", metrics={**door_plan.metrics, "clearance": np.inf}
+        door_plan,
+        validation=vkc.Report((blame,)),
+        status="rejected",
     )
     trial = record.trial(worse, method="VKC", seed=0, task="whole")
-    assert (trial["success"], trial["failed_constraint"]) == (False, "penetration forearm_link – sofa")
+    assert (trial["success"], trial["failed_constraint"]) == (
+        False,
+        "penetration forearm_link – sofa",
+    )
     assert trial["violations"] == [str(blame)]
     assert trial["task"] == "whole"
     json.dumps(trial, allow_nan=False)

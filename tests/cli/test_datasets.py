@@ -24,7 +24,12 @@ def test_generate(recipe: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
     said = capsys.readouterr()
     assert f"2 episodes are in {out}" in said.out
     assert "2/2" in said.err
-    assert main(["generate", recipe, "--episodes", "2", "--out", str(out), "--variants", "2", "--quiet"]) == 2
+    assert (
+        main(
+            ["generate", recipe, "--episodes", "2", "--out", str(out), "--variants", "2", "--quiet"]
+        )
+        == 2
+    )
     assert "run otherwise" in capsys.readouterr().err
 
 
@@ -36,7 +41,9 @@ def test_generate(recipe: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
         (["--episodes", "2", "--jobs", "0"], "jobs: out of range"),
     ],
 )
-def test_misuse(recipe: str, tmp_path: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_misuse(
+    recipe: str, tmp_path: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["generate", recipe, *words, "--out", str(tmp_path / "out")]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -53,7 +60,17 @@ def test_a_name_that_nearly_is_one(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_hopeless(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "far.yaml"
-    text = yaml.safe_dump({**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}, "rooms": {"count": 1}})
+    text = yaml.safe_dump(
+        {
+            **SMALL,
+            "tasks": ["drive-open"],
+            "start": {"distance": [90.0, 91.0]},
+            "rooms": {"count": 1},
+        }
+    )
     file.write_text(text, encoding="utf-8")
-    assert main(["generate", str(file), "--episodes", "1", "--out", str(tmp_path / "out"), "--quiet"]) == 1
+    assert (
+        main(["generate", str(file), "--episodes", "1", "--out", str(tmp_path / "out"), "--quiet"])
+        == 1
+    )
     assert "0 episodes of 1" in capsys.readouterr().err

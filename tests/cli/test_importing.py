@@ -13,9 +13,25 @@ from vkc_pin.cli import commands
 from vkc_pin.cli.importing import EXIT_SICK
 
 
-def test_a_robot_is_imported_and_examined(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_robot_is_imported_and_examined(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file, folder = write_arms(tmp_path / "given", sides=("left_", "right_")), tmp_path / "mine"
-    assert commands.run(["import-robot", str(file), "--output", str(folder), "--arm", "left", "--samples", "100"]) == 0
+    assert (
+        commands.run(
+            [
+                "import-robot",
+                str(file),
+                "--output",
+                str(folder),
+                "--arm",
+                "left",
+                "--samples",
+                "100",
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr()
     assert "arm: left, 5 joints, 2 fingers" in said.out
     assert f"wrote {folder}" in said.out
@@ -29,18 +45,26 @@ def test_a_robot_is_imported_and_examined(tmp_path: Path, capsys: pytest.Capture
     assert "the margin is 600 mm" in capsys.readouterr().out
 
 
-def test_what_is_wrong_is_said_on_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_wrong_is_said_on_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = write_arms(tmp_path / "given")
     (tmp_path / "binary").write_bytes(b"<robot>\xff")
     for arguments, part in (
         (["import-robot", str(tmp_path / "none.urdf")], "cannot read the robot"),
         (["import-robot", str(file), "--output", str(tmp_path / "given")], "got other files"),
-        (["import-robot", str(file), "--output", str(tmp_path / "new"), "--package", "meshes"], "NAME=FOLDER"),
+        (
+            ["import-robot", str(file), "--output", str(tmp_path / "new"), "--package", "meshes"],
+            "NAME=FOLDER",
+        ),
         (
             ["import-home", str(tmp_path / "binary")],
             "cannot read the URDF or MJCF (expected a URDF or MJCF file in UTF-8, got",
         ),
-        (["check", "drawer", "--plot", str(tmp_path / "it.xyz")], "--plot: not the name of a picture (expected a name that ends"),
+        (
+            ["check", "drawer", "--plot", str(tmp_path / "it.xyz")],
+            "--plot: not the name of a picture (expected a name that ends",
+        ),
         (["doctor", "husky_ur5"], "did you mean 'husky_ur5e'?"),
     ):
         assert commands.run(arguments) == commands.EXIT_MISUSE
@@ -51,19 +75,34 @@ def test_what_is_wrong_is_said_on_one_line(tmp_path: Path, capsys: pytest.Captur
     assert not (tmp_path / "new").exists()
 
 
-def test_import_object_writes_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_import_object_writes_and_reports(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "box.sdf").write_text(SDF)
     box, folder = str(tmp_path / "box.sdf"), str(tmp_path / "out")
-    assert commands.run(["import-object", box, "--output", folder, "--height", "0.7", "--most", "1"]) == 0
+    assert (
+        commands.run(["import-object", box, "--output", folder, "--height", "0.7", "--most", "1"])
+        == 0
+    )
     said = capsys.readouterr().out
     assert "0.70 m" in said
     assert "door_bar (bar, called a handle)" in said
     assert said.count("wrote") == 2
     names = ["attachments.png", "box.urdf", "box.yaml"]
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [".vkc-pin.json", *names]
-    assert commands.run(["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out")]) == commands.EXIT_MISUSE
+    assert (
+        commands.run(
+            ["import-object", str(tmp_path / "box.sdf"), "--output", str(tmp_path / "out")]
+        )
+        == commands.EXIT_MISUSE
+    )
     assert "--force" in capsys.readouterr().err
-    assert commands.run(["import-object", box, "--output", folder, "--height", "0.8", "--most", "1", "--force"]) == 0
+    assert (
+        commands.run(
+            ["import-object", box, "--output", folder, "--height", "0.8", "--most", "1", "--force"]
+        )
+        == 0
+    )
     assert "0.80 m" in capsys.readouterr().out
 
 
@@ -76,7 +115,7 @@ def test_a_folder_here_comes_before_a_name(
     command = ["import-object", "box.sdf", "--robot", "panda", "--most", "1"]
     assert commands.run(command) == commands.EXIT_MISUSE
     said = capsys.readouterr().err
-    assert "panda.urdf: touch_links: the hand of 'panda' is not known" in said
+    assert "panda.urdf: touch_links: the hand of 'panda' is undefined" in said
     assert "import-robot" in said
     write_gripper(tmp_path / "panda")
     assert commands.run(command) == 0
@@ -85,13 +124,24 @@ def test_a_folder_here_comes_before_a_name(
     assert "panda_joint1" not in capsys.readouterr().out
 
 
-def test_import_home_writes_a_scene_and_reports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_import_home_writes_a_scene_and_reports(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(HOME_MJCF)
-    command = ["import-home", str(tmp_path / "small.xml"), "--output", str(tmp_path / "out"), "--most", "1", "--seed", "3"]
+    command = [
+        "import-home",
+        str(tmp_path / "small.xml"),
+        "--output",
+        str(tmp_path / "out"),
+        "--most",
+        "1",
+        "--seed",
+        "3",
+    ]
     assert commands.run(command) == 0
     said = capsys.readouterr().out
-    assert "5 obstacles, 1 with joints, 1 to carry" in said
+    assert "5 obstacles, 1 articulated objects, 1 free objects" in said
     assert said.endswith(f"wrote {tmp_path / 'out' / 'scene.yaml'}\n")
     assert commands.run(command) == commands.EXIT_MISUSE
     assert "--force" in capsys.readouterr().err

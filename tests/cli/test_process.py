@@ -18,14 +18,25 @@ import vkc_pin as vkc
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, "-m", "vkc_pin.cli"]
-UNFINISHED = ["plan", "drawer", "--set", "drawer.slide=0.3", "--time-limit", "0.001", "--initialization", "stationary"]
+UNFINISHED = [
+    "plan",
+    "drawer",
+    "--set",
+    "drawer.slide=0.3",
+    "--time-limit",
+    "0.001",
+    "--initialization",
+    "stationary",
+]
 INFEASIBLE = ["plan", "drawer", "--set", "drawer.slide=9"]
 SUCCESS = ["plan", "drawer", "--set", "drawer.slide=0.3"]
 
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    )
 
 
 @pytest.fixture
@@ -41,14 +52,24 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def shell(redirected: str, words: list[str], folder: Path, full: Path) -> subprocess.CompletedProcess[str]:
+def shell(
+    redirected: str, words: list[str], folder: Path, full: Path
+) -> subprocess.CompletedProcess[str]:
     """Run a command with outputs redirected as a shell does it; PIPE is one that nobody reads from any more."""
     reads, writes = os.pipe()
     os.close(reads)
     redirected = redirected.replace("PIPE", f"&{writes}").replace("FULL", str(full))
     command = ["bash", "-c", f'exec "$@" {redirected}', "bash", *COMMAND, *words]
     try:
-        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, pass_fds=[writes], check=False)
+        return subprocess.run(
+            command,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            pass_fds=[writes],
+            check=False,
+        )
     finally:
         os.close(writes)
 
@@ -72,13 +93,23 @@ def whole(folder: Path) -> set[str]:
 @pytest.mark.parametrize(
     ("redirected", "words", "code"),
     [
-        *((redirected, UNFINISHED, 1) for redirected in (">PIPE", ">&-", "2>&-", "2>PIPE", "2>FULL", ">PIPE 2>PIPE")),
+        *(
+            (redirected, UNFINISHED, 1)
+            for redirected in (">PIPE", ">&-", "2>&-", "2>PIPE", "2>FULL", ">PIPE 2>PIPE")
+        ),
         (">&- 2>&- <&-", INFEASIBLE, 3),
     ],
 )
-def test_closed_outputs_lose_nothing(redirected: str, words: list[str], code: int, tmp_path: Path, full: Path) -> None:
+def test_closed_outputs_lose_nothing(
+    redirected: str, words: list[str], code: int, tmp_path: Path, full: Path
+) -> None:
     """Nor is the next file that is opened taken for the output that is closed."""
-    done = shell(redirected, [*words, "--save", "plan.npz", "--json", "plan.json", "--html", "plan.html"], tmp_path, full)
+    done = shell(
+        redirected,
+        [*words, "--save", "plan.npz", "--json", "plan.json", "--html", "plan.html"],
+        tmp_path,
+        full,
+    )
     assert done.returncode == code, done
     assert "Traceback" not in done.stderr
     assert "cannot print" not in done.stderr
@@ -88,7 +119,9 @@ def test_closed_outputs_lose_nothing(redirected: str, words: list[str], code: in
 
 
 @pytest.mark.parametrize("redirected", ["", ">PIPE", ">&-", "2>FULL"])
-def test_progress_that_nobody_sees_is_no_failure(redirected: str, tmp_path: Path, full: Path) -> None:
+def test_progress_that_nobody_sees_is_no_failure(
+    redirected: str, tmp_path: Path, full: Path
+) -> None:
     done = shell(redirected, [*SUCCESS, "--save", "plan.npz"], tmp_path, full)
     assert done.returncode == 0, done
     assert vkc.Plan.load(tmp_path / "plan.npz").success
@@ -97,7 +130,9 @@ def test_progress_that_nobody_sees_is_no_failure(redirected: str, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("words", "code"), [(UNFINISHED, 1), (INFEASIBLE, 3), (["view", "drawer"], 2)], ids=["failed", "infeasible", "done"]
+    ("words", "code"),
+    [(UNFINISHED, 1), (INFEASIBLE, 3), (["view", "drawer"], 2)],
+    ids=["failed", "infeasible", "done"],
 )
 def test_a_full_disk_is_no_success(words: list[str], code: int, tmp_path: Path, full: Path) -> None:
     """The files are there all the same, and what was no success stays what it was."""
@@ -108,15 +143,21 @@ def test_a_full_disk_is_no_success(words: list[str], code: int, tmp_path: Path, 
     assert whole(tmp_path) == {"page.html"}
 
 
-@pytest.mark.parametrize(("redirected", "code"), [(">PIPE", 0), (">&-", 0), (">FULL", 2), ("2>FULL >FULL", 2)])
+@pytest.mark.parametrize(
+    ("redirected", "code"), [(">PIPE", 0), (">&-", 0), (">FULL", 2), ("2>FULL >FULL", 2)]
+)
 @pytest.mark.parametrize("word", ["--help", "--version"])
-def test_help_goes_the_same_way(redirected: str, code: int, word: str, tmp_path: Path, full: Path) -> None:
+def test_help_goes_the_same_way(
+    redirected: str, code: int, word: str, tmp_path: Path, full: Path
+) -> None:
     done = shell(redirected, [word], tmp_path, full)
     assert done.returncode == code, done
     assert "Traceback" not in done.stderr
 
 
-def test_letters_that_the_terminal_does_not_have(tmp_path: Path, full: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_letters_that_the_terminal_does_not_have(
+    tmp_path: Path, full: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
     done = shell("", UNFINISHED, tmp_path, full)
     assert done.returncode == 1, done
@@ -132,7 +173,9 @@ def started(words: list[str], folder: Path, *options: str) -> subprocess.Popen[s
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell may have made the tests ignore it
+        preexec_fn=lambda: signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        ),  # a shell may have made the tests ignore it
     )
 
 
@@ -164,19 +207,24 @@ OUTPUTS = ["--save", "plan.npz", "--json", "plan.json", "--html", "plan.html"]
         "argparse",
         "numpy",
         "pinocchio",
-        "vkc_pin.scene.scene",
+        "vkc_pin.world.scene.scene",
         "coal",
         "casadi",
         "vkc_pin.planning.plan",
-        "vkc_pin.solver.loop",
+        "vkc_pin.planning.solver.loop",
     ],
 )
 def test_ctrl_c_while_it_imports(module: str, tmp_path: Path) -> None:
-    process, said = started([*SUCCESS, *OUTPUTS], tmp_path, "-X", "importtime"), []  # it then tells what it imports
+    process, said = (
+        started([*SUCCESS, *OUTPUTS], tmp_path, "-X", "importtime"),
+        [],
+    )  # it then tells what it imports
     begun = False
     for line in lines(process, said):
         name = line.rpartition("|")[2].strip()
-        begun = begun or name == "vkc_pin"  # from here on it is in our hands, but for the few lines that take it there
+        begun = (
+            begun or name == "vkc_pin"
+        )  # from here on it is in our hands, but for the few lines that take it there
         if begun and (name == module or module == "_signal"):
             time.sleep(0.05 if module == "_signal" else 0.0)
             process.send_signal(signal.SIGINT)
@@ -222,7 +270,9 @@ def test_ctrl_c_while_it_writes(delay: float, tmp_path: Path) -> None:
 def test_ctrl_c_that_is_ignored_stays_so(tmp_path: Path) -> None:
     """As it is in the background of a script."""
     command = [*COMMAND, "view", "drawer", "--html", "page.html"]
-    process = subprocess.Popen(command, cwd=tmp_path, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))
+    process = subprocess.Popen(
+        command, cwd=tmp_path, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)
+    )
     while process.poll() is None:
         process.send_signal(signal.SIGINT)
         time.sleep(0.05)

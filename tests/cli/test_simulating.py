@@ -22,7 +22,9 @@ def test_a_saved_plan_is_executed(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert json.loads(data.read_text(encoding="utf-8"))["ok"] is True
 
 
-def test_another_scene_is_refused_before_anything_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_scene_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     plan, data = tmp_path / "plan.npz", tmp_path / "data.json"
     drawer_plan().save(plan)
     assert main(["simulate", str(plan), "--actual", "door", "--json", str(data)]) == 2
@@ -30,7 +32,9 @@ def test_another_scene_is_refused_before_anything_is_written(tmp_path: Path, cap
     assert not data.exists()
 
 
-def test_outputs_over_the_plan_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_outputs_over_the_plan_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     plan = tmp_path / "plan.npz"
     drawer_plan().save(plan)
     before = plan.read_bytes()

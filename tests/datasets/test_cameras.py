@@ -64,13 +64,23 @@ def test_lerobots_layout_has_the_colours(made: Dataset) -> None:
     table = pq.read_table(root / "data/chunk-000/file-000.parquet")
     for camera in ("head", "wrist"):
         name = f"observation.images.{camera}"
-        assert features[name] == {"dtype": "image", "shape": [32, 40, 3], "names": ["height", "width", "channels"]}
+        assert features[name] == {
+            "dtype": "image",
+            "shape": [32, 40, 3],
+            "names": ["height", "width", "channels"],
+        }
         own = [np.asarray(image.open(io.BytesIO(one["bytes"]))) for one in table[name].to_pylist()]
-        told = np.concatenate([episode.images().pictures[f"{camera}_image"] for episode in made.episodes()])  # type: ignore[union-attr]
+        told = np.concatenate(
+            [episode.images().pictures[f"{camera}_image"] for episode in made.episodes()]
+        )  # type: ignore[union-attr]
         np.testing.assert_array_equal(np.array(own), told)
         assert np.shape(stats[name]["mean"]) == (3, 1, 1)
-        np.testing.assert_allclose(np.ravel(stats[name]["mean"]), told.mean(axis=(0, 1, 2)) / 255.0, atol=1e-9)
-        np.testing.assert_allclose(np.ravel(stats[name]["std"]), told.std(axis=(0, 1, 2)) / 255.0, atol=1e-9)
+        np.testing.assert_allclose(
+            np.ravel(stats[name]["mean"]), told.mean(axis=(0, 1, 2)) / 255.0, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            np.ravel(stats[name]["std"]), told.std(axis=(0, 1, 2)) / 255.0, atol=1e-9
+        )
         assert stats[name]["count"] == [len(told)]
 
 
@@ -96,7 +106,9 @@ def test_wrong_cameras(cameras: Any, said: str) -> None:
         load_recipe({**SEEING, "cameras": cameras})
 
 
-def test_cameras_need_physics_frames_and_opengl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cameras_need_physics_frames_and_opengl(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(vkc.InputError, match="--simulate"):
         generate(SMALL, 1, tmp_path / "out", cameras=True)
     lost = [{**EYES[0], "frame": "hed_link"}]

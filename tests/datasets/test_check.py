@@ -53,16 +53,21 @@ def test_a_scene_in_which_something_is_in_the_way(copy: Path) -> None:
     """The check builds the scenes from the files: it does not believe what planning saw."""
     import json
 
-    from vkc_pin.datasets.episode import scene_name
+    from vkc_pin.datasets.episode import compute_scene_name
 
     episode = next(Dataset.open(copy).episodes())
     middle = episode.trajectory.at(episode.trajectory.times[-1] / 2.0)
     document = json.loads(json.dumps(episode.document))
-    box = {"name": "block", "type": "box", "size": [0.3, 0.3, 1.0], "position": [float(middle[0]), float(middle[1]), 0.5]}
+    box = {
+        "name": "block",
+        "type": "box",
+        "size": [0.3, 0.3, 1.0],
+        "position": [float(middle[0]), float(middle[1]), 0.5],
+    }
     document["obstacles"].append(box)
-    (copy / "scenes" / f"{scene_name(document)}.json").write_text(json.dumps(document))
+    (copy / "scenes" / f"{compute_scene_name(document)}.json").write_text(json.dumps(document))
     with h5py.File(shard(copy), "r+") as file:
-        file["data/demo_0"].attrs["scene"] = scene_name(document)
+        file["data/demo_0"].attrs["scene"] = compute_scene_name(document)
     found = check_dataset(copy)
     assert list(found.refused) == [episode.number]
     assert "block" in found.refused[episode.number]
@@ -74,7 +79,7 @@ def test_an_episode_that_is_there_twice(copy: Path) -> None:
         del file["data/demo_3"]
         file.copy("data/demo_1", "data/demo_3")
     found = check_dataset(copy)
-    assert f"episode {numbers[1]} is there 2 times" in found.problems
+    assert f"episode {numbers[1]} occurs 2 times" in found.problems
     assert any("episodes.csv" in problem for problem in found.problems)
 
 
@@ -82,13 +87,22 @@ def test_the_page_shows_what_there_is(copy: Path, tmp_path: Path) -> None:
     found = check_dataset(copy, page=tmp_path / "page.html", seed=3)
     assert found.page == tmp_path / "page.html"
     text = found.page.read_text(encoding="utf-8")
-    for words in ("4 episodes", "given-open", "husky_ur5e", "Coverage", "Which way round", "All of them are valid"):
+    for words in (
+        "4 episodes",
+        "given-open",
+        "husky_ur5e",
+        "Coverage",
+        "Which way round",
+        "All of them are valid",
+    ):
         assert words in text, words
     assert text.count("<figure>") == 4
     assert text.count("<svg") == 5
     assert "<script" not in text
     assert 'src="http' not in text
-    assert text == check_dataset(copy, page=tmp_path / "again.html", seed=3).page.read_text(encoding="utf-8")  # type: ignore[union-attr]
+    assert text == check_dataset(copy, page=tmp_path / "again.html", seed=3).page.read_text(
+        encoding="utf-8"
+    )  # type: ignore[union-attr]
 
 
 def test_other_processes_find_the_same(copy: Path) -> None:
@@ -97,7 +111,7 @@ def test_other_processes_find_the_same(copy: Path) -> None:
 
 
 def test_no_dataset(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no dataset"):
+    with pytest.raises(InputError, match="the folder holds no dataset"):
         check_dataset(tmp_path)
 
 

@@ -5,53 +5,85 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.datasets.diversity import NEAR, Seen, homotopy, spread, way
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.datasets.diversity import (
+    NEAR,
+    DuplicateFinder,
+    compute_coverage,
+    compute_winding_numbers,
+    sample_coarse_trajectory,
+)
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def along(*points: tuple[float, float]) -> Trajectory:
     positions = np.array([[x, y, 0.0] for x, y in points])
     last = len(points) - 1
-    return Trajectory(("x", "y", "yaw"), np.arange(len(points), dtype=float), positions, (PhaseSpan("go", 0, last),), 3)
+    return Trajectory(
+        ("x", "y", "yaw"),
+        np.arange(len(points), dtype=float),
+        positions,
+        (PhaseSpan("go", 0, last),),
+        3,
+    )
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    post = {"name": "post", "type": "cylinder", "radius": 0.1, "length": 1.0, "position": [0.0, 0.0, 0.5]}
+    post = {
+        "name": "post",
+        "type": "cylinder",
+        "radius": 0.1,
+        "length": 1.0,
+        "position": [0.0, 0.0, 0.5],
+    }
     lamp = {"name": "lamp", "type": "sphere", "radius": 0.1, "position": [0.0, 0.0, 2.2]}
-    document = {"robot": "husky_ur5e", "start": {"base": [2.0, -2.0, 0.0]}, "obstacles": [post, lamp]}
+    document = {
+        "robot": "husky_ur5e",
+        "start": {"base": [2.0, -2.0, 0.0]},
+        "obstacles": [post, lamp],
+    }
     return Scene.from_document(document, load_scene("door").folder)
 
 
 def test_which_way_round(scene: Scene) -> None:
     right, left = along((-2, -0.1), (0, -1), (2, -0.1)), along((-2, -0.1), (0, 1), (2, -0.1))
-    assert homotopy(scene, right) == {}  # as the straight line goes
-    assert homotopy(scene, left) == {"post": -1}  # clockwise round it
+    assert compute_winding_numbers(scene, right) == {}  # as the straight line goes
+    assert compute_winding_numbers(scene, left) == {"post": -1}  # clockwise round it
     round_it = along((-2, -0.1), (0, -1), (2, 0), (0, 1), (-2, 0), (0, -1), (2, -0.1))
-    assert homotopy(scene, round_it) == {"post": 1}
+    assert compute_winding_numbers(scene, round_it) == {"post": 1}
 
 
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(0.5, 3)), min_size=1, max_size=6))
-def test_paths_on_one_side_are_of_one_class(scene: Scene, points: list[tuple[float, float]]) -> None:
-    assert homotopy(scene, along((-2.0, 0.5), *points, (2.0, 0.5))) == {}
+def test_paths_on_one_side_are_of_one_class(
+    scene: Scene, points: list[tuple[float, float]]
+) -> None:
+    assert compute_winding_numbers(scene, along((-2.0, 0.5), *points, (2.0, 0.5))) == {}
 
 
 def record(number: int, motion: Trajectory, **changes: object) -> dict[str, object]:
-    return {"number": number, "scene": "s", "task": "t", "object": "o", "goal": 1.0, "way": way(motion), **changes}
+    return {
+        "number": number,
+        "scene": "s",
+        "task": "t",
+        "object": "o",
+        "goal": 1.0,
+        "way": sample_coarse_trajectory(motion),
+        **changes,
+    }
 
 
 def test_near_duplicates() -> None:
-    seen, straight = Seen(), along((0, 0), (1, 0), (2, 0))
-    assert seen.twin(record(3, straight)) is None
-    assert seen.twin(record(5, along((0, 0), (1, 0.9 * NEAR), (2, 0)))) == 3
-    assert seen.twin(record(6, along((0, 0), (1, 2.0 * NEAR), (2, 0)))) is None
-    assert seen.twin(record(7, straight, scene="another")) is None
-    assert seen.twin(record(8, straight, object="another")) is None
+    seen, straight = DuplicateFinder(), along((0, 0), (1, 0), (2, 0))
+    assert seen.find_duplicate(record(3, straight)) is None
+    assert seen.find_duplicate(record(5, along((0, 0), (1, 0.9 * NEAR), (2, 0)))) == 3
+    assert seen.find_duplicate(record(6, along((0, 0), (1, 2.0 * NEAR), (2, 0)))) is None
+    assert seen.find_duplicate(record(7, straight, scene="another")) is None
+    assert seen.find_duplicate(record(8, straight, object="another")) is None
 
 
 def test_spread() -> None:
-    assert spread([], 0.0, 1.0) == 0.0
-    assert spread([0.05, 0.06, 0.95, 1.0], 0.0, 1.0) == 0.2
-    assert spread(np.linspace(0, 1, 50).tolist(), 0.0, 1.0) == 1.0
+    assert compute_coverage([], 0.0, 1.0) == 0.0
+    assert compute_coverage([0.05, 0.06, 0.95, 1.0], 0.0, 1.0) == 0.2
+    assert compute_coverage(np.linspace(0, 1, 50).tolist(), 0.0, 1.0) == 1.0

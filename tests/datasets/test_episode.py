@@ -8,14 +8,14 @@ from helpers.datasets import SMALL
 from helpers.memory import growth
 
 from vkc_pin.datasets import episode as module
-from vkc_pin.datasets.episode import attempt, made_of, packed, scene_name, unpacked
+from vkc_pin.datasets.episode import compute_scene_name, make_episode, pack, run_attempt, unpack
 from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.planning import outcome
+from vkc_pin.planning import results
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import load_scene
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.scene.scene import load_scene
+from vkc_pin.world.task.steps import Actuate
 
 DOCUMENT = load_recipe(SMALL).document
 
@@ -23,8 +23,8 @@ DOCUMENT = load_recipe(SMALL).document
 def test_read_back_and_replayed() -> None:
     """All that was planned is there again, to 1e-9 at every moment."""
     found = plan(load_scene("drawer"), [Actuate("drawer", {"slide": 0.2})])
-    data, record = packed(7, {"robot": "husky_ur5e", "task": "drive-open"}, found)
-    again = unpacked(data)
+    data, record = pack(7, {"robot": "husky_ur5e", "task": "drive-open"}, found)
+    again = unpack(data)
     motion, was = again.trajectory, found.trajectory
     times = np.linspace(was.times[0], was.times[-1], 500)
     assert np.abs(motion.at(times) - was.at(times)).max() <= 1e-9
@@ -35,47 +35,55 @@ def test_read_back_and_replayed() -> None:
     report = again.validate()
     assert report.ok
     assert report.contradictions(again.claimed) == []
-    assert record["scene"] == scene_name(again.document)
+    assert record["scene"] == compute_scene_name(again.document)
     assert len(data) <= 40_000
 
 
 def test_attempts_are_determined_by_their_number() -> None:
-    record, data = attempt(DOCUMENT, 0, {})
-    again, same = attempt(DOCUMENT, 0, {})
+    record, data = run_attempt(DOCUMENT, 0, {})
+    again, same = run_attempt(DOCUMENT, 0, {})
     assert record["success"]
     assert data == same
-    times = {name for name in record if name.endswith("_time")} | {"seconds", "memory_mb", "resident_mb"}
-    assert {k: v for k, v in record.items() if k not in times} == {k: v for k, v in again.items() if k not in times}
+    times = {name for name in record if name.endswith("_time")} | {
+        "seconds",
+        "memory_mb",
+        "resident_mb",
+    }
+    assert {k: v for k, v in record.items() if k not in times} == {
+        k: v for k, v in again.items() if k not in times
+    }
     json.dumps(record)
 
 
 def test_attempts_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is kept of rooms and programs is kept once; ten thousand attempts of a process must not add up."""
-    monkeypatch.setattr(outcome, "Plan", Plan)  # the second opinion keeps plans; the same ones are judged in other tests
-    left, _ = growth(lambda: attempt(DOCUMENT, 0, {}), warm=8)
+    monkeypatch.setattr(
+        results, "Plan", Plan
+    )  # the second opinion keeps plans; the same ones are judged in other tests
+    left, _ = growth(lambda: run_attempt(DOCUMENT, 0, {}), warm=8)
     assert left <= 3500.0  # [bytes], where eigenpy's copies in one attempt take 5000
 
 
 def test_scenes_are_called_by_what_they_say() -> None:
-    found = unpacked(attempt(DOCUMENT, 0, {})[1])
+    found = unpack(run_attempt(DOCUMENT, 0, {})[1])
     assert "start" not in found.document
-    name = scene_name(found.document)
-    assert name == scene_name(json.loads(json.dumps(found.document)))
-    assert name != scene_name({**found.document, "floor": False})
+    name = compute_scene_name(found.document)
+    assert name == compute_scene_name(json.loads(json.dumps(found.document)))
+    assert name != compute_scene_name({**found.document, "floor": False})
 
 
 def test_an_exception_is_a_failure_on_record(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*args: object) -> None:
         raise ZeroDivisionError("nothing to divide by")
 
-    monkeypatch.setattr(module, "problem", broken)
-    record, data = attempt(DOCUMENT, 3, {})
+    monkeypatch.setattr(module, "sample_problem", broken)
+    record, data = run_attempt(DOCUMENT, 3, {})
     assert (record["success"], record["status"], data) == (False, "error", b"")
     assert record["reason"] == "ZeroDivisionError: nothing to divide by"
 
 
 def test_a_plan_that_fails_is_a_failure_with_its_reason() -> None:
-    record, data = attempt({**DOCUMENT, "effort": 1}, 0, {})
+    record, data = run_attempt({**DOCUMENT, "effort": 1}, 0, {})
     assert (record["success"], data) == (False, b"")
     assert record["status"] == "effort spent"
     assert record["reason"]
@@ -83,11 +91,11 @@ def test_a_plan_that_fails_is_a_failure_with_its_reason() -> None:
 
 def test_simulated_only_where_physics_agrees() -> None:
     pytest.importorskip("mujoco")
-    record, _ = attempt({**DOCUMENT, "simulate": True}, 0, {})
+    record, _ = run_attempt({**DOCUMENT, "simulate": True}, 0, {})
     assert record["simulated"]
     assert record["success"] == (record["status"] == "success")
 
 
 def test_something_is_missing() -> None:
     with pytest.raises(InputError, match="not an episode"):
-        made_of({"number": 1}, {})
+        make_episode({"number": 1}, {})

@@ -39,7 +39,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_the_first_numbers_that_succeed(made: Dataset) -> None:
     numbers = made.numbers()
-    lines = [json.loads(line) for line in (made.folder / "journal.jsonl").read_text().splitlines()[1:]]
+    lines = [
+        json.loads(line) for line in (made.folder / "journal.jsonl").read_text().splitlines()[1:]
+    ]
     tried = {line["key"]: line["records"][0]["success"] for line in lines if "session" not in line}
     good = sorted(int(key) for key, success in tried.items() if success)
     assert sorted(numbers) == good[:EPISODES]
@@ -87,7 +89,9 @@ def test_a_finished_one_is_left_as_it_is(made: Dataset, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("removed", ["work/*", "shards/*/*", "*/*"])
-def test_what_somebody_has_removed_is_made_again(made: Dataset, tmp_path: Path, removed: str) -> None:
+def test_what_somebody_has_removed_is_made_again(
+    made: Dataset, tmp_path: Path, removed: str
+) -> None:
     generate(SMALL, 3, tmp_path / "out")
     for file in (tmp_path / "out").glob(removed):
         shutil.rmtree(file) if file.is_dir() else file.unlink()
@@ -113,7 +117,9 @@ def test_a_stop_loses_and_doubles_nothing(made: Dataset, tmp_path: Path, kind: s
     assert contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == contents(made.folder)
 
 
-@pytest.mark.parametrize(("episodes", "field"), [(0, "episodes"), (-3, "episodes"), (1.5, "episodes")])
+@pytest.mark.parametrize(
+    ("episodes", "field"), [(0, "episodes"), (-3, "episodes"), (1.5, "episodes")]
+)
 def test_how_many(tmp_path: Path, episodes: Any, field: str) -> None:
     with pytest.raises(InputError) as caught:
         generate(SMALL, episodes, tmp_path / "out")
@@ -124,7 +130,7 @@ def test_how_many(tmp_path: Path, episodes: Any, field: str) -> None:
 def test_nothing_is_written_into_what_is_something_else(made: Dataset, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.tex").write_text("x")
-    with pytest.raises(InputError, match="something else in this folder"):
+    with pytest.raises(InputError, match="the folder holds other files"):
         generate(SMALL, 1, tmp_path / "mine")
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
     with pytest.raises(InputError, match="run otherwise") as caught:
@@ -136,47 +142,81 @@ def test_nothing_is_written_into_what_is_something_else(made: Dataset, tmp_path:
 
 
 def test_hopeless_recipes_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_LEAST", 4)
-    with pytest.raises(VkcError, match=r"4 attempts gave 0 episodes of 1.*no free start"):
-        generate({**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}, 1, tmp_path / "out")
+    monkeypatch.setattr(module, "_MIN_ATTEMPTS", 4)
+    with pytest.raises(VkcError, match=r"4 attempts gave 0 of 1 episodes.*no free start"):
+        generate(
+            {**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}},
+            1,
+            tmp_path / "out",
+        )
     rows = (tmp_path / "out/journal.jsonl").read_text()
     assert rows.count("no problem") == 4
 
 
-def record(number: int, *, success: bool = True, robot: str = "a", at: float = 0.0) -> dict[str, Any]:
-    about = {"robot": robot, "scene": "s", "task": "t", "object": "o", "goal": 0.0, "way": [[at, 0.0], [at, 1.0]]}
-    return {"number": number, "success": success, "status": "success" if success else "x", "reason": "", **about}
+def record(
+    number: int, *, success: bool = True, robot: str = "a", at: float = 0.0
+) -> dict[str, Any]:
+    about = {
+        "robot": robot,
+        "scene": "s",
+        "task": "t",
+        "object": "o",
+        "goal": 0.0,
+        "way": [[at, 0.0], [at, 1.0]],
+    }
+    return {
+        "number": number,
+        "success": success,
+        "status": "success" if success else "x",
+        "reason": "",
+        **about,
+    }
 
 
 def test_what_is_accepted_does_not_depend_on_the_order(tmp_path: Path) -> None:
-    records = [record(k, success=k % 3 != 1, at=float(k // 4)) for k in range(12)]  # every fourth place is new
+    records = [
+        record(k, success=k % 3 != 1, at=float(k // 4)) for k in range(12)
+    ]  # every fourth place is new
     found = []
     for order in (range(12), reversed(range(12)), (5, 0, 11, 3, 1, 2, 9, 10, 4, 8, 7, 6)):
         register = Register(Dataset(tmp_path, load_recipe(SMALL)), 3)
         for k in order:
             register.add(records[k])
         found.append(
-            ([one["number"] for one in register.accepted], [(one["number"], one["status"]) for one in register.failures])
+            (
+                [one["number"] for one in register.accepted],
+                [(one["number"], one["status"]) for one in register.failures],
+            )
         )
     assert found[0] == found[1] == found[2]
     assert found[0][0] == [0, 5, 8]
     assert (2, "duplicate") in found[0][1]
     assert (1, "x") in found[0][1]
-    assert not any("way" in one for one in (*register.accepted, *register.failures)), "most of a record is for nothing then"
+    assert not any("way" in one for one in (*register.accepted, *register.failures)), (
+        "most of a record is for nothing then"
+    )
 
 
-def test_full_shards_are_written_once_and_their_work_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: Dataset) -> None:
+def test_full_shards_are_written_once_and_their_work_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: Dataset
+) -> None:
     monkeypatch.setattr(datasets, "EPISODES_A_SHARD", 2)
     out = generate(SMALL, EPISODES, tmp_path / "out")
-    assert [shard.name for shard in out.shards] == ["shard-00000.hdf5", "shard-00001.hdf5", "shard-00002.hdf5"]
+    assert [shard.name for shard in out.shards] == [
+        "shard-00000.hdf5",
+        "shard-00001.hdf5",
+        "shard-00002.hdf5",
+    ]
     assert sorted(out.numbers()) == sorted(made.numbers())
     left = {int(file.stem) for file in (out.folder / "work").glob("*.hdf5")}
     assert not left & set(out.numbers()[:4])
     assert set(out.numbers()[4:]) <= left
 
 
-def test_a_block_that_takes_its_process_with_it_is_tried_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vkc_pin.running.engine import Died
+def test_a_block_that_takes_its_process_with_it_is_tried_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vkc_pin.utils.parallel.engine import Died
 
     asked: list[Sequence[int]] = []
 

@@ -4,13 +4,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.datasets.grasping import grasped
+from vkc_pin.datasets.grasping import find_grasping_start
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner, plan
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate
 
-STEPS = {"drawer": Actuate("drawer", {"slide": 0.2}, "handle"), "door": Actuate("door", {"hinge": 0.6}, "handle")}
+STEPS = {
+    "drawer": Actuate("drawer", {"slide": 0.2}, "handle"),
+    "door": Actuate("door", {"hinge": 0.6}, "handle"),
+}
 
 
 def off(scene: Scene, name: str) -> float:
@@ -29,7 +32,7 @@ def test_the_hand_is_where_it_holds(name: str) -> None:
     rng, planner = np.random.default_rng(0), Planner()
     bases = []
     for _ in range(4):
-        found = grasped(scene, step, rng, Options(), planner)
+        found = find_grasping_start(scene, step, rng, Options(), planner)
         assert found is not None
         assert off(found, name) < 1e-5
         assert found.held == {name: step.attachment}
@@ -41,10 +44,17 @@ def test_the_hand_is_where_it_holds(name: str) -> None:
 def test_none_where_there_is_none() -> None:
     scene = load_scene("drawer")
     document = scene.document
-    attachment, placed = next(iter(scene.objects["drawer"].object.attachments)), scene.objects["drawer"]
+    attachment, placed = (
+        next(iter(scene.objects["drawer"].object.attachments)),
+        scene.objects["drawer"],
+    )
     at = placed.link_placement(placed.object.attachments[attachment].link).translation.tolist()
-    document["obstacles"].append({"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": at})
-    with pytest.warns(UserWarning, match="stand in others"):
+    document["obstacles"].append(
+        {"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": at}
+    )
+    with pytest.warns(UserWarning, match="overlap other shapes"):
         blocked = Scene.from_document(document, scene.folder)
     step = Actuate("drawer", {"slide": 0.2}, attachment)
-    assert grasped(blocked, step, np.random.default_rng(0), Options(), Planner()) is None
+    assert (
+        find_grasping_start(blocked, step, np.random.default_rng(0), Options(), Planner()) is None
+    )

@@ -16,7 +16,7 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.formats.hdf5 import write_shard
 from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipes.recipe import RobotEntry, load_recipe
-from vkc_pin.datasets.robots import ready_robots
+from vkc_pin.datasets.robots import prepare_robots
 from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")
@@ -138,7 +138,7 @@ def test_a_robot_of_a_recipe_that_gives_no_name(tmp_path: Path) -> None:
     recipe = load_recipe(SMALL)
     fields = recipe.fields.model_copy(update={"robots": (RobotEntry(name=f"{tmp_path}/a/.."),)})
     with pytest.raises(InputError, match="robots: not a plain file name"):
-        ready_robots(dataclasses.replace(recipe, fields=fields), tmp_path / "out" / "robots")
+        prepare_robots(dataclasses.replace(recipe, fields=fields), tmp_path / "out" / "robots")
     assert not list(tmp_path.iterdir())
 
 

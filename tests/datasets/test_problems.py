@@ -6,21 +6,26 @@ import numpy as np
 import pytest
 from helpers.datasets import SMALL
 
-from vkc_pin.datasets.problems import NoProblemError, problem
-from vkc_pin.datasets.recipes.recipe import load_recipe, robot_name
+from vkc_pin.datasets.problems import NoProblemError, sample_problem
+from vkc_pin.datasets.recipes.recipe import get_robot_name, load_recipe
 from vkc_pin.planning.planner import Planner
-from vkc_pin.scene.scene import START_CLEARANCE
-from vkc_pin.task.steps import Actuate, Grasp, Place, step_to_dict
+from vkc_pin.world.scene.scene import START_CLEARANCE
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, step_to_dict
 
 PLANNER = Planner()
 
 
 def drawn(number: int, **changes: Any) -> Any:
-    return problem(load_recipe({**SMALL, **changes}), number, {}, PLANNER)
+    return sample_problem(load_recipe({**SMALL, **changes}), number, {}, PLANNER)
 
 
 def said(found: Any) -> Any:
-    return found.scene.document, [step_to_dict(step) for step in found.steps], found.about, found.seed
+    return (
+        found.scene.document,
+        [step_to_dict(step) for step in found.steps],
+        found.about,
+        found.seed,
+    )
 
 
 @pytest.mark.parametrize("task", ["given-open", "drive-open", "fetch-place"])
@@ -52,7 +57,9 @@ def test_variants_share_all_but_the_seed() -> None:
 
 def test_what_is_opened() -> None:
     for number in range(6):
-        found = drawn(number, tasks=["drive-open"], goal={"share": [0.2, 0.3]}, start={"distance": [1.0, 4.0]})
+        found = drawn(
+            number, tasks=["drive-open"], goal={"share": [0.2, 0.3]}, start={"distance": [1.0, 4.0]}
+        )
         (step,) = found.steps
         assert isinstance(step, Actuate)
         placed = found.scene.objects[step.object]
@@ -60,7 +67,9 @@ def test_what_is_opened() -> None:
         k = placed.object.coordinates.index(joint)
         share = abs(goal - placed.state[k]) / (placed.object.upper[k] - placed.object.lower[k])
         assert 0.199 <= share <= 0.301
-        assert 1.0 <= np.linalg.norm(found.scene.start[:2] - placed.placement.translation[:2]) <= 4.0
+        assert (
+            1.0 <= np.linalg.norm(found.scene.start[:2] - placed.placement.translation[:2]) <= 4.0
+        )
         assert found.scene.start_clearance() >= START_CLEARANCE
         assert found.scene.held == {}
 
@@ -70,11 +79,16 @@ def test_what_is_fetched_is_put_on_another_table() -> None:
     grasp, place = found.steps
     assert isinstance(grasp, Grasp)
     assert isinstance(place, Place)
-    tops = {name: shape for shape, name in zip(found.scene.obstacles, found.scene.obstacle_labels, strict=True)}
+    tops = {
+        name: shape
+        for shape, name in zip(found.scene.obstacles, found.scene.obstacle_labels, strict=True)
+    }
     top = tops["table_2_top"]
     local = top.placement.actInv(np.array(found.about["goal"]))
     assert (np.abs(local[:2]) <= np.asarray(top.geometry.halfSide)[:2]).all()
-    assert local[2] == pytest.approx(top.geometry.halfSide[2] + 0.035 + 0.001, abs=2e-3)  # the ball's radius above it
+    assert local[2] == pytest.approx(
+        top.geometry.halfSide[2] + 0.035 + 0.001, abs=2e-3
+    )  # the ball's radius above it
 
 
 def test_scene_files() -> None:
@@ -88,11 +102,22 @@ def test_nothing_is_left() -> None:
         drawn(0, tasks=["drive-open"], start={"distance": [50.0, 60.0]})
     crowded = {"objects": 3, "width": [4.0, 4.0], "front": 3.0, "clutter": [1.0, 1.0]}
     with pytest.raises(NoProblemError, match="room 0 for husky_ur5e"):
-        drawn(0, tasks=["fetch-place"], objects=["random_door", "random_oven", "random_chest"], rooms=crowded)
+        drawn(
+            0,
+            tasks=["fetch-place"],
+            objects=["random_door", "random_oven", "random_chest"],
+            rooms=crowded,
+        )
 
 
 @pytest.mark.parametrize(
-    ("name", "called"), [("panda", "panda"), ("/a/b/panda/robot.yaml", "panda"), ("/a/arm.urdf", "arm"), ("/a/panda", "panda")]
+    ("name", "called"),
+    [
+        ("panda", "panda"),
+        ("/a/b/panda/robot.yaml", "panda"),
+        ("/a/arm.urdf", "arm"),
+        ("/a/panda", "panda"),
+    ],
 )
 def test_what_robots_are_called(name: str, called: str) -> None:
-    assert robot_name(name) == called
+    assert get_robot_name(name) == called

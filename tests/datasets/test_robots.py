@@ -11,17 +11,19 @@ from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.models.robot_file import find_robot, load_robot
+from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 
-def test_a_robot_without_a_hand_is_imported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_without_a_hand_is_imported_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("coacd")
     recipe = load_recipe({**SMALL, "robots": ["husky_ur5e", {"name": "panda", "height": 0.5}]})
-    found = robots.ready_robots(recipe, tmp_path)
+    found = robots.prepare_robots(recipe, tmp_path)
     assert list(found) == ["panda"]  # the other one says what its hand is
     assert load_robot(found["panda"]).touch_links
     monkeypatch.setattr(robots, "import_robot", None)
-    assert robots.ready_robots(recipe, tmp_path) == found
+    assert robots.prepare_robots(recipe, tmp_path) == found
 
 
 @pytest.mark.parametrize("given", ["robot.yaml", "husky_ur5e.urdf"])
@@ -44,4 +46,11 @@ def test_two_robots_of_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="two robots of one name") as caught:
         load_recipe({**SMALL, "robots": paths})
     assert caught.value.field == "robots[1]"
-    assert len(load_recipe({**SMALL, "robots": [{"name": paths[0], "height": z} for z in (0.1, 0.2)]}).fields.robots) == 2
+    assert (
+        len(
+            load_recipe(
+                {**SMALL, "robots": [{"name": paths[0], "height": z} for z in (0.1, 0.2)]}
+            ).fields.robots
+        )
+        == 2
+    )

@@ -13,7 +13,7 @@ from pathlib import Path
 from tests.oracle.judge import Verdict, judge
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.episode import Episode
-from vkc_pin.datasets.formats.hdf5 import episodes_of
+from vkc_pin.datasets.formats.hdf5 import read_episodes
 from vkc_pin.planning.plan import Plan
 
 __all__ = ["judged_dataset", "saved"]
@@ -27,7 +27,10 @@ def judged_dataset(folder: Path, *, jobs: int = 1) -> list[Verdict]:
     dataset = Dataset.open(folder)
     kept = _kept(folder / VERDICTS)
     left = [shard for shard in dataset.shards if _name(dataset, shard) not in kept]
-    with ProcessPoolExecutor(jobs) as pool, (folder / VERDICTS).open("a", encoding="utf-8") as lines:
+    with (
+        ProcessPoolExecutor(jobs) as pool,
+        (folder / VERDICTS).open("a", encoding="utf-8") as lines,
+    ):
         for shard, verdicts in zip(left, pool.map(_shard, [folder] * len(left), left), strict=True):
             name = _name(dataset, shard)
             kept[name] = verdicts
@@ -48,7 +51,6 @@ def saved(episode: Episode, path: Path) -> Path:
             trajectory=episode.trajectory,
             validation=episode.claimed,
             status="success",
-            metrics={},
             terms=episode.terms,
         )
         return plan.save(path)
@@ -60,7 +62,7 @@ def _shard(folder: Path, shard: Path) -> list[Verdict]:
 
 def _verdicts(folder: Path, shard: Path) -> Iterator[Verdict]:
     with tempfile.TemporaryDirectory() as work:
-        for episode in episodes_of(shard, folder / "scenes"):
+        for episode in read_episodes(shard, folder / "scenes"):
             verdict = judge(saved(episode, Path(work) / f"{episode.number:06d}.npz"))
             verdict.path.unlink()
             yield replace(verdict, path=Path(shard.parent.name) / verdict.path.name)
@@ -74,4 +76,9 @@ def _kept(file: Path) -> dict[str, list[Verdict]]:
     if not file.is_file():
         return {}
     said = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    return {one["shard"]: [Verdict(**{**verdict, "path": Path(verdict["path"])}) for verdict in one["verdicts"]] for one in said}
+    return {
+        one["shard"]: [
+            Verdict(**{**verdict, "path": Path(verdict["path"])}) for verdict in one["verdicts"]
+        ]
+        for one in said
+    }

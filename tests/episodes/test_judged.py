@@ -38,5 +38,12 @@ def test_a_motion_that_was_changed_is_refused(made: Dataset, tmp_path: Path) -> 
         positions[len(positions) // 2, 4] += 0.4
     good, changed = judged_dataset(tmp_path / "copy")
     assert not good.found
-    assert {one.rule for one in changed.found} & {"velocity", "acceleration", "closure", "collision", "apart", "penetration"}
+    assert {one.rule for one in changed.found} & {
+        "velocity",
+        "acceleration",
+        "closure",
+        "collision",
+        "apart",
+        "penetration",
+    }
     assert main([str(tmp_path / "copy")]) == 1

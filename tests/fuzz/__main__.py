@@ -20,9 +20,17 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=1000, help="how many, of all kinds together")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kind", choices=KINDS, help="this kind alone")
-    parser.add_argument("--first", type=int, default=0, help="the number of the first case of each kind")
-    parser.add_argument("--keep", action="store_true", help="write what goes wrong into the corpus, a file for each error")
-    parser.add_argument("--show", type=int, metavar="NUMBER", help="print one case of --kind, and what comes of it")
+    parser.add_argument(
+        "--first", type=int, default=0, help="the number of the first case of each kind"
+    )
+    parser.add_argument(
+        "--keep",
+        action="store_true",
+        help="write what goes wrong into the corpus, a file for each error",
+    )
+    parser.add_argument(
+        "--show", type=int, metavar="NUMBER", help="print one case of --kind, and what comes of it"
+    )
     given = parser.parse_args()
     worker, rows, seen, bad = Worker(), [], Counter[str](), 0
     if given.show is not None:
@@ -46,14 +54,18 @@ def main() -> int:
             key = f"{kind} {found['outcome']} {found['error'].partition(': ')[0] if found['outcome'] == 'raw' else ''}"
             seen[key] += 1
             if seen[key] == 1:
-                sys.stdout.write(f"{kind} {given.seed} {number}: {found['outcome']}, {found['error']}\n")
+                sys.stdout.write(
+                    f"{kind} {given.seed} {number}: {found['outcome']}, {found['error']}\n"
+                )
                 sys.stdout.flush()
                 if given.keep:
                     keep(kind, worker.run(**asked, only="make")["case"], found)
         rows.append((kind, count, outcomes, longest, largest))
     good = sorted({name for _, _, outcomes, _, _ in rows for name in outcomes} - set(BAD))
     columns = [*good, *BAD]
-    sys.stdout.write(" ".join(f"{name:>9}" for name in ("kind", "cases", *columns, "seconds", "MB")) + "\n")
+    sys.stdout.write(
+        " ".join(f"{name:>9}" for name in ("kind", "cases", *columns, "seconds", "MB")) + "\n"
+    )
     for kind, count, outcomes, longest, largest in rows:
         cells = [f"{outcomes[name]:9d}" for name in columns]
         sys.stdout.write(f"{kind:>9} {count:9d} {' '.join(cells)} {longest:9.1f} {largest:9.0f}\n")
@@ -66,7 +78,9 @@ def main() -> int:
 def keep(kind: str, case: dict[str, object], found: dict[str, str]) -> None:
     """Write a case into the corpus."""
     CORPUS.mkdir(exist_ok=True)
-    text = json.dumps({"kind": kind, "was": f"{found['outcome']}: {found['error']}", "case": case}, indent=1)
+    text = json.dumps(
+        {"kind": kind, "was": f"{found['outcome']}: {found['error']}", "case": case}, indent=1
+    )
     name = hashlib.sha256(json.dumps(case).encode()).hexdigest()[:10]
     (CORPUS / f"{kind}_{name}.json").write_text(text + "\n", encoding="ascii")
 

@@ -16,15 +16,28 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.cpin import center_of_mass, frame_jacobian, frame_placements, joint_placements, rnea
-from vkc_pin.plotting import plot_clearance, plot_joints, plot_top_view
+from vkc_pin.planning.kinematics import (
+    center_of_mass,
+    frame_jacobian,
+    frame_placements,
+    joint_placements,
+    rnea,
+)
 from vkc_pin.visualization import to_html
+from vkc_pin.visualization.plots import plot_clearance, plot_joints, plot_top_view
 
 from . import odd
 
 __all__ = ["CALLS", "case", "run"]
 
-TINY = {"max_outer": 1, "max_iterations": 3, "reach_waypoints": 4, "move_waypoints": 4, "turn_waypoints": 2, "max_restarts": 1}
+TINY = {
+    "max_outer": 1,
+    "max_iterations": 3,
+    "reach_waypoints": 4,
+    "move_waypoints": 4,
+    "turn_waypoints": 2,
+    "max_restarts": 1,
+}
 
 
 @dataclass(frozen=True)
@@ -55,7 +68,10 @@ def motion() -> vkc.Trajectory:
     names = (*scene().robot.coordinates.names, "drawer.slide")
     end = start + 0.1
     positions = np.linspace(start, end, 5)
-    phases = (vkc.PhaseSpan("reach", 0, 2), vkc.PhaseSpan("move", 2, 4, (vkc.Hold("drawer", "handle"),)))
+    phases = (
+        vkc.PhaseSpan("reach", 0, 2),
+        vkc.PhaseSpan("move", 2, 4, (vkc.Hold("drawer", "handle"),)),
+    )
     return vkc.Trajectory(names, np.arange(5.0), positions, phases, len(start) - 1)
 
 
@@ -63,7 +79,13 @@ def motion() -> vkc.Trajectory:
 def saved() -> vkc.Plan:
     """What planning with next to no time comes to."""
     options = vkc.Options(**TINY)
-    return vkc.plan(scene(), [vkc.GoTo(0.1, 0.1)], options=options, time_limit=0.5, initialization="interpolated")
+    return vkc.plan(
+        scene(),
+        [vkc.GoTo(0.1, 0.1)],
+        options=options,
+        time_limit=0.5,
+        initialization="interpolated",
+    )
 
 
 @functools.cache
@@ -77,7 +99,10 @@ def folder() -> Path:
 @functools.cache
 def files() -> dict[str, Path]:
     """The motion in all the kinds of files that can be read."""
-    made = {"csv": motion().to_csv(folder() / "motion.csv"), "json": motion().to_json(folder() / "motion.json")}
+    made = {
+        "csv": motion().to_csv(folder() / "motion.csv"),
+        "json": motion().to_json(folder() / "motion.json"),
+    }
     return {**made, "npz": saved().save(folder() / "plan.npz")}
 
 
@@ -86,7 +111,13 @@ def _steps() -> list[Any]:
 
 
 def _planning() -> dict[str, Any]:
-    return {"scene": scene(), "steps": _steps(), "options": vkc.Options(**TINY), "time_limit": 0.2, "initialization": "auto"}
+    return {
+        "scene": scene(),
+        "steps": _steps(),
+        "options": vkc.Options(**TINY),
+        "time_limit": 0.2,
+        "initialization": "auto",
+    }
 
 
 def _written(does: Callable[..., Any]) -> Callable[..., Any]:
@@ -142,20 +173,38 @@ CALLS: dict[str, Call] = {
         2.0,
     ),
     "load_object": Call(vkc.load_object, lambda: {"name_or_path": "drawer"}),
-    "Scene.from_document": Call(vkc.Scene.from_document, lambda: {"document": scene().document, "folder": scene().folder}, 0.5),
+    "Scene.from_document": Call(
+        vkc.Scene.from_document,
+        lambda: {"document": scene().document, "folder": scene().folder},
+        0.5,
+    ),
     "Scene.with_start": Call(
-        _method(scene, "with_start"), lambda: {"base": scene().start[:3].tolist(), "arm": scene().start[3:].tolist()}
+        _method(scene, "with_start"),
+        lambda: {"base": scene().start[:3].tolist(), "arm": scene().start[3:].tolist()},
     ),
-    "Scene.with_state": Call(_method(scene, "with_state"), lambda: {"name": "drawer", "values": {"slide": 0.1}}),
+    "Scene.with_state": Call(
+        _method(scene, "with_state"), lambda: {"name": "drawer", "values": {"slide": 0.1}}
+    ),
     "Scene.with_placement": Call(
-        _method(fetch, "with_placement"), lambda: {"name": next(iter(fetch().objects)), "placement": pin.SE3.Identity()}
+        _method(fetch, "with_placement"),
+        lambda: {"name": next(iter(fetch().objects)), "placement": pin.SE3.Identity()},
     ),
-    "Scene.with_held": Call(_method(scene, "with_held"), lambda: {"held": {"drawer": "handle"}, "by": {}, "at": {}}),
-    "Scene.with_held holds": Call(_method(scene, "with_held"), lambda: {"held": [vkc.Hold("drawer", "handle")]}),
+    "Scene.with_held": Call(
+        _method(scene, "with_held"), lambda: {"held": {"drawer": "handle"}, "by": {}, "at": {}}
+    ),
+    "Scene.with_held holds": Call(
+        _method(scene, "with_held"), lambda: {"held": [vkc.Hold("drawer", "handle")]}
+    ),
     "Scene.start_clearance": Call(_method(scene, "start_clearance"), lambda: {"reach": 0.1}),
-    "Scene.sample_start": Call(_method(scene, "sample_start"), lambda: {"rng": np.random.default_rng(0)}),
-    "PlacedObject.with_state": Call(_method(lambda: scene().objects["drawer"], "with_state"), lambda: {"values": {"slide": 0.1}}),
-    "PlacedObject.link_placement": Call(_method(lambda: scene().objects["drawer"], "link_placement"), lambda: {"link": "tray"}),
+    "Scene.sample_start": Call(
+        _method(scene, "sample_start"), lambda: {"rng": np.random.default_rng(0)}
+    ),
+    "PlacedObject.with_state": Call(
+        _method(lambda: scene().objects["drawer"], "with_state"), lambda: {"values": {"slide": 0.1}}
+    ),
+    "PlacedObject.link_placement": Call(
+        _method(lambda: scene().objects["drawer"], "link_placement"), lambda: {"link": "tray"}
+    ),
     "ArticulatedObject.attachment": Call(
         _method(lambda: scene().objects["drawer"].object, "attachment"), lambda: {"name": "handle"}
     ),
@@ -163,26 +212,52 @@ CALLS: dict[str, Call] = {
         _method(lambda: scene().objects["drawer"].object, "link_frame"), lambda: {"link": "tray"}
     ),
     "ArticulatedObject.link_placement": Call(
-        _method(lambda: scene().objects["drawer"].object, "link_placement"), lambda: {"link": "tray", "state": [0.1]}
+        _method(lambda: scene().objects["drawer"].object, "link_placement"),
+        lambda: {"link": "tray", "state": [0.1]},
     ),
-    "Attachment.motion": Call(_method(lambda: scene().objects["drawer"].object.attachment(), "motion"), lambda: {"values": []}),
-    "Attachment.tool": Call(_method(lambda: scene().objects["drawer"].object.attachment(), "tool"), lambda: {"values": []}),
-    "Freedom.motion": Call(vkc.Freedom("", "revolute", np.array([0.0, 0.0, 1.0]), -1.0, 1.0).motion, lambda: {"value": 0.5}),
+    "Attachment.motion": Call(
+        _method(lambda: scene().objects["drawer"].object.attachment(), "motion"),
+        lambda: {"values": []},
+    ),
+    "Attachment.tool": Call(
+        _method(lambda: scene().objects["drawer"].object.attachment(), "tool"),
+        lambda: {"values": []},
+    ),
+    "Freedom.motion": Call(
+        vkc.Freedom("", "revolute", np.array([0.0, 0.0, 1.0]), -1.0, 1.0).motion,
+        lambda: {"value": 0.5},
+    ),
     "Robot.link_of": Call(_method(lambda: scene().robot, "link_of"), lambda: {"geometry": 0}),
-    "Coordinates.q": Call(_method(lambda: scene().robot.coordinates, "q"), lambda: {"z": scene().start}),
-    "Coordinates.index": Call(_method(lambda: scene().robot.coordinates, "index"), lambda: {"name": "base_x"}),
+    "Coordinates.q": Call(
+        _method(lambda: scene().robot.coordinates, "q"), lambda: {"z": scene().start}
+    ),
+    "Coordinates.index": Call(
+        _method(lambda: scene().robot.coordinates, "index"), lambda: {"name": "base_x"}
+    ),
     "random_room": Call(
-        vkc.random_room, lambda: {"number": 0, "settings": None, "clutter": 0.0, "tables": 0, "objects": ()}, 0.3
+        vkc.random_room,
+        lambda: {"number": 0, "settings": None, "clutter": 0.0, "tables": 0, "objects": ()},
+        0.3,
     ),
     "random_task": Call(
-        vkc.random_task, lambda: {"seed": 0, "settings": None, "clutter": 0.0, "tables": 0, "objects": ("random_oven",)}, 0.3
+        vkc.random_task,
+        lambda: {
+            "seed": 0,
+            "settings": None,
+            "clutter": 0.0,
+            "tables": 0,
+            "objects": ("random_oven",),
+        },
+        0.3,
     ),
     "random_object": Call(vkc.random_object, lambda: {"kind": "oven", "seed": 0}),
     "write_object": Call(
         _written(lambda path, **k: vkc.write_object(path=path, **k)),
         lambda: {"path": "oven.yaml", "description": vkc.random_object("oven")},
     ),
-    "load_object described": Call(vkc.load_object, lambda: {"name_or_path": vkc.random_object("door"), "folder": "."}),
+    "load_object described": Call(
+        vkc.load_object, lambda: {"name_or_path": vkc.random_object("door"), "folder": "."}
+    ),
     "goals": Call(vkc.goals, lambda: {"scene": scene(), "share": 0.5}),
     "RoomSettings": Call(
         vkc.RoomSettings,
@@ -199,7 +274,11 @@ CALLS: dict[str, Call] = {
         },
         2.0,
     ),
-    "Options": Call(vkc.Options, lambda: {name: getattr(vkc.Options(), name) for name in vkc.Options.__dataclass_fields__}, 2.0),
+    "Options": Call(
+        vkc.Options,
+        lambda: {name: getattr(vkc.Options(), name) for name in vkc.Options.__dataclass_fields__},
+        2.0,
+    ),
     "Options.paper": Call(vkc.Options.paper, lambda: {"dt": 0.5, "effort": "squares"}),
     "Reach": Call(_planned(vkc.Reach), lambda: {"pose": list(_POSE), "frame": None}),
     "Grasp": Call(_planned(vkc.Grasp), lambda: {"object": "ball", "attachment": None, "by": None}),
@@ -208,9 +287,13 @@ CALLS: dict[str, Call] = {
         lambda: {"object": "drawer", "joints": {"slide": 0.2}, "attachment": "handle"},
     ),
     "Touch": Call(_planned(vkc.Touch), lambda: {"frame": "tool0", "target": [1.0, 0.2, 0.8]}),
-    "Place": Call(_planned(vkc.Place), lambda: {"object": "ball", "pose": [1.0, 0.2, 0.8], "attachment": None}),
+    "Place": Call(
+        _planned(vkc.Place), lambda: {"object": "ball", "pose": [1.0, 0.2, 0.8], "attachment": None}
+    ),
     "Release": Call(
-        lambda **k: vkc.build(scene(), [vkc.Grasp("drawer"), vkc.Release(**k)], options=vkc.Options(**TINY)),
+        lambda **k: vkc.build(
+            scene(), [vkc.Grasp("drawer"), vkc.Release(**k)], options=vkc.Options(**TINY)
+        ),
         lambda: {"object": "drawer"},
     ),
     "GoTo": Call(_planned(vkc.GoTo), lambda: {"x": 0.1, "y": 0.1, "yaw": 0.2}),
@@ -229,7 +312,13 @@ CALLS: dict[str, Call] = {
     ),
     "Cost": Call(
         functools.partial(_term, vkc.Cost),
-        lambda: {"name": "elbow", "expression": _expression, "weight": 1.0, "during": ["go to"], "holding": None},
+        lambda: {
+            "name": "elbow",
+            "expression": _expression,
+            "weight": 1.0,
+            "during": ["go to"],
+            "holding": None,
+        },
     ),
     "plan": Call(
         vkc.plan,
@@ -237,7 +326,7 @@ CALLS: dict[str, Call] = {
             **_planning(),
             "callback": None,
             "seed": 0,
-            "joint": True,
+            "simultaneous": True,
             "perturbation": 0.0,
             "progress": False,
             "terms": (),
@@ -245,9 +334,17 @@ CALLS: dict[str, Call] = {
         },
         2.0,
     ),
-    "plan_chore": Call(
-        vkc.plan_chore,
-        lambda: {**_planning(), "window": 1, "callback": None, "seed": 0, "progress": False, "terms": (), "planner": None},
+    "plan_window": Call(
+        vkc.plan,
+        lambda: {
+            **_planning(),
+            "window": 1,
+            "callback": None,
+            "seed": 0,
+            "progress": False,
+            "terms": (),
+            "planner": None,
+        },
         2.0,
     ),
     "plan_separately": Call(
@@ -265,7 +362,14 @@ CALLS: dict[str, Call] = {
     ),
     "Planner": Call(vkc.Planner, lambda: {"entries": 8, "megabytes": 4.0}),
     "build": Call(
-        vkc.build, lambda: {"scene": scene(), "steps": _steps(), "options": vkc.Options(**TINY), "terms": (), "cache": None}
+        vkc.build,
+        lambda: {
+            "scene": scene(),
+            "steps": _steps(),
+            "options": vkc.Options(**TINY),
+            "terms": (),
+            "cache": None,
+        },
     ),
     "validate": Call(
         vkc.validate,
@@ -277,15 +381,28 @@ CALLS: dict[str, Call] = {
             "terms": (),
         },
     ),
-    "invert": Call(vkc.invert, lambda: {"obj": scene().objects["drawer"].object, "link": "tray", "state": [0.1]}),
-    "consolidate": Call(vkc.consolidate, lambda: {"scene": scene(), "holds": {"drawer": "handle"}, "cache": None}),
-    "consolidate holds": Call(vkc.consolidate, lambda: {"scene": scene(), "holds": [vkc.Hold("drawer", "handle")]}),
+    "invert": Call(
+        vkc.invert,
+        lambda: {"obj": scene().objects["drawer"].object, "link": "tray", "state": [0.1]},
+    ),
+    "consolidate": Call(
+        vkc.consolidate, lambda: {"scene": scene(), "holds": {"drawer": "handle"}, "cache": None}
+    ),
+    "consolidate holds": Call(
+        vkc.consolidate, lambda: {"scene": scene(), "holds": [vkc.Hold("drawer", "handle")]}
+    ),
     "Hold": Call(
         lambda **k: scene().with_held([vkc.Hold(**k)]),
         lambda: {"object": "drawer", "attachment": "handle", "by": None, "link": None, "at": ()},
     ),
     "PhaseSpan": Call(
-        lambda **k: vkc.Trajectory(motion().names, motion().times, motion().positions, [vkc.PhaseSpan(**k)], motion().robot_size),
+        lambda **k: vkc.Trajectory(
+            motion().names,
+            motion().times,
+            motion().positions,
+            [vkc.PhaseSpan(**k)],
+            motion().robot_size,
+        ),
         lambda: {"name": "all", "first": 0, "last": 4, "holds": ()},
     ),
     "Trajectory": Call(
@@ -301,26 +418,52 @@ CALLS: dict[str, Call] = {
     ),
     "Trajectory.at": Call(_method(motion, "at"), lambda: {"time": [0.5, 1.0]}),
     "Trajectory.column": Call(_method(motion, "column"), lambda: {"name": "base_x"}),
-    "Trajectory.from_dict": Call(vkc.Trajectory.from_dict, lambda: {"data": motion().to_dict()}, 2.0),
+    "Trajectory.from_dict": Call(
+        vkc.Trajectory.from_dict, lambda: {"data": motion().to_dict()}, 2.0
+    ),
     "Trajectory.to_csv": Call(
         _written(lambda path, **k: motion().to_csv(path, **k)),
-        lambda: {"path": "t.csv", "joints": ["base_x", "base_y", "base_yaw"], "units": {"base_x": "m"}},
+        lambda: {
+            "path": "t.csv",
+            "joints": ["base_x", "base_y", "base_yaw"],
+            "units": {"base_x": "m"},
+        },
     ),
-    "Trajectory.to_json": Call(_written(lambda path, **k: motion().to_json(path, **k)), lambda: {"path": "t.json"}),
+    "Trajectory.to_json": Call(
+        _written(lambda path, **k: motion().to_json(path, **k)), lambda: {"path": "t.json"}
+    ),
     "Trajectory.to_ros": Call(
         _method(motion, "to_ros"),
-        lambda: {"joints": "robot", "rate": 5.0, "smooth": True, "derivatives": 2, "frame": "world", "stamp": 0.0},
+        lambda: {
+            "joints": "robot",
+            "rate": 5.0,
+            "smooth": True,
+            "derivatives": 2,
+            "frame": "world",
+            "stamp": 0.0,
+        },
         1.5,
     ),
-    "Trajectory.from_csv": Call(vkc.Trajectory.from_csv, lambda: {"path": files()["csv"], "robot_size": None}),
+    "Trajectory.from_csv": Call(
+        vkc.Trajectory.from_csv, lambda: {"path": files()["csv"], "robot_size": None}
+    ),
     "Trajectory.from_json": Call(vkc.Trajectory.from_json, lambda: {"path": files()["json"]}),
-    "Trajectory.from_ros": Call(vkc.Trajectory.from_ros, lambda: {"message": _ROS(), "like": motion(), "robot_size": None}, 1.5),
+    "Trajectory.from_ros": Call(
+        vkc.Trajectory.from_ros,
+        lambda: {"message": _ROS(), "like": motion(), "robot_size": None},
+        1.5,
+    ),
     "Plan.load": Call(vkc.Plan.load, lambda: {"path": files()["npz"]}),
     "Plan.save": Call(_written(lambda path: saved().save(path)), lambda: {"path": "p.npz"}),
     "Plan.to_json": Call(_written(lambda path: saved().to_json(path)), lambda: {"path": "p.json"}),
-    "Plan.to_csv": Call(_written(lambda path, **k: saved().to_csv(path, **k)), lambda: {"path": "p.csv", "joints": "all"}),
+    "Plan.to_csv": Call(
+        _written(lambda path, **k: saved().to_csv(path, **k)),
+        lambda: {"path": "p.csv", "joints": "all"},
+    ),
     "Plan.to_ros": Call(_method(saved, "to_ros"), lambda: {"joints": ["base_x"], "rate": None}),
-    "Plan.to_html": Call(_written(lambda path: saved().to_html(path)), lambda: {"path": "p.html"}, 0.2),
+    "Plan.to_html": Call(
+        _written(lambda path: saved().to_html(path)), lambda: {"path": "p.html"}, 0.2
+    ),
     "Plan.plot": Call(_written(lambda path: saved().plot(path)), lambda: {"path": "p.svg"}, 0.2),
     "to_html": Call(
         lambda path, **k: to_html(path=folder() / "p.html", **k),
@@ -337,9 +480,16 @@ CALLS: dict[str, Call] = {
     "plot_clearance": Call(plot_clearance, lambda: {"plan": saved()}, 0.2),
     "plot_top_view": Call(plot_top_view, lambda: {"plan": saved()}, 0.2),
     "joint_placements": Call(joint_placements, lambda: {"model": scene().robot.model}, 0.5),
-    "frame_placements": Call(frame_placements, lambda: {"model": scene().robot.model, "frames": ["tool0"]}),
+    "frame_placements": Call(
+        frame_placements, lambda: {"model": scene().robot.model, "frames": ["tool0"]}
+    ),
     "frame_jacobian": Call(
-        frame_jacobian, lambda: {"model": scene().robot.model, "frame": "tool0", "reference": "local_world_aligned"}
+        frame_jacobian,
+        lambda: {
+            "model": scene().robot.model,
+            "frame": "tool0",
+            "reference": "local_world_aligned",
+        },
     ),
     "rnea": Call(rnea, lambda: {"model": scene().robot.model}, 0.5),
     "center_of_mass": Call(center_of_mass, lambda: {"model": scene().robot.model}, 0.5),
@@ -354,7 +504,9 @@ def case(rng: random.Random) -> dict[str, Any]:
     changes = []
     for parameter in rng.sample(parameters, min(len(parameters), rng.choice((1, 1, 1, 2)))):
         value = rng.choice(odd.USUAL if rng.random() < 0.5 else odd.VALUES)
-        if parameter == "callback" and value in odd.RAISING:  # what a caller's own function raises is the caller's
+        if (
+            parameter == "callback" and value in odd.RAISING
+        ):  # what a caller's own function raises is the caller's
             value = "None"
         changes.append([parameter, value, rng.randrange(8) if rng.random() < 0.4 else None])
     return {"call": name, "changes": changes}

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 import vkc_pin as vkc
-from vkc_pin.files.resources import folder
+from vkc_pin.world.files.resources import folder
 
 from . import odd
 from .calls import TINY
@@ -50,7 +50,9 @@ def pool() -> Path:
 @functools.cache
 def _files() -> tuple[str, ...]:
     found = [
-        path for path in sorted(pool().rglob("*")) if path.suffix in (".yaml", ".urdf", ".srdf", ".stl", ".obj", ".ply", ".dae")
+        path
+        for path in sorted(pool().rglob("*"))
+        if path.suffix in (".yaml", ".urdf", ".srdf", ".stl", ".obj", ".ply", ".dae")
     ]
     return tuple(str(path.relative_to(pool())) for path in found)
 
@@ -81,10 +83,16 @@ def run(given: dict[str, Any]) -> str:
 
 def _loaded(file: Path) -> vkc.Scene:
     scenes, robot = pool() / "scenes", "../robots/husky_ur5e/robot.yaml"
-    bare: dict[str, Any] = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "arena": {"x": [-9, 9], "y": [-9, 9]}}
+    bare: dict[str, Any] = {
+        "robot": "husky_ur5e",
+        "start": {"base": [0, 0, 0]},
+        "arena": {"x": [-9, 9], "y": [-9, 9]},
+    }
     where = file.relative_to(pool()).parts
     if where[0] == "robots":
-        vkc.load_robot(file if file.suffix in (".yaml", ".urdf") else file.parent / "husky_ur5e.urdf")
+        vkc.load_robot(
+            file if file.suffix in (".yaml", ".urdf") else file.parent / "husky_ur5e.urdf"
+        )
         return vkc.Scene.from_document({**bare, "robot": robot}, scenes)
     if where[1] == "objects":
         file = file.with_suffix(".yaml")
@@ -92,7 +100,12 @@ def _loaded(file: Path) -> vkc.Scene:
         entry = {"name": "thing", "type": f"objects/{file.name}", "position": [3.0, 0.0, 0.5]}
         return vkc.Scene.from_document({**bare, "objects": [entry]}, scenes)
     if where[1] == "furniture":
-        entry = {"name": "thing", "type": "urdf", "file": f"furniture/{file.name}", "position": [3.0, 0.0, 0.0]}
+        entry = {
+            "name": "thing",
+            "type": "urdf",
+            "file": f"furniture/{file.name}",
+            "position": [3.0, 0.0, 0.0],
+        }
         return vkc.Scene.from_document({**bare, "obstacles": [entry]}, scenes)
     return vkc.load_scene(file if file.suffix == ".yaml" else scenes / "meshes.yaml")
 
@@ -122,13 +135,19 @@ def document_case(rng: random.Random) -> dict[str, Any]:
     """Return a case: a scene, and what is changed in its description."""
     name = rng.choice(tuple(_documents()))
     values = odd.VALUES if rng.random() < 0.2 else tuple(odd.JSON_VALUES)
-    return {"scene": name, "changes": data_changes(rng, _documents()[name], values), "plan": rng.random() < PLANNED}
+    return {
+        "scene": name,
+        "changes": data_changes(rng, _documents()[name], values),
+        "plan": rng.random() < PLANNED,
+    }
 
 
 def run_document(given: dict[str, Any]) -> str:
     """Build the scene from its description, and use it."""
     document = changed(_documents()[given["scene"]], given["changes"])
-    return _used(vkc.Scene.from_document(document, folder("scenes")), planned=given.get("plan", False))
+    return _used(
+        vkc.Scene.from_document(document, folder("scenes")), planned=given.get("plan", False)
+    )
 
 
 def options_case(rng: random.Random) -> dict[str, Any]:
@@ -147,15 +166,25 @@ def options_case(rng: random.Random) -> dict[str, Any]:
 
 def run_options(given: dict[str, Any]) -> str:
     """Make the options, and plan with them."""
-    chosen = {name: odd.value(value["odd"]) if isinstance(value, dict) else value for name, value in given["fields"].items()}
+    chosen = {
+        name: odd.value(value["odd"]) if isinstance(value, dict) else value
+        for name, value in given["fields"].items()
+    }
     options = vkc.Options(**{**(TINY if given.get("plan") else {}), **chosen})
     if not given.get("plan"):
         return "made"
-    counts = (options.reach_waypoints, options.move_waypoints, options.turn_waypoints, options.contact_slots)
+    counts = (
+        options.reach_waypoints,
+        options.move_waypoints,
+        options.turn_waypoints,
+        options.contact_slots,
+    )
     if max(counts) > 50:
         return "made"  # as large as was asked for
     scene = vkc.load_scene("drawer")
-    vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.2})], options=options, time_limit=0.2).report()
+    vkc.plan(
+        scene, [vkc.Actuate("drawer", {"slide": 0.2})], options=options, time_limit=0.2
+    ).report()
     return "planned"
 
 

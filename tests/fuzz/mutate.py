@@ -16,7 +16,22 @@ _NUMBER = re.compile(rb"-?\d+\.?\d*(?:e-?\d+)?")
 _WORD = re.compile(rb"[A-Za-z_][\w.]*")
 _TAG = re.compile(rb"</?[A-Za-z_][^<>]*>")
 _ATTRIBUTE = re.compile(rb"\s[\w:]+=\"[^\"]*\"")
-_NUMBERS = (b"nan", b"inf", b"-inf", b"1e300", b"-1", b"0", b"0,2", b"1e-300", b"1e5", b"0x10", b"1_0", b"9" * 400, b"", b"true")
+_NUMBERS = (
+    b"nan",
+    b"inf",
+    b"-inf",
+    b"1e300",
+    b"-1",
+    b"0",
+    b"0,2",
+    b"1e-300",
+    b"1e5",
+    b"0x10",
+    b"1_0",
+    b"9" * 400,
+    b"",
+    b"true",
+)
 _WORDS = (
     b"",
     b"null",
@@ -87,7 +102,9 @@ def _line(rng: random.Random, data: bytes) -> bytes:
     return b"\n".join(lines)
 
 
-def _replaced(rng: random.Random, data: bytes, pattern: re.Pattern[bytes], by: tuple[bytes, ...] = ()) -> bytes:
+def _replaced(
+    rng: random.Random, data: bytes, pattern: re.Pattern[bytes], by: tuple[bytes, ...] = ()
+) -> bytes:
     found = list(pattern.finditer(data))
     if not found:
         return _flip(rng, data)
@@ -99,7 +116,12 @@ def _replaced(rng: random.Random, data: bytes, pattern: re.Pattern[bytes], by: t
 def _number(rng: random.Random, data: bytes) -> bytes:
     if rng.random() < 0.4:  # another one that may well do
         return _replaced(
-            rng, data, _NUMBER, tuple(b"%g" % rng.choice((rng.uniform(-3, 3), rng.uniform(0, 0.1), 1e3)) for _ in "abc")
+            rng,
+            data,
+            _NUMBER,
+            tuple(
+                b"%g" % rng.choice((rng.uniform(-3, 3), rng.uniform(0, 0.1), 1e3)) for _ in "abc"
+            ),
         )
     return _replaced(rng, data, _NUMBER, _NUMBERS)
 
@@ -117,7 +139,18 @@ def _tag(rng: random.Random, data: bytes) -> bytes:
     if not found:
         return _word(rng, data)
     match, other = rng.choice(found), rng.choice(found)
-    new = rng.choice((b"", other[0], match[0] * 2, b"<x>" + match[0], match[0] + b"</x>", b"<link/>", b"<joint/>", b"<mesh/>"))
+    new = rng.choice(
+        (
+            b"",
+            other[0],
+            match[0] * 2,
+            b"<x>" + match[0],
+            match[0] + b"</x>",
+            b"<link/>",
+            b"<joint/>",
+            b"<mesh/>",
+        )
+    )
     return data[: match.start()] + new + data[match.end() :]
 
 
@@ -179,12 +212,17 @@ def places(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
             yield from places(value, (*path, key))
 
 
-def data_changes(rng: random.Random, data: Any, values: tuple[str, ...] = tuple(odd.JSON_VALUES)) -> list[list[Any]]:
+def data_changes(
+    rng: random.Random, data: Any, values: tuple[str, ...] = tuple(odd.JSON_VALUES)
+) -> list[list[Any]]:
     """Return one to a few changes for `changed`: a path, what happens there, and an odd value's name, key or path."""
     everywhere = [path for path in places(data) if path]
     made: list[list[Any]] = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
-        path, what = rng.choice(everywhere), rng.choice(("set", "set", "set", "remove", "rename", "copy", "double"))
+        path, what = (
+            rng.choice(everywhere),
+            rng.choice(("set", "set", "set", "remove", "rename", "copy", "double")),
+        )
         with_what: Any = rng.choice(values)
         if what == "copy":
             with_what = list(rng.choice(everywhere))

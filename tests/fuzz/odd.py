@@ -36,8 +36,12 @@ class _Hostile:
     def _fail(self, *_: object) -> Any:
         raise self._error("hostile")
 
-    __len__ = __iter__ = __getitem__ = __float__ = __int__ = __index__ = __bool__ = __contains__ = _fail
-    __eq__ = __lt__ = __le__ = __gt__ = __ge__ = __add__ = __mul__ = __call__ = __fspath__ = __str__ = __repr__ = _fail
+    __len__ = __iter__ = __getitem__ = __float__ = __int__ = __index__ = __bool__ = __contains__ = (
+        _fail
+    )
+    __eq__ = __lt__ = __le__ = __gt__ = __ge__ = __add__ = __mul__ = __call__ = __fspath__ = (
+        __str__
+    ) = __repr__ = _fail
 
     def __hash__(self) -> int:
         return 0
@@ -71,7 +75,8 @@ def _pose(entry: float) -> pin.SE3:
     return pin.SE3(np.full((3, 3), entry), np.full(3, entry))
 
 
-# What JSON, and so a file, can hold. NaN and infinities are among them: Python's own reader takes them.
+# What JSON, and so a file, can hold. NaN and infinities are among them: Python's own reader takes
+# them.
 JSON_VALUES: dict[str, Any] = {
     "None": None,
     "True": True,
@@ -211,10 +216,30 @@ USUAL = (
         "empty list",
         "empty object",
     ),
-    *("x", "door", "drawer", "handle", "slide", "base_x", "tool0", "array", "array 4x4", "array 0-d", "float16", "int64", "SE3"),
+    *(
+        "x",
+        "door",
+        "drawer",
+        "handle",
+        "slide",
+        "base_x",
+        "tool0",
+        "array",
+        "array 4x4",
+        "array 0-d",
+        "float16",
+        "int64",
+        "SE3",
+    ),
 )
 """Names of those that some argument may take."""
-RAISING = ("raising function", "type", "hostile ValueError", "hostile RuntimeError", "hostile KeyError")
+RAISING = (
+    "raising function",
+    "type",
+    "hostile ValueError",
+    "hostile RuntimeError",
+    "hostile KeyError",
+)
 """Names of those that can be called and raise what they like."""
 
 

@@ -32,7 +32,7 @@ def _base() -> tuple[dict[str, Any], dict[str, Any]]:
     steps: list[Any] = [vkc.Actuate("drawer", {"slide": 0.1}), vkc.GoTo(0.1, 0.1)]
     report = vkc.validate(scene(), steps, motion(), terms=terms)
     planned = saved()
-    from vkc_pin.task.terms import traced
+    from vkc_pin.world.task.terms import trace_terms
 
     plan = vkc.Plan(
         scene(),
@@ -41,9 +41,9 @@ def _base() -> tuple[dict[str, Any], dict[str, Any]]:
         motion(),
         report,
         "rejected",
-        planned.metrics,
+        planned.statistics,
         history=planned.history,
-        terms=traced(scene(), terms),
+        terms=trace_terms(scene(), terms),
     )
     file = plan.save(folder() / "base.npz")
     with np.load(file) as archive:
@@ -66,11 +66,21 @@ def case(rng: random.Random) -> dict[str, Any]:
             return {"array": rng.choice((*ARRAYS, "about")), "odd": rng.choice(odd.VALUES)}
         case 5:
             name = rng.choice(("about.npy", "times.npy", "positions.npy"))
-            return {"member": name, "does": rng.choice(("remove", "double", "empty", "garbage", "liar", "text", "deep"))}
+            return {
+                "member": name,
+                "does": rng.choice(
+                    ("remove", "double", "empty", "garbage", "liar", "text", "deep")
+                ),
+            }
         case 6:
             return {"cut": rng.randrange(5000)}
         case _:
-            return {"bytes": [[rng.randrange(6000), rng.randrange(256)] for _ in range(rng.choice((1, 1, 4, 30)))]}
+            return {
+                "bytes": [
+                    [rng.randrange(6000), rng.randrange(256)]
+                    for _ in range(rng.choice((1, 1, 4, 30)))
+                ]
+            }
 
 
 def _content(given: dict[str, Any]) -> bytes:
@@ -83,7 +93,13 @@ def _content(given: dict[str, Any]) -> bytes:
         try:
             parts[given["array"]] = np.asarray(value)
             return _archive(parts.pop("about"), parts)
-        except (ValueError, TypeError, RuntimeError, AttributeError, RecursionError):  # it is no array, and cannot be pickled
+        except (
+            ValueError,
+            TypeError,
+            RuntimeError,
+            AttributeError,
+            RecursionError,
+        ):  # it is no array, and cannot be pickled
             return b""
     data = _archive(np.array(json.dumps(about)), arrays)
     if "member" in given:
@@ -98,7 +114,10 @@ def _content(given: dict[str, Any]) -> bytes:
 
 def _members(data: bytes, name: str, does: str) -> bytes:
     buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as new:
+    with (
+        zipfile.ZipFile(io.BytesIO(data)) as old,
+        zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as new,
+    ):
         for member in old.namelist():
             content = old.read(member)
             if member == name:
@@ -106,14 +125,20 @@ def _members(data: bytes, name: str, does: str) -> bytes:
                     continue
                 lie = (
                     b"\x93NUMPY\x01\x00v\x00"
-                    + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9000000000,), }".ljust(117)
+                    + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9000000000,), }".ljust(
+                        117
+                    )
                     + b"\n"
                 )
                 nested = io.BytesIO()
                 np.save(nested, np.array("[" * 100_000))
-                content = {"empty": b"", "garbage": content[::-1], "liar": lie, "text": b"{}", "deep": nested.getvalue()}.get(
-                    does, content
-                )
+                content = {
+                    "empty": b"",
+                    "garbage": content[::-1],
+                    "liar": lie,
+                    "text": b"{}",
+                    "deep": nested.getvalue(),
+                }.get(does, content)
             new.writestr(member, content)
             if does == "double" and member == name:
                 new.writestr(f"x{member}", content)

@@ -27,7 +27,9 @@ BAD = ("raw", "slow", "memory", "crashed", "hung")
 TESTS = Path(__file__).resolve().parents[1]
 
 
-def _kinds() -> dict[str, tuple[Callable[[random.Random], dict[str, Any]], Callable[[dict[str, Any]], str]]]:
+def _kinds() -> dict[
+    str, tuple[Callable[[random.Random], dict[str, Any]], Callable[[dict[str, Any]], str]]
+]:
     from . import calls, files, lines, plans
 
     return {
@@ -41,7 +43,14 @@ def _kinds() -> dict[str, tuple[Callable[[random.Random], dict[str, Any]], Calla
     }
 
 
-KINDS = {"files": 0.35, "documents": 0.2, "options": 0.05, "calls": 0.25, "plans": 0.1, "lines": 0.05}
+KINDS = {
+    "files": 0.35,
+    "documents": 0.2,
+    "options": 0.05,
+    "calls": 0.25,
+    "plans": 0.1,
+    "lines": 0.05,
+}
 """The kinds of cases, and the share of each."""
 
 
@@ -89,7 +98,11 @@ def serve() -> None:
     requests, sys.stdin = sys.stdin, open(os.devnull)  # noqa: SIM115, PTH123 - for as long as the process lives
     for line in requests:
         asked = json.loads(line)
-        case = asked["case"] if "case" in asked else made(asked["kind"], asked["seed"], asked["number"])
+        case = (
+            asked["case"]
+            if "case" in asked
+            else made(asked["kind"], asked["seed"], asked["number"])
+        )
         if asked.get("only") == "make":
             answers.write(json.dumps({"case": case}) + "\n")
         else:
@@ -100,12 +113,16 @@ def serve() -> None:
 def _limit_memory() -> None:
     """Let an allocation fail that is far too large, before the machine has to find room for it."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**30, resource.RLIM_INFINITY))
+    resource.setrlimit(
+        resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**30, resource.RLIM_INFINITY)
+    )
 
 
 def _memory(name: str) -> float:
     text = Path("/proc/self/status").read_text(encoding="ascii")
-    return next(float(line.split()[1]) for line in text.splitlines() if line.startswith(name)) / 1024.0
+    return (
+        next(float(line.split()[1]) for line in text.splitlines() if line.startswith(name)) / 1024.0
+    )
 
 
 def _run(does: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[str, Any]:
@@ -120,8 +137,16 @@ def _run(does: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[st
         if len(text := str(refusal)) > 4000 or not text.strip():
             outcome, error = "raw", f"a message of {len(text)} characters: {text[:200]}"
     except BaseException as raised:
-        frames = [frame for frame in traceback.extract_tb(raised.__traceback__) if "/vkc_pin/" in frame.filename]
-        where = f"{frames[-1].filename.rpartition('/vkc_pin/')[2]}:{frames[-1].lineno}" if frames else "the call"
+        frames = [
+            frame
+            for frame in traceback.extract_tb(raised.__traceback__)
+            if "/vkc_pin/" in frame.filename
+        ]
+        where = (
+            f"{frames[-1].filename.rpartition('/vkc_pin/')[2]}:{frames[-1].lineno}"
+            if frames
+            else "the call"
+        )
         outcome, error = "raw", f"{type(raised).__name__} in {where}: {str(raised)[:200]!a}"
     seconds, grown = time.process_time() - began, _memory("VmHWM") - before
     if outcome != "raw" and seconds > SECONDS + PLANNING * _plans(case):
@@ -137,7 +162,7 @@ def _plans(case: dict[str, Any]) -> bool:
     planning = (
         *pictures,
         "plan",
-        "plan_chore",
+        "plan_window",
         "plan_separately",
         "Constraint",
         "Cost",
@@ -171,7 +196,11 @@ class Worker:
             }
             pipe = subprocess.PIPE
             self.process = subprocess.Popen(
-                [sys.executable, "-c", code], cwd=TESTS.parent, env=environment, stdin=pipe, stdout=pipe
+                [sys.executable, "-c", code],
+                cwd=TESTS.parent,
+                env=environment,
+                stdin=pipe,
+                stdout=pipe,
             )
             self.count = 0
         self.count += 1
@@ -183,14 +212,24 @@ class Worker:
             process.stdin.flush()
             if not select.select([process.stdout], [], [], self.hung + 60.0 * (self.count == 1))[0]:
                 self.close()
-                return {"outcome": "hung", "error": f"no answer in {self.hung:g} s", "seconds": self.hung, "grown": 0.0}
+                return {
+                    "outcome": "hung",
+                    "error": f"no answer in {self.hung:g} s",
+                    "seconds": self.hung,
+                    "grown": 0.0,
+                }
             line = process.stdout.readline()
         except BrokenPipeError:
             line = b""
         if not line:
             code_ = process.wait()
             self.close()
-            return {"outcome": "crashed", "error": f"the interpreter ended with {code_}", "seconds": 0.0, "grown": 0.0}
+            return {
+                "outcome": "crashed",
+                "error": f"the interpreter ended with {code_}",
+                "seconds": 0.0,
+                "grown": 0.0,
+            }
         found: dict[str, Any] = json.loads(line)
         return found
 

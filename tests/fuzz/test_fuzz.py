@@ -45,20 +45,37 @@ def test_cases_at_random(worker: Worker, kind: str, seed: int | str) -> None:
 def test_what_once_broke_it(worker: Worker, file: Path) -> None:
     kept = json.loads(file.read_text(encoding="ascii"))
     found = worker.run(kind=kept["kind"], case=kept["case"])
-    assert found["outcome"] not in BAD, f"{found['outcome']}, {found['error']}; before: {kept['was']}"
+    assert found["outcome"] not in BAD, (
+        f"{found['outcome']}, {found['error']}; before: {kept['was']}"
+    )
 
 
 def test_what_is_not_spoiled_works(worker: Worker) -> None:
     from fuzz import calls, files
 
-    cases: list[tuple[str, Any]] = [("calls", {"call": name, "changes": []}) for name in calls.CALLS]
-    names = ["scenes/door.yaml", "scenes/meshes.yaml", "scenes/objects/cup.urdf", "scenes/furniture/desk.urdf"]
+    cases: list[tuple[str, Any]] = [
+        ("calls", {"call": name, "changes": []}) for name in calls.CALLS
+    ]
+    names = [
+        "scenes/door.yaml",
+        "scenes/meshes.yaml",
+        "scenes/objects/cup.urdf",
+        "scenes/furniture/desk.urdf",
+    ]
     names += ["robots/husky_ur5e/husky_ur5e.srdf", "scenes/box.dae"]
     for name in names:
         content = (files.pool() / name).read_bytes().decode("latin-1")
-        cases.append(("files", {"file": name, "content": content, "plan": name == "scenes/door.yaml"}))
-    cases += [("documents", {"scene": "household", "changes": []}), ("options", {"fields": {}, "plan": True})]
-    cases += [("plans", {"about": []}), ("lines", {"argv": ["export", "NPZ", "--json", "OUT/a.json"]})]
+        cases.append(
+            ("files", {"file": name, "content": content, "plan": name == "scenes/door.yaml"})
+        )
+    cases += [
+        ("documents", {"scene": "household", "changes": []}),
+        ("options", {"fields": {}, "plan": True}),
+    ]
+    cases += [
+        ("plans", {"about": []}),
+        ("lines", {"argv": ["export", "NPZ", "--json", "OUT/a.json"]}),
+    ]
     wrong = []
     for kind, case in cases:
         found = worker.run(kind=kind, case=case)
@@ -68,7 +85,14 @@ def test_what_is_not_spoiled_works(worker: Worker) -> None:
 
 
 def test_what_goes_wrong_is_noticed() -> None:
-    outcomes = {"raise": "raw", "exit": "raw", "spin": "slow", "eat": "memory", "sleep": "hung", "crash": "crashed"}
+    outcomes = {
+        "raise": "raw",
+        "exit": "raw",
+        "spin": "slow",
+        "eat": "memory",
+        "sleep": "hung",
+        "crash": "crashed",
+    }
     worker = Worker(hung=20.0)
     for does, outcome in outcomes.items():
         assert worker.run(kind="planted", case={"does": does})["outcome"] == outcome

@@ -11,12 +11,22 @@ HEIGHT = 0.35  # [m] of the root above the floor
 
 def _link(name: str, size: str = "", at: str = "0 0 0", mesh: str = "") -> str:
     geometry = f'<mesh filename="{mesh}"/>' if mesh else f'<box size="{size}"/>'
-    shape = f'<collision><origin xyz="{at}"/><geometry>{geometry}</geometry></collision>' if size or mesh else ""
+    shape = (
+        f'<collision><origin xyz="{at}"/><geometry>{geometry}</geometry></collision>'
+        if size or mesh
+        else ""
+    )
     return f'<link name="{name}">{shape}</link>'
 
 
 def _joint(
-    name: str, kind: str, parent: str, child: str, at: str, axis: str = "0 0 1", limits: tuple[float, float] = (-2, 2)
+    name: str,
+    kind: str,
+    parent: str,
+    child: str,
+    at: str,
+    axis: str = "0 0 1",
+    limits: tuple[float, float] = (-2, 2),
 ) -> str:
     limit = f'<limit lower="{limits[0]}" upper="{limits[1]}" effort="10" velocity="1.5"/>'
     return (
@@ -25,11 +35,13 @@ def _joint(
     )
 
 
-def write_arms(folder: Path, *, sides: tuple[str, ...] = ("",), own_base: bool = False, mesh: str = "") -> Path:
+def write_arms(
+    folder: Path, *, sides: tuple[str, ...] = ("",), own_base: bool = False, mesh: str = ""
+) -> Path:
     """Write robot.urdf into a folder and return it.
 
-    The root stands `HEIGHT` above the floor, arms point up at 0; fingers close along y of the hand, which points along z, and
-    open from 0 to 80 mm between their faces.
+    The root stands `HEIGHT` above the floor, arms point up at 0; fingers close along y of the hand,
+    which points along z, and open from 0 to 80 mm between their faces.
 
     Args:
         folder: Where.
@@ -43,19 +55,35 @@ def write_arms(folder: Path, *, sides: tuple[str, ...] = ("",), own_base: bool =
         parts += [_joint("drive_x", "prismatic", "odom", "slider", "0 0 0", "1 0 0", (-9, 9))]
         parts += [_joint("drive_y", "prismatic", "slider", "column", "0 0 0", "0 1 0", (-9, 9))]
         parts += [_joint("drive_yaw", "continuous", "column", "body", "0 0 0")]
-    parts.append(_link("body", "" if mesh else "0.5 0.4 0.5", "0 0 0" if mesh else "0 0 -0.1", mesh))
+    parts.append(
+        _link("body", "" if mesh else "0.5 0.4 0.5", "0 0 0" if mesh else "0 0 -0.1", mesh)
+    )
     for side in sides:
         y = {"left_": 0.3, "right_": -0.3}.get(side, 0.0)
         below, at = "body", f"0 {y} 0.16"
         for k, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0")):
             name = f"{side}arm_{k + 1}"
-            parts += [_link(name, "0.06 0.06 0.16", "0 0 0.1"), _joint(f"{name}_joint", "revolute", below, name, at, axis)]
+            parts += [
+                _link(name, "0.06 0.06 0.16", "0 0 0.1"),
+                _joint(f"{name}_joint", "revolute", below, name, at, axis),
+            ]
             below, at = name, "0 0 0.2"
-        parts += [_link(f"{side}hand", "0.05 0.14 0.06", "0 0 0.03"), _joint(f"{side}wrist", "fixed", below, f"{side}hand", at)]
+        parts += [
+            _link(f"{side}hand", "0.05 0.14 0.06", "0 0 0.03"),
+            _joint(f"{side}wrist", "fixed", below, f"{side}hand", at),
+        ]
         for finger, sign in (("a", 1), ("b", -1)):
             name = f"{side}finger_{finger}"
             parts.append(_link(name, "0.02 0.01 0.08", f"0 {sign * 0.005} 0.04"))
-            joint = _joint(f"{name}_joint", "prismatic", f"{side}hand", name, "0 0 0.06", f"0 {sign} 0", (0.0, 0.04))
+            joint = _joint(
+                f"{name}_joint",
+                "prismatic",
+                f"{side}hand",
+                name,
+                "0 0 0.06",
+                f"0 {sign} 0",
+                (0.0, 0.04),
+            )
             parts.append(joint)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "robot.urdf"

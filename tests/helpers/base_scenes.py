@@ -9,12 +9,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from vkc_pin.driving.body import Shape
-from vkc_pin.files.meshes import convex_hull
+from vkc_pin.planning.base_paths.base_clearance import Shape
+from vkc_pin.world.files.meshes import convex_hull
 
 HALL = (-5.0, 5.0, -5.0, 5.0)
 MARGIN = 0.02
-BLINK = 1.1e-3  # [m] by which a motion may come closer than its margin between two questions, and rounding
+# [m] by which a motion may come closer than its margin between two questions, and rounding
+BLINK = 1.1e-3
 
 
 def at(x: float, y: float, z: float, yaw: float = 0.0) -> pin.SE3:
@@ -38,12 +39,18 @@ def arm() -> list[Shape]:
 
 def wedge() -> coal.Convex:
     """Return a convex mesh: a prism with a triangle as its base, lower at one end."""
-    return convex_hull([(0, 0, 0), (0.6, 0, 0), (0, 0.4, 0), (0, 0, 0.5), (0.6, 0, 0.2), (0, 0.4, 0.5)])
+    return convex_hull(
+        [(0, 0, 0), (0.6, 0, 0), (0, 0.4, 0), (0, 0, 0.5), (0.6, 0, 0.2), (0, 0.4, 0.5)]
+    )
 
 
 def furniture() -> list[Shape]:
     """A table, a table top on four legs, and a block in the way."""
-    legs = [(coal.Box(0.08, 0.08, 0.75), at(-0.5 + 1.4 * a, 3.5 + 0.7 * b, 0.375)) for a in (-1, 1) for b in (-1, 1)]
+    legs = [
+        (coal.Box(0.08, 0.08, 0.75), at(-0.5 + 1.4 * a, 3.5 + 0.7 * b, 0.375))
+        for a in (-1, 1)
+        for b in (-1, 1)
+    ]
     return [
         (coal.Box(1.0, 2.0, 0.72), at(2.5, 1.0, 0.36)),
         (coal.Box(3.0, 1.6, 0.05), at(-0.5, 3.5, 0.775)),
@@ -66,7 +73,10 @@ def clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
         elif k % 4 == 2:
             shapes.append((coal.Sphere(rng.uniform(0.1, 0.4)), at(x, y, rng.uniform(0.2, 1.0))))
         else:
-            lying = pin.SE3(pin.utils.rotate("z", yaw) @ pin.utils.rotate("x", np.pi / 2 - 0.2), np.array([x, y, 0.6]))
+            lying = pin.SE3(
+                pin.utils.rotate("z", yaw) @ pin.utils.rotate("x", np.pi / 2 - 0.2),
+                np.array([x, y, 0.6]),
+            )
             shapes.append((coal.Capsule(0.06, rng.uniform(0.2, 0.8)), lying))
     return shapes
 
@@ -78,12 +88,21 @@ def distance(shapes: Sequence[Shape], standing: Sequence[Shape], pose: Sequence[
     for shape, placement in shapes:
         where = _transform(base * placement)
         for other, there in standing:
-            found = coal.distance(shape, where, other, _transform(there), coal.DistanceRequest(), coal.DistanceResult())
+            found = coal.distance(
+                shape,
+                where,
+                other,
+                _transform(there),
+                coal.DistanceRequest(),
+                coal.DistanceResult(),
+            )
             nearest = min(nearest, found)
     return nearest
 
 
-def between(a: Sequence[float], b: Sequence[float], *, length: float = 0.01, angle: float = 0.02) -> NDArray[np.float64]:
+def between(
+    a: Sequence[float], b: Sequence[float], *, length: float = 0.01, angle: float = 0.02
+) -> NDArray[np.float64]:
     """Return poses on the straight line between two, at most so far apart [m], [rad]; shape (N, 3)."""
     change = np.subtract(b, a)
     count = 2 + int(max(np.hypot(change[0], change[1]) / length, abs(change[2]) / angle))

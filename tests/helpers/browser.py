@@ -7,7 +7,9 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
 FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -24,7 +26,12 @@ FLAGS = (
 
 
 def screenshot(
-    page: Path, picture: Path, *, time: float | None = None, size: tuple[int, int] = (1280, 720), budget: float = 6.0
+    page: Path,
+    picture: Path,
+    *,
+    time: float | None = None,
+    size: tuple[int, int] = (1280, 720),
+    budget: float = 6.0,
 ) -> Path:
     """Write a PNG of a local page; `time` [s] is where its film stands, `budget` [s] how long the page may take by its clock."""
     _run(page, time, budget, f"--screenshot={picture}", f"--window-size={size[0]},{size[1]}")
@@ -35,11 +42,18 @@ def screenshot(
 READY = 'data-ready="yes"'  # what a page says of itself once it has drawn its first picture
 
 
-def document(page: Path, *, time: float | None = None, until: str = READY, budgets: tuple[float, ...] = (6.0, 20.0, 60.0)) -> str:
+def document(
+    page: Path,
+    *,
+    time: float | None = None,
+    until: str = READY,
+    budgets: tuple[float, ...] = (6.0, 20.0, 60.0),
+) -> str:
     """Return the page's elements as they are once its scripts have run.
 
-    Chromium's virtual clock does not wait for what other threads unpack. On a busy machine it can run out before the page is
-    there; then, as long as the text lacks `until`, the page is opened again with the next of `budgets` [s].
+    Chromium's virtual clock does not wait for what other threads unpack. On a busy machine it can
+    run out before the page is there; then, as long as the text lacks `until`, the page is opened
+    again with the next of `budgets` [s].
     """
     text = ""
     for budget in budgets:

@@ -11,17 +11,23 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.drives import DT, hall
-from vkc_pin.models.object_file import load_object
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.hold import holds_of
-from vkc_pin.scene.placed import PlacedObject
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.models.object_file import load_object
+from vkc_pin.world.scene.hold import make_holds
+from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
-STICK = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.55]))  # along y, its tip to the left; its discs stand 0.05 below
+STICK = pin.SE3(
+    np.eye(3), np.array([0.8, 0.0, 0.55])
+)  # along y, its tip to the left; its discs stand 0.05 below
 TOP = 0.5  # [m] of the table
-BALL = pin.SE3(np.eye(3), np.array([0.8, 0.285, 0.7]))  # where the tip touches it when the stick is held at this height
-GUESS = np.array([0.0, 0.0, 0.0, 0.07, -1.69, -1.39, -1.63, 1.57, -1.5])  # the hand above the table, looking down
+BALL = pin.SE3(
+    np.eye(3), np.array([0.8, 0.285, 0.7])
+)  # where the tip touches it when the stick is held at this height
+GUESS = np.array(
+    [0.0, 0.0, 0.0, 0.07, -1.69, -1.39, -1.63, 1.57, -1.5]
+)  # the hand above the table, looking down
 UP = np.array([0.0, 0.0, 0.2])
 FREE = {"stick": STICK, "ball": BALL}
 
@@ -40,10 +46,15 @@ def stand(name: str = "stand", *, aside: float = 0.0, gap: float = 1e-3) -> dict
     return box(name, [0.06, 0.06, 0.5], [0.8, 0.285 + aside, 0.665 - gap - 0.25])
 
 
-def room(*obstacles: Mapping[str, Any], objects: Sequence[str] = ("stick",), base: str = "omni") -> Scene:
+def room(
+    *obstacles: Mapping[str, Any], objects: Sequence[str] = ("stick",), base: str = "omni"
+) -> Scene:
     """Return a hall with obstacles and free objects in it; the robot's hand is 0.2 m above where it takes the stick."""
     scene = hall(base=base, obstacles=obstacles)
-    document = {**scene.document, "objects": [{"name": n, "type": n, "position": _place(n)} for n in objects]}
+    document = {
+        **scene.document,
+        "objects": [{"name": n, "type": n, "position": _place(n)} for n in objects],
+    }
     scene = Scene.from_document(document)
     return scene.with_start(arm=above(STICK)[3:]) if "stick" in objects else scene
 
@@ -57,10 +68,20 @@ def lifted(placement: pin.SE3, shift: Sequence[float] | np.ndarray = UP) -> pin.
     return pin.SE3(placement.rotation, placement.translation + np.asarray(shift))
 
 
-def tool_at(object_at: pin.SE3, name: str = "stick", attachment: str = "grip", values: Sequence[float] = (0.0, 0.0)) -> pin.SE3:
+def tool_at(
+    object_at: pin.SE3,
+    name: str = "stick",
+    attachment: str = "grip",
+    values: Sequence[float] = (0.0, 0.0),
+) -> pin.SE3:
     """Return where the hand is that holds an object, whose base link is its only one, at `object_at`; by definition."""
     grasp = load_object(name).attachment(attachment)
-    return object_at * grasp.placement * freedom(attachment, values) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -grasp.standoff]))
+    return (
+        object_at
+        * grasp.placement
+        * freedom(attachment, values)
+        * pin.SE3(np.eye(3), np.array([0.0, 0.0, -grasp.standoff]))
+    )
 
 
 def freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
@@ -71,7 +92,9 @@ def freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
         slide, turn = values
         return pin.SE3(pin.utils.rotate("y", -turn), np.array([0.0, -slide, 0.0]))
     x, y, z = values
-    return pin.SE3(pin.utils.rotate("x", x) @ pin.utils.rotate("y", y) @ pin.utils.rotate("z", z), np.zeros(3))
+    return pin.SE3(
+        pin.utils.rotate("x", x) @ pin.utils.rotate("y", y) @ pin.utils.rotate("z", z), np.zeros(3)
+    )
 
 
 def reaching(tool: pin.SE3, guess: np.ndarray = GUESS) -> np.ndarray:
@@ -142,7 +165,7 @@ class Script:
         smooth, before = share**2 * (3.0 - 2.0 * share), self.rows[-1]
         first = len(self.rows) - 1
         self.rows += list(before + smooth * (row - before))
-        holds = holds_of(self.held, self.by)
+        holds = make_holds(self.held, self.by)
         self.phases.append(PhaseSpan(f"phase {len(self.phases)}", first, len(self.rows) - 1, holds))
         return self
 
@@ -150,7 +173,13 @@ class Script:
         """Stand still for two steps."""
         return self.go(self.rows[-1], steps=2)
 
-    def take(self, name: str, attachment: str = "grip", values: Sequence[float] = (0.0, 0.0), by: str | None = None) -> Script:
+    def take(
+        self,
+        name: str,
+        attachment: str = "grip",
+        values: Sequence[float] = (0.0, 0.0),
+        by: str | None = None,
+    ) -> Script:
         """Close the hand, or whatever `by` is."""
         self.held[name] = attachment
         if by is not None:
@@ -184,7 +213,13 @@ def moved_base(row: np.ndarray, **values: float) -> np.ndarray:
     return out
 
 
-def carried_over(scene: Scene, *, aside: float = 0.5, values: Sequence[float] = (0.0, 0.0), off: pin.SE3 | None = None) -> Script:
+def carried_over(
+    scene: Scene,
+    *,
+    aside: float = 0.5,
+    values: Sequence[float] = (0.0, 0.0),
+    off: pin.SE3 | None = None,
+) -> Script:
     """Take the stick from the table, carry it `aside` [m] along y, put it down, let go of it and rise.
 
     With `off` the hand closes that far beside the attachment, in the tool's frame.
@@ -208,5 +243,7 @@ def with_grasp(scene: Scene, name: str, attachment: str, **fields: Any) -> Scene
     placed = scene.objects[name]
     attachments = {**placed.object.attachments}
     attachments[attachment] = dataclasses.replace(attachments[attachment], **fields)
-    placed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, attachments=attachments))
+    placed = dataclasses.replace(
+        placed, object=dataclasses.replace(placed.object, attachments=attachments)
+    )
     return dataclasses.replace(scene, objects={**scene.objects, name: placed})

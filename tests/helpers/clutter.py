@@ -8,7 +8,7 @@ import numpy as np
 
 from helpers.carrying import room
 from helpers.small_problems import door_scene
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 
 
 def things(seed: int, count: int) -> list[dict[str, Any]]:
@@ -16,11 +16,16 @@ def things(seed: int, count: int) -> list[dict[str, Any]]:
     rng, obstacles = np.random.default_rng(seed), []
     for number in range(count):
         size = (10.0 ** rng.uniform(-2.0, 0.5, 3)).tolist()
-        thing: dict[str, Any] = {"name": f"thing_{number}", "position": rng.uniform([-3.0, -3.0, 0.0], [5.0, 3.0, 2.0]).tolist()}
+        thing: dict[str, Any] = {
+            "name": f"thing_{number}",
+            "position": rng.uniform([-3.0, -3.0, 0.0], [5.0, 3.0, 2.0]).tolist(),
+        }
         thing["rpy"] = (rng.uniform(-np.pi, np.pi, 3) * rng.choice([0.0, 1.0], 3)).tolist()
         kind = ("box", "sphere", "cylinder", "capsule")[number % 4]
         fields = {"box": {"size": size}, "sphere": {"radius": size[0] / 2}}
-        obstacles.append({**thing, "type": kind, **fields.get(kind, {"radius": size[0] / 2, "length": size[1]})})
+        obstacles.append(
+            {**thing, "type": kind, **fields.get(kind, {"radius": size[0] / 2, "length": size[1]})}
+        )
     return obstacles
 
 

@@ -54,7 +54,9 @@ def find_undeclared(extra: str = "") -> list[str]:
 
 def run_without(modules: list[str], script: Path, folder: Path) -> None:
     """Run a script in a process that cannot import some modules, with `folder` as its current one."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (CHECKOUT, CHECKOUT / "tests")))}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(map(str, (CHECKOUT, CHECKOUT / "tests")))
+    }
     command = [sys.executable, "-c", _BLOCK, json.dumps(modules), str(script)]
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, check=False

@@ -10,9 +10,9 @@ import trimesh
 def partnet(folder: Path) -> Path:
     """Write a cabinet as PartNet-Mobility has them, and return its `mobility.urdf`.
 
-    About one unit high, y up, set upright by a fixed joint below a link `base` without shapes; many small meshes, which are
-    seen and collide; names on what is seen; a drawer with a flat decoration, a door without limits, a wheel without shape, and
-    no effort or velocity anywhere.
+    About one unit high, y up, set upright by a fixed joint below a link `base` without shapes; many
+    small meshes, which are seen and collide; names on what is seen; a drawer with a flat
+    decoration, a door without limits, a wheel without shape, and no effort or velocity anywhere.
     """
     meshes = folder / "textured_objs"
     meshes.mkdir(parents=True)
@@ -23,9 +23,12 @@ def partnet(folder: Path) -> Path:
 
     def elements(parts: dict[str, str], xyz: str = "0 0 0") -> str:
         shapes = {
-            file: f'<origin xyz="{xyz}"/><geometry><mesh filename="textured_objs/{file}.obj"/></geometry>' for file in parts
+            file: f'<origin xyz="{xyz}"/><geometry><mesh filename="textured_objs/{file}.obj"/></geometry>'
+            for file in parts
         }
-        seen = "".join(f'<visual name="{name}">{shapes[file]}</visual>' for file, name in parts.items())
+        seen = "".join(
+            f'<visual name="{name}">{shapes[file]}</visual>' for file, name in parts.items()
+        )
         return seen + "".join(f"<collision>{shape}</collision>" for shape in shapes.values())
 
     # x to the right, y up, z out of the front
@@ -42,7 +45,8 @@ def partnet(folder: Path) -> Path:
         box("original-9", (0.02, 0.02, 0.08), (0.1, 0.25, 0.4)): "handle-9",
     }
     front = trimesh.Trimesh(
-        [[-0.3, 0.12, 0.361], [0.3, 0.12, 0.361], [0.3, 0.38, 0.361], [-0.3, 0.38, 0.361]], [[0, 1, 2], [0, 2, 3]]
+        [[-0.3, 0.12, 0.361], [0.3, 0.12, 0.361], [0.3, 0.38, 0.361], [-0.3, 0.38, 0.361]],
+        [[0, 1, 2], [0, 2, 3]],
     )
     front.export(meshes / "original-6.obj")
     drawer["original-6"] = "decoration-6"

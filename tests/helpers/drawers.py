@@ -11,15 +11,17 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import reaching
-from vkc_pin.models.shapes import link_name, shape_distance
 from vkc_pin.options import Options
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene, load_scene
 
 MARGIN, BESIDE_HANDLE = 0.02, 0.005  # [m]: Options.dist_safe and Options.grasp_clearance
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=8)
-STANDING = np.array([0.63, 0.08, 0.42, 2.288, -0.13, -0.55, 0.681, 1.141, 1.571])  # nearly at the handle of the shut drawer
+STANDING = np.array(
+    [0.63, 0.08, 0.42, 2.288, -0.13, -0.55, 0.681, 1.141, 1.571]
+)  # nearly at the handle of the shut drawer
 
 
 @cache
@@ -29,7 +31,10 @@ def drawer_scene() -> Scene:
 
 def with_boxes(scene: Scene, **boxes: tuple[Sequence[float], Sequence[float]]) -> Scene:
     """Return the scene with more boxes in it, each by its size and the place of its centre."""
-    added = [{"name": n, "type": "box", "size": list(size), "position": list(at)} for n, (size, at) in boxes.items()]
+    added = [
+        {"name": n, "type": "box", "size": list(size), "position": list(at)}
+        for n, (size, at) in boxes.items()
+    ]
     return changed(scene, obstacles=[*scene.document["obstacles"], *added])
 
 
@@ -40,13 +45,19 @@ def changed(scene: Scene, **fields: Any) -> Scene:
 
 def open_scene(*obstacles: dict[str, Any], base: str = "omni") -> Scene:
     """Return the drawer's arena without what stands about in it."""
-    return changed(drawer_scene(), obstacles=list(obstacles), robot={"name": "husky_ur5e", "base": base})
+    return changed(
+        drawer_scene(), obstacles=list(obstacles), robot={"name": "husky_ur5e", "base": base}
+    )
 
 
 def handle(slide: float = 0.0, *, tilt: float = 0.0) -> pin.SE3:
     """Return where a tool holds the handle: from the drawer's URDF, its place in the scene and its grasp, by hand."""
-    # The tool's z axis, along which it comes, along x; its x axis, in which the fingers close, upwards.
-    grasp = pin.SE3(np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]), np.array([1.93 - 0.115 - slide, 0.0, 0.755]))
+    # The tool's z axis, along which it comes, along x; its x axis, in which the fingers close,
+    # upwards.
+    grasp = pin.SE3(
+        np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]),
+        np.array([1.93 - 0.115 - slide, 0.0, 0.755]),
+    )
     return grasp * pin.SE3(pin.utils.rotate("y", tilt), np.zeros(3))
 
 
@@ -75,11 +86,14 @@ def holding(scene: Scene | None = None, attachment: str = "handle") -> Scene:
 def spare(scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = False) -> float:
     """Return by how much the pair that comes closest to its margin keeps it [m]; `row` begins with the robot's coordinates.
 
-    The robot's own pairs, the robot and everything, and what it holds and everything but what that is part of.
+    The robot's own pairs, the robot and everything, and what it holds and everything but what that
+    is part of.
     """
     robot, state = scene.robot, {"drawer": {"slide": slide}}
     model, data, shapes = robot.model, robot.model.createData(), robot.collision.createData()
-    pin.updateGeometryPlacements(model, data, robot.collision, shapes, robot.coordinates.q(np.array(row[: model.nv])))
+    pin.updateGeometryPlacements(
+        model, data, robot.collision, shapes, robot.coordinates.q(np.array(row[: model.nv]))
+    )
     links = list(robot.collision.geometryObjects)
     own = [(pair.first, pair.second) for pair in robot.collision.collisionPairs]
     found = [_gap(links[i], shapes.oMg[i], links[j], shapes.oMg[j]) - MARGIN for i, j in own]
@@ -87,23 +101,36 @@ def spare(scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = Fal
     for i, link in enumerate(links):
         for label, shape in things:
             wheels = label == FLOOR and link.parentJoint == 1
-            touching = label == "drawer.tray" and link_name(link.name) in robot.touch_links
+            touching = label == "drawer.tray" and get_link_name(link.name) in robot.touch_links
             if not wheels and not (touching and held):
                 gap = _gap(link, shapes.oMg[i], shape, shape.placement)
                 found.append(gap - (BESIDE_HANDLE if touching else MARGIN))
     if held:
         tray = [shape for label, shape in things if label == "drawer.tray"]
-        others = [shape for label, shape in things if not label.startswith("drawer.") and label != FLOOR]
-        found += [_gap(one, one.placement, other, other.placement) - MARGIN for one in tray for other in others]
+        others = [
+            shape for label, shape in things if not label.startswith("drawer.") and label != FLOOR
+        ]
+        found += [
+            _gap(one, one.placement, other, other.placement) - MARGIN
+            for one in tray
+            for other in others
+        ]
     return min(found)
 
 
-def _things(scene: Scene, state: Mapping[str, Mapping[str, float]]) -> list[tuple[str, pin.GeometryObject]]:
+def _things(
+    scene: Scene, state: Mapping[str, Mapping[str, float]]
+) -> list[tuple[str, pin.GeometryObject]]:
     things = list(zip(scene.obstacle_labels, scene.obstacles, strict=True))
     for name, placed in scene.objects.items():
-        things += [(f"{name}.{link_name(s.name)}", s) for s in standing_geometry(placed.with_state(state.get(name, {})))]
+        things += [
+            (f"{name}.{get_link_name(s.name)}", s)
+            for s in make_world_shapes(placed.with_state(state.get(name, {})))
+        ]
     return things
 
 
-def _gap(first: pin.GeometryObject, where: pin.SE3, second: pin.GeometryObject, there: pin.SE3) -> float:
-    return shape_distance(first.geometry, where, second.geometry, there)
+def _gap(
+    first: pin.GeometryObject, where: pin.SE3, second: pin.GeometryObject, there: pin.SE3
+) -> float:
+    return compute_shape_distance(first.geometry, where, second.geometry, there)

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 DT = 0.25  # [s]
 
@@ -35,11 +35,15 @@ def through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float = DT) -
     rows = [stops[0][None]]
     for before, after in itertools.pairwise(stops):
         rows.append(before + smooth * (after - before))
-    phases = tuple(PhaseSpan(f"drive {k + 1}", k * steps, (k + 1) * steps) for k in range(len(stops) - 1))
+    phases = tuple(
+        PhaseSpan(f"drive {k + 1}", k * steps, (k + 1) * steps) for k in range(len(stops) - 1)
+    )
     return of_rows(scene, np.vstack(rows), dt=dt, phases=phases)
 
 
-def of_rows(scene: Scene, rows: np.ndarray, *, dt: float = DT, phases: tuple[PhaseSpan, ...] = ()) -> Trajectory:
+def of_rows(
+    scene: Scene, rows: np.ndarray, *, dt: float = DT, phases: tuple[PhaseSpan, ...] = ()
+) -> Trajectory:
     """Return the motion through `rows`, shape (T, n), of the robot alone, `dt` apart."""
     names = scene.robot.coordinates.names
     phases = phases or (PhaseSpan("drive", 0, len(rows) - 1),)

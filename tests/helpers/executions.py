@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.motion.trajectory import PhaseSpan, Trajectory
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 
 __all__ = ["door_plan", "drawer_plan", "holding", "still", "with_mass"]
 
@@ -46,7 +46,13 @@ def still(scene: Scene, seconds: float = 1.0) -> Trajectory:
         names += [f"{hold.object}.{name}" for name in coordinates]
         values += list(hold.at)
     phase = PhaseSpan("stand", 0, 1, scene.holds)
-    return Trajectory(tuple(names), np.array([0.0, seconds]), np.array([values, values]), (phase,), len(scene.start))
+    return Trajectory(
+        tuple(names),
+        np.array([0.0, seconds]),
+        np.array([values, values]),
+        (phase,),
+        len(scene.start),
+    )
 
 
 def with_mass(scene: Scene, name: str, mass: float) -> Scene:

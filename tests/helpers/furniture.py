@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vkc_pin.models.articulation import ArticulatedObject
-from vkc_pin.models.object_file import load_object
+from vkc_pin.world.models.articulated_object import ArticulatedObject
+from vkc_pin.world.models.object_file import load_object
 
 BAR = '<collision{}><origin xyz="-0.08 0.5 0" /><geometry><box size="0.02 0.02 0.3"/></geometry></collision>'
 """Upright, 70 mm before a flap that is hinged at y = 0."""
 
 
 def flap(
-    folder: Path, handle: str = "", *, thick: float = 0.02, before: str = "", behind: float = 0.03, attachments: str = "[]"
+    folder: Path,
+    handle: str = "",
+    *,
+    thick: float = 0.02,
+    before: str = "",
+    behind: float = 0.03,
+    attachments: str = "[]",
 ) -> ArticulatedObject:
     """Return a cabinet, 0.6 wide and 0.8 high, closed by a flap that opens towards -x, with collision elements as its handle.
 

@@ -24,7 +24,12 @@ def _across(obstacles: Sequence[dict[str, Any]], goal: Sequence[float]) -> vkc.T
 
 def walled(gap: float) -> vkc.TrajectoryProblem:
     """Return the problem of driving past a wall across the hall that leaves a gap beside it [m]."""
-    wall = {"name": "wall", "type": "box", "size": [0.2, 6.0 - gap, 1.5], "position": [2.0, gap / 2, 0.75]}
+    wall = {
+        "name": "wall",
+        "type": "box",
+        "size": [0.2, 6.0 - gap, 1.5],
+        "position": [2.0, gap / 2, 0.75],
+    }
     return _across([wall], (4.0, 1.5, 0.0))
 
 
@@ -33,7 +38,12 @@ def gated(width: float, *, height: float = 1.5) -> vkc.TrajectoryProblem:
     size = (6.4 - width) / 2
     return _across(
         [
-            {"name": name, "type": "box", "size": [0.2, size, height], "position": [2.0, side * (size + width) / 2, height / 2]}
+            {
+                "name": name,
+                "type": "box",
+                "size": [0.2, size, height],
+                "position": [2.0, side * (size + width) / 2, height / 2],
+            }
             for name, side in (("left", 1.0), ("right", -1.0))
         ],
         GOAL,

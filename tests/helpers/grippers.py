@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from helpers.arm_urdf import HEIGHT, write_arms
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["WIDEST", "between_cheeks", "cheeky_drawer", "write_gripper"]
 
@@ -27,8 +27,8 @@ _TOOL = (
 def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> Path:
     """Write the robot's URDF, SRDF and robot.yaml into a folder, and return the last.
 
-    At home the arm is bent forwards and points the hand along x of the base, 1.22 m up. Fingers close along the tool's x axis,
-    the world's y.
+    At home the arm is bent forwards and points the hand along x of the base, 1.22 m up. Fingers
+    close along the tool's x axis, the world's y.
 
     Args:
         folder: Where.
@@ -40,15 +40,35 @@ def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> P
     before, joint, after = text.partition('<joint name="finger_b_joint"')
     body, end, rest = after.partition("</joint>")
     mimic = "<mimic joint='finger_a_joint'/>"
-    text = (before + joint + body + mimic + end + rest).replace("</robot>", _FLOOR + _TOOL + "</robot>")
-    seen = re.sub(r"<collision>(.*?)</collision>", r"<visual>\1</visual><collision>\1</collision>", text)
+    text = (before + joint + body + mimic + end + rest).replace(
+        "</robot>", _FLOOR + _TOOL + "</robot>"
+    )
+    seen = re.sub(
+        r"<collision>(.*?)</collision>", r"<visual>\1</visual><collision>\1</collision>", text
+    )
     file.write_text(seen, encoding="utf-8")
     links = ["body", *(f"arm_{k + 1}" for k in range(5)), "hand", "finger_a", "finger_b"]
-    pairs = [*itertools.pairwise(links), ("hand", "finger_b"), ("arm_5", "finger_a"), ("arm_5", "finger_b"), ("body", "arm_2")]
-    near = "".join(f'<disable_collisions link1="{one}" link2="{other}" reason="Adjacent"/>' for one, other in pairs)
+    pairs = [
+        *itertools.pairwise(links),
+        ("hand", "finger_b"),
+        ("arm_5", "finger_a"),
+        ("arm_5", "finger_b"),
+        ("body", "arm_2"),
+    ]
+    near = "".join(
+        f'<disable_collisions link1="{one}" link2="{other}" reason="Adjacent"/>'
+        for one, other in pairs
+    )
     (folder / "robot.srdf").write_text(f'<robot name="robot">{near}</robot>', encoding="utf-8")
-    lines = ["urdf: robot.urdf", "srdf: robot.srdf", "tool_frame: tool", "touch_links: [hand, finger_a, finger_b]"]
-    lines += ["home: {arm_1_joint: 0.0, arm_2_joint: -0.4, arm_3_joint: 1.0, arm_4_joint: 0.0, arm_5_joint: 0.97}"]
+    lines = [
+        "urdf: robot.urdf",
+        "srdf: robot.srdf",
+        "tool_frame: tool",
+        "touch_links: [hand, finger_a, finger_b]",
+    ]
+    lines += [
+        "home: {arm_1_joint: 0.0, arm_2_joint: -0.4, arm_3_joint: 1.0, arm_4_joint: 0.0, arm_5_joint: 0.97}"
+    ]
     yaml = folder / "robot.yaml"
     yaml.write_text("\n".join(lines) + f"\n{gripper}{more}", encoding="utf-8")
     return yaml
@@ -86,16 +106,25 @@ def between_cheeks(
         robot: The robot's robot.yaml.
         opening: What the attachment says [m]; None: nothing.
         start: How far the gripper is open at the start [m]; None: as the robot rests.
-        gap: From the middle of the handle to either cheek [m]; fingers that are fully open leave 10 mm of the default.
+        gap: From the middle of the handle to either cheek [m]; fingers that are fully open leave 10
+            mm of the default.
         other: Where another drawer stands, whose attachment says nothing.
         height: Of the drawer [m].
     """
     plain: dict[str, Any] = {"name": "grip", "link": "front", "position": [-0.05, 0.0, 0.0]}
     plain |= {"approach": [1.0, 0.0, 0.0], "closing": [0.0, 1.0, 0.0]}
     grip = plain if opening is None else {**plain, "opening": opening}
-    drawers = [("drawer", grip, [1.2, 0.0, height]), *([("other", plain, list(other))] if other else [])]
+    drawers = [
+        ("drawer", grip, [1.2, 0.0, height]),
+        *([("other", plain, list(other))] if other else []),
+    ]
     cheeks = [
-        {"name": name, "type": "box", "size": [0.08, 0.04, 0.2], "position": [1.16, side * (gap + 0.02), height]}
+        {
+            "name": name,
+            "type": "box",
+            "size": [0.08, 0.04, 0.2],
+            "position": [1.16, side * (gap + 0.02), height],
+        }
         for name, side in (("left", 1.0), ("right", -1.0))
     ]
     document = {
@@ -104,7 +133,11 @@ def between_cheeks(
         "start": {"base": [0.0, 0.0, 0.0], **({} if start is None else {"opening": start})},
         "obstacles": cheeks,
         "objects": [
-            {"name": name, "type": {"urdf": _DRAWER, "attachments": [attachment]}, "position": place}
+            {
+                "name": name,
+                "type": {"urdf": _DRAWER, "attachments": [attachment]},
+                "position": place,
+            }
             for name, attachment, place in drawers
         ],
     }
@@ -117,4 +150,7 @@ def cheeky_drawer(gap: float = 0.06) -> dict[str, Any]:
         f'<collision><origin xyz="-0.04 {side * (gap + 0.02)} 0"/><geometry><box size="0.08 0.04 0.2"/></geometry></collision>'
         for side in (1.0, -1.0)
     )
-    return {"urdf": _DRAWER.replace('<link name="frame"/>', f'<link name="frame">{posts}</link>'), "attachments": []}
+    return {
+        "urdf": _DRAWER.replace('<link name="frame"/>', f'<link name="frame">{posts}</link>'),
+        "attachments": [],
+    }

@@ -30,8 +30,9 @@ WALLS = {  # name → x from, to; y from, to [m]
 def home_urdf(folder: Path) -> tuple[Path, int]:
     """Write a home of three rooms as one URDF, and return it and how many shapes collide in it.
 
-    Its walls are shapes of the root; refrigerator, drawers and dishwasher are fixed links with joints; the door hangs on the root
-    itself; a sofa is a concave mesh, a table of several shapes; cups float, a lump is too thick for a hand, a carpet lies there.
+    Its walls are shapes of the root; refrigerator, drawers and dishwasher are fixed links with
+    joints; the door hangs on the root itself; a sofa is a concave mesh, a table of several shapes;
+    cups float, a lump is too thick for a hand, a carpet lies there.
     """
     folder.mkdir(parents=True, exist_ok=True)
     robot = ElementTree.Element("robot", name="home")
@@ -64,7 +65,9 @@ def home_urdf(folder: Path) -> tuple[Path, int]:
     ElementTree.SubElement(ElementTree.SubElement(seat, "geometry"), "mesh", filename="sofa.stl")
     _box(_link(robot, "carpet", "fixed", (0.0, -1.5, 0.0)), (2.0, 1.0, 0.01), (0.0, 0.0, 0.005))
     for k, y in enumerate((0.2, 0.6)):
-        _cylinder(_link(robot, f"cup_{k}", "floating", (0.25, y, 0.749)), 0.03, 0.1)  # one millimetre deep in the table
+        _cylinder(
+            _link(robot, f"cup_{k}", "floating", (0.25, y, 0.749)), 0.03, 0.1
+        )  # one millimetre deep in the table
     _box(_link(robot, "lump", "floating", (2.0, 5.0, 0.0)), (0.4, 0.4, 0.4), (0.0, 0.0, 0.2))
     file = folder / "flat.urdf"
     ElementTree.ElementTree(robot).write(file)
@@ -105,17 +108,35 @@ def _beside_the_door() -> dict[str, tuple[float, float, float, float]]:
         shape.geometry.computeLocalAABB()
         box, at = shape.geometry.aabb_local, data.oMi[shape.parentJoint] * shape.placement
         for corner in np.array(np.meshgrid(*zip(box.min_, box.max_, strict=True))).reshape(3, -1).T:
-            xs.append((pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.array([*PLACES["door"][:2], 0.0])) * at).act(corner)[0])
-    return {"wall_beside": (-4.7, min(xs) - 0.005, 2.95, 3.05), "wall_beyond": (max(xs) + 0.005, 4.7, 2.95, 3.05)}
+            xs.append(
+                (
+                    pin.SE3(
+                        pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.array([*PLACES["door"][:2], 0.0])
+                    )
+                    * at
+                ).act(corner)[0]
+            )
+    return {
+        "wall_beside": (-4.7, min(xs) - 0.005, 2.95, 3.05),
+        "wall_beyond": (max(xs) + 0.005, 4.7, 2.95, 3.05),
+    }
 
 
-def _link(robot: ElementTree.Element, name: str, kind: str, at: tuple[float, ...]) -> ElementTree.Element:
+def _link(
+    robot: ElementTree.Element, name: str, kind: str, at: tuple[float, ...]
+) -> ElementTree.Element:
     _joint(robot, f"{name}_stands", kind, "world", name, at)
     return ElementTree.SubElement(robot, "link", name=name)
 
 
 def _joint(
-    robot: ElementTree.Element, name: str, kind: str, parent: str, child: str, at: tuple[float, ...], yaw: float = 0.0
+    robot: ElementTree.Element,
+    name: str,
+    kind: str,
+    parent: str,
+    child: str,
+    at: tuple[float, ...],
+    yaw: float = 0.0,
 ) -> None:
     joint = ElementTree.SubElement(robot, "joint", name=name, type=kind)
     ElementTree.SubElement(joint, "parent", link=parent)
@@ -123,13 +144,22 @@ def _joint(
     ElementTree.SubElement(joint, "origin", xyz=" ".join(map(str, at)), rpy=f"0 0 {yaw}")
 
 
-def _box(link: ElementTree.Element, size: tuple[float, ...], at: tuple[float, ...], name: str = "") -> None:
+def _box(
+    link: ElementTree.Element, size: tuple[float, ...], at: tuple[float, ...], name: str = ""
+) -> None:
     shape = ElementTree.SubElement(link, "collision", **({"name": name} if name else {}))
     ElementTree.SubElement(shape, "origin", xyz=" ".join(map(str, at)))
-    ElementTree.SubElement(ElementTree.SubElement(shape, "geometry"), "box", size=" ".join(map(str, size)))
+    ElementTree.SubElement(
+        ElementTree.SubElement(shape, "geometry"), "box", size=" ".join(map(str, size))
+    )
 
 
 def _cylinder(link: ElementTree.Element, radius: float, length: float) -> None:
     shape = ElementTree.SubElement(link, "collision")
     ElementTree.SubElement(shape, "origin", xyz=f"0 0 {length / 2}")
-    ElementTree.SubElement(ElementTree.SubElement(shape, "geometry"), "cylinder", radius=str(radius), length=str(length))
+    ElementTree.SubElement(
+        ElementTree.SubElement(shape, "geometry"),
+        "cylinder",
+        radius=str(radius),
+        length=str(length),
+    )

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.models.articulation import Attachment
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.models.articulated_object import Attachment
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def only(report: Report) -> Violation:
@@ -25,12 +25,25 @@ def names(report: Report) -> set[tuple[str, str]]:
     return {(violation.constraint, violation.subject) for violation in report.violations}
 
 
-def check(plan: vkc.Plan, *, scene: Scene | None = None, trajectory: Trajectory | None = None, **options: float) -> Report:
+def check(
+    plan: vkc.Plan,
+    *,
+    scene: Scene | None = None,
+    trajectory: Trajectory | None = None,
+    **options: float,
+) -> Report:
     """Validate the planned motion with something about it changed."""
-    return validate(scene or plan.scene, plan.steps, trajectory or plan.trajectory, dataclasses.replace(plan.options, **options))
+    return validate(
+        scene or plan.scene,
+        plan.steps,
+        trajectory or plan.trajectory,
+        dataclasses.replace(plan.options, **options),
+    )
 
 
-def with_object(scene: Scene, name: str = "door", *, placement: pin.SE3 | None = None, **fields: object) -> Scene:
+def with_object(
+    scene: Scene, name: str = "door", *, placement: pin.SE3 | None = None, **fields: object
+) -> Scene:
     """Return `scene` with an object that stands elsewhere or has other fields."""
     placed = scene.objects[name]
     changed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, **fields))

@@ -24,7 +24,9 @@ class Kernel:
     def __init__(self, manager: Any, client: Any) -> None:
         self.manager, self.client = manager, client
 
-    def run(self, code: str, *, interrupt: str | None = None, delay: float = 0.0, timeout: float = 120.0) -> list[dict[str, Any]]:
+    def run(
+        self, code: str, *, interrupt: str | None = None, delay: float = 0.0, timeout: float = 120.0
+    ) -> list[dict[str, Any]]:
         """Run a cell; return what it put out, as in a saved notebook, with updates where the first output stood.
 
         Args:
@@ -44,7 +46,13 @@ class Kernel:
                 continue
             if kind == "status" and content["execution_state"] == "idle":
                 return outputs
-            if kind not in ("stream", "display_data", "update_display_data", "execute_result", "error"):
+            if kind not in (
+                "stream",
+                "display_data",
+                "update_display_data",
+                "execute_result",
+                "error",
+            ):
                 continue
             if kind == "update_display_data":
                 outputs[shown[content["transient"]["display_id"]]].update(content, updates=True)
@@ -65,7 +73,9 @@ def kernel() -> Iterator[Kernel]:
     manager, client = start_new_kernel(kernel_name="python3", cwd=str(ROOT))
     try:
         started = Kernel(manager, client)
-        started.run(f"import sys; sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'tests')!r}]\nimport vkc_pin as vkc")
+        started.run(
+            f"import sys; sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'tests')!r}]\nimport vkc_pin as vkc"
+        )
         yield started
     finally:
         client.stop_channels()

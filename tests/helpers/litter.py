@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from vkc_pin.files.resources import folder
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.scene.scene import Scene
 
 AT, BIN, BELOW = (1.0, 0.0, 0.036), (0.0, 2.0, 0.16), (-1.0, 0.0, 0.037)
 
@@ -17,7 +17,12 @@ def shelf(x: float, y: float) -> dict[str, Any]:
 
 def littered(*obstacles: dict[str, Any]) -> Scene:
     """Return the scene with obstacles and, always, the bin."""
-    inside = {"name": "bin", "type": "urdf", "file": "furniture/bin.urdf", "position": [*BIN[:2], 0.0]}
+    inside = {
+        "name": "bin",
+        "type": "urdf",
+        "file": "furniture/bin.urdf",
+        "position": [*BIN[:2], 0.0],
+    }
     document = {
         "name": "litter",
         "robot": "husky_ur5e",

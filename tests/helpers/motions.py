@@ -6,11 +6,11 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import Script, room, table
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.pairs import PairTable
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
@@ -22,11 +22,16 @@ def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
     first[3:9] += rng.uniform(-1.0, 1.0, 6)
     rows = [first]
     for _ in range(3):
-        rows.append(rows[-1] + size * rng.uniform(-1.0, 1.0, len(first)) * rng.choice([0.0, 0.1, 1.0], len(first)))
+        rows.append(
+            rows[-1]
+            + size * rng.uniform(-1.0, 1.0, len(first)) * rng.choice([0.0, 0.1, 1.0], len(first))
+        )
     positions = np.array(rows)
     positions[:, 9:] = np.clip(positions[:, 9:], door.lower, door.upper)
     names = (*scene.robot.coordinates.names, "door.hinge", "door.knob")
-    return Trajectory(names, np.arange(4.0), positions, (PhaseSpan("all", 0, 3, (Hold("door", "handle"),)),), 9)
+    return Trajectory(
+        names, np.arange(4.0), positions, (PhaseSpan("all", 0, 3, (Hold("door", "handle"),)),), 9
+    )
 
 
 def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:
@@ -34,7 +39,11 @@ def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:
     geometry = table.world.collision.copy()
     for first, second in table.pairs.tolist():
         geometry.addCollisionPair(pin.CollisionPair(first, second))
-    model, data, shapes = table.world.model, table.world.model.createData(), pin.GeometryData(geometry)
+    model, data, shapes = (
+        table.world.model,
+        table.world.model.createData(),
+        pin.GeometryData(geometry),
+    )
     out = np.empty((len(z), len(table.pairs)))
     for row, q in enumerate(table.world.coordinates.q(z)):
         pin.updateGeometryPlacements(model, data, geometry, shapes, q)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from vkc_pin.models.articulation import ArticulatedObject
-from vkc_pin.models.object_file import load_object
+from vkc_pin.world.models.articulated_object import ArticulatedObject
+from vkc_pin.world.models.object_file import load_object
 
-SHAPES = ('<box size="0.1 0.2 0.3"/>', '<sphere radius="0.1"/>', '<cylinder radius="0.1" length="0.4"/>')
+SHAPES = (
+    '<box size="0.1 0.2 0.3"/>',
+    '<sphere radius="0.1"/>',
+    '<cylinder radius="0.1" length="0.4"/>',
+)
 
 
 def joint(name: str, kind: str, parent: str, child: str, axis: str) -> str:

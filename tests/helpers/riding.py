@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 TOP = 0.67  # [m] of the plate
 POST = '<link name="post"><collision><origin xyz="0 0 0.3"/><geometry><box size="0.3 0.3 0.6"/></geometry></collision></link>'
@@ -25,7 +25,9 @@ GRIP = (
     '<collision><origin xyz="-0.23 0.09 {z}"/><geometry><box size="0.07 0.01 0.01"/></geometry></collision>'
     '<collision><origin xyz="-0.23 -0.09 {z}"/><geometry><box size="0.07 0.01 0.01"/></geometry></collision>'
 )
-BOARD = '<collision><origin xyz="0 0 0.01"/><geometry><box size="0.4 0.4 0.02"/></geometry></collision>'
+BOARD = (
+    '<collision><origin xyz="0 0 0.01"/><geometry><box size="0.4 0.4 0.02"/></geometry></collision>'
+)
 JOINT = (
     '<joint name="{name}" type="{kind}"><parent link="post"/><child link="plate"/><origin xyz="0 0 0.65"/><axis xyz="{axis}"/>'
     '<limit lower="0" upper="0.5" effort="10" velocity="1"/></joint>'
@@ -51,13 +53,19 @@ def folder() -> Path:
         plate = f'<link name="plate">{BOARD}{GRIP.format(z=0.01)}</link>'
         moving = JOINT.format(name=joint, kind=kind, axis=axis)
         (made / f"{name}.urdf").write_text(f'<robot name="{name}">{POST}{plate}{moving}</robot>')
-        (made / f"{name}.yaml").write_text(OBJECT.format(name=name, free="false", link="plate", z=0.01))
-    (made / "tray.urdf").write_text(f'<robot name="tray"><link name="tray">{BOARD}{GRIP.format(z=0.03)}</link></robot>')
+        (made / f"{name}.yaml").write_text(
+            OBJECT.format(name=name, free="false", link="plate", z=0.01)
+        )
+    (made / "tray.urdf").write_text(
+        f'<robot name="tray"><link name="tray">{BOARD}{GRIP.format(z=0.03)}</link></robot>'
+    )
     (made / "tray.yaml").write_text(OBJECT.format(name="tray", free="true", link="tray", z=0.03))
     return made
 
 
-def scene_of(objects: Sequence[Mapping[str, Any]], obstacles: Sequence[Mapping[str, Any]] = ()) -> Scene:
+def scene_of(
+    objects: Sequence[Mapping[str, Any]], obstacles: Sequence[Mapping[str, Any]] = ()
+) -> Scene:
     """Return a hall with objects and obstacles."""
     document = {
         "robot": "husky_ur5e",
@@ -73,15 +81,24 @@ def cup(name: str = "cup", *, at: Sequence[float] = (0.8, 0.05, TOP)) -> dict[st
     return {"name": name, "type": "cup", "position": list(at)}
 
 
-def plates(kind: str = "plate", *, cups: int = 1, gap: float = 0.0, wall: float | None = None) -> Scene:
+def plates(
+    kind: str = "plate", *, cups: int = 1, gap: float = 0.0, wall: float | None = None
+) -> Scene:
     """Return a plate with cups on it, `gap` above it; and maybe a wall so far behind the first [m]."""
     objects = [{"name": "plate", "type": f"{kind}.yaml", "position": [0.8, 0.0, 0.0]}]
-    objects += [cup(f"cup_{k}" if k else "cup", at=(0.8, 0.05 - 0.12 * k, TOP + gap)) for k in range(cups)]
+    objects += [
+        cup(f"cup_{k}" if k else "cup", at=(0.8, 0.05 - 0.12 * k, TOP + gap)) for k in range(cups)
+    ]
     behind = (
         []
         if wall is None
         else [
-            {"name": "wall", "type": "box", "size": [0.02, 0.02, 0.05], "position": [0.8 + 0.035 + wall + 0.01, 0.05, TOP + 0.06]}
+            {
+                "name": "wall",
+                "type": "box",
+                "size": [0.02, 0.02, 0.05],
+                "position": [0.8 + 0.035 + wall + 0.01, 0.05, TOP + 0.06],
+            }
         ]
     )
     return scene_of(objects, behind)
@@ -90,14 +107,25 @@ def plates(kind: str = "plate", *, cups: int = 1, gap: float = 0.0, wall: float 
 def slid(scene: Scene, value: float, *, steps: int = 30) -> Trajectory:
     """Return a motion in which the plate's joint goes to a value, held by a hand that is not there."""
     joint = scene.objects["plate"].object.coordinates.names[0]
-    rows = np.column_stack([np.tile(scene.start, (steps + 1, 1)), np.linspace(0.0, value, steps + 1)])
+    rows = np.column_stack(
+        [np.tile(scene.start, (steps + 1, 1)), np.linspace(0.0, value, steps + 1)]
+    )
     phases = (PhaseSpan("move", 0, steps, (Hold("plate", "handle"),)),)
-    return Trajectory((*scene.robot.coordinates.names, f"plate.{joint}"), 0.25 * np.arange(steps + 1), rows, phases, 9)
+    return Trajectory(
+        (*scene.robot.coordinates.names, f"plate.{joint}"),
+        0.25 * np.arange(steps + 1),
+        rows,
+        phases,
+        9,
+    )
 
 
 def trays() -> Scene:
     """Return a tray with a cup on it on one table, and another table."""
-    objects = [{"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]}, cup(at=(0.82, 0.05, 0.72))]
+    objects = [
+        {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
+        cup(at=(0.82, 0.05, 0.72)),
+    ]
     tables = [
         {"name": name, "type": "box", "size": [0.36, 0.5, 0.1], "position": list(at)}
         for name, at in (("table", (0.8, 0.0, 0.65)), ("other", (-0.5, -1.5, 0.65)))

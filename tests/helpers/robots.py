@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.models.robot import Robot
+from vkc_pin.world.models.robot import Robot
 
 
 def at_rest(robot: Robot) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vkc_pin.scene.scene import Scene, load_scene
+from vkc_pin.world.scene.scene import Scene, load_scene
 
 TINY = """\
 robot: husky_ur5e

@@ -1,4 +1,4 @@
-"""Lets the oracle judge every motion that is planned: `planning.outcome` puts plans together, and those are kept until asked."""
+"""Lets the oracle judge every motion that is planned: `planning.results` builds plans, and this keeps them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from oracle.judge import Verdict, judge
 
-import vkc_pin.planning.outcome as outcome
+import vkc_pin.planning.results as results
 from vkc_pin.planning.plan import Plan
 
 __all__ = ["SecondOpinion"]
@@ -40,7 +40,7 @@ class SecondOpinion:
                 self._waiting.append(plan)
             return plan
 
-        outcome.Plan = kept  # type: ignore[misc, assignment]
+        results.Plan = kept  # type: ignore[misc, assignment]
 
     def forget(self) -> None:
         """Do not judge what has been planned since `verdicts` was asked last."""
@@ -67,6 +67,11 @@ class SecondOpinion:
 
 
 def _digest(plan: Plan) -> str:
-    about = [plan.scene.document, str(plan.scene.folder), plan.to_dict()["steps"], vars(plan.options)]
+    about = [
+        plan.scene.document,
+        str(plan.scene.folder),
+        plan.to_dict()["steps"],
+        vars(plan.options),
+    ]
     content = json.dumps([about, plan.trajectory.to_dict()], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:16]

@@ -11,22 +11,23 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.cache import Cache
-from vkc_pin.chain.phase_geometry import PhaseGeometry
-from vkc_pin.models.articulation import ArticulatedObject, Attachment, Freedom
-from vkc_pin.models.object_file import load_object
 from vkc_pin.options import Options
-from vkc_pin.program.inspection import build
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.placed import PlacedObject
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Step
-from vkc_pin.task.terms import Term
+from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.planning.nlp.inspection import build
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment, Freedom
+from vkc_pin.world.models.object_file import load_object
+from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.task.terms import Term
 
 CACHE = Cache()
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=4)
 
-# A cabinet with a swinging arm on a slanted axis, on it a tray that slides, and beside the way two flaps.
+# A cabinet with a swinging arm on a slanted axis, on it a tray that slides, and beside the way two
+# flaps.
 _CABINET = """
 <robot name="cabinet">
   <link name="case"><collision><geometry><box size="0.5 0.5 0.5"/></geometry></collision></link>
@@ -78,7 +79,9 @@ def with_objects(scene: Scene, objects: Mapping[str, PlacedObject]) -> Scene:
 def with_attachment(placed: PlacedObject, attachment: Attachment) -> PlacedObject:
     """Return `placed` with one more attachment."""
     attachments = {**placed.object.attachments, attachment.name: attachment}
-    return dataclasses.replace(placed, object=dataclasses.replace(placed.object, attachments=attachments))
+    return dataclasses.replace(
+        placed, object=dataclasses.replace(placed.object, attachments=attachments)
+    )
 
 
 @cache
@@ -86,21 +89,47 @@ def full_scene() -> Scene:
     """Return the door's room with a drawer and a cabinet in it too, all of which can be grasped in every way there is."""
     scene, drawer = door_scene(), load_scene("drawer").objects["drawer"]
     state = np.array([CABINET_STATE[name] for name in cabinet().coordinates.names])
-    case = PlacedObject("cabinet", cabinet(), pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 0.8), np.array([-1.0, 1.2, 0.4])), state)
+    case = PlacedObject(
+        "cabinet",
+        cabinet(),
+        pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 0.8), np.array([-1.0, 1.2, 0.4])),
+        state,
+    )
     grip = cabinet().attachments["grip"]
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
-    turns = tuple(Freedom(f"_{name}", "revolute", unit, -0.7, 0.6) for name, unit in zip("xyz", np.eye(3), strict=True))
-    sleeve = (Freedom("_slide", "prismatic", axis, -0.05, 0.08), Freedom("_turn", "revolute", axis, -0.5, 0.9))
+    turns = tuple(
+        Freedom(f"_{name}", "revolute", unit, -0.7, 0.6)
+        for name, unit in zip("xyz", np.eye(3), strict=True)
+    )
+    sleeve = (
+        Freedom("_slide", "prismatic", axis, -0.05, 0.08),
+        Freedom("_turn", "revolute", axis, -0.5, 0.9),
+    )
     wheel = (
         Freedom("_around", "revolute", axis, -2.0, 2.0, np.array([0.1, -0.2, 0.05])),
         Freedom("_tilt", "revolute", turns[1].axis, -0.5, 0.5),
     )
-    face = (*(Freedom(f"_{name}", "prismatic", unit, -0.1, 0.1) for name, unit in zip("xy", np.eye(3), strict=False)), turns[2])
+    face = (
+        *(
+            Freedom(f"_{name}", "prismatic", unit, -0.1, 0.1)
+            for name, unit in zip("xy", np.eye(3), strict=False)
+        ),
+        turns[2],
+    )
     for freer in (
-        dataclasses.replace(grip, name="rail", joint="prismatic", freedoms=(Freedom("", "prismatic", axis, -0.05, 0.08),)),
-        dataclasses.replace(grip, name="bar", joint="revolute", freedoms=(Freedom("", "revolute", axis, -0.5, 0.9),)),
+        dataclasses.replace(
+            grip,
+            name="rail",
+            joint="prismatic",
+            freedoms=(Freedom("", "prismatic", axis, -0.05, 0.08),),
+        ),
+        dataclasses.replace(
+            grip, name="bar", joint="revolute", freedoms=(Freedom("", "revolute", axis, -0.5, 0.9),)
+        ),
         dataclasses.replace(grip, name="ball", joint="spherical", freedoms=turns),
-        dataclasses.replace(grip, name="sleeve", joint="cylindrical", freedoms=sleeve, standoff=0.02),
+        dataclasses.replace(
+            grip, name="sleeve", joint="cylindrical", freedoms=sleeve, standoff=0.02
+        ),
         dataclasses.replace(grip, name="socket", joint="spherical", freedoms=turns, standoff=0.04),
         dataclasses.replace(grip, name="spike", standoff=0.03),
         dataclasses.replace(grip, name="wheel", joint="listed", freedoms=wheel, standoff=0.02),
@@ -111,7 +140,12 @@ def full_scene() -> Scene:
 
 
 def random_configurations(
-    lower: np.ndarray, upper: np.ndarray, count: int, rng: np.random.Generator, *, arena: float = 2.0
+    lower: np.ndarray,
+    upper: np.ndarray,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    arena: float = 2.0,
 ) -> np.ndarray:
     """Return configurations between limits, shape (count, n); the base within `arena` of the origin, at any heading."""
     low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
@@ -139,7 +173,11 @@ def hand_off_the_handle(scene: Scene, row: np.ndarray, hinge: float, knob: float
 
 
 def program_of(
-    scene: Scene, steps: Sequence[Step], *, options: Options | None = None, terms: Sequence[Term] = ()
+    scene: Scene,
+    steps: Sequence[Step],
+    *,
+    options: Options | None = None,
+    terms: Sequence[Term] = (),
 ) -> TrajectoryProblem:
     """Return the program of `steps`; tests of one process share the symbolic ones."""
     return build(scene, steps, options=options, terms=terms, cache=CACHE)

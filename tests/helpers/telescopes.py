@@ -6,9 +6,17 @@ import itertools
 from pathlib import Path
 
 from helpers.grippers import between_cheeks
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["FOLLOWERS", "SEGMENT", "coupled_scene", "joint", "link", "telescope_scene", "write_telescope"]
+__all__ = [
+    "FOLLOWERS",
+    "SEGMENT",
+    "coupled_scene",
+    "joint",
+    "link",
+    "telescope_scene",
+    "write_telescope",
+]
 
 SEGMENT = 0.15  # [m] that each segment comes out
 FOLLOWERS = {f"out_{k}": "out_1" for k in (2, 3, 4)}
@@ -44,15 +52,20 @@ def joint(
     )
 
 
-def write_telescope(folder: Path, *, couplings: str | None = None, mimics: str = "", more: str = "") -> Path:
+def write_telescope(
+    folder: Path, *, couplings: str | None = None, mimics: str = "", more: str = ""
+) -> Path:
     """Write the robot's URDF, SRDF and robot.yaml into a folder, and return the last.
 
-    At 0 the arm is drawn in and points the hand along x of the base, 0.46 m up; then the tool's z axis is x, and its x axis y.
+    At 0 the arm is drawn in and points the hand along x of the base, 0.46 m up; then the tool's z
+    axis is x, and its x axis y.
 
     Args:
         folder: Where.
-        couplings: What robot.yaml says of them; None: that the second to fourth segment follow the first.
-        mimics: A word: joints that the URDF lets follow "first", each the first one, or "chain", each the one before it.
+        couplings: What robot.yaml says of them; None: that the second to fourth segment follow the
+            first.
+        mimics: A word: joints that the URDF lets follow "first", each the first one, or "chain",
+            each the one before it.
         more: Lines of robot.yaml beyond that.
     """
     parts = [link("body", "0.44 0.4 0.3", "0 0 0.2"), link("mast", "0.06 0.06 1.3", "0 0 0.65")]
@@ -67,9 +80,24 @@ def write_telescope(folder: Path, *, couplings: str | None = None, mimics: str =
         followed = {"first": "out_1", "chain": f"out_{k - 1}"}.get(mimics, "") if k > 1 else ""
         inside = f'<mimic joint="{followed}"/>' if followed else ""
         parts += [link(f"segment_{k}", f"0.2 {width} {width}", "0.1 0 0")]
-        parts.append(joint(f"out_{k}", "prismatic", below, f"segment_{k}", at, "1 0 0", (0.0, SEGMENT), inside=inside))
+        parts.append(
+            joint(
+                f"out_{k}",
+                "prismatic",
+                below,
+                f"segment_{k}",
+                at,
+                "1 0 0",
+                (0.0, SEGMENT),
+                inside=inside,
+            )
+        )
         below, at = f"segment_{k}", "0.005 0 0"
-    for name, axis, at in (("yaw", "0 0 1", "0.24 0 0"), ("pitch", "0 1 0", "0.05 0 0"), ("roll", "1 0 0", "0.05 0 0")):
+    for name, axis, at in (
+        ("yaw", "0 0 1", "0.24 0 0"),
+        ("pitch", "0 1 0", "0.05 0 0"),
+        ("roll", "1 0 0", "0.05 0 0"),
+    ):
         parts += [
             link(name, "0.03 0.03 0.03", "0.02 0 0"),
             joint(f"{name}_joint", "revolute", below, name, at, axis, (-3.0, 3.0)),
@@ -85,17 +113,34 @@ def write_telescope(folder: Path, *, couplings: str | None = None, mimics: str =
         parts += [link(name, "0.1 0.01 0.02", f"0.05 {side * 0.005} 0")]
         parts.append(joint(f"{name}_joint", "fixed", "hand", name, f"0.045 {side * 0.04} 0"))
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "robot.urdf").write_text(f'<robot name="robot">{"".join(parts)}</robot>', encoding="utf-8")
+    (folder / "robot.urdf").write_text(
+        f'<robot name="robot">{"".join(parts)}</robot>', encoding="utf-8"
+    )
     arm = ["carriage", *(f"segment_{k}" for k in range(1, 5))]
     hand = ["yaw", "pitch", "roll", "hand", "finger_a", "finger_b"]
-    pairs = [*itertools.combinations(arm, 2), *itertools.combinations(hand, 2), ("body", "mast"), ("mast", "carriage")]
+    pairs = [
+        *itertools.combinations(arm, 2),
+        *itertools.combinations(hand, 2),
+        ("body", "mast"),
+        ("mast", "carriage"),
+    ]
     pairs += [("mast", name) for name in arm] + list(itertools.product(arm[1:], ["yaw", "pitch"]))
     near = "".join(
-        f'<disable_collisions link1="{one}" link2="{other}" reason="Adjacent"/>' for one, other in dict.fromkeys(pairs)
+        f'<disable_collisions link1="{one}" link2="{other}" reason="Adjacent"/>'
+        for one, other in dict.fromkeys(pairs)
     )
     (folder / "robot.srdf").write_text(f'<robot name="robot">{near}</robot>', encoding="utf-8")
-    said = ", ".join(f"{joint}: {leader}" for joint, leader in FOLLOWERS.items()) if couplings is None else couplings
-    lines = ["urdf: robot.urdf", "srdf: robot.srdf", "tool_frame: tool", "touch_links: [hand, finger_a, finger_b]"]
+    said = (
+        ", ".join(f"{joint}: {leader}" for joint, leader in FOLLOWERS.items())
+        if couplings is None
+        else couplings
+    )
+    lines = [
+        "urdf: robot.urdf",
+        "srdf: robot.srdf",
+        "tool_frame: tool",
+        "touch_links: [hand, finger_a, finger_b]",
+    ]
     lines += [f"couplings: {{{said}}}"] if said else []
     (folder / "robot.yaml").write_text("\n".join(lines) + f"\n{more}", encoding="utf-8")
     return folder / "robot.yaml"

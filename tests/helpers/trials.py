@@ -20,8 +20,19 @@ def trials(number: int = 6, **more: Any) -> list[dict[str, Any]]:
 def square(spec: dict[str, Any]) -> dict[str, Any]:
     """A deterministic trial, with the fields and types that records have."""
     k = spec["number"]
-    values = {"effort": np.float64(k) / 3.0, "good": np.bool_(k % 2), "start": np.array([k, 0.1]), "distance": np.inf}
-    return {"number": k, "square": np.int64(k * k), **values, "violations": ["a, b", 'c "d"'], "status": "success"}
+    values = {
+        "effort": np.float64(k) / 3.0,
+        "good": np.bool_(k % 2),
+        "start": np.array([k, 0.1]),
+        "distance": np.inf,
+    }
+    return {
+        "number": k,
+        "square": np.int64(k * k),
+        **values,
+        "violations": ["a, b", 'c "d"'],
+        "status": "success",
+    }
 
 
 def mistaken(spec: dict[str, Any]) -> dict[str, Any]:

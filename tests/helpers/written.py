@@ -9,26 +9,44 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.hold import Hold
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
-FILES = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+FILES = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None
+)
 ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
 
 
 @st.composite
 def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
     """Return trajectories whose robot has up to five coordinates, with things held and carried through others."""
-    robot, things = draw(st.integers(3, 5)), draw(st.lists(st.sampled_from("abcde"), max_size=4, unique=True))
+    robot, things = (
+        draw(st.integers(3, 5)),
+        draw(st.lists(st.sampled_from("abcde"), max_size=4, unique=True)),
+    )
     names = (*ROBOT[:robot], *(f"{name}.joint" for name in things))
     steps = draw(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=8))
     times = draw(st.floats(-1e3, 1e3)) + np.cumsum([0.0, *steps])
-    numbers = st.floats(allow_nan=False, allow_infinity=False) if largest is None else st.floats(-largest, largest)
-    rows = draw(st.lists(st.lists(numbers, min_size=len(names), max_size=len(names)), min_size=len(times), max_size=len(times)))
+    numbers = (
+        st.floats(allow_nan=False, allow_infinity=False)
+        if largest is None
+        else st.floats(-largest, largest)
+    )
+    rows = draw(
+        st.lists(
+            st.lists(numbers, min_size=len(names), max_size=len(names)),
+            min_size=len(times),
+            max_size=len(times),
+        )
+    )
     cuts = sorted(draw(st.sets(st.integers(1, len(steps)))) | {len(steps)})
     label, phases, first = st.text(st.characters(exclude_categories=["Cs"]), max_size=6), [], 0
-    name, link = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="."), max_size=6), label.filter(bool)
+    name, link = (
+        st.text(st.characters(exclude_categories=["Cs"], exclude_characters="."), max_size=6),
+        label.filter(bool),
+    )
     for last in cuts:
         held = list(draw(st.dictionaries(name, label, max_size=3)).items())
         holds: list[Hold] = []
@@ -59,9 +77,19 @@ ROWS = np.array(
     ]
 )
 TIMES = np.array([0.0, 2.0, 2.5, 6.5])
-PHASES = (PhaseSpan("reach door.handle", 0, 2), PhaseSpan("move door.hinge", 2, 3, (Hold("door", "handle"),)))
+PHASES = (
+    PhaseSpan("reach door.handle", 0, 2),
+    PhaseSpan("move door.hinge", 2, 3, (Hold("door", "handle"),)),
+)
 
 
 def example(**changes: Any) -> Trajectory:
-    fields = {"names": NAMES, "times": TIMES, "positions": ROWS, "phases": PHASES, "robot_size": 5, **changes}
+    fields = {
+        "names": NAMES,
+        "times": TIMES,
+        "positions": ROWS,
+        "phases": PHASES,
+        "robot_size": 5,
+        **changes,
+    }
     return Trajectory(**fields)

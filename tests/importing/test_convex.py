@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin import kept
 from vkc_pin.importing import convex
-from vkc_pin.importing.convex import concavity, decompose, solid_volume
+from vkc_pin.importing.convex import compute_concavity, compute_solid_volume, decompose
+from vkc_pin.utils import disk_cache as kept
 
 box = trimesh.creation.box
 
@@ -54,14 +54,18 @@ def test_a_convex_mesh_stays_one_piece_of_its_own_volume() -> None:
 
 def test_bodies_become_pieces_of_their_own() -> None:
     """No search: two boxes are two boxes, to the millimetre."""
-    pieces = decompose(trimesh.util.concatenate([box((1, 0.1, 0.1)), box((0.1, 0.1, 1)).apply_translation((0.4, 0, 0.6))]))
+    pieces = decompose(
+        trimesh.util.concatenate(
+            [box((1, 0.1, 0.1)), box((0.1, 0.1, 1)).apply_translation((0.4, 0, 0.6))]
+        )
+    )
     assert sorted(len(piece.vertices) for piece in pieces.meshes) == [8, 8]
     assert pieces.volume == pytest.approx(0.02, rel=1e-6)
 
 
 def test_a_bin_becomes_hollow() -> None:
     mesh = tray()
-    assert concavity(mesh) > 0.08
+    assert compute_concavity(mesh) > 0.08
     pieces = decompose(mesh)
     assert 5 <= len(pieces.meshes) <= 12
     assert pieces.solid == pytest.approx(mesh.volume)
@@ -94,7 +98,7 @@ def test_pieces_contain_the_corners_of_whatever_is_cut(seed: int) -> None:
     pieces = decompose(mesh, most_pieces=6)
     assert 1 < len(pieces.meshes) <= 6
     assert inside(pieces.meshes, mesh.vertices).max() < 1e-7
-    assert pieces.error < 0.7 * concavity(mesh)
+    assert pieces.error < 0.7 * compute_concavity(mesh)
     assert pieces.volume < 0.8 * decompose(mesh, most_pieces=1).volume
 
 
@@ -104,14 +108,16 @@ def test_volume_of_a_skin_that_is_not_closed() -> None:
     pierced, open_ = whole.copy(), whole.copy()
     pierced.update_faces(np.arange(len(whole.faces)) != 7)
     open_.update_faces(whole.triangles_center[:, 2] < 0.0999)
-    assert solid_volume(whole) == pytest.approx(0.024)
-    assert solid_volume(open_) < 0.3 * 0.024
+    assert compute_solid_volume(whole) == pytest.approx(0.024)
+    assert compute_solid_volume(open_) < 0.3 * 0.024
     assert not pierced.is_watertight
 
 
 def test_what_cannot_be_cut_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flat = tmp_path / "flat.stl"
-    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]]).export(flat)
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]]).export(
+        flat
+    )
     with pytest.raises(vkc.InputError, match="the mesh is flat") as caught:
         decompose(flat)
     assert caught.value.file == flat
@@ -125,11 +131,13 @@ def test_what_cannot_be_cut_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyP
         decompose(tray())
 
 
-def test_a_mesh_that_was_cut_is_not_cut_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesh_that_was_cut_is_not_cut_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is kept gives the same pieces to the last bit; other meshes and settings are cut on their own."""
     monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
-    cut, real = [], convex._cut
-    monkeypatch.setattr(convex, "_cut", lambda *rest: (cut.append(rest), real(*rest))[1])
+    cut, real = [], convex._cut_mesh
+    monkeypatch.setattr(convex, "_cut_mesh", lambda *rest: (cut.append(rest), real(*rest))[1])
     mesh = tray()
     first, again = decompose(mesh), decompose(mesh)
     assert len(cut) == 1
@@ -140,7 +148,14 @@ def test_a_mesh_that_was_cut_is_not_cut_again(tmp_path: Path, monkeypatch: pytes
     wider = mesh.copy()
     wider.apply_scale((1.0, 1.0, 1.01))
     asked: list[float] = []
-    monkeypatch.setattr(convex, "_cut", lambda mesh, most, *_: (asked.append(most), [mesh.vertices])[1])
-    for other, changed in ((wider, {}), (mesh, {"most_pieces": 6}), (mesh, {"error": 0.03}), (mesh, {"seed": 1})):
+    monkeypatch.setattr(
+        convex, "_cut_mesh", lambda mesh, most, *_: (asked.append(most), [mesh.vertices])[1]
+    )
+    for other, changed in (
+        (wider, {}),
+        (mesh, {"most_pieces": 6}),
+        (mesh, {"error": 0.03}),
+        (mesh, {"seed": 1}),
+    ):
         decompose(other, **changed)  # type: ignore[arg-type]
     assert len(asked) == 4

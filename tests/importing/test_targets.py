@@ -1,4 +1,4 @@
-"""No import writes over what it has not made."""
+"""Imports overwrite only their own earlier output."""
 
 from __future__ import annotations
 
@@ -10,37 +10,43 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.importing.targets import check_target, format_comment, made_by
+from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
 
 
-def test_only_what_the_same_command_made_may_be_replaced(tmp_path: Path) -> None:
+def test_only_output_of_the_same_command_may_be_replaced(tmp_path: Path) -> None:
     folder = tmp_path / "mine"
     check_target(folder, "import-home", force=False)
     folder.mkdir()
     check_target(folder, "import-home", force=False)
-    (folder / "a.yaml").write_text(f"# Made of x {made_by('import-home')}.\n", encoding="utf-8")
+    (folder / "a.yaml").write_text(
+        f"# Made of x {get_origin_marker('import-home')}.\n", encoding="utf-8"
+    )
     (folder / "b.yaml").write_bytes(b"\xff\n")
     check_target(folder, "import-home", force=True)
     for command, force, expected in (
-        ("import-home", False, r"--force.*got what import-home made before"),
+        ("import-home", False, r"--force.*got an earlier output of import-home"),
         ("import-robot", True, r"expected a new or an empty folder, got other files"),
     ):
         with pytest.raises(vkc.InputError, match=expected) as caught:
             check_target(folder, command, force=force)
         assert caught.value.field == "folder"
-    (folder / "a.yaml").write_text(f"no first line\n{made_by('import-home')}.\n", encoding="utf-8")
+    (folder / "a.yaml").write_text(
+        f"no first line\n{get_origin_marker('import-home')}.\n", encoding="utf-8"
+    )
     with pytest.raises(vkc.InputError, match="other files"):
         check_target(folder, "import-home", force=True)
 
 
-def test_a_file_is_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text(f"# Made of x {made_by('import-home')}.\n", encoding="utf-8")
+def test_file_in_place_of_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text(
+        f"# Made of x {get_origin_marker('import-home')}.\n", encoding="utf-8"
+    )
     with pytest.raises(vkc.InputError, match="got a file"):
         check_target(tmp_path / "mine", "import-home", force=True)
 
 
 @given(st.text())
-def test_a_comment_is_one_line_of_yaml_that_says_the_text(text: str) -> None:
+def test_comment_is_one_line_with_the_text(text: str) -> None:
     line = format_comment(text)
     assert line.startswith("# ")
     assert line.splitlines(keepends=True) == [line]
@@ -51,12 +57,12 @@ def test_a_comment_is_one_line_of_yaml_that_says_the_text(text: str) -> None:
     assert escaped.decode("unicode_escape") == text
 
 
-def test_plain_text_is_a_comment_as_it_stands() -> None:
+def test_plain_text_is_kept_in_comment() -> None:
     assert format_comment("Made of Küche (1).urdf: “x”.") == "# Made of Küche (1).urdf: “x”.\n"
 
 
-def test_a_folder_is_recognized_by_a_first_line_with_the_longest_file_name(tmp_path: Path) -> None:
+def test_marker_is_found_after_the_longest_file_name(tmp_path: Path) -> None:
     name = "\udcff" * 255
-    head = format_comment(f"Made of {name} {made_by('import-home')}.")
+    head = format_comment(f"Made of {name} {get_origin_marker('import-home')}.")
     (tmp_path / "a.yaml").write_text(head, encoding="utf-8")
     check_target(tmp_path, "import-home", force=True)

@@ -8,7 +8,7 @@ import numpy as np
 from helpers.poles import POLE, write_pole
 
 import vkc_pin as vkc
-from vkc_pin.files.meshes import load_convex, load_mesh, load_parts
+from vkc_pin.world.files.meshes import load_convex, load_mesh, load_parts
 
 FORMATS = ("obj", "stl", "ply", "off", "gltf", "glb", "dae")
 DAE = """<?xml version="1.0"?>

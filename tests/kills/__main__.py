@@ -1,6 +1,7 @@
 """`python -m tests.kills --kills N --within S --log FILE -- COMMAND ...`: runs a command and kills its workers at random moments.
 
-The log has a line of JSON for every kill, and every half a minute one with the memory of all workers [MB].
+The log has a line of JSON for every kill, and every half a minute one with the memory of all
+workers [MB].
 """
 
 from __future__ import annotations
@@ -32,7 +33,10 @@ def main(arguments: list[str] | None = None) -> int:
     rng = random.Random(given.seed)
     moments = sorted(rng.uniform(0.0, given.within) for _ in range(given.kills))
     began, sampled = time.monotonic(), 0.0
-    with subprocess.Popen(given.command) as command, given.log.open("a", encoding="utf-8", buffering=1) as log:
+    with (
+        subprocess.Popen(given.command) as command,
+        given.log.open("a", encoding="utf-8", buffering=1) as log,
+    ):
         while command.poll() is None:
             time.sleep(0.2)
             now = time.monotonic() - began
@@ -40,7 +44,10 @@ def main(arguments: list[str] | None = None) -> int:
             if moments and now >= moments[0] and found:
                 moments.pop(0)
                 one = rng.choice(sorted(found))
-                log.write(json.dumps({"seconds": round(now, 1), "killed": one, "memory_mb": found[one]}) + "\n")
+                log.write(
+                    json.dumps({"seconds": round(now, 1), "killed": one, "memory_mb": found[one]})
+                    + "\n"
+                )
                 psutil.Process(one).kill()
             elif now - sampled >= _SAMPLED:
                 sampled = now

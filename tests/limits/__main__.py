@@ -13,8 +13,16 @@ from .files import limits_of, read_csv, read_npz
 def main(arguments: list[str] | None = None) -> int:
     """Judge; 1 if a limit is not kept."""
     parser = argparse.ArgumentParser(prog="python -m tests.limits", description=__doc__)
-    parser.add_argument("paths", nargs="+", type=Path, help="saved plans (.npz), or folders with some")
-    parser.add_argument("--make", type=int, default=0, metavar="N", help="plan so many problems first, into the first folder")
+    parser.add_argument(
+        "paths", nargs="+", type=Path, help="saved plans (.npz), or folders with some"
+    )
+    parser.add_argument(
+        "--make",
+        type=int,
+        default=0,
+        metavar="N",
+        help="plan so many problems first, into the first folder",
+    )
     parser.add_argument("--first", type=int, default=0, help="the number of the first problem")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)

@@ -44,8 +44,9 @@ class Verdict:
 def check(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
     """Compare a motion with limits, which must be known of all its coordinates.
 
-    Velocities and accelerations are looked at twice: as the cubics have them at every moment, and as differences of positions a
-    millisecond apart, which know of no cubics. Jerks are differences of accelerations.
+    Velocities and accelerations are looked at twice: as the cubics have them at every moment, and
+    as differences of positions a millisecond apart, which know of no cubics. Jerks are differences
+    of accelerations.
     """
     count = int(np.floor((motion.times[-1] - motion.times[0]) * RATE + 1e-9))
     times = motion.times[0] + np.arange(count + 1) / RATE
@@ -61,18 +62,28 @@ def check(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
             ("acceleration", own.acceleration, (accelerations[:, k], second[:, k])),
         ):
             for column in columns:
-                found += _worst(what, name, np.abs(column) - (1.0 + SLACK) * limit, times, column, limit)
+                found += _worst(
+                    what, name, np.abs(column) - (1.0 + SLACK) * limit, times, column, limit
+                )
                 shares[what] = max(shares[what], float(np.abs(column).max() / limit))
-        slope = np.diff(accelerations[:, k]) * RATE  # where accelerations jump, it is as steep as can be
-        found += _worst("jerk", name, np.abs(slope) - (1.0 + SLACK) * own.jerk, times, slope, own.jerk)
+        slope = (
+            np.diff(accelerations[:, k]) * RATE
+        )  # where accelerations jump, it is as steep as can be
+        found += _worst(
+            "jerk", name, np.abs(slope) - (1.0 + SLACK) * own.jerk, times, slope, own.jerk
+        )
         ends = motion.velocities[[0, -1], k]
         found += _worst("rest", name, np.abs(ends) - REST, motion.times[[0, -1]], ends, 0.0)
     return Verdict(len(times), found, **shares)
 
 
-def _worst(what: str, name: str, excess: np.ndarray, times: np.ndarray, values: np.ndarray, limit: float) -> list[Excess]:
+def _worst(
+    what: str, name: str, excess: np.ndarray, times: np.ndarray, values: np.ndarray, limit: float
+) -> list[Excess]:
     k = int(np.argmax(excess))
-    return [] if excess[k] <= 0.0 else [Excess(what, name, float(times[k]), float(values[k]), limit)]
+    return (
+        [] if excess[k] <= 0.0 else [Excess(what, name, float(times[k]), float(values[k]), limit)]
+    )
 
 
 def _sampled(motion: Motion, times: np.ndarray, order: int) -> np.ndarray:
@@ -85,7 +96,15 @@ def _sampled(motion: Motion, times: np.ndarray, order: int) -> np.ndarray:
         1: (6 * s**2 - 6 * s, 3 * s**2 - 4 * s + 1, 6 * s - 6 * s**2, 3 * s**2 - 2 * s),
         2: (12 * s - 6, 6 * s - 4, 6 - 12 * s, 6 * s - 2),
     }[order]
-    p, v, q, w = motion.positions[k], motion.velocities[k], motion.positions[k + 1], motion.velocities[k + 1]
-    # Differences of positions, not these themselves: rounding is divided by the square of a short span.
+    p, v, q, w = (
+        motion.positions[k],
+        motion.velocities[k],
+        motion.positions[k + 1],
+        motion.velocities[k + 1],
+    )
+    # Differences of positions, not these themselves: rounding is divided by the square of a short
+    # span.
     from_p = weights[0] + weights[2] if order == 0 else 0.0
-    return (from_p * p + weights[2] * (q - p) + span * (weights[1] * v + weights[3] * w)) / span**order
+    return (
+        from_p * p + weights[2] * (q - p) + span * (weights[1] * v + weights[3] * w)
+    ) / span**order

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class Motion:
-    """Knots of cubics in time: times (K,) [s], positions and velocities (K, n), by the names of the coordinates."""
+    """KeyframeSampler of cubics in time: times (K,) [s], positions and velocities (K, n), by the names of the coordinates."""
 
     names: list[str]
     times: np.ndarray
@@ -43,7 +43,10 @@ def read_npz(path: Path) -> tuple[Motion, dict[str, Any]]:
     """Return the motion in a saved plan, and what the file says beside it."""
     with np.load(path, allow_pickle=False) as archive:
         about = json.loads(str(archive["about"]))
-        knots = [np.array(archive[name], float) for name in ("knot_times", "knot_positions", "knot_rates")]
+        knots = [
+            np.array(archive[name], float)
+            for name in ("knot_times", "knot_positions", "knot_rates")
+        ]
     return Motion(about["trajectory"]["names"], *knots), about
 
 
@@ -52,11 +55,20 @@ def read_csv(path: Path) -> Motion:
     with path.open(encoding="utf-8", newline="") as file:
         head, *lines = list(csv.reader(file))
     plain = [cell.rpartition(" [")[0] for cell in head]
-    speeds = {cell.removesuffix(" velocity"): k for k, cell in enumerate(plain) if cell.endswith(" velocity")}
+    speeds = {
+        cell.removesuffix(" velocity"): k
+        for k, cell in enumerate(plain)
+        if cell.endswith(" velocity")
+    }
     names = [cell for cell in plain if cell in speeds]
     rows = np.array([[float(cell) for cell in line[: max(speeds.values()) + 1]] for line in lines])
     columns = [plain.index(name) for name in names]
-    return Motion(names, rows[:, plain.index("time")], rows[:, columns], rows[:, [speeds[name] for name in names]])
+    return Motion(
+        names,
+        rows[:, plain.index("time")],
+        rows[:, columns],
+        rows[:, [speeds[name] for name in names]],
+    )
 
 
 def limits_of(about: dict[str, Any], plan: Path) -> dict[str, Limits]:
@@ -69,7 +81,11 @@ def limits_of(about: dict[str, Any], plan: Path) -> dict[str, Limits]:
     for item in scene.get("objects") or ():
         found |= _object(item, folder)
     grows = about["options"].get("jerk_time", 0.0)
-    return {name: replace(own, jerk=own.acceleration / grows) for name, own in found.items()} if grows else found
+    return (
+        {name: replace(own, jerk=own.acceleration / grows) for name, own in found.items()}
+        if grows
+        else found
+    )
 
 
 def _robot(scene: dict[str, Any], folder: Path) -> dict[str, Limits]:
@@ -80,14 +96,21 @@ def _robot(scene: dict[str, Any], folder: Path) -> dict[str, Limits]:
     own = yaml.safe_load(file.read_text(encoding="utf-8"))
     base, joints, arena = own.get("base") or {}, own.get("joints") or {}, scene.get("arena") or {}
     spans = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
-    speeds, strengths = base.get("velocity", (1.0, 1.0, 2.0)), base.get("acceleration", (3.0, 3.0, 6.0))
+    speeds, strengths = (
+        base.get("velocity", (1.0, 1.0, 2.0)),
+        base.get("acceleration", (3.0, 3.0, 6.0)),
+    )
     found = {"base_yaw": Limits(velocity=speeds[2], acceleration=strengths[2])}
     for k, axis in enumerate("xy"):
         low, high = arena.get(axis, spans[k])
-        found[f"base_{axis}"] = Limits(max(low, spans[k][0]), min(high, spans[k][1]), speeds[k], strengths[k])
+        found[f"base_{axis}"] = Limits(
+            max(low, spans[k][0]), min(high, spans[k][1]), speeds[k], strengths[k]
+        )
     for name, limit in _urdf((file.parent / own["urdf"]).read_text(encoding="utf-8")).items():
         said = joints.get(name, {})
-        velocity = said.get("velocity", limit.velocity if math.isfinite(limit.velocity) else math.pi)
+        velocity = said.get(
+            "velocity", limit.velocity if math.isfinite(limit.velocity) else math.pi
+        )
         found[name] = Limits(limit.low, limit.high, velocity, said.get("acceleration", 1.4))
     return found
 
@@ -100,14 +123,22 @@ def _object(item: dict[str, Any], folder: Path) -> dict[str, Limits]:
         own, folder = yaml.safe_load(file.read_text(encoding="utf-8")), file.parent
     else:
         own = kind
-    text = own["urdf"] if own["urdf"].lstrip().startswith("<") else (folder / own["urdf"]).read_text(encoding="utf-8")
+    text = (
+        own["urdf"]
+        if own["urdf"].lstrip().startswith("<")
+        else (folder / own["urdf"]).read_text(encoding="utf-8")
+    )
     found, joints = dict[str, Limits](), own.get("joints") or {}
     for name, limit in _urdf(text).items():
         said = joints.get(name, {})
         velocity = said.get("velocity", limit.velocity if math.isfinite(limit.velocity) else 1.0)
-        found[f"{item['name']}.{name}"] = Limits(limit.low, limit.high, velocity, said.get("acceleration", 2.0))
+        found[f"{item['name']}.{name}"] = Limits(
+            limit.low, limit.high, velocity, said.get("acceleration", 2.0)
+        )
     for entry in own.get("attachments") or ():
-        found |= {f"{item['name']}.{name}": Limits(*span) for name, span in _freedoms(entry).items()}
+        found |= {
+            f"{item['name']}.{name}": Limits(*span) for name, span in _freedoms(entry).items()
+        }
     return found
 
 

@@ -19,7 +19,8 @@ def exported(folder: Path, count: int, *, first: int = 0, seed: int = 0) -> Iter
     Args:
         folder: Where to write.
         count: How many problems.
-        first: The number of the first: every fourth one is in a random room, as long as there are such.
+        first: The number of the first: every fourth one is in a random room, as long as there are
+            such.
         seed: Of the starts and of planning.
     """
     rooms = range(_ROOMS)

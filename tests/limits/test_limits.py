@@ -75,15 +75,27 @@ def _no_rest(motion: Motion) -> Motion:
 
 
 @pytest.mark.parametrize(
-    ("change", "what"), [(_faster, "acceleration"), (_too_far, "position"), (_kink, "acceleration"), (_no_rest, "rest")]
+    ("change", "what"),
+    [
+        (_faster, "acceleration"),
+        (_too_far, "position"),
+        (_kink, "acceleration"),
+        (_no_rest, "rest"),
+    ],
 )
-def test_what_exceeds_a_limit_is_found(plans: list[Path], change: Callable[[Motion], Motion], what: str) -> None:
+def test_what_exceeds_a_limit_is_found(
+    plans: list[Path], change: Callable[[Motion], Motion], what: str
+) -> None:
     motion, about = read_npz(plans[0])
     verdict = check(change(motion), limits_of(about, plans[0]))
-    assert what in {excess.what for excess in verdict.found}, [str(excess) for excess in verdict.found]
+    assert what in {excess.what for excess in verdict.found}, [
+        str(excess) for excess in verdict.found
+    ]
 
 
-def test_limits_of_jerk_are_kept_and_only_those_motions_keep_them(plans: list[Path], tmp_path: Path) -> None:
+def test_limits_of_jerk_are_kept_and_only_those_motions_keep_them(
+    plans: list[Path], tmp_path: Path
+) -> None:
     scene, options = vkc.load_scene("drawer"), vkc.Options(jerk_time=0.1)
     plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=options)
     assert plan.success
@@ -95,13 +107,23 @@ def test_limits_of_jerk_are_kept_and_only_those_motions_keep_them(plans: list[Pa
     assert not verdict.found, [str(excess) for excess in verdict.found]
     assert {excess.what for excess in check(_faster(motion), limits).found} >= {"jerk"}
     plain, said = read_npz(plans[0])
-    own = {name: replace(limit, jerk=10.0 * limit.acceleration) for name, limit in limits_of(said, plans[0]).items()}
+    own = {
+        name: replace(limit, jerk=10.0 * limit.acceleration)
+        for name, limit in limits_of(said, plans[0]).items()
+    }
     assert "jerk" in {excess.what for excess in check(plain, own).found}
 
 
 def test_it_shares_nothing_with_the_package() -> None:
     for name in ("files", "check"):
         tree = ast.parse((FOLDER / f"{name}.py").read_text(encoding="utf-8"))
-        named = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
-        named += [str(n.module) for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level]
+        named = [
+            alias.name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Import)
+            for alias in node.names
+        ]
+        named += [
+            str(n.module) for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level
+        ]
         assert {module.partition(".")[0] for module in named} <= ALLOWED

@@ -17,37 +17,53 @@ from .running import PACKAGE, ROOT, measured, outcome, warm
 # What judges motions, what is close, poses and their errors, and the solver.
 MODULES = [
     "validation",
-    "chain/collision_pairs.py",
-    "chain/contacts.py",
-    "chain/easing.py",
-    "chain/pose.py",
-    "solver",
-    "program/merit.py",
+    "planning/chain/collision_pairs.py",
+    "planning/chain/contacts.py",
+    "planning/chain/easing.py",
+    "planning/chain/pose.py",
+    "planning/solver",
+    "planning/nlp/merit.py",
 ]
-MODULES += ["scene/contact.py", "planning/one_problem.py"]
+MODULES += ["world/scene/contact_rules.py", "planning/solve_task.py"]
 TESTS = [
     "tests/validation",
-    "tests/solver",
+    "tests/planning/solver",
     "tests/oracle",
-    "tests/program/test_merit.py",
-    "tests/program/test_merit_numbers.py",
-    "tests/program/test_problem.py",
+    "tests/planning/nlp/test_merit.py",
+    "tests/planning/nlp/test_merit_numbers.py",
+    "tests/planning/nlp/test_problem.py",
 ]
-TESTS += ["tests/scene/test_contact.py"]
+TESTS += ["tests/world/scene/test_contact_rules.py"]
 TESTS += [
-    f"tests/chain/test_{name}.py"
-    for name in ("collision_pairs", "contacts", "contacts_carried", "easing", "easing_parts", "pose", "inverse_kinematics")
+    f"tests/planning/chain/test_{name}.py"
+    for name in (
+        "collision_pairs",
+        "contacts",
+        "contacts_carried",
+        "easing",
+        "easing_parts",
+        "pose",
+        "inverse_kinematics",
+    )
 ]
 TESTS += [
     f"tests/planning/test_{name}.py"
-    for name in ("one_problem", "one_problem_parts", "pushes", "near_grasps", "riding", "plan_loaded", "infeasible")
+    for name in (
+        "solve_task",
+        "pushes",
+        "near_grasps",
+        "riding",
+        "plan_loaded",
+        "infeasible",
+    )
 ]
 
 
 def drawn(modules: list[str], count: int, seed: int) -> list[Mutant]:
     """Return faults of modules: no line gives a second one before every line has given one.
 
-    The order hangs on the seed and on the words of a line alone: what is written elsewhere does not change who else is drawn.
+    The order hangs on the seed and on the words of a line alone: what is written elsewhere does not
+    change who else is drawn.
     """
     found: list[tuple[int, bytes, Mutant]] = []
     for module in modules:
@@ -71,13 +87,30 @@ def main() -> int:
     parser.add_argument("--sample", type=int, default=200, help="how many faults")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--module", action="append", metavar="FILE", help="of this module alone, such as solver/loop.py; may be repeated"
+        "--module",
+        action="append",
+        metavar="FILE",
+        help="of this module alone, such as solver/loop.py; may be repeated",
     )
-    parser.add_argument("--most", type=float, default=60.0, metavar="S", help="CPU time of the tests of a fault (default 60 s)")
-    parser.add_argument("--again", action="store_true", help="run those that survived once more, as after writing tests")
+    parser.add_argument(
+        "--most",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="CPU time of the tests of a fault (default 60 s)",
+    )
+    parser.add_argument(
+        "--again",
+        action="store_true",
+        help="run those that survived once more, as after writing tests",
+    )
     parser.add_argument("--json", type=Path, help="write what came of all of them here")
     given = parser.parse_args()
-    paths = [path for name in MODULES for path in ([PACKAGE / name] if name.endswith(".py") else (PACKAGE / name).rglob("*.py"))]
+    paths = [
+        path
+        for name in MODULES
+        for path in ([PACKAGE / name] if name.endswith(".py") else (PACKAGE / name).rglob("*.py"))
+    ]
     every = sorted(str(path.relative_to(PACKAGE)) for path in paths)
     folder = ROOT / "out" / "mutants"
     warm()
@@ -93,18 +126,27 @@ def main() -> int:
             row = known.get(mutant.name)
             again = given.again and row is not None and row["outcome"] in ("survived", "uncovered")
             if row is None or (again and mutant.name not in EQUIVALENT):
-                row = {"name": mutant.name, "line": mutant.line, **outcome(mutant, coverage, folder / "log.txt", given.most)}
+                row = {
+                    "name": mutant.name,
+                    "line": mutant.line,
+                    **outcome(mutant, coverage, folder / "log.txt", given.most),
+                }
                 file.write(json.dumps(row, ensure_ascii=False) + "\n")
                 file.flush()
                 if row["outcome"] in ("survived", "uncovered"):
-                    sys.stdout.write(f"{row['outcome']}: {mutant.module}:{mutant.line}: {mutant.what}\n    {mutant.at}\n")
+                    sys.stdout.write(
+                        f"{row['outcome']}: {mutant.module}:{mutant.line}: {mutant.what}\n    {mutant.at}\n"
+                    )
                     sys.stdout.flush()
             if row["outcome"] in ("survived", "uncovered") and mutant.name in EQUIVALENT:
                 row = {**row, "outcome": "equivalent", "why": EQUIVALENT[mutant.name]}
             rows.append({**row, "module": mutant.module})
     if given.json:
         about = {"sample": given.sample, "seed": given.seed}
-        given.json.write_text(json.dumps({"meta": about, "trials": rows}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        given.json.write_text(
+            json.dumps({"meta": about, "trials": rows}, indent=1, ensure_ascii=False) + "\n",
+            encoding="utf-8",
+        )
     sys.stdout.write(table(rows))
     return int(any(row["outcome"] in ("survived", "uncovered") for row in rows))
 
@@ -116,7 +158,11 @@ def table(rows: list[dict[str, Any]]) -> str:
     for wing in [*sorted({row["module"].partition("/")[0] for row in rows}), ""]:
         own = Counter(row["outcome"] for row in rows if row["module"].startswith(wing))
         noticed, all_of_them = own["killed"] + own["endless"], own.total() - own["equivalent"]
-        cells = [f"{wing or 'all':>12}", *(f"{own[kind]:12d}" for kind in kinds), f"{noticed / max(all_of_them, 1):12.1%}"]
+        cells = [
+            f"{wing or 'all':>12}",
+            *(f"{own[kind]:12d}" for kind in kinds),
+            f"{noticed / max(all_of_them, 1):12.1%}",
+        ]
         lines.append("".join(cells))
     return "\n".join(lines) + "\n"
 

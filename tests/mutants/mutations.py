@@ -35,7 +35,8 @@ class Mutant:
         line: Where the fault is, from 1.
         what: "kind: before → after".
         at: The line as it stands, without the space around it.
-        lines: The lines that behave otherwise: itself, or those that use what it defines outside of functions.
+        lines: The lines that behave otherwise: itself, or those that use what it defines outside of
+            functions.
         source: The whole module with the fault.
         again: How many earlier places of the module have the same words and the same fault.
     """
@@ -51,7 +52,9 @@ class Mutant:
     @property
     def name(self) -> str:
         """What it is known by, wherever the line moves to."""
-        return f"{self.module}: {self.at} | {self.what}" + (f" (the same, {self.again + 1})" if self.again else "")
+        return f"{self.module}: {self.at} | {self.what}" + (
+            f" (the same, {self.again + 1})" if self.again else ""
+        )
 
 
 class _Text:
@@ -86,7 +89,19 @@ def mutants(module: str, source: str) -> Iterator[Mutant]:
                 continue
             line = text.bytes[:begin].count(b"\n") + 1
             what = f"{kind}: {' '.join(before.split())} → {' '.join(piece.split())}"
-            found.append((begin, Mutant(module, line, what, lines[line - 1].strip(), users.get(line, (line,)), changed)))
+            found.append(
+                (
+                    begin,
+                    Mutant(
+                        module,
+                        line,
+                        what,
+                        lines[line - 1].strip(),
+                        users.get(line, (line,)),
+                        changed,
+                    ),
+                )
+            )
     seen: Counter[str] = Counter()
     for _, mutant in sorted(found, key=lambda pair: pair[0]):
         yield dataclasses.replace(mutant, again=seen[mutant.name])
@@ -103,8 +118,17 @@ def _users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
     for item in tree.body:
         if isinstance(item, ast.Assign | ast.AnnAssign):
             targets = item.targets if isinstance(item, ast.Assign) else [item.target]
-            names = {node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)}
-            loads = (node for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load))
+            names = {
+                node.id
+                for target in targets
+                for node in ast.walk(target)
+                if isinstance(node, ast.Name)
+            }
+            loads = (
+                node
+                for node in ast.walk(tree)
+                if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
+            )
             using = tuple(sorted({node.lineno for node in loads if node.id in names}))
             found |= dict.fromkeys(range(item.lineno, (item.end_lineno or item.lineno) + 1), using)
     return found
@@ -127,7 +151,11 @@ def _only_text(node: ast.AST) -> bool:
     """Return whether a statement is a docstring, names what is public, or makes a sentence for people to read."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return True
-    names = [target.id for target in node.targets if isinstance(target, ast.Name)] if isinstance(node, ast.Assign) else []
+    names = (
+        [target.id for target in node.targets if isinstance(target, ast.Name)]
+        if isinstance(node, ast.Assign)
+        else []
+    )
     return bool({"__all__", "detail", "expected", "why"} & set(names))
 
 
@@ -139,8 +167,14 @@ def _faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], 
         left, right = text.of(node.left), text.of(node.right)
         begin, end = text.span(node.left)[1], text.span(node.right)[0]
         gap = text.bytes[begin:end].decode()
-        sign = next((sign for sign in ("**", "//", "+", "-", "*", "/", "%", "&", "|") if sign in gap), None)
-        if sign is not None and not left.startswith(('"', "'")) and not right.startswith(('"', "'")):
+        sign = next(
+            (sign for sign in ("**", "//", "+", "-", "*", "/", "%", "&", "|") if sign in gap), None
+        )
+        if (
+            sign is not None
+            and not left.startswith(('"', "'"))
+            and not right.startswith(('"', "'"))
+        ):
             at = begin + gap.index(sign)
             yield "arithmetic", (at, at + len(sign)), OPERATORS[type(node.op)]
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
@@ -152,7 +186,9 @@ def _faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], 
         yield "boolean", (begin + gap.index(old), begin + gap.index(old) + len(old)), new
     elif isinstance(node, ast.Constant):
         yield from _constants(node, text)
-    elif isinstance(node, ast.If | ast.IfExp | ast.While) and not isinstance(node.test, ast.Compare):
+    elif isinstance(node, ast.If | ast.IfExp | ast.While) and not isinstance(
+        node.test, ast.Compare
+    ):
         yield "condition", text.span(node.test), f"(not ({text.of(node.test)}))"
     elif isinstance(node, ast.Call):
         yield from _calls(node, text)
@@ -179,7 +215,10 @@ def _comparisons(node: ast.Compare, text: _Text) -> Iterator[tuple[str, tuple[in
     for k, operator in enumerate(node.ops):
         begin, end = text.span(sides[k])[1], text.span(sides[k + 1])[0]
         gap = text.bytes[begin:end]
-        begin, end = begin + len(gap) - len(gap.lstrip(b") ")), end - (len(gap) - len(gap.rstrip(b"( ")))
+        begin, end = (
+            begin + len(gap) - len(gap.lstrip(b") ")),
+            end - (len(gap) - len(gap.rstrip(b"( "))),
+        )
         yield "comparison", (begin, end), COMPARISONS[type(operator)]
         if type(operator) in REVERSED:
             yield "comparison", (begin, end), REVERSED[type(operator)]
@@ -198,7 +237,9 @@ def _calls(node: ast.Call, text: _Text) -> Iterator[tuple[str, tuple[int, int], 
     if isinstance(node.func, ast.Name) and node.func.id in NAMES:
         yield "name", text.span(node.func), NAMES[node.func.id]
     first = node.args[:2]
-    if len(first) == 2 and not any(isinstance(argument, ast.Starred | ast.GeneratorExp) for argument in first):
+    if len(first) == 2 and not any(
+        isinstance(argument, ast.Starred | ast.GeneratorExp) for argument in first
+    ):
         (begin, middle), (other, end) = (text.span(argument) for argument in first)
         between = text.bytes[middle:other].decode()
         yield "swapped", (begin, end), f"{text.of(first[1])}{between}{text.of(first[0])}"

@@ -35,7 +35,9 @@ OTHERS = (
     "casadi", "coal", "hypothesis", "hypothesis.extra.numpy", "matplotlib", "meshcat", "numpy", "pink", "pinocchio", "pydantic",
     "qpsolvers", "scipy.optimize", "scipy.sparse", "scipy.spatial", "toppra", "trimesh", "yaml",
 )  # fmt: skip
-ALWAYS = -1  # the "line" that everything runs that runs any of a module: what stands outside of functions
+ALWAYS = (
+    -1
+)  # the "line" that everything runs that runs any of a module: what stands outside of functions
 PATIENCE = 5  # times as long as the tests took without a fault, and
 PATIENCE_SECONDS = 30  # [s] more: then the fault has made them endless, which is noticed as well
 
@@ -54,24 +56,46 @@ class Coverage:
     def tests_of(self, mutant: Mutant, most: float) -> list[str]:
         """Return the tests that execute a changed line: those of the module's own files, then others, files that are quick first.
 
-        Those whose names begin as the module's do are its own: test_sweep.py and test_sweep_line.py are sweep.py's.
+        Those whose names begin as the module's do are its own: test_sweep.py and test_sweep_line.py
+        are sweep.py's.
 
         Args:
-            mutant: The fault. One outside of functions is in the lines that use what is defined there.
+            mutant: The fault. One outside of functions is in the lines that use what is defined
+                there.
             most: CPU time that they may take together [s]; those that are left out are the last.
         """
-        found = {test for line in mutant.lines for test in self.lines.get(f"{mutant.module}:{line}", [])}
+        found = {
+            test for line in mutant.lines for test in self.lines.get(f"{mutant.module}:{line}", [])
+        }
         mine = f"tests/{Path(mutant.module).with_suffix('').parent}/test_{Path(mutant.module).stem}"
-        own = {file for file in map(_file, self.seconds) if file == f"{mine}.py" or file.startswith(f"{mine}_")}
+        own = {
+            file
+            for file in map(_file, self.seconds)
+            if file == f"{mine}.py" or file.startswith(f"{mine}_")
+        }
         if mutant.lines != (mutant.line,):  # a constant, which tests may look at themselves
             own_tests = {test for test in self.seconds if _file(test) in own}
-            found |= own_tests | (set() if found else set(self.lines.get(f"{mutant.module}:{ALWAYS}", [])))
+            found |= own_tests | (
+                set() if found else set(self.lines.get(f"{mutant.module}:{ALWAYS}", []))
+            )
         whole: dict[str, float] = defaultdict(float)
         for test in found:
             whole[_file(test)] += self.seconds[test]
-        order = sorted(found, key=lambda test: (_file(test) not in own, whole[_file(test)], _file(test), self.seconds[test]))
+        order = sorted(
+            found,
+            key=lambda test: (
+                _file(test) not in own,
+                whole[_file(test)],
+                _file(test),
+                self.seconds[test],
+            ),
+        )
         spent = list(itertools.accumulate(self.seconds[test] for test in order))
-        return [test for test, until in zip(order, spent, strict=True) if until <= most or test == order[0]]
+        return [
+            test
+            for test, until in zip(order, spent, strict=True)
+            if until <= most or test == order[0]
+        ]
 
 
 def _file(test: str) -> str:
@@ -134,7 +158,9 @@ class _Recorder:
     def __init__(self, modules: Sequence[str]) -> None:
         self.modules = {str(PACKAGE / module): module for module in modules}
         self.now: set[str] = set()
-        self.at_import: set[str] = set()  # in functions that a file of tests calls before any of them runs
+        self.at_import: set[str] = (
+            set()
+        )  # in functions that a file of tests calls before any of them runs
         self.of_test: dict[str, set[str]] = {}
         self.of_fixture: dict[str, set[str]] = defaultdict(set)
         self.fixtures: dict[str, list[str]] = {}
@@ -142,7 +168,9 @@ class _Recorder:
 
     def trace(self, frame: FrameType, event: str, argument: Any) -> Any:
         module = self.modules.get(frame.f_code.co_filename)
-        if module is None or (self.now is self.at_import and not frame.f_code.co_flags & inspect.CO_OPTIMIZED):
+        if module is None or (
+            self.now is self.at_import and not frame.f_code.co_flags & inspect.CO_OPTIMIZED
+        ):
             return None
         self.now.add(f"{module}:{ALWAYS}")
         self.now.add(f"{module}:{frame.f_lineno}")
@@ -184,7 +212,9 @@ class _Recorder:
     def coverage(self) -> dict[str, Any]:
         lines = defaultdict(list)
         for test, own in self.of_test.items():
-            for line in own.union(self.at_import, *(self.of_fixture.get(name, set()) for name in self.fixtures[test])) - {""}:
+            for line in own.union(
+                self.at_import, *(self.of_fixture.get(name, set()) for name in self.fixtures[test])
+            ) - {""}:
                 lines[line].append(test)
         return {"seconds": self.seconds, "lines": lines}
 
@@ -199,12 +229,18 @@ def measured(modules: Sequence[str], tests: Sequence[str], folder: Path) -> Cove
     lines: dict[str, list[str]] = defaultdict(list)
     folder.mkdir(parents=True, exist_ok=True)
     files = [
-        file for name in tests for file in ([ROOT / name] if name.endswith(".py") else sorted((ROOT / name).rglob("test_*.py")))
+        file
+        for name in tests
+        for file in (
+            [ROOT / name] if name.endswith(".py") else sorted((ROOT / name).rglob("test_*.py"))
+        )
     ]
     for file in files:
         name = str(file.relative_to(ROOT))
         kept = folder / f"{name.replace('/', '.')}.json"
-        newest = max(path.stat().st_mtime for path in (file, *(PACKAGE / module for module in modules)))
+        newest = max(
+            path.stat().st_mtime for path in (file, *(PACKAGE / module for module in modules))
+        )
         if not kept.is_file() or kept.stat().st_mtime < newest:
             sys.stdout.write(f"runs {name} without a fault\n")
 
@@ -217,7 +253,9 @@ def measured(modules: Sequence[str], tests: Sequence[str], folder: Path) -> Cove
 
             code, _ = _forked(work, folder / "log.txt", None)
             if code not in (0, 5):
-                raise SystemExit(f"{name} fails without a fault:\n{(folder / 'log.txt').read_text()}")
+                raise SystemExit(
+                    f"{name} fails without a fault:\n{(folder / 'log.txt').read_text()}"
+                )
         found = json.loads(kept.read_text())
         seconds.update(found["seconds"])
         for line, own in found["lines"].items():
@@ -245,7 +283,9 @@ class _Finder(importlib.abc.MetaPathFinder):
         self.name = "vkc_pin." + mutant.module.removesuffix(".py").replace("/", ".")
         self.source = mutant.source
 
-    def find_spec(self, fullname: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
+    def find_spec(
+        self, fullname: str, path: Any, target: Any = None
+    ) -> importlib.machinery.ModuleSpec | None:
         if fullname != self.name:
             return None
         loader = _Loader(fullname, str(self.path))
@@ -261,14 +301,17 @@ class _Chosen:
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        items[:] = sorted((item for item in items if item.nodeid in self.order), key=lambda item: self.order[item.nodeid])
+        items[:] = sorted(
+            (item for item in items if item.nodeid in self.order),
+            key=lambda item: self.order[item.nodeid],
+        )
 
 
 def outcome(mutant: Mutant, coverage: Coverage, log: Path, most: float) -> dict[str, Any]:
     """Run tests that execute a changed line, for so much CPU time at most [s]; return what came of it, and what that took.
 
-    "killed": a test fails. "endless": they take much longer than without the fault. "survived": no test notices.
-    "uncovered": no test executes that line.
+    "killed": a test fails. "endless": they take much longer than without the fault. "survived": no
+    test notices. "uncovered": no test executes that line.
     """
     tests = coverage.tests_of(mutant, most)
     if not tests:
@@ -281,6 +324,10 @@ def outcome(mutant: Mutant, coverage: Coverage, log: Path, most: float) -> dict[
     limit = PATIENCE_SECONDS + PATIENCE * sum(coverage.seconds[test] for test in tests)
     code, seconds = _forked(work, log, limit)
     found = "endless" if code is None else "survived" if code == 0 else "killed"
-    failed = [line for line in log.read_text(errors="replace").splitlines() if line.startswith(("FAILED", "ERROR"))]
+    failed = [
+        line
+        for line in log.read_text(errors="replace").splitlines()
+        if line.startswith(("FAILED", "ERROR"))
+    ]
     by = failed[0].split()[1] if failed else ""
     return {"outcome": found, "tests": len(tests), "seconds": round(seconds, 1), "by": by}

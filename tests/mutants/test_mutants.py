@@ -60,7 +60,9 @@ def test_a_fault_is_one_change_of_a_source_that_can_be_read() -> None:
     for mutant in mutants("x.py", SOURCE):
         assert ast.dump(ast.parse(mutant.source)) != ast.dump(ast.parse(SOURCE))
         before, after = SOURCE.splitlines(), mutant.source.splitlines()
-        assert [k for k, (one, other) in enumerate(zip(before, after, strict=True), 1) if one != other] == [mutant.line]
+        assert [
+            k for k, (one, other) in enumerate(zip(before, after, strict=True), 1) if one != other
+        ] == [mutant.line]
         assert mutant.at == before[mutant.line - 1].strip()
 
 
@@ -68,7 +70,12 @@ def test_texts_types_and_what_is_raised_are_left_alone() -> None:
     changed = {mutant.line for mutant in mutants("x.py", SOURCE)}
     lines = SOURCE.splitlines()
     assert not {
-        k for k in changed if any(word in lines[k - 1] for word in ("Docstring", "__all__", "raise", "detail =", "Return 1"))
+        k
+        for k in changed
+        if any(
+            word in lines[k - 1]
+            for word in ("Docstring", "__all__", "raise", "detail =", "Return 1")
+        )
     }
 
 
@@ -95,15 +102,21 @@ def test_every_equivalent_fault_is_one_of_a_line_that_is_there() -> None:
     assert not gone
 
 
-def test_what_is_written_elsewhere_changes_no_other_draw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_written_elsewhere_changes_no_other_draw(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(__main__, "PACKAGE", tmp_path)
     (tmp_path / "x.py").write_text(SOURCE)
     before = [mutant.name for mutant in drawn(["x.py"], 100, 1)]
     (tmp_path / "x.py").write_text(
-        SOURCE.replace("class Kept", "MOST = 7\n\n\nclass Kept").replace("        self.count += 1\n", "")
+        SOURCE.replace("class Kept", "MOST = 7\n\n\nclass Kept").replace(
+            "        self.count += 1\n", ""
+        )
     )
     after = [mutant.name for mutant in drawn(["x.py"], 100, 1)]
-    assert [name for name in after if "MOST" not in name] == [name for name in before if "self.count" not in name]
+    assert [name for name in after if "MOST" not in name] == [
+        name for name in before if "self.count" not in name
+    ]
     assert before != [mutant.name for mutant in drawn(["x.py"], 100, 2)]
 
 
@@ -124,6 +137,14 @@ def test_a_modules_own_files_are_asked_first_and_quick_ones_before_slow_ones() -
     }
     mutant = next(iter(mutants("wing/x.py", "def f(a):\n    return a + 1\n")))
     known = Coverage(seconds, {"wing/x.py:2": list(seconds)})
-    own = ["tests/wing/test_x_line.py::a", "tests/wing/test_x_line.py::b", "tests/wing/test_x.py::slow"]
-    assert known.tests_of(mutant, 100.0) == [*own, "tests/wing/test_xy.py::other", "tests/other/test_x.py::far"]
+    own = [
+        "tests/wing/test_x_line.py::a",
+        "tests/wing/test_x_line.py::b",
+        "tests/wing/test_x.py::slow",
+    ]
+    assert known.tests_of(mutant, 100.0) == [
+        *own,
+        "tests/wing/test_xy.py::other",
+        "tests/other/test_x.py::far",
+    ]
     assert known.tests_of(mutant, 5.0) == own[:2]

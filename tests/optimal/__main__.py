@@ -16,7 +16,7 @@ from vkc_pin.benchmarks.harness.record import commit
 from vkc_pin.benchmarks.harness.tables import foot
 from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
 from vkc_pin.benchmarks.problems.problem_set import started
-from vkc_pin.running.machine import machine, peak_memory, versions
+from vkc_pin.utils.parallel.machine import machine, peak_memory, versions
 
 from .bound import bound
 
@@ -32,8 +32,13 @@ def table(rows: list[dict[str, Any]]) -> str:
     ]
     for task in dict.fromkeys(row["task"] for row in rows):
         own = [row for row in rows if row["task"] == task]
-        takes, least = (sum(row[field] for row in own) / len(own) for field in ("duration", "least"))
-        worst, heavy = max(row["duration"] / row["least"] for row in own), sum(row["heavy"] > 0 for row in own)
+        takes, least = (
+            sum(row[field] for row in own) / len(own) for field in ("duration", "least")
+        )
+        worst, heavy = (
+            max(row["duration"] / row["least"] for row in own),
+            sum(row["heavy"] > 0 for row in own),
+        )
         lines.append(f"| {task} | {len(own)} | {takes:.2f} | {least:.2f} | {worst:.3f} | {heavy} |")
     return "\n".join(lines) + "\n"
 
@@ -59,13 +64,27 @@ def main(arguments: list[str] | None = None) -> int:
             if plan.success:
                 least, heavy = bound(plan.scene, plan.trajectory)
                 duration = float(plan.trajectory.times[-1])
-                row = {"task": name, "number": number, "duration": duration, "least": least, "heavy": heavy}
+                row = {
+                    "task": name,
+                    "number": number,
+                    "duration": duration,
+                    "least": least,
+                    "heavy": heavy,
+                }
                 rows.append({**row, "commit": commit()})
     if given.json is not None:
         session = {"jobs": 1, "trials": len(rows), "seconds": round(time.perf_counter() - began, 1)}
-        meta = {"versions": versions(), "machine": known, "seed": given.seed, "starts": given.starts, "sessions": [session]}
+        meta = {
+            "versions": versions(),
+            "machine": known,
+            "seed": given.seed,
+            "starts": given.starts,
+            "sessions": [session],
+        }
         meta["peak_memory_mb"] = round(peak_memory(), 1)
-        given.json.write_text(json.dumps({"meta": meta, "trials": rows}, indent=1) + "\n", encoding="utf-8")
+        given.json.write_text(
+            json.dumps({"meta": meta, "trials": rows}, indent=1) + "\n", encoding="utf-8"
+        )
     sys.stdout.write(table(rows))
     return int(any(row["duration"] > 1.15 * row["least"] for row in rows))
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.retiming import retime
-from vkc_pin.scene.scene import Scene
+from vkc_pin.planning.retiming import retime
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["FINE", "bound"]
 
@@ -21,13 +21,21 @@ _SAME = 1e-6  # [s] by which the motion, timed anew, may take another time
 def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, int]:
     """Return the least time [s] under the limits of velocity, acceleration and torque, and in how many runs torques bound it.
 
-    The motion is timed anew, which must come to the same. Whatever path TOPP-RA is asked about on the way, it is asked about
-    again, at many more places. Stops and rests are those of the motion.
+    The motion is timed anew, which must come to the same. Whatever path TOPP-RA is asked about on
+    the way, it is asked about again, at many more places. Stops and rests are those of the motion.
     """
-    asked, rests, solve, rest = dict[int, tuple[Any, ...]](), list[float](), retime.speeds_along, retime._straight
+    asked, rests, solve, rest = (
+        dict[int, tuple[Any, ...]](),
+        list[float](),
+        retime.compute_speeds,
+        retime._make_straight_curve,
+    )
 
     def noted(path: Any, places: Any, *limits: Any) -> Any:
-        asked[id(path)] = (path, *limits)  # the last time, torques among the limits if they bound it
+        asked[id(path)] = (
+            path,
+            *limits,
+        )  # the last time, torques among the limits if they bound it
         return solve(path, places, *limits)
 
     def rested(*given: Any) -> Any:
@@ -36,14 +44,18 @@ def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, in
         return curve
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(retime, "speeds_along", noted)
-        patch.setattr(retime, "_straight", rested)
-        again = retime.retimed(scene, motion, _parts(motion))
-    assert abs(again.times[-1] - motion.times[-1]) <= _SAME, "the motion that was timed anew is another one"
+        patch.setattr(retime, "compute_speeds", noted)
+        patch.setattr(retime, "_make_straight_curve", rested)
+        again = retime.retime_trajectory(scene, motion, _parts(motion))
+    assert abs(again.times[-1] - motion.times[-1]) <= _SAME, (
+        "the motion that was timed anew is another one"
+    )
     least = sum(rests)
     for path, *limits in asked.values():
         shares = np.arange(fine) / fine
-        places = np.append((path.x[:-1, None] + np.diff(path.x)[:, None] * shares).ravel(), path.x[-1])
+        places = np.append(
+            (path.x[:-1, None] + np.diff(path.x)[:, None] * shares).ravel(), path.x[-1]
+        )
         speeds = solve(path, places, *limits)
         assert speeds is not None
         least += float((2.0 * np.diff(places) / (speeds[1:] + speeds[:-1])).sum())

@@ -9,7 +9,7 @@ from helpers.executions import door_plan, drawer_plan
 
 import vkc_pin as vkc
 from optimal.bound import bound
-from vkc_pin.retiming.retime import retimed
+from vkc_pin.planning.retiming.retime import retime_trajectory
 
 
 @pytest.mark.parametrize("made", [door_plan, drawer_plan])
@@ -31,9 +31,11 @@ def test_the_bound_obeys_limits() -> None:
     """With a quarter of the acceleration, and twice the time, no velocity is the same share of its limit."""
     plan = drawer_plan()
     robot = plan.scene.robot
-    weak = dataclasses.replace(robot, acceleration=robot.acceleration / 4.0, velocity=robot.velocity / 2.0)
+    weak = dataclasses.replace(
+        robot, acceleration=robot.acceleration / 4.0, velocity=robot.velocity / 2.0
+    )
     scene = dataclasses.replace(plan.scene, robot=weak)
-    slow = retimed(scene, plan.trajectory)
+    slow = retime_trajectory(scene, plan.trajectory)
     assert bound(scene, slow)[0] > 1.5 * bound(plan.scene, plan.trajectory)[0]
     with pytest.raises(AssertionError, match="another one"):
         bound(scene, plan.trajectory)

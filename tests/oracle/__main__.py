@@ -12,9 +12,15 @@ from .agreement import judged, recorded, table, written
 def main(arguments: list[str] | None = None) -> int:
     """Judge; 1 if a plan is a success by its own word and not by the oracle's."""
     parser = argparse.ArgumentParser(prog="python -m tests.oracle", description=__doc__)
-    parser.add_argument("paths", nargs="+", type=Path, help="saved plans (.npz), or folders with some")
+    parser.add_argument(
+        "paths", nargs="+", type=Path, help="saved plans (.npz), or folders with some"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--record", type=Path, help="results.json of the only folder's trials, in which verdicts are noted")
+    parser.add_argument(
+        "--record",
+        type=Path,
+        help="results.json of the only folder's trials, in which verdicts are noted",
+    )
     given = parser.parse_args(arguments)
     if given.record and len(given.paths) > 1:
         parser.error("--record is of one folder")

@@ -25,7 +25,10 @@ def judged(paths: Sequence[Path], *, jobs: int = 1) -> list[Verdict]:
 def written(verdicts: Iterable[Verdict], folder: Path) -> None:
     """Write verdicts.jsonl, a line a plan, and agreement.md into a folder."""
     verdicts = list(verdicts)
-    lines = [json.dumps({**asdict(one), "path": one.path.relative_to(folder).as_posix()}) for one in verdicts]
+    lines = [
+        json.dumps({**asdict(one), "path": one.path.relative_to(folder).as_posix()})
+        for one in verdicts
+    ]
     (folder / "verdicts.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
     (folder / "agreement.md").write_text(table(verdicts) + "\n", encoding="utf-8")
 
@@ -40,7 +43,9 @@ def recorded(verdicts: Iterable[Verdict], record: Path) -> None:
     own = {one.path.stem: one for one in verdicts}
     keys = {trial["key"] for trial in result["trials"]}
     if keys != set(own):
-        raise ValueError(f"{record}: plans and trials are others: {', '.join(sorted(keys ^ set(own))[:5])}")
+        raise ValueError(
+            f"{record}: plans and trials are others: {', '.join(sorted(keys ^ set(own))[:5])}"
+        )
     if skipped := [one.path for one in own.values() if one.unjudged]:
         raise ValueError(f"{record}: {len(skipped)} plans were not judged, {skipped[0]} for one")
     for trial in result["trials"]:
@@ -63,7 +68,10 @@ def table(verdicts: Sequence[Verdict]) -> str:
     rows.append(f"| any | not judged | {len(verdicts) - len(said)} |")
     for one in said:
         if not one.agrees:
-            rows += ["", f"- {one.path.name}: {one.status}; the plan finds {', '.join(one.says) or 'nothing'}"]
+            rows += [
+                "",
+                f"- {one.path.name}: {one.status}; the plan finds {', '.join(one.says) or 'nothing'}",
+            ]
             rows += [f"  - {violation}" for violation in one.found]
     for reason, count in Counter(one.unjudged for one in verdicts if one.unjudged).items():
         rows += ["", f"- not judged, {count}: {reason}"]

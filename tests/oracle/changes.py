@@ -17,12 +17,16 @@ Content = dict[str, Any]
 def changed(source: Path, target: Path, change: Callable[[Content], None]) -> Path:
     """Write a copy of a plan to `target` that `change` has changed.
 
-    It gets a dictionary with `scene`, `steps`, `options`, `names`, `times`, `positions`, `phases` and `column`, which returns one
-    of the positions' columns by name. Waypoints that it has moved, in place or time, have straight lines between them.
+    It gets a dictionary with `scene`, `steps`, `options`, `names`, `times`, `positions`, `phases`
+    and `column`, which returns one of the positions' columns by name. Waypoints that it has moved,
+    in place or time, have straight lines between them.
     """
     with np.load(source, allow_pickle=False) as archive:
         about = json.loads(str(archive["about"]))
-        content: Content = {"times": archive["times"].copy(), "positions": archive["positions"].copy()}
+        content: Content = {
+            "times": archive["times"].copy(),
+            "positions": archive["positions"].copy(),
+        }
         before = {name: array.copy() for name, array in content.items()}
         knots = {name: archive[name] for name in archive if name.startswith("knot_")}
     motion = about["trajectory"]
@@ -33,6 +37,10 @@ def changed(source: Path, target: Path, change: Callable[[Content], None]) -> Pa
     about |= {"scene": content["scene"], "steps": content["steps"]}
     about["trajectory"] = {**motion, "phases": content["phases"], "names": content["names"]}
     same = all(np.array_equal(before[name], content[name]) for name in before)
-    arrays: dict[str, Any] = {"times": content["times"], "positions": content["positions"], **(knots if same else {})}
+    arrays: dict[str, Any] = {
+        "times": content["times"],
+        "positions": content["positions"],
+        **(knots if same else {}),
+    }
     np.savez_compressed(target, about=np.array(json.dumps(about)), **arrays)
     return target

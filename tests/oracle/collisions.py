@@ -1,8 +1,8 @@
 """Distances of all pairs along a phase, every 2 mm and 5 mrad.
 
-A sample is left out only where the pair cannot have come together since one that was looked at: by balls around shapes and boxes
-around what stands, over blocks of samples, and by how far the two can have moved against each other since their distance was
-asked.
+A sample is left out only where the pair cannot have come together since one that was looked at: by
+balls around shapes and boxes around what stands, over blocks of samples, and by how far the two can
+have moved against each other since their distance was asked.
 """
 
 from __future__ import annotations
@@ -27,26 +27,43 @@ BLOCK = 32  # samples
 class Pairs:
     """What moves in a phase, what does not, and how far each shape can have gone.
 
-    `gone` has for every moving shape how far any point of it has moved from sample to sample, seen from the world, the robot's
-    base and its tool, shape (3, S - 1): two shapes move against each other by no more than the sum of both in any of the three.
+    `gone` has for every moving shape how far any point of it has moved from sample to sample, seen
+    from the world, the robot's base and its tool, shape (3, S - 1): two shapes move against each
+    other by no more than the sum of both in any of the three.
     """
 
     def __init__(self, world: World, stage: Stage) -> None:
         self.world, self.stage = world, stage
-        self.moving = [part for part in stage.solids if part.owner == "robot" or (part.owner, part.link) in stage.moving]
+        self.moving = [
+            part
+            for part in stage.solids
+            if part.owner == "robot" or (part.owner, part.link) in stage.moving
+        ]
         taken = {id(part) for part in self.moving}
         self.standing = [part for part in stage.solids if id(part) not in taken]
         self.length = len(stage.times)
         base = stage.links["robot", world.robot.tree.urdf.base]
         frames = [None, base.inverse(), stage.tool.inverse()]
         self.turns = np.array([part.at.turn[0] for part in self.standing]).reshape(-1, 3, 3)
-        self.middles = np.array([part.at.points(part.shape.centre)[0] for part in self.standing]).reshape(-1, 3)
+        self.middles = np.array(
+            [part.at.points(part.shape.centre)[0] for part in self.standing]
+        ).reshape(-1, 3)
         self.halves = np.array([part.shape.half for part in self.standing]).reshape(-1, 3)
         self.centres, self.gone = [], []
         for part in self.moving:
-            whole = Poses(np.broadcast_to(part.at.turn, (self.length, 3, 3)), np.broadcast_to(part.at.at, (self.length, 3)))
+            whole = Poses(
+                np.broadcast_to(part.at.turn, (self.length, 3, 3)),
+                np.broadcast_to(part.at.at, (self.length, 3)),
+            )
             self.centres.append(whole.points(part.shape.centre))
-            self.gone.append(np.array([self._steps(whole if frame is None else frame @ whole, part) for frame in frames]))
+            self.gone.append(
+                np.array(
+                    [
+                        self._steps(whole if frame is None else frame @ whole, part)
+                        for frame in frames
+                    ]
+                )
+            )
 
     @staticmethod
     def _steps(place: Poses, part: Solid) -> np.ndarray:
@@ -82,22 +99,31 @@ class Pairs:
         return np.asarray(apart - self.moving[i].shape.radius - self.moving[j].shape.radius)
 
 
-def check_collisions(world: World, stage: Stage, allowed: list[Licence], built: Neighbours) -> Iterator[Violation]:
+def check_collisions(
+    world: World, stage: Stage, allowed: list[Licence], built: Neighbours
+) -> Iterator[Violation]:
     """Yield what overlaps ("overlap"), and what is too close at waypoints: "clearance"."""
     pairs = Pairs(world, stage)
     begins = np.arange(0, pairs.length, BLOCK)
     ends = np.append(begins[1:], pairs.length) - 1
     middles, waypoints = (begins + ends) // 2, stage.rows[1:]
-    safe, own_safe = (float(world.plan.options[key]) - SHORT for key in ("dist_safe", "self_distance"))
+    safe, own_safe = (
+        float(world.plan.options[key]) - SHORT for key in ("dist_safe", "self_distance")
+    )
     for i, one in enumerate(pairs.moving):
         arcs = pairs.arcs(i)
         reach = np.maximum(arcs[:, ends] - arcs[:, middles], arcs[:, middles] - arcs[:, begins])
-        active, close = pairs.standing_bounds(i, middles) < reach[0][:, None], pairs.standing_bounds(i, waypoints) < safe
+        active, close = (
+            pairs.standing_bounds(i, middles) < reach[0][:, None],
+            pairs.standing_bounds(i, waypoints) < safe,
+        )
         some = np.flatnonzero(active.any(axis=0) | close.any(axis=0))
         todo = [(pairs.standing[k], arcs[0], active[:, k], close[:, k]) for k in some]
         for j, other in enumerate(pairs.moving[:i]):
             bounds = pairs.ball_bounds(i, j, middles), pairs.ball_bounds(i, j, waypoints)
-            todo.append((other, arcs[1 + j], bounds[0] < reach[1 + j], bounds[1] < max(safe, own_safe)))
+            todo.append(
+                (other, arcs[1 + j], bounds[0] < reach[1 + j], bounds[1] < max(safe, own_safe))
+            )
         for other, arc, blocks, near in todo:
             if not pairs.counts(one, other):
                 continue
@@ -110,17 +136,31 @@ def check_collisions(world: World, stage: Stage, allowed: list[Licence], built: 
                 time = float(stage.times[k])
                 licensed = any(own.covers(one.label, other.label, time, apart) for own in allowed)
                 if apart < least and not close[k] and not licensed:
-                    yield Violation("clearance", names, time, least - apart, f"{1e3 * apart:.2f} mm apart at a waypoint")
+                    yield Violation(
+                        "clearance",
+                        names,
+                        time,
+                        least - apart,
+                        f"{1e3 * apart:.2f} mm apart at a waypoint",
+                    )
             slack = CONTACT + np.maximum(built_in, max(0.0, -asked))
             for own in allowed:
                 if own.depth and own.names(one.label, other.label):
                     slack[(own.begin <= stage.times) & (stage.times <= own.end)] += own.depth
             depth, row = _deepest(one, other, arc, blocks, slack)
             if depth > 0.0:
-                yield Violation("overlap", names, float(stage.times[row]), depth, f"overlap by {1e3 * depth:.2f} mm")
+                yield Violation(
+                    "overlap",
+                    names,
+                    float(stage.times[row]),
+                    depth,
+                    f"overlap by {1e3 * depth:.2f} mm",
+                )
 
 
-def _deepest(one: Solid, other: Solid, arc: np.ndarray, active: np.ndarray, slack: np.ndarray) -> tuple[float, int]:
+def _deepest(
+    one: Solid, other: Solid, arc: np.ndarray, active: np.ndarray, slack: np.ndarray
+) -> tuple[float, int]:
     """Return by how much two shapes overlap more than they may [m], negative if they never do as far as is known, and where.
 
     Args:

@@ -31,12 +31,18 @@ class End:
 
     def frame(self, name: str | None) -> Poses:
         owner, _, link = (name or self.world.robot.tool).partition(".")
-        key = (owner, link) if owner in self.world.things and link else ("robot", name or self.world.robot.tool)
+        key = (
+            (owner, link)
+            if owner in self.world.things and link
+            else ("robot", name or self.world.robot.tool)
+        )
         return self.stage.links[key].row(self.row)
 
     def value(self, name: str) -> float:
         index = self.world.plan.index(name)
-        return self.world.start[name] if index is None else float(self.stage.columns[self.row, index])
+        return (
+            self.world.start[name] if index is None else float(self.stage.columns[self.row, index])
+        )
 
 
 def _target(goal: Any) -> Poses:
@@ -56,23 +62,48 @@ def misses(world: World, step: dict[str, Any], end: End) -> list[tuple[str, floa
     if kind == "Actuate":
         for joint, goal in step["joints"].items():
             limit = far if world.things[step["object"]].slides(joint) else turn
-            expect(f"{step['object']}.{joint}", abs(end.value(f"{step['object']}.{joint}") - goal), limit, "value")
+            expect(
+                f"{step['object']}.{joint}",
+                abs(end.value(f"{step['object']}.{joint}") - goal),
+                limit,
+                "value",
+            )
     elif kind == "GoTo":
-        expect("base", float(np.hypot(end.value("base_x") - step["x"], end.value("base_y") - step["y"])), far, "place")
+        expect(
+            "base",
+            float(np.hypot(end.value("base_x") - step["x"], end.value("base_y") - step["y"])),
+            far,
+            "place",
+        )
         if step["yaw"] is not None:
             off = abs((end.value("base_yaw") - step["yaw"] + np.pi) % (2 * np.pi) - np.pi)
             expect("base heading", off, turn, "heading")
     elif kind in ("Reach", "Touch", "Place"):
-        base = f"{step['object']}.{world.things[step['object']].tree.urdf.base}" if kind == "Place" else step["frame"]
+        base = (
+            f"{step['object']}.{world.things[step['object']].tree.urdf.base}"
+            if kind == "Place"
+            else step["frame"]
+        )
         here, there = end.frame(base), _target(step.get("pose", step.get("target")))
         expect(base or "tool", float(np.linalg.norm(here.at - there.at)), far, "place")
         if np.shape(step.get("pose", step.get("target"))) == (4, 4):
-            expect(base or "tool", float(turn_between(here.turn, there.turn)[0]), turn, "orientation")
+            expect(
+                base or "tool", float(turn_between(here.turn, there.turn)[0]), turn, "orientation"
+            )
         elif kind == "Place":
             stood = world.things[step["object"]].at.turn[0]
-            up = np.array([0.0, 0.0, 1.0]) if step["object"] in {hold.object for hold in world.held} else stood[2]
+            up = (
+                np.array([0.0, 0.0, 1.0])
+                if step["object"] in {hold.object for hold in world.held}
+                else stood[2]
+            )
             now = here.turn[0, 2]  # the world's vertical, seen from the object
-            expect(base or "", float(np.arctan2(np.linalg.norm(np.cross(up, now)), up @ now)), turn, "vertical")
+            expect(
+                base or "",
+                float(np.arctan2(np.linalg.norm(np.cross(up, now)), up @ now)),
+                turn,
+                "vertical",
+            )
     if kind == "Grasp":
         found += _grasp(world, step, end, far, turn)
     if kind in ("Place", "Release"):
@@ -82,7 +113,9 @@ def misses(world: World, step: dict[str, Any], end: End) -> list[tuple[str, floa
     return found
 
 
-def _grasp(world: World, step: dict[str, Any], end: End, far: float, turn: float) -> list[tuple[str, float, str]]:
+def _grasp(
+    world: World, step: dict[str, Any], end: End, far: float, turn: float
+) -> list[tuple[str, float, str]]:
     thing = world.things[step["object"]]
     used = [hold.attachment for hold in (*end.before, *end.after) if hold.object == step["object"]]
     name = step["attachment"] or next(iter(used), None)
@@ -91,12 +124,25 @@ def _grasp(world: World, step: dict[str, Any], end: End, far: float, turn: float
     for freedom, *_ in grasp.freedoms:
         index = world.plan.index(f"{step['object']}.{freedom}")
         values[freedom] = np.array([0.0 if index is None else end.stage.columns[row, index]])
-    right, hand = end.frame(f"{step['object']}.{grasp.link}") @ grasp.tool(values), end.frame(step["by"])
+    right, hand = (
+        end.frame(f"{step['object']}.{grasp.link}") @ grasp.tool(values),
+        end.frame(step["by"]),
+    )
     hand = hand @ world.front(grasp.opening) if grasp.pushed else hand
-    off, angle = float(np.linalg.norm(hand.at - right.at)), float(turn_between(hand.turn, right.turn)[0])
+    off, angle = (
+        float(np.linalg.norm(hand.at - right.at)),
+        float(turn_between(hand.turn, right.turn)[0]),
+    )
     subject = f"{step['object']}.{grasp.name}"
     found = [(subject, off - far, f"Grasp: {off:.5f} m away")] if off > far + 1e-7 else []
-    return [*found, *([(subject, angle - turn, f"Grasp: turned by {angle:.5f} rad")] if angle > turn + 1e-7 else [])]
+    return [
+        *found,
+        *(
+            [(subject, angle - turn, f"Grasp: turned by {angle:.5f} rad")]
+            if angle > turn + 1e-7
+            else []
+        ),
+    ]
 
 
 def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
@@ -109,7 +155,10 @@ def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
         links = {step["frame"]}
         if owner not in world.things:
             owner, tree = "robot", world.robot.tree
-            above = {tree.model.names[joint] for joint in tree.model.supports[tree.frame(step["frame"]).parentJoint]}
+            above = {
+                tree.model.names[joint]
+                for joint in tree.model.supports[tree.frame(step["frame"]).parentJoint]
+            }
             links = {
                 link
                 for link, joints in world.robot.moved_by.items()
@@ -117,13 +166,20 @@ def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
             }
         safe = world.plan.options["dist_safe"]
         others = [part for part in stage.solids if part.owner not in (owner, "robot")]
-        near = {part.label for part in others if distance(POINT, target, part.shape.solid, part.at, row) < safe}
+        near = {
+            part.label
+            for part in others
+            if distance(POINT, target, part.shape.solid, part.at, row) < safe
+        }
         yield links, near
 
 
 def check_goals(world: World, stages: list[Stage]) -> Iterator[Violation]:
     """Check that there are ends of phases, in order, at which the steps are done, and that nothing moves out of turn."""
-    steps, ends = world.plan.steps, [End(world, stages, number) for number in range(len(stages) + 1)]
+    steps, ends = (
+        world.plan.steps,
+        [End(world, stages, number) for number in range(len(stages) + 1)],
+    )
     missing = [[misses(world, step, end) for end in ends] for step in steps]
     moved = [_moved(world, stage) for stage in stages]
     own = [{step["object"]} if step["step"] == "Actuate" else set() for step in steps]
@@ -131,9 +187,15 @@ def check_goals(world: World, stages: list[Stage]) -> Iterator[Violation]:
     for number, row in enumerate(missing):
         last = number == len(steps) - 1
         if not any(not found for found in (row[-1:] if last else row)):
-            best = len(ends) - 1 if last else min(range(1, len(ends)), key=lambda k: max(m[1] for m in row[k]))
+            best = (
+                len(ends) - 1
+                if last
+                else min(range(1, len(ends)), key=lambda k: max(m[1] for m in row[k]))
+            )
             for subject, amount, detail in row[best]:
-                yield Violation("goal", subject, ends[best].time, amount, f"step {number + 1}, {detail}")
+                yield Violation(
+                    "goal", subject, ends[best].time, amount, f"step {number + 1}, {detail}"
+                )
             never = True
     if never:
         return
@@ -147,7 +209,13 @@ def check_goals(world: World, stages: list[Stage]) -> Iterator[Violation]:
             if n in reached and not missing[n][number]:
                 reached.add(n + 1)
     if len(steps) not in reached:
-        yield Violation("order", "steps", float(stages[-1].times[-1]), 1.0, "steps are not done one after the other")
+        yield Violation(
+            "order",
+            "steps",
+            float(stages[-1].times[-1]),
+            1.0,
+            "steps are not done one after the other",
+        )
 
 
 def _moved(world: World, stage: Stage) -> set[str]:

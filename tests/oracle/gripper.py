@@ -28,22 +28,38 @@ class Fingers:
 
     def __init__(self, robot: Robot) -> None:
         self.robot, self.joints = robot, list(robot.gripper)
-        self.known: dict[float | None, dict[str, float]] = {None: {joint: robot.locked[joint] for joint in self.joints}}
-        hand = [link for link, joints in robot.moved_by.items() if joints == robot.moved_by[robot.tool]]
+        self.known: dict[float | None, dict[str, float]] = {
+            None: {joint: robot.locked[joint] for joint in self.joints}
+        }
+        hand = [
+            link for link, joints in robot.moved_by.items() if joints == robot.moved_by[robot.tool]
+        ]
         self.shapes = [shape for shape in robot.tree.urdf.shapes if shape.link in hand]
         if self.joints:
-            self.least, self.most, self.resting = (self.width(at) for at in (self.share(0.0), self.share(1.0), self.known[None]))
+            self.least, self.most, self.resting = (
+                self.width(at) for at in (self.share(0.0), self.share(1.0), self.known[None])
+            )
 
     def share(self, of: float) -> dict[str, float]:
         """Return where the joints are at a share of the way from closed to open."""
-        return {joint: (1.0 - of) * closed + of * open_ for joint, (closed, open_) in self.robot.gripper.items()}
+        return {
+            joint: (1.0 - of) * closed + of * open_
+            for joint, (closed, open_) in self.robot.gripper.items()
+        }
 
     def room(self, width: float, at: dict[str, float]) -> bool:
         """Whether a bar of some width fits between the fingers where the tool is, along its x axis."""
         bar, robot = coal.Box(width, THICK, THICK), self.robot
-        links = robot.tree.links({**robot.locked, **at}, None, sorted({robot.tool, *(shape.link for shape in self.shapes)}))
+        links = robot.tree.links(
+            {**robot.locked, **at},
+            None,
+            sorted({robot.tool, *(shape.link for shape in self.shapes)}),
+        )
         tool = links[robot.tool].inverse()
-        return all(distance(shape.solid, tool @ links[shape.link] @ shape.place, bar, IDENTITY) > 0.0 for shape in self.shapes)
+        return all(
+            distance(shape.solid, tool @ links[shape.link] @ shape.place, bar, IDENTITY) > 0.0
+            for shape in self.shapes
+        )
 
     def width(self, at: dict[str, float]) -> float:
         low, high = 0.0, SAFE
@@ -54,7 +70,11 @@ class Fingers:
 
     def near(self, asked: float | None) -> float | None:
         """Return how far it opens if that is asked for."""
-        return None if asked is None or not self.joints else float(np.clip(asked, self.least, self.most))
+        return (
+            None
+            if asked is None or not self.joints
+            else float(np.clip(asked, self.least, self.most))
+        )
 
     def at(self, opening: float | None) -> dict[str, float]:
         """Return where its joints are at an opening; None: at rest."""
@@ -64,7 +84,11 @@ class Fingers:
                 high = 0.0
             while high - low > 1e-7:
                 middle = (low + high) / 2
-                low, high = (low, middle) if self.room(float(opening), self.share(middle)) else (middle, high)
+                low, high = (
+                    (low, middle)
+                    if self.room(float(opening), self.share(middle))
+                    else (middle, high)
+                )
             self.known[opening] = self.share(high)
         return self.known[opening]
 
@@ -83,7 +107,10 @@ def check_openings(world: World) -> Iterator[Violation]:
         hold = next((hold for hold in (*phase.holds, *later) if hold.by is None), None)
         if hold is None or not fingers.joints:
             continue
-        is_, right = (fingers.resting if one is None else one for one in (phase.opening, required(world, hold)))
+        is_, right = (
+            fingers.resting if one is None else one
+            for one in (phase.opening, required(world, hold))
+        )
         if abs(is_ - right) > SAME:
             detail = f"{1e3 * is_:.1f} mm instead of {1e3 * right:.1f} mm"
             subject, time = f"{hold.object}.{hold.attachment}", float(plan.times[phase.first])

@@ -1,7 +1,7 @@
 """Torques of the arm, by what every body needs to move as it does: accelerations are differences of where it is, three at a time.
 
-A joint's torque is the work that the forces on all bodies do when that joint alone moves a little (virtual work). Nothing of
-rigid body algorithms is used: only where links are.
+A joint's torque is the work that the forces on all bodies do when that joint alone moves a little
+(virtual work). Nothing of rigid body algorithms is used: only where links are.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 GRIP = 0.1  # [m] lever by which a torque of the hand counts as a force
 EXCESS = 0.01  # of a limit
 STILL = 1e-6
-_SHARES, _STEP = np.array([0.03, 0.5, 0.97]), 0.025  # where in a cubic, and how far apart three places are, as shares of it
+_SHARES, _STEP = (
+    np.array([0.03, 0.5, 0.97]),
+    0.025,
+)  # where in a cubic, and how far apart three places are, as shares of it
 _NUDGE = 1e-6  # [m] or [rad]
 
 
@@ -41,7 +44,11 @@ Places = Callable[[np.ndarray], Mapping[str, Poses]]  # coordinates, shape (S, n
 def check_motors(world: World, stage: Stage) -> Iterator[Violation]:
     """Check that no motor of the arm has to do more than it can."""
     plan, robot = world.plan, world.robot
-    bodies = [Body(link, *robot.tree.urdf.weight(link)) for link, joints in robot.moved_by.items() if joints]
+    bodies = [
+        Body(link, *robot.tree.urdf.weight(link))
+        for link, joints in robot.moved_by.items()
+        if joints
+    ]
     bodies = [body for body in bodies if body.mass > 0.0]
     limits = np.array([robot.efforts[joint] for joint in robot.arm])
     if plan.curve is None or not bodies or not (limits > 0.0).any():
@@ -67,35 +74,62 @@ def check_motors(world: World, stage: Stage) -> Iterator[Violation]:
         if not thing.free and thing.limits:
             pulls, where = _pull(world, stage, thing, hold.attachment, rows, h)
             local = places(rows[1])[robot.tool]
-            inside = np.einsum("kji,kj->ki", np.broadcast_to(local.turn, (len(h), 3, 3)), where - local.at)
+            inside = np.einsum(
+                "kji,kj->ki", np.broadcast_to(local.turn, (len(h), 3, 3)), where - local.at
+            )
             for k, column in enumerate(arm):
                 shift, turn = _nudged(places, rows[1], column, robot.tool, inside)
-                torques[:, k] += np.einsum("ki,ki->k", pulls[:, :3], shift) + np.einsum("ki,ki->k", pulls[:, 3:], turn)
+                torques[:, k] += np.einsum("ki,ki->k", pulls[:, :3], shift) + np.einsum(
+                    "ki,ki->k", pulls[:, 3:], turn
+                )
     for k, joint in enumerate(robot.arm):
         worst = int(np.argmax(np.abs(torques[:, k])))
         over = abs(torques[worst, k]) - (1.0 + EXCESS) * limits[k]
         if limits[k] > 0.0 and over > 0.0 and _carries(world, bodies, places, arm[k], limits[k]):
-            yield Violation("torque", joint, float(moments[worst]), float(over), f"{torques[worst, k]:.4g} of {limits[k]:g}")
+            yield Violation(
+                "torque",
+                joint,
+                float(moments[worst]),
+                float(over),
+                f"{torques[worst, k]:.4g} of {limits[k]:g}",
+            )
 
 
 def _needed(
-    places: Places, bodies: list[Body], rows: list[np.ndarray], h: np.ndarray, columns: list[int], gravity: np.ndarray
+    places: Places,
+    bodies: list[Body],
+    rows: list[np.ndarray],
+    h: np.ndarray,
+    columns: list[int],
+    gravity: np.ndarray,
 ) -> np.ndarray:
     """Return what must be applied to some coordinates so that bodies move as they do, shape (S, k)."""
     before, now, after = (places(part) for part in rows)
     found = np.zeros((len(h), len(columns)))
-    nudges = [(places(_moved(rows[1], c, _NUDGE)), places(_moved(rows[1], c, -_NUDGE))) for c in columns]
+    nudges = [
+        (places(_moved(rows[1], c, _NUDGE)), places(_moved(rows[1], c, -_NUDGE))) for c in columns
+    ]
     for body in bodies:
         x = [frames[body.link].points(body.centre) for frames in (before, now, after)]
         pulled = body.mass * ((x[0] - 2.0 * x[1] + x[2]) / h[:, None] ** 2 - gravity)
-        turns = [np.broadcast_to(frames[body.link].turn, (len(h), 3, 3)) for frames in (before, now, after)]
+        turns = [
+            np.broadcast_to(frames[body.link].turn, (len(h), 3, 3))
+            for frames in (before, now, after)
+        ]
         spins = [_vector(turns[i + 1] @ turns[i].transpose(0, 2, 1)) / h[:, None] for i in (0, 1)]
         half = [_between(turns[i], turns[i + 1]) for i in (0, 1)]
-        momenta = [np.einsum("kij,kj->ki", t @ body.inertia @ t.transpose(0, 2, 1), w) for t, w in zip(half, spins, strict=True)]
+        momenta = [
+            np.einsum("kij,kj->ki", t @ body.inertia @ t.transpose(0, 2, 1), w)
+            for t, w in zip(half, spins, strict=True)
+        ]
         twisted = (momenta[1] - momenta[0]) / h[:, None]
         for k, (more, less) in enumerate(nudges):
-            shift = (more[body.link].points(body.centre) - less[body.link].points(body.centre)) / (2.0 * _NUDGE)
-            turn = _vector(more[body.link].turn @ less[body.link].turn.transpose(0, 2, 1)) / (2.0 * _NUDGE)
+            shift = (more[body.link].points(body.centre) - less[body.link].points(body.centre)) / (
+                2.0 * _NUDGE
+            )
+            turn = _vector(more[body.link].turn @ less[body.link].turn.transpose(0, 2, 1)) / (
+                2.0 * _NUDGE
+            )
             found[:, k] += np.einsum("ki,ki->k", pulled, np.broadcast_to(shift, pulled.shape))
             found[:, k] += np.einsum("ki,ki->k", twisted, np.broadcast_to(turn, twisted.shape))
     return found
@@ -107,19 +141,35 @@ def _moved(columns: np.ndarray, column: int, by: float) -> np.ndarray:
     return moved
 
 
-def _nudged(places: Places, columns: np.ndarray, column: int, link: str, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nudged(
+    places: Places, columns: np.ndarray, column: int, link: str, inside: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return how points of a link, shape (S, 3) in its frame, move and turn with a coordinate."""
     more, less = (places(_moved(columns, column, sign * _NUDGE))[link] for sign in (1.0, -1.0))
-    ends = [np.einsum("kij,kj->ki", np.broadcast_to(p.turn, (len(inside), 3, 3)), inside) + p.at for p in (more, less)]
+    ends = [
+        np.einsum("kij,kj->ki", np.broadcast_to(p.turn, (len(inside), 3, 3)), inside) + p.at
+        for p in (more, less)
+    ]
     turn = _vector(more.turn @ less.turn.transpose(0, 2, 1)) / (2.0 * _NUDGE)
     return (ends[0] - ends[1]) / (2.0 * _NUDGE), np.broadcast_to(turn, inside.shape)
 
 
 def _vector(turns: np.ndarray) -> np.ndarray:
     """Return small rotations as vectors, shape (S, 3)."""
-    skew = np.stack([turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]], axis=1)
+    skew = np.stack(
+        [
+            turns[:, 2, 1] - turns[:, 1, 2],
+            turns[:, 0, 2] - turns[:, 2, 0],
+            turns[:, 1, 0] - turns[:, 0, 1],
+        ],
+        axis=1,
+    )
     sine = 0.5 * np.linalg.norm(skew, axis=1, keepdims=True)
-    return 0.5 * skew * np.where(sine > 1e-9, np.arcsin(np.minimum(sine, 1.0)) / np.maximum(sine, 1e-12), 1.0)
+    return (
+        0.5
+        * skew
+        * np.where(sine > 1e-9, np.arcsin(np.minimum(sine, 1.0)) / np.maximum(sine, 1e-12), 1.0)
+    )
 
 
 def _between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -137,7 +187,9 @@ def _in_hand(world: World, stage: Stage) -> Iterator[tuple[float, np.ndarray, np
                             for (owner, link), place in stage.links.items() if owner == name})  # fmt: skip
 
 
-def _weights(thing: Thing, links: Mapping[str, Poses]) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+def _weights(
+    thing: Thing, links: Mapping[str, Poses]
+) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yield the weights of an object's links, of which none is known by shape alone here."""
     own = {link: thing.tree.urdf.weight(link) for link in thing.tree.urdf.links}
     total = sum(mass for mass, _, _ in own.values())
@@ -161,7 +213,9 @@ def _pull(
                          for j, k in zip(names, known, strict=True)], axis=1)  # fmt: skip
 
     def places(values: np.ndarray) -> Mapping[str, Poses]:
-        links = thing.tree.links({j: values[:, k] for k, j in enumerate(names)}, None, thing.tree.urdf.links)
+        links = thing.tree.links(
+            {j: values[:, k] for k, j in enumerate(names)}, None, thing.tree.urdf.links
+        )
         return {link: thing.at @ place for link, place in links.items()}
 
     z = [state(part) for part in rows]
@@ -174,11 +228,16 @@ def _pull(
     speed, change = (z[2] - z[0]) / (2.0 * h[:, None]), (z[0] - 2.0 * z[1] + z[2]) / h[:, None] ** 2
     bolts = {latch["joint"]: latch["held_at"] for latch in thing.latches}
     for k, joint in enumerate(names):
-        own_terms, moving = thing.resists[joint], np.where(np.abs(speed[:, k]) > STILL, speed[:, k], 0.0)
+        own_terms, moving = (
+            thing.resists[joint],
+            np.where(np.abs(speed[:, k]) > STILL, speed[:, k], 0.0),
+        )
         asked[:, k] += own_terms["stiffness"] * (z[1][:, k] - own_terms["springref"])
         asked[:, k] += own_terms["damping"] * moving + own_terms["friction"] * np.sign(moving)
         low, high = thing.limits[joint][:2]
-        stopped = (z[1][:, k] <= low + STILL) & (asked[:, k] > 0.0) | (z[1][:, k] >= high - STILL) & (asked[:, k] < 0.0)
+        stopped = (z[1][:, k] <= low + STILL) & (asked[:, k] > 0.0) | (
+            z[1][:, k] >= high - STILL
+        ) & (asked[:, k] < 0.0)
         stopped |= np.abs(z[1][:, k] - bolts.get(joint, np.inf)) <= STILL
         asked[stopped & (moving == 0.0) & (np.abs(change[:, k]) <= 1e-5), k] = 0.0
     index = {f: plan.index(f"{thing.name}.{f}") for f, *_ in grasp.freedoms}
@@ -193,10 +252,15 @@ def _pull(
     if grasp.pushed:
         normal = np.broadcast_to((link.turn @ grasp.place.turn)[:, :, 2], (len(h), 3))
         along = np.stack([np.einsum("ki,ki->k", way[:, :3], normal) for way in ways], axis=1)
-        size = np.einsum("ki,ki->k", along, np.stack(wants, axis=1)) / np.maximum((along**2).sum(axis=1), 1e-12)
+        size = np.einsum("ki,ki->k", along, np.stack(wants, axis=1)) / np.maximum(
+            (along**2).sum(axis=1), 1e-12
+        )
         return np.hstack([size[:, None] * normal, np.zeros((len(h), 3))]), where
     for freedom in () if grasp.firm else values:
-        ends = [link @ grasp.tool({**values, freedom: values[freedom] + sign * _NUDGE}) for sign in (1.0, -1.0)]
+        ends = [
+            link @ grasp.tool({**values, freedom: values[freedom] + sign * _NUDGE})
+            for sign in (1.0, -1.0)
+        ]
         shift = (ends[0].at - ends[1].at) / (2.0 * _NUDGE)
         turn = _vector(ends[0].turn @ ends[1].turn.transpose(0, 2, 1)) / (2.0 * _NUDGE)
         ways.append(np.hstack([np.broadcast_to(part, (len(h), 3)) for part in (shift, turn)]))
@@ -208,7 +272,9 @@ def _pull(
     for k, (way, want) in enumerate(zip(ways, wants, strict=True)):
         system[:, 6 + k, :6] = system[:, :6, 6 + k] = way
         right[:, 6 + k] = want
-    return np.stack([np.linalg.lstsq(a, b, rcond=1e-12)[0][:6] for a, b in zip(system, right, strict=True)]), where
+    return np.stack(
+        [np.linalg.lstsq(a, b, rcond=1e-12)[0][:6] for a, b in zip(system, right, strict=True)]
+    ), where
 
 
 def _carries(world: World, bodies: list[Body], places: Places, column: int, limit: float) -> bool:
@@ -218,5 +284,9 @@ def _carries(world: World, bodies: list[Body], places: Places, column: int, limi
     low, high = (np.clip([span[k] for span in spans], -np.pi, np.pi) for k in (0, 1))
     postures = np.random.default_rng(1).uniform(low, high, (200, len(names)))
     more, less = (places(_moved(postures, column, sign * _NUDGE)) for sign in (1.0, -1.0))
-    lift = sum(body.mass * (more[body.link].points(body.centre) - less[body.link].points(body.centre))[:, 2] for body in bodies)
+    lift = sum(
+        body.mass
+        * (more[body.link].points(body.centre) - less[body.link].points(body.centre))[:, 2]
+        for body in bodies
+    )
     return bool(np.abs(9.81 * lift / (2.0 * _NUDGE)).max() <= limit)

@@ -1,9 +1,9 @@
 """Pairs that may be close for longer than a moment: those that a scene allows, and what is built as close as that.
 
-A shape of an object that no hand can carry away, and another that is fixed there, are neighbours if they are closer than the
-clearance at the start or with every joint at zero: for as long as each of their joints is between the values at which it alone
-would take them that far apart. Neighbours need no clearance. Those that overlap where they stand may do so, as deep as one joint
-alone takes them.
+A shape of an object that no hand can carry away, and another that is fixed there, are neighbours if
+they are closer than the clearance at the start or with every joint at zero: for as long as each of
+their joints is between the values at which it alone would take them that far apart. Neighbours need
+no clearance. Those that overlap where they stand may do so, as deep as one joint alone takes them.
 """
 
 from __future__ import annotations
@@ -49,14 +49,20 @@ class Neighbours:
             name: {joint: float(np.clip(0.0, *thing.limits[joint][:2])) for joint in thing.state}
             for name, thing in self.fixed.items()
         }
-        self.pairs = [*self._found({name: thing.state for name, thing in self.fixed.items()}), *self._found(zero)]
+        self.pairs = [
+            *self._found({name: thing.state for name, thing in self.fixed.items()}),
+            *self._found(zero),
+        ]
 
     def _listed(self) -> list[tuple[str, str, float]]:
         found = []
         for item in self.world.plan.scene.get("allow") or ():
             if item.get("srdf"):
                 root = ElementTree.parse(self.world.plan.folder / item["srdf"]).getroot()
-                found += [(each.get("link1"), each.get("link2"), -np.inf) for each in root.iter("disable_collisions")]
+                found += [
+                    (each.get("link1"), each.get("link2"), -np.inf)
+                    for each in root.iter("disable_collisions")
+                ]
             else:
                 margin = item.get("margin")
                 found.append((*item["pair"], -np.inf if margin is None else float(margin)))
@@ -69,7 +75,11 @@ class Neighbours:
             return part.label == name or (part.owner == name and name in self.world.things)
 
         return min(
-            (m for a, b, m in self.listed if (means(a, one) and means(b, other)) or (means(a, other) and means(b, one))),
+            (
+                m
+                for a, b, m in self.listed
+                if (means(a, one) and means(b, other)) or (means(a, other) and means(b, one))
+            ),
             default=np.inf,
         )
 
@@ -82,7 +92,11 @@ class Neighbours:
                 holds = np.ones(len(stage.times), bool)
                 for name, (low, high) in pair.joints.items():
                     index, (owner, _, joint) = self.world.plan.index(name), name.partition(".")
-                    values = stage.columns[:, index] if index is not None else np.array([self.fixed[owner].state[joint]])
+                    values = (
+                        stage.columns[:, index]
+                        if index is not None
+                        else np.array([self.fixed[owner].state[joint]])
+                    )
                     holds &= (low <= values) & (values <= high)
                 close |= holds
                 depth = np.maximum(depth, np.where(holds, pair.depth, 0.0))
@@ -90,12 +104,25 @@ class Neighbours:
 
     def _found(self, state: dict[str, dict[str, float]]) -> list[Pair]:
         """Return what is close where all objects that no hand carries away are in some state."""
-        links = {name: thing.tree.links(state[name], None, thing.tree.urdf.links) for name, thing in self.fixed.items()}
+        links = {
+            name: thing.tree.links(state[name], None, thing.tree.urdf.links)
+            for name, thing in self.fixed.items()
+        }
         parts: list[tuple[str, Shape, Poses]] = []
         for name, thing in self.fixed.items():
             for shape in thing.tree.urdf.shapes:
-                parts.append((f"{name}.{shape.link}", shape, thing.at @ links[name][shape.link] @ shape.place))
-        parts += [(solid.label, solid.shape, solid.at) for solid in self.world.obstacles if solid.owner != "floor"]
+                parts.append(
+                    (
+                        f"{name}.{shape.link}",
+                        shape,
+                        thing.at @ links[name][shape.link] @ shape.place,
+                    )
+                )
+        parts += [
+            (solid.label, solid.shape, solid.at)
+            for solid in self.world.obstacles
+            if solid.owner != "floor"
+        ]
         found, done = [], set()
         for label, shape, place in parts:
             for other, second, there in parts if self._joints(label) else ():
@@ -133,19 +160,30 @@ class Neighbours:
         return [joint for joint in urdf.path_to(link) if urdf.moves(joint)]
 
     def _range(
-        self, label: str, shape: Shape, joint: str, state: dict[str, float], other: tuple[Shape, Poses]
+        self,
+        label: str,
+        shape: Shape,
+        joint: str,
+        state: dict[str, float],
+        other: tuple[Shape, Poses],
     ) -> tuple[tuple[float, float], float]:
         """Return between which values of a joint a shape stays closer to another than the clearance, and how deep it gets."""
         owner, _, link = label.partition(".")
         thing, deepest = self.fixed[owner], 0.0
 
         def apart(values: np.ndarray) -> np.ndarray:
-            place = thing.at @ thing.tree.links({**state, joint: values}, None, [link])[link] @ shape.place
+            place = (
+                thing.at
+                @ thing.tree.links({**state, joint: values}, None, [link])[link]
+                @ shape.place
+            )
             return np.array([self._apart((shape, place), other, k) for k in range(len(values))])
 
         ends = []
         for limit, sign in zip(thing.limits[joint][:2], (-1.0, 1.0), strict=True):
-            values = np.linspace(state[joint], limit if np.isfinite(limit) else state[joint] + sign * np.pi, VALUES)
+            values = np.linspace(
+                state[joint], limit if np.isfinite(limit) else state[joint] + sign * np.pi, VALUES
+            )
             distances = apart(values)
             beyond = np.flatnonzero(distances >= self.safe)
             inside = distances[: beyond[0]] if len(beyond) else distances
@@ -159,6 +197,8 @@ class Neighbours:
             near, far = values[max(beyond[0] - 1, 0)], values[beyond[0]]
             for _ in range(30):
                 middle = (near + far) / 2
-                near, far = (near, middle) if apart(np.array([middle]))[0] >= self.safe else (middle, far)
+                near, far = (
+                    (near, middle) if apart(np.array([middle]))[0] >= self.safe else (middle, far)
+                )
             ends.append(float(far))
         return (ends[0], ends[1]), deepest

@@ -29,7 +29,9 @@ class Violation:
     detail: str
 
     def __str__(self) -> str:
-        return f"{self.rule} {self.subject} at {self.time:.2f} s by {self.amount:.3g}: {self.detail}"
+        return (
+            f"{self.rule} {self.subject} at {self.time:.2f} s by {self.amount:.3g}: {self.detail}"
+        )
 
 
 @dataclass(frozen=True)
@@ -65,18 +67,28 @@ class Curve:
 
     def inside(self, parts: int) -> np.ndarray:
         """Moments in every cubic, both ends among them."""
-        return self.times[:-1, None] + np.diff(self.times)[:, None] * np.linspace(0.0, 1.0, parts + 1)
+        return self.times[:-1, None] + np.diff(self.times)[:, None] * np.linspace(
+            0.0, 1.0, parts + 1
+        )
 
-    def derivative(self, moments: np.ndarray, order: int, number: np.ndarray | None = None) -> np.ndarray:
+    def derivative(
+        self, moments: np.ndarray, order: int, number: np.ndarray | None = None
+    ) -> np.ndarray:
         """The positions (0), velocities (1) or accelerations (2) at some moments, of the cubics with these numbers."""
-        k = np.clip(np.searchsorted(self.times, moments, side="right") - 1, 0, len(self.times) - 2) if number is None else number
+        k = (
+            np.clip(np.searchsorted(self.times, moments, side="right") - 1, 0, len(self.times) - 2)
+            if number is None
+            else number
+        )
         h, since = np.diff(self.times)[k][:, None], (moments - self.times[k])[:, None]
         p, v, step = self.positions[k], self.rates[k], self.positions[k + 1] - self.positions[k]
         c2 = (3.0 * step / h - 2.0 * v - self.rates[k + 1]) / h
         c3 = (v + self.rates[k + 1] - 2.0 * step / h) / h**2
         if order == 0:
             return p + since * (v + since * (c2 + since * c3))
-        return v + since * (2.0 * c2 + 3.0 * since * c3) if order == 1 else 2.0 * c2 + 6.0 * since * c3
+        return (
+            v + since * (2.0 * c2 + 3.0 * since * c3) if order == 1 else 2.0 * c2 + 6.0 * since * c3
+        )
 
 
 @dataclass(frozen=True)
@@ -105,7 +117,9 @@ class SavedPlan:
         """Where all coordinates are at some times."""
         if self.curve is not None:
             return self.curve.derivative(moments, 0)
-        return np.stack([np.interp(moments, self.times, column) for column in self.positions.T], axis=1)
+        return np.stack(
+            [np.interp(moments, self.times, column) for column in self.positions.T], axis=1
+        )
 
     def fine(self) -> np.ndarray:
         """Where all coordinates are all along: at the waypoints, and so often between them that nothing is missed."""

@@ -17,7 +17,9 @@ class Poses(NamedTuple):
     at: np.ndarray
 
     def __matmul__(self, other: Poses) -> Poses:
-        return Poses(self.turn @ other.turn, np.einsum("kij,kj->ki", *_alike(self.turn, other.at)) + self.at)
+        return Poses(
+            self.turn @ other.turn, np.einsum("kij,kj->ki", *_alike(self.turn, other.at)) + self.at
+        )
 
     def inverse(self) -> Poses:
         back = self.turn.transpose(0, 2, 1)
@@ -35,12 +37,16 @@ class Poses(NamedTuple):
     @property
     def still(self) -> bool:
         """Whether it does not change."""
-        return bool(np.ptp(self.turn, axis=0).max() < 1e-12 and np.ptp(self.at, axis=0).max() < 1e-12)
+        return bool(
+            np.ptp(self.turn, axis=0).max() < 1e-12 and np.ptp(self.at, axis=0).max() < 1e-12
+        )
 
 
 def _alike(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     size = max(len(one), len(other))
-    return np.broadcast_to(one, (size, *one.shape[1:])), np.broadcast_to(other, (size, *other.shape[1:]))
+    return np.broadcast_to(one, (size, *one.shape[1:])), np.broadcast_to(
+        other, (size, *other.shape[1:])
+    )
 
 
 def rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
@@ -63,19 +69,28 @@ def orientation(about: Mapping[str, Any]) -> np.ndarray:
 
 def pose(position: object = (0.0, 0.0, 0.0), turn: np.ndarray | None = None) -> Poses:
     """Return one placement."""
-    return Poses((np.eye(3) if turn is None else np.asarray(turn, float))[None], np.asarray(position, float)[None])
+    return Poses(
+        (np.eye(3) if turn is None else np.asarray(turn, float))[None],
+        np.asarray(position, float)[None],
+    )
 
 
 def axis_turn(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Return rotations about an axis by angles, shape (S,): shape (S, 3, 3) (Rodrigues)."""
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angles)[:, None, None] * cross + (1 - np.cos(angles))[:, None, None] * (cross @ cross)
+    return (
+        np.eye(3)
+        + np.sin(angles)[:, None, None] * cross
+        + (1 - np.cos(angles))[:, None, None] * (cross @ cross)
+    )
 
 
 def turn_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return the angles between rotations, shape (S,) [rad]; precise where they are small."""
-    return 2.0 * np.arcsin(np.clip(np.linalg.norm(one - other, axis=(1, 2)) / np.sqrt(8.0), 0.0, 1.0))
+    return 2.0 * np.arcsin(
+        np.clip(np.linalg.norm(one - other, axis=(1, 2)) / np.sqrt(8.0), 0.0, 1.0)
+    )
 
 
 IDENTITY = pose()

@@ -27,15 +27,24 @@ def distance(one: object, here: Poses, other: object, there: Poses, k: int = 0) 
     return float(coal.distance(one, a, other, b, _REQUEST, _RESULT))
 
 
-def stands_on(world: World, links: dict[tuple[str, str], Poses], name: str, support: tuple[str, str]) -> bool:
+def stands_on(
+    world: World, links: dict[tuple[str, str], Poses], name: str, support: tuple[str, str]
+) -> bool:
     """Whether an object, lowered by 5 mm, overlaps a link by more than 2.5 mm, and, lifted as much, does not."""
     ours = world.things[name].tree.urdf.shapes
-    theirs = [shape for shape in world.things[support[0]].tree.urdf.shapes if shape.link == support[1]]
+    theirs = [
+        shape for shape in world.things[support[0]].tree.urdf.shapes if shape.link == support[1]
+    ]
 
     def overlap(height: float) -> float:
         moved, there = pose((0.0, 0.0, height)), links[support].row(0)
         found = [
-            -distance(one.solid, moved @ links[name, one.link].row(0) @ one.place, other.solid, there @ other.place)
+            -distance(
+                one.solid,
+                moved @ links[name, one.link].row(0) @ one.place,
+                other.solid,
+                there @ other.place,
+            )
             for one in ours
             for other in theirs
         ]
@@ -45,7 +54,10 @@ def stands_on(world: World, links: dict[tuple[str, str], Poses], name: str, supp
 
 
 def riders(
-    world: World, links: dict[tuple[str, str], Poses], moving: set[tuple[str, str]], waiting: list[str]
+    world: World,
+    links: dict[tuple[str, str], Poses],
+    moving: set[tuple[str, str]],
+    waiting: list[str],
 ) -> dict[str, tuple[str, str]]:
     """Return what of some free objects nobody holds stands on a moving link, or on what does: object → (owner, link)."""
     found: dict[str, tuple[str, str]] = {}
@@ -53,7 +65,10 @@ def riders(
     while below:
         new = {}
         for name in (name for name in waiting if name not in found):
-            support = next((key for key in below if key[0] != name and stands_on(world, links, name, key)), None)
+            support = next(
+                (key for key in below if key[0] != name and stands_on(world, links, name, key)),
+                None,
+            )
             if support is not None:
                 new[name] = support
         found |= new

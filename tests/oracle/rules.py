@@ -26,13 +26,19 @@ def check_motion(world: World) -> Iterator[Violation]:
     for k, name in enumerate(plan.names):
         column = plan.positions[:, k]
         if name in world.start and (off := abs(column[0] - world.start[name])) > 1e-9:
-            yield Violation("start", name, 0.0, off, f"{column[0]:.6g} instead of {world.start[name]:.6g}")
+            yield Violation(
+                "start", name, 0.0, off, f"{column[0]:.6g} instead of {world.start[name]:.6g}"
+            )
         low, high, fastest, strongest = _limits(world, name)
         outside = np.maximum(low - fine[:, k], fine[:, k] - high)
-        most = 1e-2 if max(low - column[0], column[0] - high) <= 1e-2 else 0.0  # the robot is where it is
+        most = (
+            1e-2 if max(low - column[0], column[0] - high) <= 1e-2 else 0.0
+        )  # the robot is where it is
         near = np.abs(fine[:, k] - column[0]) <= 1e-9
         outside[near] -= most
-        yield from _worst("limit", name, outside - 1e-5, np.zeros(len(outside)), f"limits {low:.4g} to {high:.4g}")
+        yield from _worst(
+            "limit", name, outside - 1e-5, np.zeros(len(outside)), f"limits {low:.4g} to {high:.4g}"
+        )
         if plan.curve is None:
             spans = np.diff(plan.times)
             speed = np.diff(column) / spans
@@ -42,11 +48,23 @@ def check_motion(world: World) -> Iterator[Violation]:
         else:
             inside = plan.curve.inside(8)
             number, when = np.repeat(np.arange(len(inside)), inside.shape[1]), inside.ravel()
-            speed, strength = (np.abs(plan.curve.derivative(when, order, number)[:, k]) for order in (1, 2))
+            speed, strength = (
+                np.abs(plan.curve.derivative(when, order, number)[:, k]) for order in (1, 2)
+            )
             moments = when
-            yield from _worst("velocity", name, np.abs(plan.curve.rates[[0, -1], k]) - 1e-6, plan.times[[0, -1]], "no rest")
-        yield from _worst("velocity", name, np.abs(speed) - 1.001 * fastest - 1e-9, moments, f"limit {fastest:g}")
-        yield from _worst("acceleration", name, strength - 1.001 * strongest - 1e-9, when, f"limit {strongest:g}")
+            yield from _worst(
+                "velocity",
+                name,
+                np.abs(plan.curve.rates[[0, -1], k]) - 1e-6,
+                plan.times[[0, -1]],
+                "no rest",
+            )
+        yield from _worst(
+            "velocity", name, np.abs(speed) - 1.001 * fastest - 1e-9, moments, f"limit {fastest:g}"
+        )
+        yield from _worst(
+            "acceleration", name, strength - 1.001 * strongest - 1e-9, when, f"limit {strongest:g}"
+        )
     if world.robot.base in ("differential", "ackermann"):
         yield from _rolling(world)
     yield from _dwell(world)
@@ -56,12 +74,17 @@ def check_motion(world: World) -> Iterator[Violation]:
 def _rolling(world: World) -> Iterator[Violation]:
     """Wheels do not go sideways; one that is steered lies on a circle that is wide enough; none is too fast.
 
-    Along a curve that is asked of velocities [m/s], at moments inside every cubic; otherwise of steps [m], of whose arc the chord
-    points where the base heads half-way.
+    Along a curve that is asked of velocities [m/s], at moments inside every cubic; otherwise of
+    steps [m], of whose arc the chord points where the base heads half-way.
     """
     plan, robot = world.plan, world.robot
     if plan.curve is None:
-        change, times, spans, much = np.diff(plan.positions[:, :3], axis=0), plan.times, np.diff(plan.times), 1e-4
+        change, times, spans, much = (
+            np.diff(plan.positions[:, :3], axis=0),
+            plan.times,
+            np.diff(plan.times),
+            1e-4,
+        )
         heading = plan.positions[:-1, 2] + change[:, 2] / 2
     else:
         inside = plan.curve.inside(24)
@@ -73,14 +96,24 @@ def _rolling(world: World) -> Iterator[Violation]:
     yield from _worst("slip", "base", np.abs(seen.imag) - much, times, "moves sideways")
     if robot.base == "ackermann":
         short = robot.turning_radius * turn - np.abs(seen.real)
-        yield from _worst("turning", "base", short - much, times, f"turns tighter than {robot.turning_radius:g} m")
+        yield from _worst(
+            "turning", "base", short - much, times, f"turns tighter than {robot.turning_radius:g} m"
+        )
     if robot.wheels is not None:
         track, fastest = robot.wheels["track"], robot.wheels["radius"] * robot.wheels["speed"]
         rims = [np.abs(seen.real + side * track / 2 * turn) / spans for side in (-1, 1)]
-        yield from _worst("wheels", "base", np.max(rims, axis=0) - 1.001 * fastest, times, f"limit {fastest:g} m/s")
+        yield from _worst(
+            "wheels",
+            "base",
+            np.max(rims, axis=0) - 1.001 * fastest,
+            times,
+            f"limit {fastest:g} m/s",
+        )
 
 
-def _worst(rule: str, subject: str, excess: np.ndarray, times: np.ndarray, detail: str) -> Iterator[Violation]:
+def _worst(
+    rule: str, subject: str, excess: np.ndarray, times: np.ndarray, detail: str
+) -> Iterator[Violation]:
     k = int(np.argmax(excess))
     if not excess[k] <= 0.0:
         yield Violation(rule, subject, float(times[k]), float(excess[k]), detail)
@@ -99,7 +132,9 @@ def _limits(world: World, name: str) -> tuple[float, float, float, float]:
     thing = world.things[owner]
     if own in thing.limits:
         return thing.limits[own]
-    low, high = next(f[3:] for grasp in thing.grasps.values() for f in grasp.freedoms if f[0] == own)
+    low, high = next(
+        f[3:] for grasp in thing.grasps.values() for f in grasp.freedoms if f[0] == own
+    )
     return low, high, np.inf, np.inf
 
 
@@ -118,8 +153,17 @@ def _dwell(world: World) -> Iterator[Violation]:
         rest = plan.times[last] - plan.times[first]
         short = float(plan.options["grasp_time"] - rest)
         if short > 1e-9:
-            what = ", ".join(sorted(hold.object for hold in set(one.holds) ^ set(other.holds))) or "gripper"
-            yield Violation("dwell", what, float(plan.times[one.last]), short, f"rests for {rest:.3f} s while the hand moves")
+            what = (
+                ", ".join(sorted(hold.object for hold in set(one.holds) ^ set(other.holds)))
+                or "gripper"
+            )
+            yield Violation(
+                "dwell",
+                what,
+                float(plan.times[one.last]),
+                short,
+                f"rests for {rest:.3f} s while the hand moves",
+            )
 
 
 def check_stage(world: World, stage: Stage) -> Iterator[Violation]:
@@ -132,7 +176,13 @@ def check_stage(world: World, stage: Stage) -> Iterator[Violation]:
         grasp = world.things[hold.object].grasps[hold.attachment]
         for name, *_ in grasp.freedoms if grasp.firm else ():
             column = stage.columns[:, world.plan.names.index(f"{hold.object}.{name}")]
-            yield from _worst("slide", f"{hold.object}.{name}", np.abs(column - column[0]) - STILL, stage.times, "firm grasp")
+            yield from _worst(
+                "slide",
+                f"{hold.object}.{name}",
+                np.abs(column - column[0]) - STILL,
+                stage.times,
+                "firm grasp",
+            )
     for name, (owner, link) in stage.riding.items():
         turn = stage.links[name, world.things[name].tree.urdf.base].turn
         lean = np.arccos(np.clip((turn @ stage.upright[name])[:, 2], -1.0, 1.0))
@@ -144,19 +194,30 @@ def _unheld(world: World, stage: Stage) -> Iterator[Violation]:
     driven = set()
     for hold in stage.phase.holds:
         thing = world.things[hold.object]
-        driven |= {f"{hold.object}.{joint}" for joint in thing.tree.urdf.path_to(thing.grasps[hold.attachment].link)}
+        driven |= {
+            f"{hold.object}.{joint}"
+            for joint in thing.tree.urdf.path_to(thing.grasps[hold.attachment].link)
+        }
     for k, name in enumerate(world.plan.names):
         owner, _, own = name.partition(".")
         if own and own in world.things[owner].limits and name not in driven:
             column = stage.columns[:, k]
-            yield from _worst("unheld", name, np.abs(column - column[0]) - STILL, stage.times, f"moves in '{stage.phase.name}'")
+            yield from _worst(
+                "unheld",
+                name,
+                np.abs(column - column[0]) - STILL,
+                stage.times,
+                f"moves in '{stage.phase.name}'",
+            )
 
 
 def _latches(world: World, stage: Stage) -> Iterator[Violation]:
     """A latched joint goes away from where it is held only while the release is far enough."""
     for owner, thing in world.things.items():
         for latch in thing.latches:
-            indices = [world.plan.index(f"{owner}.{latch[key]}") for key in ("joint", "released_by")]
+            indices = [
+                world.plan.index(f"{owner}.{latch[key]}") for key in ("joint", "released_by")
+            ]
             if indices[0] is None:
                 continue
             off = np.abs(stage.columns[:, indices[0]] - latch["held_at"])
@@ -165,8 +226,16 @@ def _latches(world: World, stage: Stage) -> Iterator[Violation]:
             side = np.sign(stage.columns[:, indices[0]] - latch["held_at"])
             leaves = ((np.diff(off) > 1e-12) | (side[1:] * side[:-1] < 0)) & (off[1:] > 1e-4)
             leaves &= np.minimum(off[:-1], off[1:]) <= latch["engaged_within"]
-            short = np.where(leaves, latch["threshold"] - 1e-4 - np.minimum(release[:-1], release[1:]), -1.0)
-            yield from _worst("latch", f"{owner}.{latch['joint']}", short, stage.times, f"needs {latch['released_by']}")
+            short = np.where(
+                leaves, latch["threshold"] - 1e-4 - np.minimum(release[:-1], release[1:]), -1.0
+            )
+            yield from _worst(
+                "latch",
+                f"{owner}.{latch['joint']}",
+                short,
+                stage.times,
+                f"needs {latch['released_by']}",
+            )
 
 
 def _push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
@@ -176,13 +245,19 @@ def _push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
         return
     size, link = len(stage.times), stage.links[hold.object, grasp.link]
     turns, middles = np.broadcast_to(link.turn, (size, 3, 3)), np.broadcast_to(link.at, (size, 3))
-    touched = (stage.tool @ world.front(grasp.opening) @ pose((0.0, 0.0, grasp.standoff))).at  # in the world
+    touched = (
+        stage.tool @ world.front(grasp.opening) @ pose((0.0, 0.0, grasp.standoff))
+    ).at  # in the world
     in_link = np.einsum("kji,kj->ki", turns, touched - middles)
     later = np.einsum("kij,kj->ki", turns[1:], in_link[:-1]) + middles[1:]
     into = (turns @ grasp.place.turn[0])[:-1, :, 2]
     ahead = np.concatenate([[0.0], np.cumsum(np.einsum("ki,ki->k", into, later - touched[:-1]))])
     yield from _worst(
-        "push", f"{hold.object}.{hold.attachment}", np.maximum.accumulate(ahead) - ahead - BACK, stage.times, "pulls"
+        "push",
+        f"{hold.object}.{hold.attachment}",
+        np.maximum.accumulate(ahead) - ahead - BACK,
+        stage.times,
+        "pulls",
     )
 
 
@@ -191,11 +266,15 @@ def _closure(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
     grasp, thing = world.things[hold.object].grasps[hold.attachment], world.things[hold.object]
     times, columns = stage.times, stage.columns
     tool, link = stage.tool, stage.links[hold.object, grasp.link]
-    if hold.by is None and not thing.free:  # nothing but the joints moves it: as finely as the curve may bend
+    if (
+        hold.by is None and not thing.free
+    ):  # nothing but the joints moves it: as finely as the curve may bend
         robot = world.robot
         times, columns, _, _ = world.samples(stage.number, FINE, FINE)
         arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
-        tool = robot.tree.links({**robot.locked, **robot.moved(arm)}, columns[:, :3], [robot.tool])[robot.tool]
+        tool = robot.tree.links({**robot.locked, **robot.moved(arm)}, columns[:, :3], [robot.tool])[
+            robot.tool
+        ]
         link = thing.at @ world.links_of(thing, columns)[grasp.link]
     holder = tool @ world.front(grasp.opening) if grasp.pushed else tool
     if hold.by is not None:

@@ -36,16 +36,23 @@ class Solid:
 
     @property
     def label(self) -> str:
-        return self.link if self.owner == "robot" else f"{self.owner}.{self.link}" if self.link else self.owner
+        return (
+            self.link
+            if self.owner == "robot"
+            else f"{self.owner}.{self.link}"
+            if self.link
+            else self.owner
+        )
 
 
 @dataclass(frozen=True)
 class Stage:
     """A phase.
 
-    `rows` are the samples that are waypoints; `links` has where every link is, by (owner, link); `tool` the robot's tool frame;
-    `moving` the links of objects that move; `riding` what stands on what and is carried along, object → (owner, link);
-    `upright` the direction, in the object's own frame, that was up when it was last put down.
+    `rows` are the samples that are waypoints; `links` has where every link is, by (owner, link);
+    `tool` the robot's tool frame; `moving` the links of objects that move; `riding` what stands on
+    what and is carried along, object → (owner, link); `upright` the direction, in the object's own
+    frame, that was up when it was last put down.
     """
 
     number: int
@@ -67,21 +74,33 @@ class World:
     def __init__(self, plan: SavedPlan) -> None:
         self.plan = plan
         scene = plan.scene
-        self.robot = load_robot(scene["robot"], plan.folder, plan.names[3 : plan.robot_size], scene["start"].get("z"))
-        self.things = {item["name"]: load_thing(item, plan.folder) for item in scene.get("objects") or ()}
+        self.robot = load_robot(
+            scene["robot"], plan.folder, plan.names[3 : plan.robot_size], scene["start"].get("z")
+        )
+        self.things = {
+            item["name"]: load_thing(item, plan.folder) for item in scene.get("objects") or ()
+        }
         arena = scene.get("arena") or {}
         self.arena = (*arena.get("x", (-5.0, 5.0)), *arena.get("y", (-5.0, 5.0)))
-        self.obstacles = [part for item in scene.get("obstacles") or () for part in self._obstacle(item)]
+        self.obstacles = [
+            part for item in scene.get("obstacles") or () for part in self._obstacle(item)
+        ]
         if scene.get("floor", True):
             ground = Shape(FLOOR, coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0), IDENTITY, np.array([0.0, 0.0, -50.0]),
                            np.array([1e3, 1e3, 50.0]), 1e3)  # fmt: skip
             self.obstacles.append(Solid(FLOOR, "", ground, IDENTITY))
         start = scene["start"]
         arm = start.get("arm", "home")
-        self.start: dict[str, float] = dict(zip(("base_x", "base_y", "base_yaw"), start["base"], strict=True))
+        self.start: dict[str, float] = dict(
+            zip(("base_x", "base_y", "base_yaw"), start["base"], strict=True)
+        )
         angles = [self.robot.home[joint] for joint in self.robot.arm] if arm == "home" else arm
         self.start |= dict(zip(self.robot.arm, angles, strict=True))
-        self.start |= {f"{name}.{joint}": value for name, thing in self.things.items() for joint, value in thing.state.items()}
+        self.start |= {
+            f"{name}.{joint}": value
+            for name, thing in self.things.items()
+            for joint, value in thing.state.items()
+        }
         self.held: list[Hold] = []
         for name, said in (start.get("held") or {}).items():
             about = {"attachment": said} if isinstance(said, str) else said
@@ -89,17 +108,33 @@ class World:
             grasp, values = self.things[name].grasps[about["attachment"]], about.get("at")
             for k, (freedom, *_) in enumerate(grasp.freedoms):
                 self.start[f"{name}.{freedom}"] = values[k] if values else 0.0
-        self.held.sort(key=lambda hold: hold.by is not None and hold.by.partition(".")[0] in {h.object for h in self.held})
+        self.held.sort(
+            key=lambda hold: (
+                hold.by is not None and hold.by.partition(".")[0] in {h.object for h in self.held}
+            )
+        )
 
     def _obstacle(self, item: dict[str, Any]) -> list[Solid]:
         here, name = pose(item["position"], orientation(item)), item["name"]
         if item["type"] == "urdf":
             urdf = read_urdf(self.plan.folder / item["file"])
-            links = Tree(urdf, drives=False).links({}, None, sorted({shape.link for shape in urdf.shapes}))
-            return [Solid(name, "", shape, here @ links[shape.link] @ shape.place) for shape in urdf.shapes]
+            links = Tree(urdf, drives=False).links(
+                {}, None, sorted({shape.link for shape in urdf.shapes})
+            )
+            return [
+                Solid(name, "", shape, here @ links[shape.link] @ shape.place)
+                for shape in urdf.shapes
+            ]
         if item["type"] == "mesh":
             scale = np.broadcast_to(np.array(item.get("scale", 1.0), float), (3,))
-            return [Solid(name, "", Shape.of("", mesh_hull(self.plan.folder / item["file"], scale), IDENTITY), here)]
+            return [
+                Solid(
+                    name,
+                    "",
+                    Shape.of("", mesh_hull(self.plan.folder / item["file"], scale), IDENTITY),
+                    here,
+                )
+            ]
         return [Solid(name, "", Shape.of("", solid(item["type"], item), IDENTITY), here)]
 
     def slides(self, name: str) -> bool:
@@ -116,21 +151,36 @@ class World:
 
     def front(self, opening: float | None) -> Poses:
         """The hand's foremost point, in the tool's frame: as far ahead as any of its touch links reaches, so far open."""
-        robot, wall = self.robot, coal.Halfspace(np.array([0.0, 0.0, -1.0]), -1.0)  # all that is a metre ahead, and beyond
+        robot, wall = (
+            self.robot,
+            coal.Halfspace(np.array([0.0, 0.0, -1.0]), -1.0),
+        )  # all that is a metre ahead, and beyond
         fingers = self.fingers.at(self.fingers.near(opening))
-        frames = robot.tree.links({**robot.locked, **fingers}, None, sorted({robot.tool, *robot.touch}))
+        frames = robot.tree.links(
+            {**robot.locked, **fingers}, None, sorted({robot.tool, *robot.touch})
+        )
         tool = frames[robot.tool].inverse()
         hand = [shape for shape in robot.tree.urdf.shapes if shape.link in robot.touch]
-        gaps = [distance(shape.solid, tool @ frames[shape.link] @ shape.place, wall, IDENTITY) for shape in hand]
+        gaps = [
+            distance(shape.solid, tool @ frames[shape.link] @ shape.place, wall, IDENTITY)
+            for shape in hand
+        ]
         return pose((0.0, 0.0, 1.0 - min(gaps)))
 
     @cached_property
     def resting(self) -> np.ndarray:
         """For every step between waypoints, whether robot and objects stand still; freedoms of grasps are not looked at."""
-        things = {f"{name}.{joint}" for name, thing in self.things.items() for joint in thing.limits}
-        bodies = [k < self.plan.robot_size or name in things for k, name in enumerate(self.plan.names)]
+        things = {
+            f"{name}.{joint}" for name, thing in self.things.items() for joint in thing.limits
+        }
+        bodies = [
+            k < self.plan.robot_size or name in things for k, name in enumerate(self.plan.names)
+        ]
         plan = self.plan
-        along = [plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1))[:, bodies] for a, b in itertools.pairwise(plan.times)]
+        along = [
+            plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1))[:, bodies]
+            for a, b in itertools.pairwise(plan.times)
+        ]
         return np.array([np.ptp(rows, axis=0).max() < 1e-9 for rows in along])
 
     @cached_property
@@ -142,7 +192,11 @@ class World:
     def at_first(self) -> float | None:
         """How far it is open at the start."""
         hold = next((hold for hold in self.held if hold.by is None), None)
-        return self.fingers.near(self.plan.scene["start"].get("opening")) if hold is None else required(self, hold)
+        return (
+            self.fingers.near(self.plan.scene["start"].get("opening"))
+            if hold is None
+            else required(self, hold)
+        )
 
     def opened(self, number: int) -> np.ndarray:
         """Return where the fingers' joints are at a phase's waypoints, shape (T, k): they move from the first to the second."""
@@ -150,7 +204,10 @@ class World:
         phase = phases[number]
         here = fingers.at(phase.opening)
         rows = np.tile([here[joint] for joint in fingers.joints], (phase.last - phase.first + 1, 1))
-        moves = bool(number) or not np.ptp(self.plan.positions[:2, : self.plan.robot_size], axis=0).any()
+        moves = (
+            bool(number)
+            or not np.ptp(self.plan.positions[:2, : self.plan.robot_size], axis=0).any()
+        )
         if moves:
             before = fingers.at(phases[number - 1].opening if number else self.at_first)
             rows[0] = [before[joint] for joint in fingers.joints]
@@ -161,70 +218,119 @@ class World:
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
         """Return times, coordinates, where the fingers' joints are, and which rows are waypoints, of a phase.
 
-        From one sample to the next no coordinate changes by more than `length` [m] or `angle` [rad].
+        From one sample to the next no coordinate changes by more than `length` [m] or `angle`
+        [rad].
         """
         plan, phase, fingers = self.plan, self.plan.phases[number], self.opened(number)
-        z, t = plan.positions[phase.first : phase.last + 1], plan.times[phase.first : phase.last + 1]
+        z, t = (
+            plan.positions[phase.first : phase.last + 1],
+            plan.times[phase.first : phase.last + 1],
+        )
         if plan.curve is None:
             steps = np.abs(np.diff(z, axis=0))
         else:  # as often as the fastest stretch of it asks for
-            parts = np.stack([plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1)) for a, b in itertools.pairwise(t)])
+            parts = np.stack(
+                [
+                    plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1))
+                    for a, b in itertools.pairwise(t)
+                ]
+            )
             steps = _PARTS * np.abs(np.diff(parts, axis=1)).max(axis=1)
         units = np.array([length if self.slides(name) else angle for name in plan.names])
         for joint, (by, factor, _) in self.robot.coupled.items():
-            k, unit = 3 + self.robot.arm.index(by), length if self.robot.tree.urdf.kind(joint) == "prismatic" else angle
+            k, unit = (
+                3 + self.robot.arm.index(by),
+                length if self.robot.tree.urdf.kind(joint) == "prismatic" else angle,
+            )
             units[k] = min(units[k], unit / abs(factor))
-        ratio = np.maximum((steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / length)
+        ratio = np.maximum(
+            (steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / length
+        )
         if self.fingers.joints:
-            own = np.array([length if self.slides(joint) else angle for joint in self.fingers.joints])
+            own = np.array(
+                [length if self.slides(joint) else angle for joint in self.fingers.joints]
+            )
             ratio = np.maximum(ratio, (np.abs(np.diff(fingers, axis=0)) / own).max(axis=1))
         counts = np.maximum(1, np.ceil(ratio - 1e-9)).astype(int)
-        share = np.concatenate([k + np.arange(n) / n for k, n in enumerate(counts)] + [[len(counts)]])
+        share = np.concatenate(
+            [k + np.arange(n) / n for k, n in enumerate(counts)] + [[len(counts)]]
+        )
         waypoints = np.arange(len(t))
         columns = plan.at(np.interp(share, waypoints, t))
-        hand = {name: np.interp(share, waypoints, column) for name, column in zip(self.fingers.joints, fingers.T, strict=True)}
-        return np.interp(share, waypoints, t), columns, hand, np.concatenate([[0], np.cumsum(counts)])
+        hand = {
+            name: np.interp(share, waypoints, column)
+            for name, column in zip(self.fingers.joints, fingers.T, strict=True)
+        }
+        return (
+            np.interp(share, waypoints, t),
+            columns,
+            hand,
+            np.concatenate([[0], np.cumsum(counts)]),
+        )
 
     def stages(self) -> Iterator[Stage]:
         """Yield the phases, one after the other; free objects stay where the phase before has left them."""
         free = {name: thing.at for name, thing in self.things.items() if thing.free}
         upright: dict[str, np.ndarray] = {}
         robot, plan = self.robot, self.plan
-        wanted = sorted({shape.link for shape in robot.tree.urdf.shapes} | {robot.tool, robot.tree.urdf.base} | self._asked())
+        wanted = sorted(
+            {shape.link for shape in robot.tree.urdf.shapes}
+            | {robot.tool, robot.tree.urdf.base}
+            | self._asked()
+        )
         for number, phase in enumerate(plan.phases):
             times, columns, hand, rows = self.samples(number)
             arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
-            frames = robot.tree.links({**robot.locked, **hand, **robot.moved(arm)}, columns[:, :3], wanted)
+            frames = robot.tree.links(
+                {**robot.locked, **hand, **robot.moved(arm)}, columns[:, :3], wanted
+            )
             if number == 0:
                 first = {name: frame.row(0) for name, frame in frames.items()}
                 free |= self._in_hand(first[robot.tool], free)
             links = {("robot", name): frame for name, frame in frames.items()}
             for name, thing in self.things.items():
                 own = self.links_of(thing, columns)
-                links |= {(name, link): (free[name] if thing.free else thing.at) @ place for link, place in own.items()}
+                links |= {
+                    (name, link): (free[name] if thing.free else thing.at) @ place
+                    for link, place in own.items()
+                }
             moving = {key for key, place in links.items() if key[0] != "robot" and not place.still}
             carried = self._carry(phase, columns, links, free)
-            moving |= {(name, link) for name in carried for link in self.things[name].tree.urdf.links}
+            moving |= {
+                (name, link) for name in carried for link in self.things[name].tree.urdf.links
+            }
             waiting = [name for name in free if name not in carried]
             upright = {name: upright.get(name, free[name].turn[0, 2]) for name in waiting}
             riding = riders(self, links, moving, waiting)
             for name, support in riding.items():  # in the order in which they stand on each other
                 there = links[support]
                 self._set_down(name, there @ (there.row(0).inverse() @ free[name]), links)
-            moving |= {(name, link) for name in riding for link in self.things[name].tree.urdf.links}
-            free = {name: links[name, self.things[name].tree.urdf.base].row(len(times) - 1) for name in free}
+            moving |= {
+                (name, link) for name in riding for link in self.things[name].tree.urdf.links
+            }
+            free = {
+                name: links[name, self.things[name].tree.urdf.base].row(len(times) - 1)
+                for name in free
+            }
             solids = [
                 Solid(owner, shape.link, shape, links[owner, shape.link] @ shape.place)
-                for owner, tree in [("robot", robot.tree), *((name, thing.tree) for name, thing in self.things.items())]
+                for owner, tree in [
+                    ("robot", robot.tree),
+                    *((name, thing.tree) for name, thing in self.things.items()),
+                ]
                 for shape in tree.urdf.shapes
             ]
             tool = frames[robot.tool]
             solids += self.obstacles
-            yield Stage(number, phase, times, columns, rows, tool, links, solids, moving, riding, upright)
+            yield Stage(
+                number, phase, times, columns, rows, tool, links, solids, moving, riding, upright
+            )
 
     def _asked(self) -> set[str]:
         """Return frames of the robot that steps name."""
-        named = {step.get("frame") for step in self.plan.steps if step["step"] in ("Reach", "Touch")}
+        named = {
+            step.get("frame") for step in self.plan.steps if step["step"] in ("Reach", "Touch")
+        }
         return {name for name in named if name and name.partition(".")[0] not in self.things}
 
     def links_of(self, thing: Thing, columns: np.ndarray) -> dict[str, Poses]:
@@ -233,7 +339,9 @@ class World:
         for joint, value in thing.state.items():
             index = self.plan.index(f"{thing.name}.{joint}")
             column = None if index is None else columns[:, index]
-            values[joint] = value if column is None else column if np.ptp(column) > 0.0 else float(column[0])
+            values[joint] = (
+                value if column is None else column if np.ptp(column) > 0.0 else float(column[0])
+            )
         return thing.tree.links(values, None, thing.tree.urdf.links)
 
     def freedoms(self, hold: Hold, columns: np.ndarray) -> dict[str, np.ndarray]:
@@ -267,7 +375,13 @@ class World:
                 found[hold.object] = holder @ (links[grasp.link] @ grasp.tool(values)).inverse()
         return found
 
-    def _carry(self, phase: Phase, columns: np.ndarray, links: dict[tuple[str, str], Poses], free: dict[str, Poses]) -> list[str]:
+    def _carry(
+        self,
+        phase: Phase,
+        columns: np.ndarray,
+        links: dict[tuple[str, str], Poses],
+        free: dict[str, Poses],
+    ) -> list[str]:
         """Move what is held with what holds it, from where it was when that took hold; return what that is."""
         carried = []
         for hold in phase.holds:
@@ -275,7 +389,12 @@ class World:
                 continue
             owner, _, link = (hold.by or "").partition(".")
             holder = links[owner, link] if hold.by else links["robot", self.robot.tool]
-            ideal = holder @ self.in_object(hold, columns, self.links_of(self.things[hold.object], columns)).inverse()
+            ideal = (
+                holder
+                @ self.in_object(
+                    hold, columns, self.links_of(self.things[hold.object], columns)
+                ).inverse()
+            )
             self._set_down(hold.object, ideal @ (ideal.row(0).inverse() @ free[hold.object]), links)
             carried.append(hold.object)
         return carried

@@ -42,7 +42,9 @@ def plans(tmp_path_factory: pytest.TempPathFactory, door_plan: vkc.Plan) -> dict
     return {name: plan.save(folder / f"{name}.npz") for name, plan in found.items()}
 
 
-def test_good_plans_pass(plans: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_good_plans_pass(
+    plans: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name, path in plans.items():
         verdict = judge(path)
         assert verdict.agrees, (name, [str(one) for one in verdict.found])
@@ -77,7 +79,9 @@ def _arena(c: Content) -> None:
 def _wall(c: Content) -> None:
     k = int(np.argmax(np.abs(np.diff(c["column"]("base_x")))))
     x, y = (float(c["column"](name)[k : k + 2].mean()) for name in ("base_x", "base_y"))
-    c["scene"]["obstacles"].append({"name": "post", "type": "cylinder", "radius": 0.02, "length": 0.2, "position": [x, y, 0.3]})
+    c["scene"]["obstacles"].append(
+        {"name": "post", "type": "cylinder", "radius": 0.02, "length": 0.2, "position": [x, y, 0.3]}
+    )
 
 
 def _drift(c: Content) -> None:
@@ -126,8 +130,14 @@ def _out_of_turn(c: Content) -> None:
 def _blocked(c: Content) -> None:
     drawer = c["scene"]["objects"][0]
     x, y, _ = drawer["position"]
-    spot = [x - 0.28, y, 0.0]  # before its handle; what stood in it from the start would be built so
-    c["scene"]["obstacles"].append({"name": "box", "type": "box", "size": [0.05, 0.05, 3.0], "position": spot})
+    spot = [
+        x - 0.28,
+        y,
+        0.0,
+    ]  # before its handle; what stood in it from the start would be built so
+    c["scene"]["obstacles"].append(
+        {"name": "box", "type": "box", "size": [0.05, 0.05, 3.0], "position": spot}
+    )
 
 
 CHANGES: list[tuple[str, Callable[[Content], None], str, str]] = [
@@ -152,13 +162,24 @@ CHANGES: list[tuple[str, Callable[[Content], None], str, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "change", "rule", "subject"), CHANGES, ids=[f"{c[0]}{c[1].__name__}-{c[2]}" for c in CHANGES])
+@pytest.mark.parametrize(
+    ("name", "change", "rule", "subject"),
+    CHANGES,
+    ids=[f"{c[0]}{c[1].__name__}-{c[2]}" for c in CHANGES],
+)
 def test_changes_are_found(
-    plans: dict[str, Path], tmp_path: Path, name: str, change: Callable[[Content], None], rule: str, subject: str
+    plans: dict[str, Path],
+    tmp_path: Path,
+    name: str,
+    change: Callable[[Content], None],
+    rule: str,
+    subject: str,
 ) -> None:
     verdict = judge(changed(plans[name], tmp_path / "changed.npz", change))
     assert verdict.success  # by its own word, which nobody changed
-    assert any(one.rule == rule and one.subject.startswith(subject) for one in verdict.found), list(map(str, verdict.found))
+    assert any(one.rule == rule and one.subject.startswith(subject) for one in verdict.found), list(
+        map(str, verdict.found)
+    )
 
 
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
@@ -201,11 +222,16 @@ def test_clearance_is_measured(plans: dict[str, Path], tmp_path: Path) -> None:
             at = [x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw), 0.39 + height + 0.01]
             for column in c["positions"].T:
                 column[1:] = column[0]
-            c["scene"]["obstacles"].append({"name": "ball", "type": "sphere", "radius": 0.01, "position": at})
+            c["scene"]["obstacles"].append(
+                {"name": "ball", "type": "sphere", "radius": 0.01, "position": at}
+            )
 
         return change
 
-    near, far = (judge(changed(plans["drawer"], tmp_path / "b.npz", ball(height))).found for height in (0.015, 0.025))
+    near, far = (
+        judge(changed(plans["drawer"], tmp_path / "b.npz", ball(height))).found
+        for height in (0.015, 0.025)
+    )
     (found,) = [one for one in near if one.rule == "clearance"]
     assert found.subject == "base_link - ball"
     assert found.amount == pytest.approx(0.019 - 0.015, abs=1e-3)
@@ -225,7 +251,9 @@ def test_what_stands_in_a_drawer_goes_with_it(plans: dict[str, Path], tmp_path: 
 
 def _with_cup(c: Content) -> None:
     x, y, _ = c["scene"]["objects"][0]["position"]
-    c["scene"]["objects"].append({"name": "cup", "type": "cup", "position": [x + 0.15, y, 0.653]})  # 1 mm above the tray's bottom
+    c["scene"]["objects"].append(
+        {"name": "cup", "type": "cup", "position": [x + 0.15, y, 0.653]}
+    )  # 1 mm above the tray's bottom
 
 
 def test_what_stands_on_something_that_tilts_tips(plans: dict[str, Path], tmp_path: Path) -> None:
@@ -253,7 +281,9 @@ def test_nothing_is_shared_with_the_package(plans: dict[str, Path]) -> None:
     for file in files:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            names += (
+                [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            )
             assert {name.partition(".")[0] for name in names} <= ALLOWED, file.name
     blocked = "import sys; sys.modules['vkc_pin'] = None; sys.path.insert(0, sys.argv[1])\n"
     blocked += "from oracle.judge import judge; from pathlib import Path\n"

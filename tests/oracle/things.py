@@ -25,12 +25,16 @@ class Tree:
 
     def __init__(self, urdf: Urdf, *, drives: bool, height: float = 0.0) -> None:
         self.urdf = urdf
-        self.model = pin.buildModelFromXML(urdf.text, *((pin.JointModelPlanar(), "base") if drives else ()))
+        self.model = pin.buildModelFromXML(
+            urdf.text, *((pin.JointModelPlanar(), "base") if drives else ())
+        )
         if drives:
             self.model.jointPlacements[1] = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
         self.data = self.model.createData()
 
-    def links(self, values: Mapping[str, np.ndarray | float], base: np.ndarray | None, wanted: list[str]) -> dict[str, Poses]:
+    def links(
+        self, values: Mapping[str, np.ndarray | float], base: np.ndarray | None, wanted: list[str]
+    ) -> dict[str, Poses]:
         """Return where links (or other frames) are in the frame of the root's parent.
 
         Args:
@@ -38,7 +42,9 @@ class Tree:
             base: x, y [m] and yaw [rad] of one that drives, shape (S, 3).
             wanted: Names of frames.
         """
-        rows = max([1 if base is None else len(base), *(np.size(value) for value in values.values())])
+        rows = max(
+            [1 if base is None else len(base), *(np.size(value) for value in values.values())]
+        )
         q = np.tile(pin.neutral(self.model), (rows, 1))
         if base is not None:
             q[:, :2], q[:, 2], q[:, 3] = base[:, :2], np.cos(base[:, 2]), np.sin(base[:, 2])
@@ -55,15 +61,23 @@ class Tree:
             pin.forwardKinematics(self.model, self.data, q[k])
             for column, joint in enumerate(joints):
                 found[k, column] = self.data.oMi[joint].homogeneous
-        of_joint = {joint: Poses(found[:, i, :3, :3], found[:, i, :3, 3]) for i, joint in enumerate(joints)}
+        of_joint = {
+            joint: Poses(found[:, i, :3, :3], found[:, i, :3, 3]) for i, joint in enumerate(joints)
+        }
         return {
-            name: of_joint[frame.parentJoint] @ pose(frame.placement.translation, frame.placement.rotation)
+            name: of_joint[frame.parentJoint]
+            @ pose(frame.placement.translation, frame.placement.rotation)
             for name, frame in frames.items()
         }
 
     def frame(self, name: str) -> Any:
         """The frame of a link, or else of another of that name."""
-        for kind in (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.FIXED_JOINT, pin.FrameType.JOINT):
+        for kind in (
+            pin.FrameType.BODY,
+            pin.FrameType.OP_FRAME,
+            pin.FrameType.FIXED_JOINT,
+            pin.FrameType.JOINT,
+        ):
             if self.model.existFrame(name, kind):
                 return self.model.frames[self.model.getFrameId(name, kind)]
         raise KeyError(f"{self.urdf.path.name} has no frame {name}")
@@ -73,8 +87,9 @@ class Tree:
 class Grasp:
     """An attachment: the tool in a link's frame is place · J(v) · standoff back along the tool's z axis.
 
-    `freedoms` are (name of the coordinate in the object, slides or not, axis, lower, upper); those that turn do so about an axis
-    through a point of `through`. Of a grasp that is `pushed`, the hand's foremost point is where the tool would be.
+    `freedoms` are (name of the coordinate in the object, slides or not, axis, lower, upper); those
+    that turn do so about an axis through a point of `through`. Of a grasp that is `pushed`, the
+    hand's foremost point is where the tool would be.
     """
 
     name: str
@@ -147,20 +162,31 @@ class Robot:
 
     def moved(self, arm: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return where all joints are that move with the arm, of values of its planned ones."""
-        return {**arm, **{joint: factor * arm[by] + offset for joint, (by, factor, offset) in self.coupled.items()}}
+        return {
+            **arm,
+            **{
+                joint: factor * arm[by] + offset
+                for joint, (by, factor, offset) in self.coupled.items()
+            },
+        }
 
     @cached_property
     def moved_by(self) -> dict[str, tuple[str, ...]]:
         """Link → the planned joints between it and the base."""
         urdf = self.tree.urdf
         return {
-            link: tuple(joint for joint in urdf.path_to(link) if joint in self.arm or joint in self.coupled)
+            link: tuple(
+                joint for joint in urdf.path_to(link) if joint in self.arm or joint in self.coupled
+            )
             for link in urdf.links
         }
 
     def apart(self, one: str, other: str) -> bool:
         """Whether two of its links move against each other and are to stay apart."""
-        return self.moved_by[one] != self.moved_by[other] and frozenset((one, other)) not in self.exempt
+        return (
+            self.moved_by[one] != self.moved_by[other]
+            and frozenset((one, other)) not in self.exempt
+        )
 
     @cached_property
     def on_the_floor(self) -> set[str]:
@@ -189,7 +215,10 @@ def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
         limits[joint] = (low, high, float(fastest), float(own.get("acceleration", 2.0)))
         rest[joint] = float(np.clip(0.0, low, high))
     free = bool(about.get("free", False))
-    grasps = {entry["name"]: _grasp(entry, free, item.get("reversed") or ()) for entry in about["attachments"]}
+    grasps = {
+        entry["name"]: _grasp(entry, free, item.get("reversed") or ())
+        for entry in about["attachments"]
+    }
     return Thing(
         name=item["name"],
         tree=Tree(urdf, drives=False),
@@ -199,7 +228,10 @@ def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
         limits=limits,
         grasps=grasps,
         latches=[{"held_at": 0.0, **latch} for latch in about.get("latches") or ()],
-        resists={joint: _resists(urdf, joint, (about.get("joints") or {}).get(joint, {})) for joint in joints},
+        resists={
+            joint: _resists(urdf, joint, (about.get("joints") or {}).get(joint, {}))
+            for joint in joints
+        },
         mass=about.get("mass"),
     )
 
@@ -208,33 +240,63 @@ def _resists(urdf: Urdf, joint: str, said: Mapping[str, Any]) -> dict[str, float
     """Return friction, damping, stiffness and springref of an object's joint."""
     dynamics = urdf.joints[joint].find("dynamics")
     found = {"friction": 0.0, "damping": 0.0, "stiffness": 0.0, "springref": 0.0}
-    found |= {} if dynamics is None else {key: float(value) for key, value in dynamics.attrib.items() if key in found}
+    found |= (
+        {}
+        if dynamics is None
+        else {key: float(value) for key, value in dynamics.attrib.items() if key in found}
+    )
     return found | {key: float(said[key]) for key in found if key in said}
 
 
 def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -> Grasp:
     if "approach" in entry:
-        z, x = (np.array(entry[key], float) / np.linalg.norm(entry[key]) for key in ("approach", "closing"))
+        z, x = (
+            np.array(entry[key], float) / np.linalg.norm(entry[key])
+            for key in ("approach", "closing")
+        )
         turn = np.column_stack([x, np.cross(z, x), z])
     else:
         turn = orientation(entry)
     name, joint = entry["name"], entry.get("joint", "fixed")
-    axis = np.array(entry["axis"], float) / np.linalg.norm(entry["axis"]) if "axis" in entry else np.zeros(3)
+    axis = (
+        np.array(entry["axis"], float) / np.linalg.norm(entry["axis"])
+        if "axis" in entry
+        else np.zeros(3)
+    )
     freedoms: list[tuple[str, bool, np.ndarray, float, float]] = []
-    through = [np.array(own.get("through", (0.0, 0.0, 0.0)), float) for own in entry.get("freedoms", ())]
+    through = [
+        np.array(own.get("through", (0.0, 0.0, 0.0)), float) for own in entry.get("freedoms", ())
+    ]
     for own in entry.get("freedoms", ()):
         direction = np.array(own["slide"] if "slide" in own else own["turn"], float)
-        freedoms.append((f"{name}_{own['name']}", "slide" in own, direction / np.linalg.norm(direction), *own["limits"]))
+        freedoms.append(
+            (
+                f"{name}_{own['name']}",
+                "slide" in own,
+                direction / np.linalg.norm(direction),
+                *own["limits"],
+            )
+        )
     if joint == "spherical":
         low, high = entry.get("limits", (-np.pi, np.pi))
-        freedoms = [(f"{name}_{letter}", False, np.eye(3)[i], low, high) for i, letter in enumerate("xyz")]
+        freedoms = [
+            (f"{name}_{letter}", False, np.eye(3)[i], low, high) for i, letter in enumerate("xyz")
+        ]
     elif joint == "cylindrical":
-        freedoms = [(f"{name}_slide", True, axis, *entry["limits"]), (f"{name}_turn", False, axis, *entry["turn"])]
+        freedoms = [
+            (f"{name}_slide", True, axis, *entry["limits"]),
+            (f"{name}_turn", False, axis, *entry["turn"]),
+        ]
     elif joint != "fixed":
         freedoms = [(name, joint == "prismatic", axis, *entry["limits"])]
-    if name in reversed_ones:  # the fingers close along the same line, the hand comes from the other side
+    if (
+        name in reversed_ones
+    ):  # the fingers close along the same line, the hand comes from the other side
         turn = np.column_stack([turn[:, 0], -turn[:, 1], -turn[:, 2]])
-        freedoms = [(*freedom[:2], np.array([1.0, -1.0, -1.0]) * freedom[2], *freedom[3:]) for freedom in freedoms]
+        freedoms = [
+            (*freedom[:2], np.array([1.0, -1.0, -1.0]) * freedom[2], *freedom[3:])
+            for freedom in freedoms
+        ]
     place = pose(entry.get("position", (0.0, 0.0, 0.0)), turn)
     standoff, firm = float(entry.get("standoff", 0.0)), bool(entry.get("firm", free))
     through = through or [np.zeros(3) for _ in freedoms]
@@ -243,14 +305,18 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
     return Grasp(name, entry["link"], place, tuple(freedoms), tuple(through), standoff, firm, *own)
 
 
-def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str], height: float | None) -> Robot:
+def load_robot(
+    item: Mapping[str, Any] | str, folder: Path, arm: list[str], height: float | None
+) -> Robot:
     """Return the robot of a scene's `robot`; `arm` are its planned joints, which a saved motion names."""
     about = {"name": item} if isinstance(item, str) else dict(item)
     file = _robot_file(about["name"], folder)
     own: dict[str, Any] = {"urdf": file.name}
     if file.suffix != ".yaml" and (file.parent / "robot.yaml").is_file():
         beside = yaml.safe_load((file.parent / "robot.yaml").read_text(encoding="utf-8"))
-        own, file = (beside, file.parent / "robot.yaml") if beside["urdf"] == file.name else (own, file)
+        own, file = (
+            (beside, file.parent / "robot.yaml") if beside["urdf"] == file.name else (own, file)
+        )
     elif file.suffix == ".yaml":
         own = yaml.safe_load(file.read_text(encoding="utf-8"))
     urdf = read_urdf(file.parent / own["urdf"])
@@ -264,34 +330,54 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str], heig
         raise NotJudged("no SRDF says which links of the robot may touch")
     base, joints = own.get("base") or {}, own.get("joints") or {}
     height = float(base.get("height", 0.0)) if height is None else height
-    speeds, strengths = base.get("velocity", (1.0, 1.0, 2.0)), base.get("acceleration", (3.0, 3.0, 6.0))
+    speeds, strengths = (
+        base.get("velocity", (1.0, 1.0, 2.0)),
+        base.get("acceleration", (3.0, 3.0, 6.0)),
+    )
     (x, y) = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
     spans = (x, y, (-np.inf, np.inf))
-    limits = {f"base_{k}": (*span, v, a) for k, span, v, a in zip(("x", "y", "yaw"), spans, speeds, strengths, strict=True)}
+    limits = {
+        f"base_{k}": (*span, v, a)
+        for k, span, v, a in zip(("x", "y", "yaw"), spans, speeds, strengths, strict=True)
+    }
     coupled = _coupled(urdf, own.get("couplings") or {}, arm)
     for joint in arm:
-        members = {joint: (joint, 1.0, 0.0)} | {name: how for name, how in coupled.items() if how[0] == joint}
+        members = {joint: (joint, 1.0, 0.0)} | {
+            name: how for name, how in coupled.items() if how[0] == joint
+        }
         low, high, fastest, strongest = -np.inf, np.inf, np.inf, np.inf
         for name, (_, factor, offset) in members.items():
             least, most, fast = urdf.limits(name)
             ends = [(end - offset) / factor for end in (least, most)]
             low, high, said = max(low, min(ends)), min(high, max(ends)), joints.get(name, {})
             fast = said.get("velocity", fast if 0.0 < fast < 1e3 else np.inf)
-            fastest, strongest = min(fastest, fast / abs(factor)), min(strongest, said.get("acceleration", np.inf) / abs(factor))
+            fastest, strongest = (
+                min(fastest, fast / abs(factor)),
+                min(strongest, said.get("acceleration", np.inf) / abs(factor)),
+            )
         most = max(abs(factor) for _, factor, _ in members.values())
-        fastest, strongest = (said if said < np.inf else unsaid / most for said, unsaid in ((fastest, np.pi), (strongest, 1.4)))
+        fastest, strongest = (
+            said if said < np.inf else unsaid / most
+            for said, unsaid in ((fastest, np.pi), (strongest, 1.4))
+        )
         limits[joint] = (low, high, fastest, strongest)
-    gripper = {joint: (said["closed"], said["open"]) for joint, said in (own.get("gripper") or {}).items()}
+    gripper = {
+        joint: (said["closed"], said["open"]) for joint, said in (own.get("gripper") or {}).items()
+    }
     wide = {joint: opened for joint, (_, opened) in gripper.items()}
     locked = {**own.get("home", {}), **wide, **own.get("locked_joints", {})}
     rest = {}
-    for joint in (name for name in urdf.joints if urdf.moves(name) and name not in arm and name not in coupled):
+    for joint in (
+        name for name in urdf.joints if urdf.moves(name) and name not in arm and name not in coupled
+    ):
         low, high, _ = urdf.limits(joint)
         rest[joint] = locked.get(joint, 0.0 if low <= 0.0 <= high else (low + high) / 2)
     for joint in rest:
         if (mimic := urdf.mimics(joint)) is not None and joint not in locked and mimic[0] in rest:
             rest[joint] = mimic[1] * rest[mimic[0]] + mimic[2]
-    for joint, (master, factor, offset) in ((joint, urdf.mimics(joint) or ("", 0.0, 0.0)) for joint in rest):
+    for joint, (master, factor, offset) in (
+        (joint, urdf.mimics(joint) or ("", 0.0, 0.0)) for joint in rest
+    ):
         if master in gripper:
             closed, opened = (factor * end + offset for end in gripper[master])
             gripper[joint] = (closed, opened)
@@ -303,22 +389,36 @@ def load_robot(item: Mapping[str, Any] | str, folder: Path, arm: list[str], heig
         arm=arm,
         locked=rest,
         limits=limits,
-        home={**_home(semantics, arm), **{joint: value for joint, value in own.get("home", {}).items() if joint in arm}},
-        exempt={frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in semantics.findall("disable_collisions")},
+        home={
+            **_home(semantics, arm),
+            **{joint: value for joint, value in own.get("home", {}).items() if joint in arm},
+        },
+        exempt={
+            frozenset((pair.get("link1", ""), pair.get("link2", "")))
+            for pair in semantics.findall("disable_collisions")
+        },
         gripper=gripper,
         coupled=coupled,
         wheels=base.get("wheels"),
         turning_radius=float(about.get("turning_radius") or base.get("turning_radius") or 0.0),
-        efforts={joint: float(joints.get(joint, {}).get("effort", urdf.effort(joint))) for joint in arm},
+        efforts={
+            joint: float(joints.get(joint, {}).get("effort", urdf.effort(joint))) for joint in arm
+        },
     )
 
 
-def _coupled(urdf: Urdf, stated: Mapping[str, Any], arm: list[str]) -> dict[str, tuple[str, float, float]]:
+def _coupled(
+    urdf: Urdf, stated: Mapping[str, Any], arm: list[str]
+) -> dict[str, tuple[str, float, float]]:
     """Return the joints that move with a planned one, and how: what leads both may be either, or a third."""
     follows = {joint: how for joint in urdf.joints if (how := urdf.mimics(joint)) is not None}
     for joint, said in stated.items():
         about = {"joint": said} if isinstance(said, str) else said
-        follows[joint] = about["joint"], float(about.get("multiplier", 1.0)), float(about.get("offset", 0.0))
+        follows[joint] = (
+            about["joint"],
+            float(about.get("multiplier", 1.0)),
+            float(about.get("offset", 0.0)),
+        )
     of_leader: dict[str, tuple[str, float, float]] = {}
     for joint in (name for name in urdf.joints if urdf.moves(name)):
         leader, factor, offset = joint, 1.0, 0.0
@@ -349,7 +449,11 @@ def _robot_file(name: str, folder: Path) -> Path:
 
 def _srdf(urdf: Path, folder: Path, named: str | None) -> ElementTree.Element | None:
     stems = dict.fromkeys((urdf.stem, urdf.stem.removesuffix("_robot")))
-    places = [folder / named] if named else [p / f"{s}.srdf" for s in stems for p in (urdf.parent, urdf.parent.parent / "srdf")]
+    places = (
+        [folder / named]
+        if named
+        else [p / f"{s}.srdf" for s in stems for p in (urdf.parent, urdf.parent.parent / "srdf")]
+    )
     file = next((place for place in places if place.is_file()), None)
     return None if file is None else ElementTree.parse(file).getroot()
 
@@ -358,7 +462,10 @@ def _home(semantics: ElementTree.Element, arm: list[str]) -> dict[str, float]:
     """Return where an SRDF says that all planned joints rest, a state called home first."""
     states = sorted(semantics.findall("group_state"), key=lambda state: state.get("name") != "home")
     for state in states:
-        values = {joint.get("name", ""): float(joint.get("value", "0").split()[0]) for joint in state.findall("joint")}
+        values = {
+            joint.get("name", ""): float(joint.get("value", "0").split()[0])
+            for joint in state.findall("joint")
+        }
         if set(arm) <= set(values):
             return {joint: values[joint] for joint in arm}
     return dict.fromkeys(arm, 0.0)

@@ -1,7 +1,7 @@
 """What may touch what, and when: the least that is right.
 
-- The hand's touch links and the link that is grasped, from shortly before the grasp until shortly after letting go. From the
-  object's other links they keep the attachment's clearance then.
+- The hand's touch links and the link that is grasped, from shortly before the grasp until shortly
+  after letting go. From the object's other links they keep the attachment's clearance then.
 - What is held through something, and the link that holds it, for as long.
 - A free object and what it stands on, where it is lifted and put down.
 - The link that a `Touch` brings somewhere and what is there, around the moment when it is.
@@ -9,7 +9,8 @@
 - What is built close to something; see `neighbours`.
 - A free object and what it stands in at the start, while it is lifted for the first time.
 
-Shortly is a second, or four waypoints where these take longer: the program's margins are eased over four waypoints.
+Shortly is a second, or four waypoints where these take longer: the program's margins are eased over
+four waypoints.
 """
 
 from __future__ import annotations
@@ -49,10 +50,16 @@ class Licence:
     depth: float = 0.0
 
     def names(self, one: str, other: str) -> bool:
-        return (one in self.ones and other in self.others) or (other in self.ones and one in self.others)
+        return (one in self.ones and other in self.others) or (
+            other in self.ones and one in self.others
+        )
 
     def covers(self, one: str, other: str, time: float, apart: float) -> bool:
-        return self.names(one, other) and self.begin - 1e-9 <= time <= self.end + 1e-9 and apart >= self.least - SHORT
+        return (
+            self.names(one, other)
+            and self.begin - 1e-9 <= time <= self.end + 1e-9
+            and apart >= self.least - SHORT
+        )
 
 
 class _Clock:
@@ -66,7 +73,12 @@ class _Clock:
     def after(self, waypoint: int) -> float:
         while waypoint < len(self.still) and self.still[waypoint]:  # the hand opens or closes
             waypoint += 1
-        return float(max(self.times[waypoint] + SHORTLY, self.times[min(waypoint + WAYPOINTS, len(self.times) - 1)]))
+        return float(
+            max(
+                self.times[waypoint] + SHORTLY,
+                self.times[min(waypoint + WAYPOINTS, len(self.times) - 1)],
+            )
+        )
 
 
 def licences(world: World, stages: list[Stage]) -> list[Licence]:
@@ -76,7 +88,9 @@ def licences(world: World, stages: list[Stage]) -> list[Licence]:
     for stage in stages:
         for name, (owner, link) in stage.riding.items():
             ours = frozenset(f"{name}.{own}" for own in world.things[name].tree.urdf.links)
-            found.append(Licence(ours, frozenset({f"{owner}.{link}"}), stage.times[0], stage.times[-1]))
+            found.append(
+                Licence(ours, frozenset({f"{owner}.{link}"}), stage.times[0], stage.times[-1])
+            )
     return found
 
 
@@ -86,7 +100,11 @@ def _held(world: World, clock: _Clock) -> Iterator[Licence]:
     spans: list[tuple[Hold, float, float]] = []
     for number, phase in enumerate(plan.phases):
         before = set(world.held if number == 0 else plan.phases[number - 1].holds)
-        after = set(plan.phases[number + 1].holds) if number + 1 < len(plan.phases) else set(phase.holds)
+        after = (
+            set(plan.phases[number + 1].holds)
+            if number + 1 < len(plan.phases)
+            else set(phase.holds)
+        )
         for hold in phase.holds:
             begin = float(plan.times[phase.first]) if hold in before else clock.before(phase.first)
             end = float(plan.times[phase.last]) if hold in after else clock.after(phase.last)
@@ -101,7 +119,9 @@ def _held(world: World, clock: _Clock) -> Iterator[Licence]:
         grasp = thing.grasps[hold.attachment]
         ours = frozenset({hold.by}) if hold.by else frozenset(world.robot.touch)
         yield Licence(ours, frozenset({f"{hold.object}.{grasp.link}"}), begin, end)
-        others = frozenset(f"{hold.object}.{link}" for link in thing.tree.urdf.links if link != grasp.link)
+        others = frozenset(
+            f"{hold.object}.{link}" for link in thing.tree.urdf.links if link != grasp.link
+        )
         least = plan.options["grasp_clearance"] if grasp.clearance is None else grasp.clearance
         yield Licence(ours, others, begin, end, least=least)
 
@@ -111,33 +131,57 @@ def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licenc
     for number, stage in enumerate(stages):
         before = {hold.object for hold in stages[number - 1].phase.holds} if number else set()
         now = {hold.object for hold in stage.phase.holds}
-        after = {hold.object for hold in stages[number + 1].phase.holds} if number + 1 < len(stages) else now
+        after = (
+            {hold.object for hold in stages[number + 1].phase.holds}
+            if number + 1 < len(stages)
+            else now
+        )
         for name in now:
             if not world.things[name].free:
                 continue
-            for there, row, waypoint in ((before, 0, stage.phase.first), (after, len(stage.times) - 1, stage.phase.last)):
+            for there, row, waypoint in (
+                (before, 0, stage.phase.first),
+                (after, len(stage.times) - 1, stage.phase.last),
+            ):
                 if name not in there:
                     ours = [part for part in stage.solids if part.owner == name]
                     others = [part for part in stage.solids if part.owner not in (name, "robot")]
-                    near = frozenset(other.label for other in others for part in ours if _close(world, part, other, row))
+                    near = frozenset(
+                        other.label
+                        for other in others
+                        for part in ours
+                        if _close(world, part, other, row)
+                    )
                     labels = frozenset(part.label for part in ours)
                     yield Licence(labels, near, clock.before(waypoint), clock.after(waypoint))
                     if row == 0 and name not in carried:
                         for part in ours:
                             for other in others:
-                                apart = distance(part.shape.solid, part.at, other.shape.solid, other.at, 0)
+                                apart = distance(
+                                    part.shape.solid, part.at, other.shape.solid, other.at, 0
+                                )
                                 if apart < 0.0:
                                     pair = frozenset({part.label}), frozenset({other.label})
-                                    yield Licence(*pair, clock.before(waypoint), clock.after(waypoint), depth=-apart)
+                                    yield Licence(
+                                        *pair,
+                                        clock.before(waypoint),
+                                        clock.after(waypoint),
+                                        depth=-apart,
+                                    )
         carried |= now
 
 
 def _close(world: World, one: Solid, other: Solid, row: int) -> bool:
-    return distance(one.shape.solid, one.at, other.shape.solid, other.at, row) < world.plan.options["dist_safe"]
+    return (
+        distance(one.shape.solid, one.at, other.shape.solid, other.at, row)
+        < world.plan.options["dist_safe"]
+    )
 
 
 def _touches(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
     for stage in stages:
         for links, near in touched(world, stage):
             waypoint = stage.phase.last
-            yield Licence(frozenset(links), frozenset(near), clock.before(waypoint), clock.after(waypoint))
+            yield Licence(
+                frozenset(links), frozenset(near), clock.before(waypoint), clock.after(waypoint)
+            )

@@ -22,8 +22,8 @@ __all__ = ["Shape", "Urdf", "mesh_hull", "read_urdf", "solid"]
 class Shape:
     """A convex solid on a link, with a ball and a box around it.
 
-    `place` is its placement in the link's frame; `centre` and `half` are the box in the shape's own frame, `radius` that of the
-    ball around its centre [m].
+    `place` is its placement in the link's frame; `centre` and `half` are the box in the shape's own
+    frame, `radius` that of the ball around its centre [m].
     """
 
     link: str
@@ -39,7 +39,14 @@ class Shape:
             corners = np.array(body.points())
             low, high = corners.min(axis=0), corners.max(axis=0)
             centre, half = (low + high) / 2, (high - low) / 2
-            return cls(link, body, place, centre, half, float(np.linalg.norm(corners - centre, axis=1).max()))
+            return cls(
+                link,
+                body,
+                place,
+                centre,
+                half,
+                float(np.linalg.norm(corners - centre, axis=1).max()),
+            )
         if isinstance(body, coal.Box):
             half = np.array(body.halfSide)
             radius = float(np.linalg.norm(half))
@@ -49,7 +56,10 @@ class Shape:
             radius = body.halfLength + body.radius
             half = np.array([body.radius, body.radius, radius])
         else:
-            half, radius = np.array([body.radius, body.radius, body.halfLength]), float(np.hypot(body.radius, body.halfLength))
+            half, radius = (
+                np.array([body.radius, body.radius, body.halfLength]),
+                float(np.hypot(body.radius, body.halfLength)),
+            )
         return cls(link, body, place, np.zeros(3), half, radius)
 
 
@@ -149,12 +159,20 @@ class Urdf:
 
     def weight(self, link: str) -> tuple[float, np.ndarray, np.ndarray]:
         """Return mass [kg], centre of mass [m] and inertia about that [kg·m²] of a link, in its frame."""
-        inertial = next(item for item in self.root.findall("link") if item.get("name") == link).find("inertial")
+        inertial = next(
+            item for item in self.root.findall("link") if item.get("name") == link
+        ).find("inertial")
         if inertial is None:
             return 0.0, np.zeros(3), np.zeros((3, 3))
         origin, about = inertial.find("origin"), inertial.find("inertia").attrib
         i = {key: float(about[key]) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")}
-        tensor = np.array([[i["ixx"], i["ixy"], i["ixz"]], [i["ixy"], i["iyy"], i["iyz"]], [i["ixz"], i["iyz"], i["izz"]]])
+        tensor = np.array(
+            [
+                [i["ixx"], i["ixy"], i["ixz"]],
+                [i["ixy"], i["iyy"], i["iyz"]],
+                [i["ixz"], i["iyz"], i["izz"]],
+            ]
+        )
         turn = np.eye(3) if origin is None else rpy(*_numbers(origin.get("rpy"), (0.0, 0.0, 0.0)))
         centre = np.zeros(3) if origin is None else _numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
         return float(inertial.find("mass").get("value")), centre, turn @ tensor @ turn.T
@@ -163,14 +181,22 @@ class Urdf:
         """Return lower, upper and velocity limit; infinite where there are none."""
         limit = self.joints[joint].find("limit")
         about = {} if limit is None else {key: float(value) for key, value in limit.attrib.items()}
-        low, high = (about.get("lower", 0.0), about.get("upper", 0.0)) if self.kind(joint) != "continuous" else (-np.inf, np.inf)
+        low, high = (
+            (about.get("lower", 0.0), about.get("upper", 0.0))
+            if self.kind(joint) != "continuous"
+            else (-np.inf, np.inf)
+        )
         return low, high, about.get("velocity", np.inf)
 
     def mimics(self, joint: str) -> tuple[str, float, float] | None:
         mimic = self.joints[joint].find("mimic")
         if mimic is None:
             return None
-        return str(mimic.get("joint")), float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
+        return (
+            str(mimic.get("joint")),
+            float(mimic.get("multiplier", 1.0)),
+            float(mimic.get("offset", 0.0)),
+        )
 
     @cached_property
     def shapes(self) -> list[Shape]:
@@ -182,7 +208,10 @@ class Urdf:
                 assert geometry is not None
                 (shape,) = list(geometry)[:1]
                 if shape.tag == "mesh":
-                    body = mesh_hull(self._file(shape.get("filename", "")), _numbers(shape.get("scale"), (1.0, 1.0, 1.0)))
+                    body = mesh_hull(
+                        self._file(shape.get("filename", "")),
+                        _numbers(shape.get("scale"), (1.0, 1.0, 1.0)),
+                    )
                 else:
                     about: dict[str, Any] = dict(shape.attrib)
                     body = solid(shape.tag, {**about, "size": about.get("size", "").split()})

@@ -11,7 +11,13 @@ from helpers.small_problems import door_scene
 
 import vkc_pin as vkc
 
-PILLAR = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6, "position": [1.2, 0.05, 0.8]}
+PILLAR = {
+    "name": "pillar",
+    "type": "cylinder",
+    "radius": 0.15,
+    "length": 1.6,
+    "position": [1.2, 0.05, 0.8],
+}
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -28,14 +34,21 @@ def test_a_handle_is_reached_by_a_robot_that_stands_still(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_drawer_is_pulled_by_a_robot_that_stands_still(seed: int) -> None:
     """In as many waypoints as usual: where few have to do, ways between them are long and lead through things."""
-    plan = vkc.plan(drawer_scene(), [vkc.Actuate("drawer", {"slide": 0.3})], initialization="stationary", seed=seed)
+    plan = vkc.plan(
+        drawer_scene(),
+        [vkc.Actuate("drawer", {"slide": 0.3})],
+        initialization="stationary",
+        seed=seed,
+    )
     assert plan.success, plan.report()
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_seed_that_shakes_by_half_a_metre(seed: int) -> None:
     options = vkc.Options(reach_waypoints=20)
-    plan = vkc.plan(hall(obstacles=[PILLAR]), [vkc.GoTo(2.4, 0.0)], perturbation=0.5, seed=seed, options=options)
+    plan = vkc.plan(
+        hall(obstacles=[PILLAR]), [vkc.GoTo(2.4, 0.0)], perturbation=0.5, seed=seed, options=options
+    )
     assert plan.success, plan.report()
 
 
@@ -45,6 +58,14 @@ def test_the_hand_turns_right_round(axis: list[float], angle: float) -> None:
     """From a seed in which nothing moves: there the residual's slope is zero, or leads the long way."""
     scene = hall()
     tool = scene.tool_placement()
-    turned = pin.SE3(tool.rotation @ pin.exp3(angle * np.array(axis)), tool.translation + np.array([0.1, 0.1, 0.0]))
-    plan = vkc.plan(scene, [vkc.Reach(turned)], initialization="stationary", options=vkc.Options(reach_waypoints=20))
+    turned = pin.SE3(
+        tool.rotation @ pin.exp3(angle * np.array(axis)),
+        tool.translation + np.array([0.1, 0.1, 0.0]),
+    )
+    plan = vkc.plan(
+        scene,
+        [vkc.Reach(turned)],
+        initialization="stationary",
+        options=vkc.Options(reach_waypoints=20),
+    )
     assert plan.success, plan.report()

@@ -25,7 +25,11 @@ def digest(plan: vkc.Plan) -> str:
     """Return a hash of a motion's times and positions, to the last bit."""
     assert plan.success, plan.report()
     motion = plan.trajectory
-    data = [" ".join(motion.names).encode(), np.ascontiguousarray(motion.times), np.ascontiguousarray(motion.positions)]
+    data = [
+        " ".join(motion.names).encode(),
+        np.ascontiguousarray(motion.times),
+        np.ascontiguousarray(motion.positions),
+    ]
     return hashlib.sha256(b"".join(bytes(part) for part in data)).hexdigest()
 
 
@@ -38,7 +42,9 @@ def door(planner: vkc.Planner | None = None) -> vkc.Plan:
 def stick(planner: vkc.Planner | None = None) -> vkc.Plan:
     """Return a task of two steps, with a tool."""
     scene = vkc.load_scene("init_2")
-    return vkc.plan(scene, [vkc.Grasp("stick"), vkc.Touch("stick.tip", initialization.TARGET)], planner=planner)
+    return vkc.plan(
+        scene, [vkc.Grasp("stick"), vkc.Touch("stick.tip", initialization.TARGET)], planner=planner
+    )
 
 
 def elsewhere(task: str, **variables: str) -> str:
@@ -104,7 +110,9 @@ def test_in_threads_that_plan_at_once(fresh: dict[str, str]) -> None:
 @pytest.mark.parametrize("number", ["1", "2"])
 def test_whatever_the_number_of_threads_of_libraries(fresh: dict[str, str], number: str) -> None:
     """Of BLAS, OpenMP and MUMPS, which sum in another order then."""
-    variables = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), number)
+    variables = dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), number
+    )
     assert elsewhere("stick", **variables) == fresh["stick"]
 
 
@@ -114,7 +122,16 @@ def test_on_one_process_or_two(tmp_path: Path) -> None:
     for jobs in (1, 2):
         out = tmp_path / str(jobs)
         result = initialization.run(
-            starts=2, repeats=1, seed=3, out=out, jobs=jobs, scenes=("init_1",), methods=("astar",), progress=False
+            starts=2,
+            repeats=1,
+            seed=3,
+            out=out,
+            jobs=jobs,
+            scenes=("init_1",),
+            methods=("astar",),
+            progress=False,
         )
-        records.append([{key: trial[key] for key in trial if "time" not in key} for trial in result["trials"]])
+        records.append(
+            [{key: trial[key] for key in trial if "time" not in key} for trial in result["trials"]]
+        )
     assert json.dumps(records[0]) == json.dumps(records[1])

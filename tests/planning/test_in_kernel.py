@@ -26,7 +26,11 @@ def jupyter() -> Iterator[Kernel]:
 
 def printed(outputs: list[dict[str, Any]]) -> str:
     assert not [output for output in outputs if output["kind"] == "error"], outputs
-    return "".join(output["text"] for output in outputs if output["kind"] == "stream" and output["name"] == "stdout")
+    return "".join(
+        output["text"]
+        for output in outputs
+        if output["kind"] == "stream" and output["name"] == "stdout"
+    )
 
 
 def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
@@ -38,7 +42,9 @@ def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
 
 
 def test_the_value_of_a_cell_is_an_overview(jupyter: Kernel) -> None:
-    jupyter.run("from vkc_pin.planning.outcome import joined\nfrom vkc_pin.planning.settings import Settings")
+    jupyter.run(
+        "from vkc_pin.planning.results import joined\nfrom vkc_pin.planning.request import Settings"
+    )
     jupyter.run("plan = joined(scene, steps, Settings('auto', vkc.Options()), [])")
     for code, text in (("plan", "FAILED, interrupted"), ("scene", "obstacles")):
         (output,) = jupyter.run(code)
@@ -62,17 +68,17 @@ def test_progress_is_one_line_that_is_written_over(jupyter: Kernel) -> None:
 @pytest.mark.parametrize(
     ("where", "code"),
     [
-        ("seeds", "vkc_pin.seeds.initialization._SeedSearch, '_search'"),
-        ("solver", "vkc_pin.solver.subproblem.Subproblem, 'solve'"),
-        ("validation", "vkc_pin.planning.one_problem, 'validate'"),
-        ("building", "vkc_pin.planning.one_problem, 'TrajectoryProblem'"),
+        ("seeds", "vkc_pin.planning.initialization.methods._GuessSearch, '_search'"),
+        ("solver", "vkc_pin.planning.solver.subproblem.Subproblem, 'solve'"),
+        ("validation", "vkc_pin.planning.solve_task, 'validate'"),
+        ("building", "vkc_pin.planning.solve_task, 'TrajectoryProblem'"),
     ],
 )
 def test_an_interrupted_cell_leaves_a_plan(jupyter: Kernel, where: str, code: str) -> None:
     """The kernel is interrupted once planning has come to a place where it stays for a while."""
     slow = f"""
 import time, importlib
-import vkc_pin.seeds.initialization, vkc_pin.solver.loop, vkc_pin.planning.one_problem
+import vkc_pin.planning.initialization.methods, vkc_pin.planning.solver.loop, vkc_pin.planning.solve_task
 owner, name = {code}
 original = getattr(owner, name)
 def slow(*arguments, **options):
@@ -95,4 +101,6 @@ finally:
     assert "FAILED, interrupted" in view["data"]["text/html"]
     (value,) = jupyter.run("plan")
     assert "FAILED, interrupted" in value["data"]["text/html"]
-    assert printed(jupyter.run("print(vkc.plan(scene, steps).status)")) == "success\n", "the next one is as if nothing had been"
+    assert printed(jupyter.run("print(vkc.plan(scene, steps).status)")) == "success\n", (
+        "the next one is as if nothing had been"
+    )

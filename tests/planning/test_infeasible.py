@@ -11,7 +11,9 @@ from helpers.drives import hall
 
 import vkc_pin as vkc
 
-QUICK = vkc.Options(reach_waypoints=15, turn_waypoints=4, move_waypoints=12, max_restarts=1, max_outer=8)
+QUICK = vkc.Options(
+    reach_waypoints=15, turn_waypoints=4, move_waypoints=12, max_restarts=1, max_outer=8
+)
 
 
 def box(name: str, size: Sequence[float], position: Sequence[float]) -> dict[str, Any]:
@@ -44,7 +46,9 @@ def explained(plan: vkc.Plan, *texts: str) -> str:
 
 def the(plan: vkc.Plan, constraint: str, subject: str) -> vkc.Violation:
     """Return the violation of a constraint whose subject contains `subject`."""
-    found = [v for v in plan.validation.violations if v.constraint == constraint and subject in v.subject]
+    found = [
+        v for v in plan.validation.violations if v.constraint == constraint and subject in v.subject
+    ]
     assert found, plan.report()
     return found[0]
 
@@ -57,7 +61,10 @@ def test_a_door_behind_a_wall() -> None:
     assert the(plan, "penetration", "– barrier").unit == "m"
 
 
-@pytest.mark.parametrize(("joints", "name", "beyond"), [({"hinge": 2.0}, "door.hinge", 0.43), ({"knob": -0.5}, "door.knob", 0.5)])
+@pytest.mark.parametrize(
+    ("joints", "name", "beyond"),
+    [({"hinge": 2.0}, "door.hinge", 0.43), ({"knob": -0.5}, "door.knob", 0.5)],
+)
 def test_a_goal_beyond_a_joint_limit(joints: dict[str, float], name: str, beyond: float) -> None:
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", joints)], options=QUICK)
     assert plan.status == "infeasible"
@@ -71,23 +78,38 @@ def test_a_goal_beyond_a_joint_limit(joints: dict[str, float], name: str, beyond
 def test_a_goal_off_the_arena() -> None:
     plan = vkc.plan(hall(), [vkc.GoTo(9.0, -6.5)], options=QUICK)
     assert plan.status == "infeasible"
-    explained(plan, "goal base_x: 9 is beyond the limits -6 to 6 by 3", "goal base_y: -6.5 is beyond the limits -6 to 6 by 0.5")
+    explained(
+        plan,
+        "goal base_x: 9 is beyond the limits -6 to 6 by 3",
+        "goal base_y: -6.5 is beyond the limits -6 to 6 by 0.5",
+    )
     assert the(plan, "goal", "base_x").waypoint == QUICK.reach_waypoints
 
 
 def test_a_target_out_of_reach() -> None:
     plan = vkc.plan(hall(), [vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))], options=QUICK)
     assert plan.status == "infeasible"
-    explained(plan, "because reach with tool: out of reach, proven: ", "1.25 m too high or low", "goal tool")
+    explained(
+        plan,
+        "because reach with tool: out of reach, proven: ",
+        "1.25 m too high or low",
+        "goal tool",
+    )
     goal = the(plan, "goal", "tool")
     assert goal.amount == pytest.approx(2.3135, abs=1e-3)  # nothing was tried: it stands still
     assert goal.waypoint == len(plan.trajectory.times) - 1
 
 
 def test_a_start_in_collision() -> None:
-    plan = vkc.plan(hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))]), [vkc.GoTo(-1.0, 0.0)], options=QUICK)
+    plan = vkc.plan(
+        hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))]),
+        [vkc.GoTo(-1.0, 0.0)],
+        options=QUICK,
+    )
     assert plan.status == "infeasible"
-    explained(plan, "start base_link – crate: overlap by 195.0 mm at the start (waypoint 0, 0.00 s)")
+    explained(
+        plan, "start base_link – crate: overlap by 195.0 mm at the start (waypoint 0, 0.00 s)"
+    )
     first = plan.validation.violations[0]
     assert (first.constraint, first.subject, first.waypoint) == ("start", "base_link – crate", 0)
     assert first.amount == pytest.approx(0.195, abs=1e-3)
@@ -105,11 +127,18 @@ def test_a_start_that_collides_with_itself() -> None:
 WALLS = [box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]
 
 
-@pytest.mark.parametrize("step", [vkc.GoTo(3.0, 0.0), vkc.Reach((3.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0))], ids=["base", "reach"])
+@pytest.mark.parametrize(
+    "step",
+    [vkc.GoTo(3.0, 0.0), vkc.Reach((3.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0))],
+    ids=["base", "reach"],
+)
 def test_a_closed_gap(step: Any) -> None:
     plan = vkc.plan(hall(obstacles=WALLS), [step], options=QUICK)
     assert plan.status == "infeasible"
-    explained(plan, "no way for the base, proven: at any heading, with the arm anywhere, it is cut off by fence")
+    explained(
+        plan,
+        "no path for the base, proven: at any heading, with the arm anywhere, it is cut off by fence",
+    )
     assert plan.metrics["rounds"] == 0  # nothing was tried
     assert the(plan, "goal", "").waypoint == len(plan.trajectory.times) - 1
 
@@ -123,9 +152,17 @@ def test_a_base_goal_inside_furniture() -> None:
 
 def test_a_base_goal_next_to_furniture() -> None:
     crate = box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))
-    plan = vkc.plan(hall(obstacles=[crate]), [vkc.GoTo(0.75, 0.0, 0.0)], options=QUICK)  # across it would fit
+    plan = vkc.plan(
+        hall(obstacles=[crate]), [vkc.GoTo(0.75, 0.0, 0.0)], options=QUICK
+    )  # across it would fit
     assert plan.status == "infeasible"
-    explained(plan, "because go to: all", "are blocked", "base_link – crate overlap by", "penetration base_link – crate")
+    explained(
+        plan,
+        "because go to: all",
+        "are blocked",
+        "base_link – crate overlap by",
+        "penetration base_link – crate",
+    )
 
 
 def test_all_reasons_are_given_at_once() -> None:
@@ -143,5 +180,10 @@ def test_what_failed_is_saved_with_its_reasons(tmp_path: Any) -> None:
 
 def test_the_stationary_seed_is_explained_too() -> None:
     crate = box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))
-    plan = vkc.plan(hall(obstacles=[crate]), [vkc.GoTo(0.75, 0.0, 0.0)], initialization="stationary", options=QUICK)
+    plan = vkc.plan(
+        hall(obstacles=[crate]),
+        [vkc.GoTo(0.75, 0.0, 0.0)],
+        initialization="stationary",
+        options=QUICK,
+    )
     explained(plan, "base_link – crate")

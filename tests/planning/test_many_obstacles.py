@@ -18,28 +18,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.benchmarks.scale import crowded
-from vkc_pin.chain import easing
-from vkc_pin.chain.contacts import ContactModel
-from vkc_pin.chain.phase_geometry import PhaseGeometry
-from vkc_pin.distances.clearances import Clearances, Nearest
-from vkc_pin.distances.shapes import asked
-from vkc_pin.driving.body import Body
-from vkc_pin.models import shapes as geometry
-from vkc_pin.models.shapes import clearance, shape_distance
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
+from vkc_pin.planning.base_paths.base_clearance import MovingShapes
+from vkc_pin.planning.chain import easing
+from vkc_pin.planning.chain.contacts import ContactModel
+from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.plotting.clearance import clearance_curves
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.scene import Scene
-from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
-from vkc_pin.validation.distances import Placed, Solids, travelled
+from vkc_pin.validation.distances import CollisionShapes, PlacedShapes, bound_displacements
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import _Sweep, sweep
+from vkc_pin.visualization.plots.clearance import compute_clearance_curves
+from vkc_pin.world.collision.clearances import Clearances, ClosePairs
+from vkc_pin.world.collision.shapes import count_distance_queries
+from vkc_pin.world.models import shapes as geometry
+from vkc_pin.world.models.shapes import compute_clearance, compute_shape_distance
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
@@ -54,7 +54,7 @@ class Counter:
 
     @contextmanager
     def counting(self, patch: pytest.MonkeyPatch) -> Iterator[None]:
-        real, counter, before = coal.distance, self, asked()
+        real, counter, before = coal.distance, self, count_distance_queries()
 
         def distance(*arguments: Any) -> float:
             counter.asked += 1
@@ -63,10 +63,11 @@ class Counter:
         with patch.context() as context:
             context.setattr(coal, "distance", distance)
             yield
-        self.asked += asked() - before
+        self.asked += count_distance_queries() - before
 
 
-# --- what it costs --------------------------------------------------------------------------------------------------
+# --- what it costs
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,9 @@ def plans() -> dict[int, tuple[Plan, int]]:
     return found
 
 
-def test_distances_asked_for_hardly_depend_on_the_number_of_obstacles(plans: dict[int, tuple[Plan, int]]) -> None:
+def test_distances_asked_for_hardly_depend_on_the_number_of_obstacles(
+    plans: dict[int, tuple[Plan, int]],
+) -> None:
     (few, asked_few), (many, asked_many) = plans[30], plans[1000]
     assert few.success
     assert many.success
@@ -107,13 +110,14 @@ def test_pictures_of_clearance_ask_for_few(plans: dict[int, tuple[Plan, int]]) -
     for result, _ in plans.values():
         counter, times = Counter(), result.trajectory.times
         with counter.counting(pytest.MonkeyPatch()):
-            found.append(clearance_curves(result.scene, result.trajectory, times))
+            found.append(compute_clearance_curves(result.scene, result.trajectory, times))
         counts.append(counter.asked / len(times))
     assert [curve.name for curve in found[0]] == [curve.name for curve in found[1]]
     assert max(counts) < 200  # at every moment, of 26,000 pairs
 
 
-# --- contacts -------------------------------------------------------------------------------------------------------
+# --- contacts
+# -------------------------------------------------------------------------------------------------------
 
 
 def all_distances(problem: TrajectoryProblem, part: PhaseGeometry, z: np.ndarray) -> np.ndarray:
@@ -147,16 +151,24 @@ def check_contacts(
     number = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
     which = np.array([number[tuple(pair)] for pair in contacts.pair.tolist()], int)
     every, same = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
-    margins = np.array([part.margins_at(every, same, z, np.full(len(every), row)) for row in range(len(z))])
+    margins = np.array(
+        [part.margins_at(every, same, z, np.full(len(every), row)) for row in range(len(z))]
+    )
     assert len(set(zip(contacts.waypoint.tolist(), which.tolist(), strict=True))) == len(which)
-    np.testing.assert_allclose(contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL)
+    np.testing.assert_allclose(
+        contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL
+    )
     np.testing.assert_array_equal(contacts.margin, margins[contacts.waypoint, which])
     for row in range(len(z)):
-        mine = contacts.distance[contacts.waypoint == row] - contacts.margin[contacts.waypoint == row]
+        mine = (
+            contacts.distance[contacts.waypoint == row] - contacts.margin[contacts.waypoint == row]
+        )
         assert np.all(np.diff(mine) >= 0.0)
         asked = (distances[row] < reach) & (margins[row] > -np.inf)
         lack = np.sort((distances[row] - margins[row])[asked])[:nearest]
-        sure = (np.abs(distances[row] - reach) > COAL).all()  # a pair just at the reach may count or not
+        sure = (
+            np.abs(distances[row] - reach) > COAL
+        ).all()  # a pair just at the reach may count or not
         assert not sure or len(mine) == len(lack)
         np.testing.assert_allclose(mine[: len(lack)], lack[: len(mine)], rtol=0.0, atol=COAL)
 
@@ -166,7 +178,9 @@ REACHES, NUMBERS = st.sampled_from([0.0, 0.02, 0.25, 1.0]), st.sampled_from([Non
 
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([0, 3, 40, 150]), REACHES, NUMBERS)
-def test_contacts_are_those_among_all_pairs(seed: int, count: int, reach: float, nearest: int | None) -> None:
+def test_contacts_are_those_among_all_pairs(
+    seed: int, count: int, reach: float, nearest: int | None
+) -> None:
     problem = program_of(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
     rng = np.random.default_rng(seed)
     for phase in (0, 2):
@@ -175,13 +189,21 @@ def test_contacts_are_those_among_all_pairs(seed: int, count: int, reach: float,
 
 @settings(max_examples=15, deadline=None)
 @given(SEEDS, st.sampled_from([0, 1, 60]), REACHES, NUMBERS)
-def test_contacts_of_what_is_carried_are_those_among_all_pairs(seed: int, count: int, reach: float, nearest: int | None) -> None:
+def test_contacts_of_what_is_carried_are_those_among_all_pairs(
+    seed: int, count: int, reach: float, nearest: int | None
+) -> None:
     """Of a stick in the hand, of a ball on its tip, and of what the motion leaves somewhere."""
-    steps = [Grasp("stick"), Grasp("ball", "pull", "stick.tip"), Reach(POSE), Release("ball"), GoTo(0.0, 0.0)]
+    steps = [
+        Grasp("stick"),
+        Grasp("ball", "pull", "stick.tip"),
+        Reach(POSE),
+        Release("ball"),
+        GoTo(0.0, 0.0),
+    ]
     problem = program_of(cluttered_room(seed, count), steps, options=SHORT)
     rng = np.random.default_rng(seed)
     z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
-    model = problem.contacts.settled(z)
+    model = problem.contacts.with_released_objects(z)
     assert [len(phase.held) for phase in problem.task.phases] == [0, 1, 2, 1]
     for phase in range(4):
         check_contacts(problem, model, phase, rng, reach=reach, nearest=nearest)
@@ -191,7 +213,9 @@ def test_contacts_of_what_is_carried_are_those_among_all_pairs(seed: int, count:
 @given(SEEDS, st.sampled_from([3, 60]))
 def test_no_distance_depends_on_what_was_asked_before(seed: int, count: int) -> None:
     problem = program_of(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
-    z = random_configurations(problem.chain.lower, problem.chain.upper, 6, np.random.default_rng(seed))
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, 6, np.random.default_rng(seed)
+    )
     waypoints = np.full(len(z), problem.ends[2])
     few = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=3)
     every = problem.contacts.evaluate(z[::-1], waypoints, reach=0.3)
@@ -201,7 +225,8 @@ def test_no_distance_depends_on_what_was_asked_before(seed: int, count: int) -> 
             np.testing.assert_array_equal(one[mine], other[same])
 
 
-# --- validation -----------------------------------------------------------------------------------------------------
+# --- validation
+# -----------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=20, deadline=None)
@@ -213,20 +238,26 @@ def test_validation_sees_what_brute_force_sees(seed: int, count: int, size: floa
 
 @settings(max_examples=12, deadline=None)
 @given(SEEDS, st.sampled_from([0, 1, 60]), st.sampled_from([0.02, 0.1, 0.5]))
-def test_validation_sees_what_brute_force_sees_of_what_is_carried(seed: int, count: int, size: float) -> None:
+def test_validation_sees_what_brute_force_sees_of_what_is_carried(
+    seed: int, count: int, size: float
+) -> None:
     check_sweep(*whirl(seed, size=size, scene=cluttered_room(seed, count)))
 
 
 def check_sweep(scene: Scene, motion: Trajectory) -> None:
     """The smallest distance of all, whatever overlaps at a sample, and whatever falls short of its margin at a waypoint."""
     samples = Samples(scene, motion)
-    table = PairTable(scene, Solids(samples.world), motion, 0.02)
+    table = PairTable(scene, CollisionShapes(samples.world), motion, 0.02)
     hits = list(sweep(table, samples.z, samples.waypoint_rows))
-    moves = table._moves[table._phase[np.searchsorted(samples.waypoint_rows, np.arange(len(samples.z)))]]
+    moves = table._moves[
+        table._phase[np.searchsorted(samples.waypoint_rows, np.arange(len(samples.z)))]
+    ]
     distances = np.where(moves[:, table.pairs].any(axis=2), brute_force(table, samples.z), np.inf)
     at_samples = min(hit.distance for hit in hits)
     assert at_samples <= distances.min() + COAL
-    assert at_samples >= distances.min() - 2e-3 or min(distances.min(), 0.0) > at_samples  # it looks between samples, too
+    assert (
+        at_samples >= distances.min() - 2e-3 or min(distances.min(), 0.0) > at_samples
+    )  # it looks between samples, too
     found = {(hit.row, hit.first, hit.second) for hit in hits}
     for row, k in np.argwhere(distances < -COAL):
         assert (row, *pair_names(table, k)) in found
@@ -242,72 +273,119 @@ def check_sweep(scene: Scene, motion: Trajectory) -> None:
 def test_bounds_are_bounds(seed: int, count: int, size: float) -> None:
     scene = cluttered(seed, count)
     samples = Samples(scene, wander(scene, seed, size=size))
-    table = PairTable(scene, Solids(samples.world), samples.trajectory, 0.02)
+    table = PairTable(scene, CollisionShapes(samples.world), samples.trajectory, 0.02)
     z = samples.z[samples.waypoint_rows]
     distances = brute_force(table, z)
     moves = table._moves[table._phase][:, table.pairs].any(axis=2)
-    placed, count = table.solids.at(samples.world.coordinates.q(z)), len(table.pairs)
+    placed, count = table.solids.place(samples.world.coordinates.q(z)), len(table.pairs)
     at, pairs = np.repeat(np.arange(len(z)), count), np.tile(table.pairs, (len(z), 1))
-    bounds = placed.bounds(at, pairs).reshape(-1, count)
+    bounds = placed.compute_lower_bounds(at, pairs).reshape(-1, count)
     assert (bounds <= distances + COAL).all()
     assert (bounds[np.isfinite(bounds)] >= 0.0).all()
     for reach in (0.02, 0.5):
-        close = table.near(placed, np.arange(len(z)), np.arange(len(z)), np.zeros((len(z), len(table.group))), reach)
+        close = table.find_close_pairs(
+            placed,
+            np.arange(len(z)),
+            np.arange(len(z)),
+            np.zeros((len(z), len(table.groups))),
+            reach,
+        )
         assert set(map(tuple, np.argwhere((distances < reach - COAL) & moves).tolist())) <= set(
             zip(*map(np.ndarray.tolist, close), strict=True)
         )
-    np.testing.assert_allclose(placed.distances(at, pairs).reshape(-1, count), distances, rtol=0.0, atol=COAL)
-    nearest, least = placed.nearest(table.pairs)
+    np.testing.assert_allclose(
+        placed.compute_distances(at, pairs).reshape(-1, count), distances, rtol=0.0, atol=COAL
+    )
+    nearest, least = placed.find_nearest(table.pairs)
     np.testing.assert_allclose(least, distances.min(axis=1), rtol=0.0, atol=COAL)
-    np.testing.assert_allclose(distances[np.arange(len(z)), nearest], distances.min(axis=1), rtol=0.0, atol=COAL)
-    moved = np.diff(travelled(table.solids, samples.z)[samples.waypoint_rows], axis=0)
+    np.testing.assert_allclose(
+        distances[np.arange(len(z)), nearest], distances.min(axis=1), rtol=0.0, atol=COAL
+    )
+    moved = np.diff(bound_displacements(table.solids, samples.z)[samples.waypoint_rows], axis=0)
     floor = (distances[:-1] + distances[1:] - moved[:, table.pairs].sum(axis=2)) / 2
     for smallest in (1e-3, 0.1):
-        active = set(zip(*map(np.ndarray.tolist, _Sweep(table)._active(placed, moved, smallest)), strict=True))
+        active = set(
+            zip(
+                *map(np.ndarray.tolist, _Sweep(table)._find_active_pairs(placed, moved, smallest)),
+                strict=True,
+            )
+        )
         assert set(map(tuple, np.argwhere(floor < smallest - COAL).tolist())) <= active
 
 
-# --- plans ----------------------------------------------------------------------------------------------------------
+# --- plans
+# ----------------------------------------------------------------------------------------------------------
 
 
 def cull_nothing(patch: pytest.MonkeyPatch) -> None:
     """Let every pair be asked of coal, at every configuration that anybody asks about."""
 
     def all_of_them(
-        near: Clearances, q: np.ndarray, z: np.ndarray, at: np.ndarray, *, reach: float, most: Any = None, standing: bool = True
-    ) -> Nearest:
-        where, every = near.placements.at(q), near.boxes.pairs
+        near: Clearances,
+        q: np.ndarray,
+        z: np.ndarray,
+        at: np.ndarray,
+        *,
+        reach: float,
+        max_pairs: Any = None,
+        include_fixed: bool = True,
+    ) -> ClosePairs:
+        where, every = near.placements.compute_placements(q), near.boxes.pairs
         w, k = np.indices((len(q), len(every))).reshape(2, -1)
-        margins = near.margins.at(k, at[w], z, w)
-        counts = (margins > -np.inf) & (standing | (every[k, 1] < where.shape[1]))
+        margins = near.margins.compute_margins(k, at[w], z, w)
+        counts = (margins > -np.inf) & (include_fixed | (every[k, 1] < where.shape[1]))
         w, k, margins = w[counts], k[counts], margins[counts]
-        known: dict[str, Any] = {"numbers": k, "margins": margins, "bounds": np.full(len(k), -np.inf), "rounding": 0.0}
+        known: dict[str, Any] = {
+            "ranks": k,
+            "margins": margins,
+            "bounds": np.full(len(k), -np.inf),
+            "rounding": 0.0,
+        }
         edges = np.searchsorted(w, np.arange(len(q) + 1))
-        chosen, found = near.shapes.shortest(where, edges, every[k], reach=reach, most=most, **known)
-        return Nearest(w[chosen], k[chosen], found.distance, margins[chosen], *found[1:])
+        chosen, found = near.shapes.find_closest_pairs(
+            where, edges, every[k], reach=reach, max_pairs=max_pairs, **known
+        )
+        return ClosePairs(w[chosen], k[chosen], found.distance, margins[chosen], *found[1:])
 
-    def one_by_one(near: Clearances, q: np.ndarray, z: np.ndarray, waypoint: int, *, reach: float, allowed: float) -> int:
+    def one_by_one(
+        near: Clearances,
+        q: np.ndarray,
+        z: np.ndarray,
+        waypoint: int,
+        *,
+        reach: float,
+        allowed: float,
+    ) -> int:
         found = all_of_them(near, q, z, np.full(len(q), waypoint), reach=reach)
         return int(min(found.row[found.margin - found.distance > allowed], default=len(q)))
 
-    def nowhere(placed: Placed, states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    def nowhere(placed: PlacedShapes, states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         return np.full(len(pairs), -np.inf)
 
     def all_of(
-        table: PairTable, _: Placed, first: np.ndarray, last: np.ndarray, moved: np.ndarray, limit: float
+        table: PairTable,
+        _: PlacedShapes,
+        first: np.ndarray,
+        last: np.ndarray,
+        moved: np.ndarray,
+        limit: float,
     ) -> tuple[np.ndarray, ...]:
         return np.nonzero(table._moves[table._phase[last]][:, table.pairs].any(axis=2))
 
-    def everywhere(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[np.ndarray, np.ndarray]:
+    def everywhere(
+        shape: coal.CollisionGeometry, placement: pin.SE3
+    ) -> tuple[np.ndarray, np.ndarray]:
         return np.full(3, -1e3), np.full(3, 1e3)
 
-    patch.setattr(Clearances, "nearest", all_of_them)
-    patch.setattr(Clearances, "first_blocked", one_by_one)
-    patch.setattr(Placed, "bounds", nowhere)
-    patch.setattr(PairTable, "near", all_of)
-    patch.setattr(Body, "_close", lambda body, along: np.arange(len(body.moving)))
+    patch.setattr(Clearances, "find_closest_pairs", all_of_them)
+    patch.setattr(Clearances, "find_first_violation", one_by_one)
+    patch.setattr(PlacedShapes, "compute_lower_bounds", nowhere)
+    patch.setattr(PairTable, "find_close_pairs", all_of)
+    patch.setattr(
+        MovingShapes, "_find_close_pairs", lambda body, along: np.arange(len(body.moving))
+    )
     for module in (geometry, easing):
-        patch.setattr(module, "world_box", everywhere)
+        patch.setattr(module, "compute_world_box", everywhere)
 
 
 @pytest.mark.parametrize("task", ["door", pytest.param("stick", marks=pytest.mark.long)])
@@ -317,7 +395,9 @@ def test_culling_changes_no_plan(task: str, monkeypatch: pytest.MonkeyPatch) -> 
     scene = crowded(30)
     if task == "stick":  # it is put down further along the table, beside a fence
         steps = [Place("stick", lifted(STICK, [0.0, 0.4, 0.0]))]
-        scene = room(table(), *(box(f"pale_{k}", [0.1] * 3, [1.5, 0.12 * k - 1.0, 0.5]) for k in range(20)))
+        scene = room(
+            table(), *(box(f"pale_{k}", [0.1] * 3, [1.5, 0.12 * k - 1.0, 0.5]) for k in range(20))
+        )
     counts, found = [], []
     for culled in (True, False):
         counter = Counter()
@@ -332,35 +412,55 @@ def test_culling_changes_no_plan(task: str, monkeypatch: pytest.MonkeyPatch) -> 
     assert one.success
     assert other.success
     assert one.initialization == other.initialization
-    np.testing.assert_allclose(one.trajectory.positions, other.trajectory.positions, rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(
+        one.trajectory.positions, other.trajectory.positions, rtol=0.0, atol=1e-5
+    )
     for name in ("clearance", "closure_error", "base_effort", "arm_effort"):
         assert one.metrics[name] == pytest.approx(other.metrics[name], abs=1e-5)
     for name in ("rounds", "iterations"):
         assert one.metrics[name] == other.metrics[name]
 
 
-# --- scenes ---------------------------------------------------------------------------------------------------------
+# --- scenes
+# ---------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([1, 5, 60]), st.sampled_from([np.inf, 0.3, 0.03]))
-def test_the_clearance_at_the_start_is_that_of_all_pairs(seed: int, count: int, reach: float) -> None:
+def test_the_clearance_at_the_start_is_that_of_all_pairs(
+    seed: int, count: int, reach: float
+) -> None:
     scene = cluttered(seed, count)
     model, geometry = scene.robot.model, scene.robot.collision
     data, shapes = model.createData(), geometry.createData()
-    pin.updateGeometryPlacements(model, data, geometry, shapes, scene.robot.coordinates.q(scene.start))
-    moving = [(shape.geometry, where) for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)]
-    standing = [s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR]
-    standing += standing_geometry(scene.objects["door"])
-    expected = min(shape_distance(shape, where, other.geometry, other.placement) for shape, where in moving for other in standing)
+    pin.updateGeometryPlacements(
+        model, data, geometry, shapes, scene.robot.coordinates.q(scene.start)
+    )
+    moving = [
+        (shape.geometry, where)
+        for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+    ]
+    standing = [
+        s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR
+    ]
+    standing += make_world_shapes(scene.objects["door"])
+    expected = min(
+        compute_shape_distance(shape, where, other.geometry, other.placement)
+        for shape, where in moving
+        for other in standing
+    )
     found = scene.start_clearance(reach=reach)
     assert found == (pytest.approx(expected, abs=1e-9) if expected < reach else reach)
-    assert clearance(moving, []) == np.inf
+    assert compute_clearance(moving, []) == np.inf
 
 
 def test_what_a_scene_does_not_change_it_shares() -> None:
     scene = crowded(100)
-    moved = scene.with_start(base=[-0.5, 0.2, 0.0]).with_state("door", {"hinge": 0.5}).with_held({"door": "handle"})
+    moved = (
+        scene.with_start(base=[-0.5, 0.2, 0.0])
+        .with_state("door", {"hinge": 0.5})
+        .with_held({"door": "handle"})
+    )
     assert moved.obstacles is scene.obstacles
     assert moved.described is scene.described
     assert moved.document["obstacles"] == scene.document["obstacles"]
@@ -371,8 +471,12 @@ def test_what_a_scene_does_not_change_it_shares() -> None:
 
 def test_a_world_shows_all_its_shapes() -> None:
     world = World(crowded(50))
-    assert [shape.name for shape in world.shapes] == [shape.name for shape in world.collision.geometryObjects]
+    assert [shape.name for shape in world.shapes] == [
+        shape.name for shape in world.collision.geometryObjects
+    ]
     assert len(world.shapes) == len(world.collision_labels)
     for shape, twin in zip(world.shapes, world.collision.geometryObjects, strict=True):
         assert shape.parentJoint == twin.parentJoint
-        np.testing.assert_allclose(shape.placement.homogeneous, twin.placement.homogeneous, atol=1e-12)
+        np.testing.assert_allclose(
+            shape.placement.homogeneous, twin.placement.homogeneous, atol=1e-12
+        )

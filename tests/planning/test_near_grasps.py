@@ -13,18 +13,23 @@ from oracle.judge import judge
 import vkc_pin as vkc
 
 OBJECTS = Path(vkc.load_object("drawer").urdf).parent
-FINGERS = 0.0742  # [m] from the tool frame to where the open fingers end, in the direction in which they close
+# [m] from the tool frame to where the open fingers end, in the direction in which they close
+FINGERS = 0.0742
 BAR = 0.755  # [m] height of the drawer's bar
 STEPS = [vkc.Actuate("drawer", {"slide": 0.3}, "handle")]
 
 
-def below_a_ledge(folder: Path, *, gap: float, clearance: float | None = None, own: bool = True) -> vkc.Scene:
+def below_a_ledge(
+    folder: Path, *, gap: float, clearance: float | None = None, own: bool = True
+) -> vkc.Scene:
     """Return the drawer's room with a ledge above the bar, `gap` above the open hand: the cabinet's `own`, or an obstacle."""
     size, at = [0.1, 0.6, 0.02], [-0.1, 0.0, BAR + FINGERS + gap + 0.01]
     urdf = (OBJECTS / "drawer.urdf").read_text()
     if own:
         box = f'<collision><origin xyz="{at[0]} 0 {at[2]}"/><geometry><box size="0.1 0.6 0.02"/></geometry></collision>'
-        glue = '<joint name="glue" type="fixed"><parent link="cabinet"/><child link="ledge"/></joint>'
+        glue = (
+            '<joint name="glue" type="fixed"><parent link="cabinet"/><child link="ledge"/></joint>'
+        )
         urdf = urdf.replace("</robot>", f'<link name="ledge">{box}</link>{glue}</robot>')
     (folder / "drawer.urdf").write_text(urdf)
     about: dict[str, Any] = yaml.safe_load((OBJECTS / "drawer.yaml").read_text())
@@ -34,7 +39,12 @@ def below_a_ledge(folder: Path, *, gap: float, clearance: float | None = None, o
     scene = vkc.load_scene(folder / "scene.yaml").document
     scene["objects"][0]["type"] = "drawer.yaml"
     place = scene["objects"][0]["position"]
-    wall = {"name": "ledge", "type": "box", "size": size, "position": [place[0] + at[0], place[1], at[2]]}
+    wall = {
+        "name": "ledge",
+        "type": "box",
+        "size": size,
+        "position": [place[0] + at[0], place[1], at[2]],
+    }
     scene["obstacles"] += [] if own else [wall]
     return vkc.Scene.from_document(scene, folder)
 
@@ -47,21 +57,33 @@ def test_a_handle_that_has_a_neighbour_of_the_same_object_can_be_taken(tmp_path:
     assert 0.0 < plan.validation.clearance < 0.0125  # it does come that close
     file = plan.save(tmp_path / "plan.npz")
     assert judge(file).agrees
-    stricter = below_a_ledge(tmp_path, gap=0.012, clearance=0.016)  # the files that the plan's scene is made of
+    stricter = below_a_ledge(
+        tmp_path, gap=0.012, clearance=0.016
+    )  # the files that the plan's scene is made of
     found = {(one.rule, one.subject.partition(" - ")[2]) for one in judge(file).found}
     assert found == {("clearance", "drawer.ledge")}
     said = vkc.validate(stricter, STEPS, plan.trajectory).violations
-    assert {(one.constraint, "drawer.ledge" in one.subject) for one in said} == {("clearance", True)}
+    assert {(one.constraint, "drawer.ledge" in one.subject) for one in said} == {
+        ("clearance", True)
+    }
     below_a_ledge(tmp_path, gap=0.012)  # as it was, for whoever judges the plan again
 
 
 @pytest.mark.parametrize(("gap", "clearance"), [(0.012, 0.016), (0.003, None)])
-def test_the_attachment_says_how_close_is_too_close(tmp_path: Path, gap: float, clearance: float | None) -> None:
-    plan = vkc.plan(below_a_ledge(tmp_path, gap=gap, clearance=clearance), STEPS, options=vkc.Options(max_restarts=1))
+def test_the_attachment_says_how_close_is_too_close(
+    tmp_path: Path, gap: float, clearance: float | None
+) -> None:
+    plan = vkc.plan(
+        below_a_ledge(tmp_path, gap=gap, clearance=clearance),
+        STEPS,
+        options=vkc.Options(max_restarts=1),
+    )
     assert not plan.success
     assert any("drawer.ledge" in str(one) for one in plan.validation.violations)
 
 
 def test_a_neighbour_that_is_no_part_of_the_object_keeps_the_full_clearance(tmp_path: Path) -> None:
-    plan = vkc.plan(below_a_ledge(tmp_path, gap=0.012, own=False), STEPS, options=vkc.Options(max_restarts=1))
+    plan = vkc.plan(
+        below_a_ledge(tmp_path, gap=0.012, own=False), STEPS, options=vkc.Options(max_restarts=1)
+    )
     assert not plan.success

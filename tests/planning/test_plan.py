@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.motion.formats.archives import FORMAT
 from vkc_pin.validation.report import Report, Violation
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.trajectory.formats.archives import FORMAT
 
 TETRAHEDRON = """v 0 0 0
 v 0.4 0 0
@@ -50,7 +50,10 @@ def same(first: vkc.Plan, second: vkc.Plan) -> None:
 
 def contents(path: Path) -> dict[str, Any]:
     with np.load(path, allow_pickle=False) as archive:
-        return {"about": json.loads(str(archive["about"])), **{k: archive[k] for k in archive.files if k != "about"}}
+        return {
+            "about": json.loads(str(archive["about"])),
+            **{k: archive[k] for k in archive.files if k != "about"},
+        }
 
 
 def rewritten(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
@@ -88,18 +91,32 @@ def short_plan(scene: vkc.Scene) -> vkc.Plan:
 def test_round_trip(door_plan: vkc.Plan, saved: Path) -> None:
     loaded = vkc.Plan.load(saved)
     same(door_plan, loaded)
-    assert vkc.validate(loaded.scene, loaded.steps, loaded.trajectory, loaded.options) == door_plan.validation
+    assert (
+        vkc.validate(loaded.scene, loaded.steps, loaded.trajectory, loaded.options)
+        == door_plan.validation
+    )
     same(door_plan, vkc.Plan.load(loaded.save(saved.parent / "again.npz")))
 
 
 def test_round_trip_of_every_step(door_plan: vkc.Plan, tmp_path: Path) -> None:
-    steps = (vkc.Grasp("door", "handle"), *door_plan.steps, vkc.Reach((1, 2, 3, 0.1, 0.2, 0.3), "tool"), vkc.GoTo(1.0, 2.0))
-    odd = dataclasses.replace(door_plan, steps=steps, options=vkc.Options(dt=0.1 + 0.2), seed=7, status="rejected")
-    odd = dataclasses.replace(odd, validation=vkc.validate(odd.scene, steps, odd.trajectory, odd.options))
+    steps = (
+        vkc.Grasp("door", "handle"),
+        *door_plan.steps,
+        vkc.Reach((1, 2, 3, 0.1, 0.2, 0.3), "tool"),
+        vkc.GoTo(1.0, 2.0),
+    )
+    odd = dataclasses.replace(
+        door_plan, steps=steps, options=vkc.Options(dt=0.1 + 0.2), seed=7, status="rejected"
+    )
+    odd = dataclasses.replace(
+        odd, validation=vkc.validate(odd.scene, steps, odd.trajectory, odd.options)
+    )
     same(odd, vkc.Plan.load(odd.save(tmp_path / "odd.npz")))
 
 
-def test_a_plan_of_the_package_loads_anywhere(door_plan: vkc.Plan, saved: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_plan_of_the_package_loads_anywhere(
+    door_plan: vkc.Plan, saved: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
     elsewhere = tmp_path / "far" / "away"
     elsewhere.mkdir(parents=True)
     moved = shutil.move(saved, elsewhere / "moved.npz")
@@ -115,14 +132,20 @@ def test_nothing_in_the_file_is_a_pickle_or_a_place_on_this_machine(saved: Path)
             assert array.dtype != object
     about = json.dumps(contents(saved)["about"])
     assert contents(saved)["about"]["folder"] == {"package": "scenes"}
-    for place in (str(Path.home()), str(Path(vkc.__file__).resolve().parent.parent), str(saved.parent)):
+    for place in (
+        str(Path.home()),
+        str(Path(vkc.__file__).resolve().parent.parent),
+        str(saved.parent),
+    ):
         assert place == "/" or place not in about
 
 
 def test_a_plan_moves_with_its_scene(own_scene: vkc.Scene, tmp_path: Path) -> None:
     plan = short_plan(own_scene)
     plan.save(tmp_path / "work" / "out" / "yard.npz")
-    assert contents(tmp_path / "work" / "out" / "yard.npz")["about"]["folder"]["relative"] == str(Path("..", "scenes"))
+    assert contents(tmp_path / "work" / "out" / "yard.npz")["about"]["folder"]["relative"] == str(
+        Path("..", "scenes")
+    )
     shutil.move(tmp_path / "work", tmp_path / "home")
     loaded = vkc.Plan.load(tmp_path / "home" / "out" / "yard.npz")
     same(plan, loaded)
@@ -177,7 +200,12 @@ def _array(path: Path) -> None:
 
 
 def _pickled(path: Path) -> None:
-    np.savez(path, about=np.array({"format": FORMAT}, dtype=object), times=np.zeros(2), positions=np.zeros((2, 9)))
+    np.savez(
+        path,
+        about=np.array({"format": FORMAT}, dtype=object),
+        times=np.zeros(2),
+        positions=np.zeros((2, 9)),
+    )
 
 
 def _listed(path: Path) -> None:
@@ -191,7 +219,10 @@ def _no_json(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        *((damage, "not a saved plan") for damage in (_garbage, _empty, _truncated, _flipped, _foreign, _array, _pickled)),
+        *(
+            (damage, "not a saved plan")
+            for damage in (_garbage, _empty, _truncated, _flipped, _foreign, _array, _pickled)
+        ),
         (_listed, r"wrong value .expected fields"),
         (_no_json, "not JSON"),
     ],
@@ -209,7 +240,11 @@ def test_a_newer_format(saved: Path) -> None:
     rewritten(saved, lambda about: (about.update(format=FORMAT + 1), about.pop("trajectory")))
     with pytest.raises(vkc.InputError, match="unknown format") as caught:
         vkc.Plan.load(saved)
-    assert (caught.value.file, caught.value.expected, caught.value.got) == (saved, FORMAT, FORMAT + 1)
+    assert (caught.value.file, caught.value.expected, caught.value.got) == (
+        saved,
+        FORMAT,
+        FORMAT + 1,
+    )
 
 
 @pytest.mark.parametrize(
@@ -228,7 +263,9 @@ def test_a_newer_format(saved: Path) -> None:
         (lambda about: about.update(folder=7), "folder: wrong value"),
     ],
 )
-def test_a_plan_with_something_wrong_in_it(saved: Path, change: Callable[[dict[str, Any]], Any], text: str) -> None:
+def test_a_plan_with_something_wrong_in_it(
+    saved: Path, change: Callable[[dict[str, Any]], Any], text: str
+) -> None:
     rewritten(saved, change)
     with pytest.raises(vkc.InputError, match=text) as caught:
         vkc.Plan.load(saved)
@@ -236,7 +273,13 @@ def test_a_plan_with_something_wrong_in_it(saved: Path, change: Callable[[dict[s
 
 
 def test_a_plan_from_before_links_of_the_robot_had_a_clearance_of_their_own(saved: Path) -> None:
-    rewritten(saved, lambda about: (about["options"].pop("self_distance"), about["options"].update(dist_safe=0.013)))
+    rewritten(
+        saved,
+        lambda about: (
+            about["options"].pop("self_distance"),
+            about["options"].update(dist_safe=0.013),
+        ),
+    )
     options = vkc.Plan.load(saved).options
     assert (options.dist_safe, options.self_distance) == (0.013, 0.013)
 
@@ -273,7 +316,10 @@ def test_writing_replaces_what_was_there(tmp_path: Path) -> None:
 
 def test_the_report_of_a_success(door_plan: vkc.Plan) -> None:
     report, m = door_plan.report(), door_plan.metrics
-    assert report.splitlines()[0] == "door: success — reach door.handle, turn door.knob, move door.hinge, door.knob"
+    assert (
+        report.splitlines()[0]
+        == "door: success — reach door.handle, turn door.knob, move door.hinge, door.knob"
+    )
     for text in (
         f"{m['duration']:.1f} s, {len(door_plan.trajectory.times)} waypoints",
         f"base {m['base_effort']:.2f} m",
@@ -292,9 +338,17 @@ def test_the_report_of_a_success(door_plan: vkc.Plan) -> None:
 
 def test_the_report_of_a_failure(door_plan: vkc.Plan) -> None:
     blame = Violation(
-        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+        "penetration",
+        "forearm_link – sofa",
+        waypoint=9,
+        time=4.0,
+        amount=0.03,
+        unit="m",
+        detail="overlap by 30 mm",
     )
-    failed = dataclasses.replace(door_plan, status="rejected", validation=Report((blame,), -0.03, states=100))
+    failed = dataclasses.replace(
+        door_plan, status="rejected", validation=Report((blame,), -0.03, states=100)
+    )
     report = failed.report()
     assert report.startswith("door: FAILED, rejected — reach")
     assert "penetration forearm_link – sofa: overlap by 30 mm (waypoint 9, 4.00 s)" in report
@@ -303,19 +357,32 @@ def test_the_report_of_a_failure(door_plan: vkc.Plan) -> None:
 def test_success_needs_both_words(door_plan: vkc.Plan) -> None:
     assert door_plan.success
     assert not dataclasses.replace(door_plan, status="not converged").success
-    blame = Violation("goal", "base", waypoint=9, time=4.0, amount=0.03, unit="m", detail="elsewhere")
+    blame = Violation(
+        "goal", "base", waypoint=9, time=4.0, amount=0.03, unit="m", detail="elsewhere"
+    )
     assert not dataclasses.replace(door_plan, validation=Report((blame,))).success
 
 
 def test_plain_data(door_plan: vkc.Plan) -> None:
     data = json.loads(json.dumps(door_plan.to_dict(), allow_nan=False))
     assert (data["scene"], data["success"], data["status"]) == ("door", True, "success")
-    assert data["steps"] == [{"step": "Actuate", "object": "door", "joints": {"hinge": 1.2}, "attachment": None}]
+    assert data["steps"] == [
+        {"step": "Actuate", "object": "door", "joints": {"hinge": 1.2}, "attachment": None}
+    ]
     assert data["violations"] == []
     np.testing.assert_array_equal(data["trajectory"]["positions"], door_plan.trajectory.positions)
-    assert data["trajectory"]["phases"][0] == {"name": "reach door.handle", "first": 0, "last": 40, "held": {}, "by": {}}
-    endless = dataclasses.replace(door_plan, metrics={**door_plan.metrics, "clearance": float("inf")})
-    assert json.loads(json.dumps(endless.to_dict(), allow_nan=False))["metrics"]["clearance"] is None
+    assert data["trajectory"]["phases"][0] == {
+        "name": "reach door.handle",
+        "first": 0,
+        "last": 40,
+        "held": {},
+        "by": {},
+    }
+    open_space = dataclasses.replace(door_plan.validation, clearance=float("inf"))
+    endless = dataclasses.replace(door_plan, validation=open_space)
+    assert (
+        json.loads(json.dumps(endless.to_dict(), allow_nan=False))["metrics"]["clearance"] is None
+    )
 
 
 def test_repr(door_plan: vkc.Plan) -> None:

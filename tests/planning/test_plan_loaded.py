@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,21 @@ def saved(door_plan: vkc.Plan, tmp_path: Path) -> Path:
 
 def test_a_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -> None:
     blame = Violation(
-        "penetration", "forearm_link – sofa", waypoint=9, time=4.0, amount=0.03, unit="m", detail="overlap by 30 mm"
+        "penetration",
+        "forearm_link – sofa",
+        waypoint=9,
+        time=4.0,
+        amount=0.03,
+        unit="m",
+        detail="overlap by 30 mm",
     )
     report = Report(
-        (blame,), float("inf"), closure_error=1e-4, closure_angle=2e-4, states=77, notes=("the sofa stands in the way",)
+        (blame,),
+        float("inf"),
+        closure_error=1e-4,
+        closure_angle=2e-4,
+        states=77,
+        notes=("the sofa stands in the way",),
     )
     positions = door_plan.trajectory.positions.copy()
     positions[5, 2] += 1.5  # such reports are not of motions that are right
@@ -32,24 +42,35 @@ def test_a_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path)
     loaded = vkc.Plan.load(failed.save(tmp_path / "failed.npz"))
     assert (loaded.success, loaded.status, loaded.claimed) == (False, "infeasible", report)
     assert (loaded.validation.violations, loaded.validation.notes) == ((blame,), report.notes)
-    late = dataclasses.replace(failed, status="time limit")  # then the violations are those of the motion
+    late = dataclasses.replace(
+        failed, status="time limit"
+    )  # then the violations are those of the motion
     loaded = vkc.Plan.load(late.save(tmp_path / "late.npz"))
-    assert {v.constraint for v in loaded.validation.violations} == {"velocity", "acceleration", "torque"}
-    assert (loaded.success, loaded.status, loaded.validation.notes) == (False, "time limit", report.notes)
+    assert {v.constraint for v in loaded.validation.violations} == {
+        "velocity",
+        "acceleration",
+        "torque",
+    }
+    assert (loaded.success, loaded.status, loaded.validation.notes) == (
+        False,
+        "time limit",
+        report.notes,
+    )
 
 
 def spoiled(plan: vkc.Plan) -> vkc.Plan:
     """The plan of another motion, which says of itself what the right one says."""
     positions = plan.trajectory.positions.copy()
     positions[5, 2] += 1.5
-    return dataclasses.replace(plan, trajectory=dataclasses.replace(plan.trajectory, positions=positions, curve=None))
+    return dataclasses.replace(
+        plan, trajectory=dataclasses.replace(plan.trajectory, positions=positions, curve=None)
+    )
 
 
-@pytest.mark.parametrize("check", [False, True])
-def test_success_is_not_what_the_file_says(door_plan: vkc.Plan, tmp_path: Path, check: bool) -> None:
+def test_success_is_not_what_the_file_says(door_plan: vkc.Plan, tmp_path: Path) -> None:
     bad = spoiled(door_plan)
     assert bad.success
-    loaded = vkc.Plan.load(bad.save(tmp_path / "bad.npz"), check=check)
+    loaded = vkc.Plan.load(bad.save(tmp_path / "bad.npz"))
     assert (loaded.success, loaded.status) == (False, "rejected")
     assert loaded.report().startswith("door: FAILED, rejected")
     assert loaded.to_dict()["status"] == "rejected"
@@ -61,34 +82,35 @@ def test_success_is_not_what_the_file_says(door_plan: vkc.Plan, tmp_path: Path, 
     assert (again.success, again.contradictions()) == (False, [])
 
 
-def test_a_plan_is_checked_when_somebody_asks(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[vkc.Trajectory] = []
+def test_without_validation_the_report_is_the_claim_of_the_file(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def validate(*_: Any) -> Report:
+        raise AssertionError("validated")
 
-    def check(scene: vkc.Scene, steps: Any, trajectory: vkc.Trajectory, *more: Any) -> Report:
-        asked.append(trajectory)
-        return vkc.validate(scene, steps, trajectory, *more)
-
-    monkeypatch.setattr("vkc_pin.planning.plan.validate", check)
-    loaded = vkc.Plan.load(saved)
-    assert not asked
-    alike = copy.copy(loaded)
-    for plan in (loaded, dataclasses.replace(loaded, seed=1)):
-        assert (plan.success, plan.report()[:13], plan.metrics["clearance"] > 0) == (True, "door: success", True)
-    assert len(asked) == 1
-    assert alike.validation == loaded.validation
-    assert len(asked) == 2
-    vkc.Plan.load(saved, check=True)
-    assert len(asked) == 3
+    monkeypatch.setattr("vkc_pin.planning.plan.validate", validate)
+    loaded = vkc.Plan.load(saved, validate=False)
+    assert (loaded.is_validated, loaded.success, loaded.validation) == (
+        False,
+        False,
+        loaded.claimed,
+    )
+    with pytest.raises(AssertionError, match="validated"):
+        vkc.Plan.load(saved)
+    with pytest.raises(vkc.InputError, match="validate"):
+        vkc.Plan.load(saved, validate="no")  # type: ignore[arg-type]
 
 
-def test_what_the_file_says_of_the_task_does_not_matter_when_it_is_checked(door_plan: vkc.Plan, tmp_path: Path) -> None:
+def test_the_reasons_of_an_infeasible_task_are_those_of_its_file(
+    door_plan: vkc.Plan, tmp_path: Path
+) -> None:
     blame = Violation("penetration", "a – b", amount=0.03, unit="m", detail="overlap by 30 mm")
-    said = dataclasses.replace(spoiled(door_plan), status="infeasible", validation=Report((blame,), notes=("so it is",)))
+    said = dataclasses.replace(
+        spoiled(door_plan), status="infeasible", validation=Report((blame,), notes=("so it is",))
+    )
     path = said.save(tmp_path / "said.npz")
     assert vkc.Plan.load(path).validation.violations == (blame,)
-    checked = vkc.Plan.load(path, check=True).validation
-    assert {v.constraint for v in checked.violations} == {"velocity", "acceleration", "torque"}
-    assert checked.notes == ()
+    assert vkc.Plan.load(path).validation.notes == ("so it is",)
     right = dataclasses.replace(door_plan, status="infeasible", validation=said.validation)
     loaded = vkc.Plan.load(right.save(path))
     assert (loaded.validation.ok, loaded.success) == (True, False)
@@ -97,8 +119,12 @@ def test_what_the_file_says_of_the_task_does_not_matter_when_it_is_checked(door_
 
 def test_a_motion_of_another_robot(door_plan: vkc.Plan, tmp_path: Path) -> None:
     names = ("arm", *door_plan.trajectory.names[1:])
-    path = dataclasses.replace(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, names=names)).save(tmp_path / "a")
-    with pytest.raises(vkc.InputError, match=r"trajectory.names: not this robot's coordinates") as caught:
+    path = dataclasses.replace(
+        door_plan, trajectory=dataclasses.replace(door_plan.trajectory, names=names)
+    ).save(tmp_path / "a")
+    with pytest.raises(
+        vkc.InputError, match=r"trajectory.names: not this robot's coordinates"
+    ) as caught:
         vkc.Plan.load(path)
     assert caught.value.file == path
 
@@ -112,7 +138,9 @@ def test_a_motion_without_end(door_plan: vkc.Plan, tmp_path: Path) -> None:
         if said is None:
             loaded = vkc.Plan.load(path)
             assert not loaded.success
-            assert "sampling" in {violation.constraint for violation in loaded.validation.violations}
+            assert "sampling" in {
+                violation.constraint for violation in loaded.validation.violations
+            }
             continue
         with pytest.raises(vkc.InputError, match=said) as caught:
             vkc.Plan.load(path)

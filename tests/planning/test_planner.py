@@ -19,10 +19,10 @@ from helpers.carrying import BALL, STICK, lifted, room, stand, table, tool_at
 from helpers.drives import hall
 
 import vkc_pin as vkc
-from vkc_pin.files.resources import folder
-from vkc_pin.motion.rolling import rolling_of
-from vkc_pin.motion.world import World
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.trajectory.wheels import make_rolling_limits
+from vkc_pin.world.trajectory.world_model import World
 
 ROOT = Path(__file__).resolve().parents[2]
 HINGE = 1.2
@@ -52,8 +52,12 @@ def handle(hinge: float, knob: float) -> pin.SE3:
         q[model.joints[model.getJointId(name)].idx_q] = value
     pin.framesForwardKinematics(model, data, q)
     lever = data.oMf[model.getFrameId("lever")]
-    # The tool's x axis, in which the fingers close, along the lever's z; its z axis, along which it comes, along x.
-    grasp = pin.SE3(np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]), np.array([-0.105, 0.07, 0.0]))
+    # The tool's x axis, in which the fingers close, along the lever's z; its z axis, along which it
+    # comes, along x.
+    grasp = pin.SE3(
+        np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]),
+        np.array([-0.105, 0.07, 0.0]),
+    )
     return pin.SE3(np.eye(3), np.array([2.55, 0.44, 0.0])) * lever * grasp
 
 
@@ -108,22 +112,31 @@ def test_the_demo_is_one_unbroken_motion(demo: vkc.Plan) -> None:
     # The robot waits at the handle for the gripper to close.
     grasp = trajectory.phases[0].last
     np.testing.assert_array_equal(trajectory.positions[grasp], trajectory.positions[grasp + 1])
-    assert trajectory.times[grasp + 1] - trajectory.times[grasp] == pytest.approx(demo.options.grasp_time)
+    assert trajectory.times[grasp + 1] - trajectory.times[grasp] == pytest.approx(
+        demo.options.grasp_time
+    )
     # It does not wander: from the start to the handle and on by the door's width.
     assert trajectory.base_effort() < 6.0
 
 
 def test_metrics_are_the_trajectorys(demo: vkc.Plan) -> None:
-    m, positions = demo.metrics, demo.trajectory(np.linspace(0.0, demo.trajectory.times[-1], 50_001))
+    m, positions = (
+        demo.metrics,
+        demo.trajectory(np.linspace(0.0, demo.trajectory.times[-1], 50_001)),
+    )
     base = np.diff(positions[:, :2], axis=0)
     assert m["base_effort"] == pytest.approx(np.sqrt((base**2).sum(axis=1)).sum(), rel=1e-3)
     assert m["base_effort_l1"] == pytest.approx(np.abs(base).sum(), rel=1e-3)
-    assert m["arm_effort"] == pytest.approx(np.abs(np.diff(positions[:, 3:9], axis=0)).sum(), rel=1e-3)
+    assert m["arm_effort"] == pytest.approx(
+        np.abs(np.diff(positions[:, 3:9], axis=0)).sum(), rel=1e-3
+    )
     assert m["duration"] == demo.trajectory.times[-1]
     assert m["clearance"] == demo.validation.clearance
     assert m["clearance"] > 0.0
     assert m["closure_error"] == demo.validation.closure_error
-    parts = sum(m[f"time_{part}"] for part in ("initialization", "coal", "casadi", "ipopt", "validation"))
+    parts = sum(
+        m[f"time_{part}"] for part in ("initialization", "coal", "casadi", "ipopt", "validation")
+    )
     assert 0.0 < parts <= m["planning_time"] * 1.05
     assert m["rounds"] == len(demo.history)
     assert m["iterations"] == _iterations(demo)
@@ -131,7 +144,11 @@ def test_metrics_are_the_trajectorys(demo: vkc.Plan) -> None:
 
 def _iterations(plan: vkc.Plan) -> float:
     """Ipopt iterations of all seeds: the last row of each, the rounds of a seed counting from 1."""
-    ends = [row for row, after in zip(plan.history, [*plan.history[1:], {"round": 1}], strict=True) if after["round"] == 1]
+    ends = [
+        row
+        for row, after in zip(plan.history, [*plan.history[1:], {"round": 1}], strict=True)
+        if after["round"] == 1
+    ]
     return sum(row["iterations"] for row in ends)
 
 
@@ -168,7 +185,10 @@ def test_the_drawer() -> None:
     confirm(plan)
     assert column(plan, "drawer.slide")[-1] == pytest.approx(0.3, abs=1e-3)
     hold = plan.trajectory.phases[-1]
-    x = [tool(plan.scene, row).translation[0] for row in plan.trajectory.positions[[hold.first, hold.last]]]
+    x = [
+        tool(plan.scene, row).translation[0]
+        for row in plan.trajectory.positions[[hold.first, hold.last]]
+    ]
     assert x[1] - x[0] == pytest.approx(-0.3, abs=2e-3)  # pulled towards the robot
 
 
@@ -185,7 +205,8 @@ def test_through_the_door_that_was_opened() -> None:
     assert column(plan, "door.hinge")[-1] == pytest.approx(1.5, abs=1e-3)
 
 
-# --- with something in the hand ---------------------------------------------------------------------------------------
+# --- with something in the hand
+# ---------------------------------------------------------------------------------------
 
 
 def at_a_distance(scene: vkc.Scene) -> vkc.Scene:
@@ -195,13 +216,18 @@ def at_a_distance(scene: vkc.Scene) -> vkc.Scene:
 def left_at(plan: vkc.Plan, name: str) -> pin.SE3:
     """Return where a free object is at the end."""
     world = World(plan.scene)
-    return world.placement(name, world.positions(plan.trajectory)[-1])
+    return world.get_placement(name, world.compute_positions(plan.trajectory)[-1])
 
 
 @pytest.mark.parametrize("joint", [True, False], ids=["jointly", "step by step"])
 def test_a_stick_is_put_elsewhere(joint: bool) -> None:
     scene, aside = at_a_distance(room(table())), lifted(STICK, [0.0, 0.5, 0.0])
-    plan = vkc.plan(scene, [vkc.Grasp("stick"), vkc.Place("stick", aside), vkc.GoTo(-1.0, 0.0)], options=SEEN, joint=joint)
+    plan = vkc.plan(
+        scene,
+        [vkc.Grasp("stick"), vkc.Place("stick", aside), vkc.GoTo(-1.0, 0.0)],
+        options=SEEN,
+        simultaneous=joint,
+    )
     confirm(plan)
     assert max(apart(left_at(plan, "stick"), aside)) <= 1e-3
     held = [phase for phase in plan.trajectory.phases if phase.held]
@@ -215,7 +241,9 @@ def test_a_stick_is_put_elsewhere(joint: bool) -> None:
 
 def test_a_stick_touches_and_is_let_go_of() -> None:
     scene, point = at_a_distance(room(table())), np.array([0.8, 1.0, 0.9])
-    plan = vkc.plan(scene, [vkc.Touch("stick.tip", point), vkc.Release(), vkc.GoTo(-1.0, 0.0)], options=SEEN)
+    plan = vkc.plan(
+        scene, [vkc.Touch("stick.tip", point), vkc.Release(), vkc.GoTo(-1.0, 0.0)], options=SEEN
+    )
     confirm(plan)
     last = plan.trajectory.phases[-1]
     assert dict(last.held) == {}
@@ -224,7 +252,9 @@ def test_a_stick_touches_and_is_let_go_of() -> None:
 
 
 def test_a_ball_is_fetched_with_a_stick() -> None:
-    scene = room(stand(), stand("stand_2", aside=0.3), objects=("stick", "ball")).with_held({"stick": "grip"})
+    scene = room(stand(), stand("stand_2", aside=0.3), objects=("stick", "ball")).with_held(
+        {"stick": "grip"}
+    )
     aside = lifted(BALL, [0.0, 0.3, 0.0])
     steps = [vkc.Grasp("ball", "pull", "stick.tip"), vkc.Place("ball", aside), vkc.GoTo(-0.6, -0.3)]
     plan = vkc.plan(scene.with_start(base=[-0.6, -0.3, 0.0]), steps, options=SEEN)
@@ -235,7 +265,9 @@ def test_a_ball_is_fetched_with_a_stick() -> None:
 
 
 def test_what_is_put_at_a_point_stays_upright() -> None:
-    plan = vkc.plan(at_a_distance(room(table())), [vkc.Place("stick", (0.8, 0.6, 0.551))], options=SEEN)
+    plan = vkc.plan(
+        at_a_distance(room(table())), [vkc.Place("stick", (0.8, 0.6, 0.551))], options=SEEN
+    )
     confirm(plan)
     there = left_at(plan, "stick")
     np.testing.assert_allclose(there.translation, [0.8, 0.6, 0.551], rtol=0.0, atol=1e-3)
@@ -243,7 +275,9 @@ def test_what_is_put_at_a_point_stays_upright() -> None:
 
 
 def digest(plan: vkc.Plan) -> str:
-    return hashlib.sha256(plan.trajectory.positions.tobytes() + plan.trajectory.times.tobytes()).hexdigest()
+    return hashlib.sha256(
+        plan.trajectory.positions.tobytes() + plan.trajectory.times.tobytes()
+    ).hexdigest()
 
 
 def test_the_same_seed_gives_the_same_motion(demo: vkc.Plan) -> None:
@@ -259,7 +293,13 @@ def test_the_same_seed_gives_the_same_motion(demo: vkc.Plan) -> None:
     for hash_seed in ("7", "8"):
         environment = {**os.environ, "PYTHONHASHSEED": hash_seed}
         other = subprocess.run(
-            [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120, env=environment
+            [sys.executable, "-c", code],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+            env=environment,
         )
         digests.add(other.stdout.split()[-1])
     assert len(digests) == 1
@@ -277,7 +317,17 @@ def test_the_callback_sees_every_round() -> None:
     assert [dataclasses.asdict(row) for row in rows] == list(plan.history)
     assert all(isinstance(row, vkc.Iteration) for row in rows)
     assert [row.round for row in rows] == list(range(1, len(rows) + 1))
-    columns = {"round", "iterations", "objective", "clearance", "shortfall", "pose_error", "step", "radius", "penalty"}
+    columns = {
+        "round",
+        "iterations",
+        "objective",
+        "clearance",
+        "shortfall",
+        "pose_error",
+        "step",
+        "radius",
+        "penalty",
+    }
     assert columns <= {field.name for field in dataclasses.fields(vkc.Iteration)}
 
 
@@ -290,12 +340,16 @@ def test_an_error_in_the_callback_is_not_hidden() -> None:
 
 
 @pytest.mark.parametrize("rounds", [0, 1, 2])
-def test_a_time_limit_ends_planning_with_the_best_so_far(demo: vkc.Plan, rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_time_limit_ends_planning_with_the_best_so_far(
+    demo: vkc.Plan, rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On a clock by which every round takes a day."""
     real, day, done = time.perf_counter, 86400.0, list[vkc.Iteration]()
     monkeypatch.setattr(time, "perf_counter", lambda: real() + day * len(done))
     limit = (rounds - 0.5) * day if rounds else 1e-9
-    plan = vkc.plan(demo.scene, demo.steps, initialization="stationary", time_limit=limit, callback=done.append)
+    plan = vkc.plan(
+        demo.scene, demo.steps, initialization="stationary", time_limit=limit, callback=done.append
+    )
     assert plan.status == "time limit"
     assert not plan.success
     assert len(done) == plan.metrics["rounds"] == rounds
@@ -339,7 +393,9 @@ def test_ctrl_c_returns_the_best_so_far(demo: vkc.Plan, ctrl_c: Any, delay: floa
 
     before = signal.getsignal(signal.SIGINT)
     options = dataclasses.replace(demo.options, max_outer=100)
-    plan = vkc.plan(demo.scene, demo.steps, initialization="stationary", callback=callback, options=options)
+    plan = vkc.plan(
+        demo.scene, demo.steps, initialization="stationary", callback=callback, options=options
+    )
     assert plan.status == "interrupted"
     assert not plan.success
     assert plan.validation.violations
@@ -370,7 +426,12 @@ def test_a_start_outside_its_limits_by_rounding() -> None:
 
 @pytest.mark.parametrize("gap", [0.01, 0.002, 0.0005])
 def test_a_start_closer_than_dist_safe(gap: float) -> None:
-    wall = {"name": "wall", "type": "box", "size": [0.1, 2.0, 0.5], "position": [0.545 + gap, 0.0, 0.25]}
+    wall = {
+        "name": "wall",
+        "type": "box",
+        "size": [0.1, 2.0, 0.5],
+        "position": [0.545 + gap, 0.0, 0.25],
+    }
     scene = hall(obstacles=[wall])
     assert 0.0 < scene.start_clearance() < SEEN.dist_safe / 2 + 1e-6
     plan = vkc.plan(scene, [vkc.GoTo(-1.0, 0.5)], options=SEEN)
@@ -379,7 +440,9 @@ def test_a_start_closer_than_dist_safe(gap: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "step", [vkc.Reach((1.5, 1.0, 0.9, 0.0, np.pi / 2, 0.0)), vkc.GoTo(0.0, 1.0, 0.0), vkc.GoTo(-1.0, 1.0)], ids=repr
+    "step",
+    [vkc.Reach((1.5, 1.0, 0.9, 0.0, np.pi / 2, 0.0)), vkc.GoTo(0.0, 1.0, 0.0), vkc.GoTo(-1.0, 1.0)],
+    ids=repr,
 )
 def test_a_differential_base_does_not_slip(step: Any) -> None:
     plan = vkc.plan(hall(base="differential"), [step])
@@ -396,12 +459,16 @@ def test_a_differential_base_does_not_slip(step: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "step", [vkc.Reach((1.5, 1.0, 0.9, 0.0, np.pi / 2, 0.0)), vkc.GoTo(0.0, 1.0, 0.0), vkc.GoTo(-1.0, 1.0)], ids=repr
+    "step",
+    [vkc.Reach((1.5, 1.0, 0.9, 0.0, np.pi / 2, 0.0)), vkc.GoTo(0.0, 1.0, 0.0), vkc.GoTo(-1.0, 1.0)],
+    ids=repr,
 )
 def test_a_steered_base_drives_as_a_car(step: Any) -> None:
     plan = vkc.plan(hall(base="ackermann", turning_radius=0.8), [step])
     confirm(plan)
-    along, aside, turn = rolling_of(plan.scene.robot).steps(plan.trajectory.positions)
+    along, aside, turn = make_rolling_limits(plan.scene.robot).compute_steps(
+        plan.trajectory.positions
+    )
     assert np.abs(aside).max() < 1e-4
     assert (0.8 * np.abs(turn) - np.abs(along)).max() < 1e-4
     assert plan.metrics["base_effort"] > 0.3
@@ -410,7 +477,9 @@ def test_a_steered_base_drives_as_a_car(step: Any) -> None:
 def test_wheels_make_a_motion_slow(tmp_path: Path) -> None:
     """Wheels that go 0.2 m/s, where those of the robot as it is go faster."""
     files = folder("robots") / "husky_ur5e"
-    text = (files / "robot.yaml").read_text(encoding="utf-8").replace("speed: 6.057", "speed: 1.2114")
+    text = (
+        (files / "robot.yaml").read_text(encoding="utf-8").replace("speed: 6.057", "speed: 1.2114")
+    )
     for file in files.iterdir():
         if file.name != "robot.yaml":
             (tmp_path / file.name).symlink_to(file)
@@ -421,14 +490,19 @@ def test_wheels_make_a_motion_slow(tmp_path: Path) -> None:
     for scene in (quick, slow):
         plan = vkc.plan(scene, [vkc.GoTo(4.0, 1.0, 1.0)])
         confirm(plan)
-        along, _, turn = rolling_of(scene.robot).steps(plan.trajectory.positions)
-        rims.append((np.abs(along) + scene.robot.wheels.track / 2 * np.abs(turn)) / np.diff(plan.trajectory.times))
+        along, _, turn = make_rolling_limits(scene.robot).compute_steps(plan.trajectory.positions)
+        rims.append(
+            (np.abs(along) + scene.robot.wheels.track / 2 * np.abs(turn))
+            / np.diff(plan.trajectory.times)
+        )
     assert rims[0].max() > 0.3
     assert 0.1 < rims[1].max() <= 0.2 * 1.001
 
 
 def test_a_fixed_base_stays() -> None:
-    plan = vkc.plan(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SEEN)
+    plan = vkc.plan(
+        hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SEEN
+    )
     confirm(plan)
     assert np.ptp(plan.trajectory.positions[:, :3], axis=0).max() == 0.0
 
@@ -437,7 +511,9 @@ def test_another_robot() -> None:
     document = {
         "robot": "panda",
         "start": {"base": [0.0, 0.0, 0.0], "arm": "home"},
-        "obstacles": [{"name": "post", "type": "box", "size": [0.1, 0.1, 1.0], "position": [0.9, -0.5, 0.5]}],
+        "obstacles": [
+            {"name": "post", "type": "box", "size": [0.1, 0.1, 1.0], "position": [0.9, -0.5, 0.5]}
+        ],
     }
     scene = vkc.Scene.from_document(document)
     target = pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0.0, 0.0), np.array([1.2, 0.3, 0.6]))
@@ -448,7 +524,11 @@ def test_another_robot() -> None:
 
 
 MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
-    "unknown initialization": ({"initialization": "interpolate"}, "initialization", "did you mean 'interpolated'"),
+    "unknown initialization": (
+        {"initialization": "interpolate"},
+        "initialization",
+        "did you mean 'interpolated'",
+    ),
     "no time": ({"time_limit": 0.0}, "time_limit", "more than 0"),
     "negative time": ({"time_limit": -1.0}, "time_limit", "-1.0"),
     "endless time": ({"time_limit": float("inf")}, "time_limit", "inf"),
@@ -463,7 +543,11 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
     "None": ({"steps": None}, "steps", "a list of steps"),
     "one step alone": ({"steps": vkc.GoTo(0.0, 0.0)}, "steps", "a list of steps"),
     "no steps": ({"steps": []}, "steps", "at least one step"),
-    "not a step": ({"steps": [vkc.GoTo(0.0, 0.0), "open"]}, "steps[1]", "Reach, Grasp, Actuate, GoTo, Touch, Place, Release"),
+    "not a step": (
+        {"steps": [vkc.GoTo(0.0, 0.0), "open"]},
+        "steps[1]",
+        "Reach, Grasp, Actuate, GoTo, Touch, Place, Release",
+    ),
     "scene by name": ({"scene": "door"}, "scene", "a Scene"),
     "unknown object": ({"steps": [vkc.Actuate("dor", {"hinge": 1.0})]}, "steps[0].object", "dor"),
 }
@@ -485,7 +569,7 @@ def test_steps_may_come_from_anywhere() -> None:
     assert plan.steps == (vkc.GoTo(0.5, 0.0),)
 
 
-@pytest.mark.filterwarnings("ignore:.*links overlap where the arm would rest")
+@pytest.mark.filterwarnings("ignore:.*links overlap at the default home")
 def test_a_robot_that_nobody_prepared_reaches() -> None:
     """Tiago, from a URDF alone: free at its home, and where links always are as close as 18.8 mm it keeps half of that."""
     scene = vkc.Scene.from_document({"robot": "tiago", "start": {"base": [0.0, 0.0, 0.0]}})

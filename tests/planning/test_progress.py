@@ -16,8 +16,8 @@ import pytest
 from helpers.drives import hall
 
 import vkc_pin as vkc
-from vkc_pin.planning import one_problem
 from vkc_pin.planning import progress as module
+from vkc_pin.planning import solve_task
 from vkc_pin.planning.progress import Progress, shown
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,7 +44,9 @@ class Terminal(io.StringIO):
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     stream = Terminal()
     monkeypatch.setattr(module, "sys", SimpleNamespace(stderr=stream))
-    monkeypatch.setattr(module.shutil, "get_terminal_size", lambda *_, **__: os.terminal_size((70, 24)))
+    monkeypatch.setattr(
+        module.shutil, "get_terminal_size", lambda *_, **__: os.terminal_size((70, 24))
+    )
     return stream
 
 
@@ -59,8 +61,13 @@ def test_it_says_what_is_done() -> None:
     line.begin(["reach cup.side", "place cup"])
     line.doing("looking for a seed")
     line(row())
-    assert seen[-2][0] == "0 s · steps 3 to 4 of 18 · looking for a seed · reach cup.side, place cup"
-    assert seen[-1][0] == "0 s · steps 3 to 4 of 18 · round 3, 12.3 mm missing, objective 4.57 · reach cup.side, place cup"
+    assert (
+        seen[-2][0] == "0 s · steps 3 to 4 of 18 · looking for a seed · reach cup.side, place cup"
+    )
+    assert (
+        seen[-1][0]
+        == "0 s · steps 3 to 4 of 18 · round 3, 12.3 mm missing, objective 4.57 · reach cup.side, place cup"
+    )
     line.part(7, 1, 18)
     line(row(shortfall=0.0))
     assert "step 7 of 18 · round 3, clear, " in seen[-1][0]
@@ -84,7 +91,9 @@ def test_a_terminal_has_one_line(terminal: Terminal) -> None:
     assert plan.success
     first, rest = terminal.lines()
     assert rest == ""
-    assert re.match(r".*: success — base \d\.\d\d m, arm .* rad, planned in [\d.]+ s$|.*: success — ", first)
+    assert re.match(
+        r".*: success — base \d\.\d\d m, arm .* rad, planned in [\d.]+ s$|.*: success — ", first
+    )
     assert all(len(part.rstrip()) < 70 for part in re.split(r"[\r\n]", terminal.getvalue()))
     assert "looking for a seed" in terminal.getvalue()
     assert "round 1" in terminal.getvalue()
@@ -104,19 +113,23 @@ def test_ctrl_c_leaves_a_line_as_well(terminal: Terminal, monkeypatch: pytest.Mo
         signal.raise_signal(signal.SIGINT)
         return iter(())
 
-    monkeypatch.setattr(one_problem, "initialize", stop)
+    monkeypatch.setattr(solve_task, "initialize", stop)
     plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
     assert plan.status == "interrupted"
     assert "FAILED, interrupted" in terminal.lines()[0]
     assert terminal.lines()[1:] == [""]
 
 
-def test_a_terminal_that_goes_away_is_no_reason_to_stop(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_that_goes_away_is_no_reason_to_stop(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def gone(text: str) -> int:
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(terminal, "write", gone)
-    plan = vkc.plan(hall(), [vkc.GoTo(0.3, 0.2)], options=vkc.Options(reach_waypoints=8), progress=True)
+    plan = vkc.plan(
+        hall(), [vkc.GoTo(0.3, 0.2)], options=vkc.Options(reach_waypoints=8), progress=True
+    )
     assert plan.success
 
 
@@ -142,7 +155,7 @@ def test_true_or_false(value: Any) -> None:
 def test_a_chore_says_which_step(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[str] = []
     monkeypatch.setattr(module, "_screen", lambda: lambda text, last: seen.append(text))
-    plan = vkc.plan_chore(hall(), [vkc.GoTo(-1.0, 0.5), vkc.GoTo(-0.5, 0.3)], progress=True)
+    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5), vkc.GoTo(-0.5, 0.3)], progress=True, window=2)
     assert plan.success
     parts = [match[0] for text in seen if (match := re.search(r"steps? \d[\w ]* of 2", text))]
     assert list(dict.fromkeys(parts)) == ["step 1 of 2", "step 2 of 2", "steps 1 to 2 of 2"]
@@ -157,7 +170,14 @@ import vkc_pin as vkc
 vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
 """
     ours, theirs = pty.openpty()
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=theirs, timeout=120, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=theirs,
+        timeout=120,
+        check=True,
+    )
     os.close(theirs)
     text = os.read(ours, 100_000).decode()
     os.close(ours)

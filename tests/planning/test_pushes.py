@@ -26,24 +26,52 @@ CASES = [  # scene, object, joint, where it is at the start, the face
 
 @cache
 def shut(scene: str, thing: str, joint: str, begin: float, face: str) -> vkc.Plan:
-    return vkc.plan(vkc.load_scene(scene).with_state(thing, {joint: begin}), [vkc.Actuate(thing, {joint: 0.0}, face)])
+    return vkc.plan(
+        vkc.load_scene(scene).with_state(thing, {joint: begin}),
+        [vkc.Actuate(thing, {joint: 0.0}, face)],
+    )
 
 
 def gaps(plan: vkc.Plan, thing: str, face: str) -> np.ndarray:
     """Return how far the hand's foremost point is from the plane of the face, wherever it pushes, by numeric Pinocchio [m]."""
     scene, motion = plan.scene, plan.trajectory
-    (phase,), robot, placed, found = [one for one in motion.phases if one.holds], scene.robot, scene.objects[thing], []
+    (phase,), robot, placed, found = (
+        [one for one in motion.phases if one.holds],
+        scene.robot,
+        scene.objects[thing],
+        [],
+    )
     attachment, model, data = placed.object.attachments[face], robot.model, robot.model.createData()
     frame, shapes = model.getFrameId(robot.tool_frame), robot.collision.createData()
-    hand = [i for i in range(len(robot.collision.geometryObjects)) if robot.link_of(i) in robot.touch_links]
+    hand = [
+        i
+        for i in range(len(robot.collision.geometryObjects))
+        if robot.link_of(i) in robot.touch_links
+    ]
     for row in motion.positions[phase.first : phase.last + 1]:
-        pin.updateGeometryPlacements(model, data, robot.collision, shapes, robot.coordinates.q(row[: motion.robot_size]))
+        pin.updateGeometryPlacements(
+            model, data, robot.collision, shapes, robot.coordinates.q(row[: motion.robot_size])
+        )
         tool = pin.updateFramePlacement(model, data, frame)
-        corners = [shapes.oMg[i].act(point) for i in hand for point in robot.collision.geometryObjects[i].geometry.points()]
-        foremost = tool.act(np.array([0.0, 0.0, max(float(tool.actInv(corner)[2]) for corner in corners)]))
+        corners = [
+            shapes.oMg[i].act(point)
+            for i in hand
+            for point in robot.collision.geometryObjects[i].geometry.points()
+        ]
+        foremost = tool.act(
+            np.array([0.0, 0.0, max(float(tool.actInv(corner)[2]) for corner in corners)])
+        )
         named = dict(zip(motion.names, row.tolist(), strict=True))
-        state = {name: named[f"{thing}.{name}"] for name in placed.object.coordinates.names if f"{thing}.{name}" in named}
-        found.append(-(placed.with_state(state).link_placement(attachment.link) * attachment.placement).actInv(foremost)[2])
+        state = {
+            name: named[f"{thing}.{name}"]
+            for name in placed.object.coordinates.names
+            if f"{thing}.{name}" in named
+        }
+        found.append(
+            -(
+                placed.with_state(state).link_placement(attachment.link) * attachment.placement
+            ).actInv(foremost)[2]
+        )
     return np.array(found)
 
 
@@ -68,17 +96,25 @@ def test_a_push_that_goes_back_is_found_by_the_validation_and_by_the_oracle(tmp_
     middle = (phase.first + phase.last) // 2
 
     def back(rows: np.ndarray) -> None:
-        rows[middle + 1] = rows[middle - 1]  # robot and door together: it would hold if the hand did
+        rows[middle + 1] = rows[
+            middle - 1
+        ]  # robot and door together: it would hold if the hand did
 
     rows = motion.positions.copy()
     back(rows)
-    said = vkc.validate(plan.scene, plan.steps, dataclasses.replace(motion, positions=rows, curve=None)).violations
+    said = vkc.validate(
+        plan.scene, plan.steps, dataclasses.replace(motion, positions=rows, curve=None)
+    ).violations
     (push,) = [one for one in said if one.constraint == "push"]
     assert (push.subject, push.unit) == ("door.push", "m")
     hinge = motion.positions[:, motion.names.index("door.hinge")]
     lever = push.amount / (hinge[middle] - hinge[middle - 1])
     assert 0.3 < lever < 0.8  # [m] from the hinge: the region's
-    other = changed(plan.save(tmp_path / "plan.npz"), tmp_path / "back.npz", lambda content: back(content["positions"]))
+    other = changed(
+        plan.save(tmp_path / "plan.npz"),
+        tmp_path / "back.npz",
+        lambda content: back(content["positions"]),
+    )
     assert {one.subject for one in judge(other).found if one.rule == "push"} == {"door.push"}
 
 
@@ -94,9 +130,13 @@ def test_a_bowl_is_taken_at_its_rim(yaw: float) -> None:
     robot = plan.scene.robot
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(row[: motion.robot_size]))
-    tool = plan.scene.objects["bowl"].placement.actInv(data.oMf[robot.model.getFrameId(robot.tool_frame)])
+    tool = plan.scene.objects["bowl"].placement.actInv(
+        data.oMf[robot.model.getFrameId(robot.tool_frame)]
+    )
     assert np.hypot(*tool.translation[:2]) == pytest.approx(0.107, abs=2e-3)
     assert tool.translation[2] == pytest.approx(0.055, abs=2e-3)
     outwards = tool.translation[:2] / np.hypot(*tool.translation[:2])
-    assert abs(tool.rotation[:2, 0] @ outwards) > np.cos(0.4) - 1e-2  # the fingers close across the wall
+    assert (
+        abs(tool.rotation[:2, 0] @ outwards) > np.cos(0.4) - 1e-2
+    )  # the fingers close across the wall
     assert tool.rotation[2, 2] < -np.cos(0.4) + 1e-2

@@ -11,39 +11,49 @@ from helpers.judging import names
 from helpers.riding import TOP, plates, slid, trays
 
 import vkc_pin as vkc
-from vkc_pin.motion.carrying import FreeObjects
-from vkc_pin.motion.world import World, scene_after
 from vkc_pin.options import Options
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.free_objects import FreeObjects
+from vkc_pin.world.trajectory.world_model import World, compute_final_scene
 
 
 def where(plan: vkc.Plan, name: str = "cup") -> list[pin.SE3]:
     world = World(plan.scene)
-    return [world.placement(name, row) for row in world.positions(plan.trajectory)]
+    return [world.get_placement(name, row) for row in world.compute_positions(plan.trajectory)]
 
 
 def test_a_cup_on_a_plate_comes_along_and_is_taken_off() -> None:
-    plan = vkc.plan(plates(wall=0.03), [vkc.Actuate("plate", {"slide": 0.4}), vkc.Place("cup", [0.2, -1.0, 0.0])])
+    plan = vkc.plan(
+        plates(wall=0.03),
+        [vkc.Actuate("plate", {"slide": 0.4}), vkc.Place("cup", [0.2, -1.0, 0.0])],
+    )
     assert plan.success, plan.report()
     slide = plan.trajectory.column("plate.slide")
     for value, placement in zip(slide[: plan.trajectory.phases[1].last], where(plan), strict=False):
-        np.testing.assert_allclose(placement.translation, [0.8 - value, 0.05, TOP], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            placement.translation, [0.8 - value, 0.05, TOP], rtol=0.0, atol=1e-9
+        )
     np.testing.assert_allclose(where(plan)[-1].translation, [0.2, -1.0, 0.0], rtol=0.0, atol=1e-3)
-    rides = FreeObjects(plan.scene, plan.trajectory).rides
+    rides = FreeObjects(plan.scene, plan.trajectory).supports
     assert [riding for riding in rides if riding] == [{"cup": "plate.plate"}]
 
 
 def test_it_is_where_it_came_to_in_the_scene_after() -> None:
     scene = plates()
-    after = scene_after(scene, slid(scene, 0.3), ())
-    np.testing.assert_allclose(after.objects["cup"].placement.translation, [0.5, 0.05, TOP], rtol=0.0, atol=1e-12)
+    after = compute_final_scene(scene, slid(scene, 0.3), ())
+    np.testing.assert_allclose(
+        after.objects["cup"].placement.translation, [0.5, 0.05, TOP], rtol=0.0, atol=1e-12
+    )
     assert after.objects["plate"].state[0] == pytest.approx(0.3)
 
 
 def test_a_tray_is_carried_level() -> None:
     plan = vkc.plan(trays(), [vkc.Place("tray", [-0.5, -1.5, 0.7])])
     assert plan.success, plan.report()
-    assert max(float(np.arccos(min(placement.rotation[2, 2], 1.0))) for placement in where(plan)) < 1e-3
+    assert (
+        max(float(np.arccos(min(placement.rotation[2, 2], 1.0))) for placement in where(plan))
+        < 1e-3
+    )
     apart = where(plan, "tray")[-1].actInv(where(plan)[-1]).translation
     np.testing.assert_allclose(apart, [0.02, 0.05, 0.02], rtol=0.0, atol=1e-9)
 
@@ -51,7 +61,7 @@ def test_a_tray_is_carried_level() -> None:
 def test_what_stands_on_what_is_in_the_hand_from_the_start_comes_along() -> None:
     first = vkc.plan(trays(), [vkc.Grasp("tray"), vkc.GoTo(-1.0, 0.3)])
     assert first.success, first.report()
-    after = scene_after(first.scene, first.trajectory, first.trajectory.phases[-1].holds)
+    after = compute_final_scene(first.scene, first.trajectory, first.trajectory.phases[-1].holds)
     second = vkc.plan(after, [vkc.Place("tray", [-0.5, -1.5, 0.7])])
     assert second.success, second.report()
     apart = where(second, "tray")[-1].actInv(where(second)[-1]).translation
@@ -62,9 +72,16 @@ def test_validation_sees_what_tips_and_what_the_cup_hits() -> None:
     flap, options = plates("flap"), Options()
     tipped = validate(flap, [vkc.Actuate("plate", {"tip": 0.4})], slid(flap, 0.4), options)
     assert ("tips", "cup") in names(tipped)
-    assert ("tips", "cup") not in names(validate(flap, [vkc.Actuate("plate", {"tip": 0.05})], slid(flap, 0.05), options))
+    assert ("tips", "cup") not in names(
+        validate(flap, [vkc.Actuate("plate", {"tip": 0.05})], slid(flap, 0.05), options)
+    )
     ahead = plates()
-    post = {"name": "post", "type": "box", "size": [0.02, 0.02, 0.05], "position": [0.55, 0.05, TOP + 0.06]}
+    post = {
+        "name": "post",
+        "type": "box",
+        "size": [0.02, 0.02, 0.05],
+        "position": [0.55, 0.05, TOP + 0.06],
+    }
     ahead = vkc.Scene.from_document({**ahead.document, "obstacles": [post]}, ahead.folder)
     hit = validate(ahead, [vkc.Actuate("plate", {"slide": 0.4})], slid(ahead, 0.4), options)
     assert ("penetration", "cup.cup – post") in names(hit)
@@ -79,7 +96,9 @@ def test_the_hand_closes_while_the_robot_stands_still() -> None:
     curve = plan.trajectory.curve
     assert curve is not None
     knots = np.where(curve.times > plan.trajectory.times[begin], curve.times - 0.4, curve.times)
-    hurried = dataclasses.replace(plan.trajectory, times=times, curve=dataclasses.replace(curve, times=knots))
+    hurried = dataclasses.replace(
+        plan.trajectory, times=times, curve=dataclasses.replace(curve, times=knots)
+    )
     hasty = validate(plan.scene, plan.steps, hurried, plan.options)
     assert names(hasty) == {("dwell", "plate.handle")}
     (found,) = hasty.violations

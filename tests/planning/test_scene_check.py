@@ -11,8 +11,8 @@ from helpers.drawers import changed, drawer_scene, with_boxes
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.planning.scene_check import SceneCheck, check_scene
-from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,9 @@ def found() -> SceneCheck:
 def test_a_free_scene_has_nothing_to_say_but_where_handles_are(found: SceneCheck) -> None:
     assert found.ok
     assert (found.robot, found.close, found.allowed, found.problems) == ((), (), (), ())
-    assert [one.attachment for one in found.attachments] == list(drawer_scene().objects["drawer"].object.attachments)
+    assert [one.attachment for one in found.attachments] == list(
+        drawer_scene().objects["drawer"].object.attachments
+    )
     for one in found.attachments:
         np.testing.assert_allclose(one.approach, [1.0, 0.0, 0.0], atol=1e-9)
         np.testing.assert_allclose(one.closing, [0.0, 0.0, 1.0], atol=1e-9)
@@ -31,7 +33,11 @@ def test_a_free_scene_has_nothing_to_say_but_where_handles_are(found: SceneCheck
 
 def test_what_is_reached_is_a_grasp_that_validation_agrees_with(found: SceneCheck) -> None:
     scene = drawer_scene()
-    grasps = {name for name, one in scene.objects["drawer"].object.attachments.items() if one.contact == "grasp"}
+    grasps = {
+        name
+        for name, one in scene.objects["drawer"].object.attachments.items()
+        if one.contact == "grasp"
+    }
     for one in (one for one in found.attachments if one.attachment in grasps):
         assert one.configuration is not None
         there = scene.with_start(base=one.configuration[:3], arm=one.configuration[3:])
@@ -39,7 +45,9 @@ def test_what_is_reached_is_a_grasp_that_validation_agrees_with(found: SceneChec
             tuple(scene.robot.coordinates.names)
             + ("drawer.slide", f"drawer.{one.attachment}")[: 1 + (one.attachment != "handle")],
             np.array([0.0, 1.0]),
-            np.tile([*one.configuration, *([0.0] if one.attachment == "handle" else [0.0, 0.0])], (2, 1)),
+            np.tile(
+                [*one.configuration, *([0.0] if one.attachment == "handle" else [0.0, 0.0])], (2, 1)
+            ),
             (vkc.PhaseSpan("stand", 0, 1, ()),),
             len(one.configuration),
         )
@@ -60,14 +68,18 @@ def test_what_is_too_high_is_not_reached() -> None:
     (drawer,) = drawer_scene().document["objects"]
     high = check_scene(changed(drawer_scene(), objects=[{**drawer, "position": [1.93, 0.0, 2.0]}]))
     assert not high.ok
-    assert [one.configuration for one in high.attachments] == [None] * len(drawer_scene().objects["drawer"].object.attachments)
+    assert [one.configuration for one in high.attachments] == [None] * len(
+        drawer_scene().objects["drawer"].object.attachments
+    )
 
 
 def test_what_is_in_the_hand_is_not_tried_and_does_not_fill_it() -> None:
     """Whether the rest can be reached is asked of an empty hand."""
     cup = {"name": "cup", "type": "cup", "position": [0.0, 0.0, 1.5]}
     scene = changed(drawer_scene(), objects=[*drawer_scene().document["objects"], cup])
-    held = check_scene(scene.with_held({"cup": next(iter(scene.objects["cup"].object.attachments))}))
+    held = check_scene(
+        scene.with_held({"cup": next(iter(scene.objects["cup"].object.attachments))})
+    )
     assert {one.object for one in held.attachments} == {"drawer"}
     assert any(one.configuration is not None for one in held.attachments)
 
@@ -109,7 +121,9 @@ def test_one_plans_on_from_the_end_scene() -> None:
     grasp = vkc.plan(scene, [vkc.Grasp("drawer")])
     held = grasp.end_scene()
     assert held.held == {"drawer": "handle"}
-    np.testing.assert_allclose(held.start, grasp.trajectory.positions[-1, : len(held.start)], atol=1e-9)
+    np.testing.assert_allclose(
+        held.start, grasp.trajectory.positions[-1, : len(held.start)], atol=1e-9
+    )
     pulled = vkc.plan(held, [vkc.Actuate("drawer", {"slide": 0.3})])
     assert pulled.success, pulled.report()
     after = pulled.end_scene()

@@ -16,11 +16,11 @@ from oracle.judge import judge
 
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
-from vkc_pin.chain.chain import consolidate
-from vkc_pin.motion.curve import Curve
-from vkc_pin.motion.placements import sample_motion
-from vkc_pin.motion.world import World
-from vkc_pin.seeds.knots import Knots
+from vkc_pin.planning.chain.chain import consolidate
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.placements import sample_motion
+from vkc_pin.world.trajectory.world_model import World
 
 NAMES = ("base_x", "base_y", "base_yaw", "lift", "out_1", "yaw_joint", "pitch_joint", "roll_joint")
 
@@ -49,7 +49,13 @@ def test_all_segments_move_in_pictures(opened: vkc.Plan) -> None:
     joints = [world.model.getJointId(f"out_{k}") for k in range(1, 5)]
     assert moved.moving[joints].all()
     ways = np.array(
-        [[place.translation[0] - moved.local[joint][0].translation[0] for place in moved.local[joint]] for joint in joints]
+        [
+            [
+                place.translation[0] - moved.local[joint][0].translation[0]
+                for place in moved.local[joint]
+            ]
+            for joint in joints
+        ]
     )
     assert np.ptp(ways[0]) > 0.02
     np.testing.assert_allclose(ways[1:], np.broadcast_to(ways[0], ways[1:].shape), atol=1e-12)
@@ -60,7 +66,11 @@ def test_a_table_has_one_column(opened: vkc.Plan, tmp_path: Path) -> None:
     file = opened.trajectory.to_csv(tmp_path / "motion.csv")
     with Path(file).open(encoding="utf-8") as lines:
         head = next(csv.reader(line for line in lines if not line.startswith("#")))
-    assert [name for name in head if "out_" in name] == [name for name in head if "out_1" in name] != []
+    assert (
+        [name for name in head if "out_" in name]
+        == [name for name in head if "out_1" in name]
+        != []
+    )
 
 
 def test_a_message_has_the_coordinate_alone(opened: vkc.Plan) -> None:
@@ -69,7 +79,11 @@ def test_a_message_has_the_coordinate_alone(opened: vkc.Plan) -> None:
     assert message["joint_names"] == list(NAMES[3:])
     robot = opened.scene.robot
     rows = np.array([point["positions"] for point in message["points"]])
-    ways = {str(robot.model.names[j]): f * rows[:, k - 3] + b for k, j, f, b, _ in robot.coordinates.moves if k > 2}
+    ways = {
+        str(robot.model.names[j]): f * rows[:, k - 3] + b
+        for k, j, f, b, _ in robot.coordinates.moves
+        if k > 2
+    }
     assert {*ways} == {*NAMES[3:], *FOLLOWERS}
     for joint, leader in FOLLOWERS.items():
         np.testing.assert_array_equal(ways[joint], ways[leader])
@@ -84,7 +98,9 @@ def test_it_counts_as_what_its_segments_go(opened: vkc.Plan) -> None:
     assert problem.effort.metric[out] == pytest.approx(16.0 * problem.effort.metric[lift])
     model = chain.robot.model
     q = chain.robot.coordinates.q(np.concatenate([np.zeros(3), chain.robot.home]))
-    jacobian = pin.computeFrameJacobian(model, model.createData(), q, model.getFrameId("tool"), pin.LOCAL_WORLD_ALIGNED)
+    jacobian = pin.computeFrameJacobian(
+        model, model.createData(), q, model.getFrameId("tool"), pin.LOCAL_WORLD_ALIGNED
+    )
     assert np.linalg.norm(jacobian[:3, out]) == pytest.approx(4.0)
 
 
@@ -92,7 +108,10 @@ def test_inverse_kinematics_of_the_arm_alone_moves_all_segments(opened: vkc.Plan
     """That of the baseline, by Pink, from near the last waypoint."""
     assert opened.trajectory is not None
     problem = program_of(opened.scene, list(opened.steps))
-    arm, goal = ArmKinematics(problem, Knots(problem, np.random.default_rng(0))), opened.trajectory.positions[-1]
+    arm, goal = (
+        ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0))),
+        opened.trajectory.positions[-1],
+    )
     begin = goal + np.array([0.0, 0.0, 0.0, 0.05, -0.03, 0.1, 0.1, 0.1, 0.0])
     z, solved = arm.solve(begin, problem.segments)
     assert solved
@@ -108,7 +127,10 @@ def test_inverse_kinematics_of_the_arm_alone_moves_all_segments(opened: vkc.Plan
 @pytest.fixture(scope="module")
 def coupled(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
     """The hand is brought somewhere by joints that follow backwards, at other rates, turning as another slides."""
-    scene = coupled_scene(tmp_path_factory.mktemp("coupled"), more="joints: {roll_joint: {velocity: 0.9, acceleration: 0.6}}\n")
+    scene = coupled_scene(
+        tmp_path_factory.mktemp("coupled"),
+        more="joints: {roll_joint: {velocity: 0.9, acceleration: 0.6}}\n",
+    )
     plan = vkc.plan(scene, [vkc.Reach(reachable(scene))], seed=0)
     assert plan.success, plan.report()
     return plan
@@ -126,19 +148,28 @@ def shares(plan: vkc.Plan, motion: vkc.Trajectory) -> dict[str, float]:
     file = ElementTree.parse(Path(plan.scene.folder) / "robot.urdf")
     urdf = {str(joint.get("name")): {key: float(value) for key, value in limit.attrib.items()}
             for joint in file.iter("joint") if (limit := joint.find("limit")) is not None}  # fmt: skip
-    times, robot, found = np.arange(*motion.times[[0, -1]], 1e-3), plan.scene.robot, dict[str, float]()
+    times, robot, found = (
+        np.arange(*motion.times[[0, -1]], 1e-3),
+        plan.scene.robot,
+        dict[str, float](),
+    )
     places, rates, changes = motion(times), motion.velocity(times), motion.acceleration(times)
     for k, joint, factor, offset, _ in robot.coordinates.moves[3:]:
         name = str(robot.model.names[joint])
         own, place = urdf[name], factor * places[:, k] + offset
         assert own["lower"] - 1e-9 <= place.min() <= place.max() <= own["upper"] + 1e-9
         fastest, strongest = (0.9, 0.6) if name == "roll_joint" else (own["velocity"], np.inf)
-        used = np.abs(factor * rates[:, k]).max() / fastest, np.abs(factor * changes[:, k]).max() / strongest
+        used = (
+            np.abs(factor * rates[:, k]).max() / fastest,
+            np.abs(factor * changes[:, k]).max() / strongest,
+        )
         found[name] = float(max(used))
     return found
 
 
-def test_along_the_curve_every_joint_keeps_its_own_limits(coupled: vkc.Plan, tmp_path: Path) -> None:
+def test_along_the_curve_every_joint_keeps_its_own_limits(
+    coupled: vkc.Plan, tmp_path: Path
+) -> None:
     """And is as fast as that lets it be: three per cent faster, validation and oracle both name the coordinate."""
     motion = coupled.trajectory
     assert motion is not None

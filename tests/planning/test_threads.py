@@ -41,5 +41,12 @@ print("done")
 
 def test_eight_threads_with_one_planner_and_the_shared_one_and_their_own() -> None:
     """The same call gives the same bits in each; a crash of the interpreter would show in what the process returns."""
-    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
     assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr

@@ -12,14 +12,16 @@ from helpers.drawers import SHORT, drawer_scene
 import vkc_pin as vkc
 from vkc_pin.baselines import plan_separately
 from vkc_pin.benchmarks.chores import fetch
-from vkc_pin.budget import Budget
+from vkc_pin.utils.budget import Budget
 
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 CALLS: dict[str, Callable[[], vkc.Plan]] = {
     "plan": lambda: vkc.plan(drawer_scene(), PULL, options=SHORT, planner=vkc.Planner()),
-    "steps": lambda: vkc.plan(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, joint=False),
+    "steps": lambda: vkc.plan(
+        drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, simultaneous=False
+    ),
     "trees": lambda: vkc.plan(drawer_scene(), PULL, initialization="rrt"),
-    "chore": lambda: vkc.plan_chore(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT),
+    "chore": lambda: vkc.plan(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, window=2),
     "baseline": lambda: plan_separately(drawer_scene(), PULL, method="B2", retries=1),
 }
 
@@ -41,7 +43,9 @@ class Looks:
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_a_plan_comes_back_wherever_time_is_up(call: Callable[[], vkc.Plan], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_comes_back_wherever_time_is_up(
+    call: Callable[[], vkc.Plan], monkeypatch: pytest.MonkeyPatch
+) -> None:
     looks = Looks(monkeypatch)
     whole = looks.upto(np.inf, call)
     assert whole.success, whole.report()
@@ -60,11 +64,11 @@ def test_a_plan_comes_back_wherever_time_is_up(call: Callable[[], vkc.Plan], mon
 
 def test_what_is_decided_of_a_chore_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     looks, steps = Looks(monkeypatch), [*PULL, vkc.GoTo(0.0, 0.0), vkc.GoTo(0.3, 0.0)]
-    whole = looks.upto(np.inf, lambda: vkc.plan_chore(drawer_scene(), steps, options=SHORT))
+    whole = looks.upto(np.inf, lambda: vkc.plan(drawer_scene(), steps, options=SHORT, window=2))
     assert whole.success, whole.report()
     phases = []
     for last in np.linspace(1, looks.count - 1, 8).astype(int).tolist():
-        plan = looks.upto(last, lambda: vkc.plan_chore(drawer_scene(), steps, options=SHORT))
+        plan = looks.upto(last, lambda: vkc.plan(drawer_scene(), steps, options=SHORT, window=2))
         phases.append(len(plan.trajectory.phases))
     assert phases == sorted(phases)
     assert phases[0] == 1 < phases[-1]
@@ -75,7 +79,7 @@ def test_a_hard_task_takes_no_longer_than_it_may(limit: float) -> None:
     """It takes a minute and more; on a machine that does something else, too, 0.3 s become more."""
     scene = vkc.load_scene("fetch")
     began = time.perf_counter()
-    plan = vkc.plan_chore(scene, fetch(scene), time_limit=limit, planner=vkc.Planner())
+    plan = vkc.plan(scene, fetch(scene), time_limit=limit, planner=vkc.Planner(), window=2)
     assert time.perf_counter() - began < limit + 3.0
     assert plan.status == "time limit"
     assert plan.validation.violations

@@ -1,4 +1,4 @@
-"""Plans do in physics what they say, and what is wrong with the world comes out."""
+"""Simulation reproduces valid plans and reports deviations of the world."""
 
 from __future__ import annotations
 
@@ -11,43 +11,56 @@ from helpers.executions import door_plan, drawer_plan, holding, still, with_mass
 from helpers.telescopes import telescope_scene
 
 import vkc_pin as vkc
-from vkc_pin.scene.scene import Scene
 from vkc_pin.simulation.execution import simulate
+from vkc_pin.world.scene.scene import Scene
 
 
-def test_a_drawer_is_pulled() -> None:
+def test_drawer_is_pulled() -> None:
     result = drawer_plan().simulate()
     assert result.ok, result.report()
     (miss,) = result.misses
     assert (miss.subject, miss.unit) == ("drawer.slide", "m")
     assert miss.amount < 0.01
-    assert abs(result.trajectory.column("drawer.slide")[-1] - 0.3) == pytest.approx(miss.amount, abs=1e-9)
+    assert abs(result.trajectory.column("drawer.slide")[-1] - 0.3) == pytest.approx(
+        miss.amount, abs=1e-9
+    )
     assert np.degrees(result.tracking.arm[0]) < 1.0
     assert result.tracking.base[0] < 0.02
     (grip,) = result.grips
     assert grip.what == "drawer.handle"
     assert grip.broken is None
-    # What the hand must give at least: the drawer's mass times the plan's largest acceleration.
+    # Lower bound: the drawer's mass times the plan's largest acceleration.
     plan = drawer_plan().trajectory
     column = plan.names.index("drawer.slide")
     assert grip.force > 0.3 * 5.0 * np.abs(plan.accelerations()[:, column]).max()
     assert result.contacts == ()
 
 
-def test_one_motor_pulls_with_all_segments_of_a_telescope(tmp_path: Path) -> None:
+def test_telescope_segments_move_together(tmp_path: Path) -> None:
     scene = telescope_scene(tmp_path, base="fixed")
     file = tmp_path / "robot.urdf"
-    file.write_text(file.read_text().replace('effort="10"', 'effort="300"'))  # the lift carries all that is on it
-    plan = vkc.plan(vkc.Scene.from_document(scene.document, tmp_path), [vkc.Actuate("drawer", {"slide": 0.15})], seed=0)
+    file.write_text(
+        file.read_text().replace('effort="10"', 'effort="300"')
+    )  # the lift carries the whole arm
+    plan = vkc.plan(
+        vkc.Scene.from_document(scene.document, tmp_path),
+        [vkc.Actuate("drawer", {"slide": 0.15})],
+        seed=0,
+    )
     assert plan.success, plan.report()
     result = plan.simulate()
     assert result.ok, result.report()
     assert result.tracking.arm[0] < np.radians(1.0)
-    assert np.abs(result.trajectory.column("out_1") - plan.trajectory.at(result.trajectory.times)[:, 4]).max() < 1e-3
+    assert (
+        np.abs(
+            result.trajectory.column("out_1") - plan.trajectory.at(result.trajectory.times)[:, 4]
+        ).max()
+        < 1e-3
+    )
     assert {*result.tracking.shares} == {*scene.robot.coordinates.names[3:]}
 
 
-def test_a_latched_door_is_opened_with_its_lever() -> None:
+def test_latched_door_opens_when_its_lever_is_turned() -> None:
     result = door_plan().simulate()
     assert result.ok, result.report()
     before = result.trajectory.times < result.grips[0].begin
@@ -58,11 +71,13 @@ def test_a_latched_door_is_opened_with_its_lever() -> None:
     assert max(result.tracking.shares.values()) < 1.0
 
 
-def test_a_lever_that_is_not_turned_keeps_the_door_shut() -> None:
-    """The same motion of the robot at a latch that needs more: the door stays shut, and its handle is torn from the hand."""
+def test_latch_with_higher_threshold_keeps_the_door_closed() -> None:
+    """The robot repeats its motion at a stiffer latch: the hand loses the handle."""
     plan = door_plan()
     document = plan.scene.document
-    scene = Scene.from_document(document, plan.scene.folder).with_start(base=plan.scene.start[:3], arm=plan.scene.start[3:])
+    scene = Scene.from_document(document, plan.scene.folder).with_start(
+        base=plan.scene.start[:3], arm=plan.scene.start[3:]
+    )
     (latch,) = scene.objects["door"].object.latches
     object.__setattr__(latch, "threshold", 0.75)
     result = plan.simulate(actual=scene)
@@ -72,21 +87,28 @@ def test_a_lever_that_is_not_turned_keeps_the_door_shut() -> None:
     assert any("door.hinge" in line for line in result.problems())
 
 
-def test_what_is_too_heavy_is_lost() -> None:
+def test_hand_loses_heavy_object() -> None:
     scene = holding()
     light = simulate(scene, [vkc.Grasp("stick")], still(scene))
-    heavy = simulate(scene, [vkc.Grasp("stick")], still(scene), actual=with_mass(scene, "stick", 60.0))
+    heavy = simulate(
+        scene, [vkc.Grasp("stick")], still(scene), actual=with_mass(scene, "stick", 60.0)
+    )
     assert light.grips[0].broken is None
     assert heavy.grips[0].broken is not None
     assert "stick.grip was pulled out of the hand" in heavy.report()
     assert not heavy.ok
 
 
-def test_what_was_moved_into_the_way_is_named() -> None:
+def test_contact_with_unplanned_obstacle_is_reported() -> None:
     plan = drawer_plan()
     middle = plan.trajectory.at(10.0)[:2]
     document = dict(plan.scene.document)
-    crate = {"name": "crate", "type": "box", "size": [0.3, 0.3, 0.4], "position": [*middle.tolist(), 0.2]}
+    crate = {
+        "name": "crate",
+        "type": "box",
+        "size": [0.3, 0.3, 0.4],
+        "position": [*middle.tolist(), 0.2],
+    }
     document["obstacles"] = [*document["obstacles"], crate]
     changed = Scene.from_document(document, plan.scene.folder)
     result = plan.simulate(actual=changed)
@@ -95,30 +117,30 @@ def test_what_was_moved_into_the_way_is_named() -> None:
     assert hit
     assert 0.0 < hit[0].begin < 11.0
     assert max(contact.depth for contact in hit) > 1e-4
-    assert any("drawer.slide" in line for line in result.problems())  # it did not get there
+    assert any("drawer.slide" in line for line in result.problems())  # the drawer stays closed
     assert "crate" in result.report()
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_computation_that_breaks_down_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_diverged_simulation_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     wild = vkc.Physics(timestep=0.01, base_bandwidth=1e7, arm_bandwidth=1e7)
     result = drawer_plan().simulate(physics=wild)
     assert result.diverged is not None
     assert result.diverged < 10.0
     assert not result.ok
-    assert "the computation broke down" in result.report()
+    assert "the integration diverged" in result.report()
     assert len(result.rows) == len(result.trajectory.times)
     assert np.isfinite(result.rows).all()
     assert list(tmp_path.iterdir()) == []  # MuJoCo would log it here
 
 
-def test_the_same_again_is_the_same() -> None:
+def test_simulation_is_deterministic() -> None:
     one, other = drawer_plan().simulate(), drawer_plan().simulate()
     np.testing.assert_array_equal(one.rows, other.rows)
 
 
-def test_results_are_plain_data(tmp_path: Path) -> None:
+def test_result_round_trips_through_json(tmp_path: Path) -> None:
     result = drawer_plan().simulate()
     data = json.loads(result.to_json(tmp_path / "result.json").read_text(encoding="utf-8"))
     assert data["ok"] is True
@@ -135,13 +157,13 @@ def test_results_are_plain_data(tmp_path: Path) -> None:
         ({"actual": "drawer"}, "actual"),
     ],
 )
-def test_wrong_arguments_are_named(options: dict[str, object], field: str) -> None:
+def test_invalid_argument_is_named(options: dict[str, object], field: str) -> None:
     with pytest.raises(vkc.InputError) as caught:
         drawer_plan().simulate(**options)
     assert caught.value.field == field
 
 
-def test_another_scene_is_refused() -> None:
-    with pytest.raises(vkc.InputError, match="not there") as caught:
+def test_missing_object_is_refused() -> None:
+    with pytest.raises(vkc.InputError, match="lacks the object 'drawer'") as caught:
         drawer_plan().simulate(actual=vkc.load_scene("door"))
     assert caught.value.expected == "drawer"

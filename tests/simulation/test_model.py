@@ -1,4 +1,4 @@
-"""The model has the kinematics, masses and shapes of the tree that it is made of."""
+"""The MuJoCo model has the kinematics, masses and shapes of the kinematic tree."""
 
 from __future__ import annotations
 
@@ -13,91 +13,103 @@ from helpers.executions import drawer_plan, still
 from helpers.telescopes import coupled_scene
 
 import vkc_pin as vkc
-from vkc_pin.models.dynamics.resistance import Resistance
-from vkc_pin.models.shapes import triangles
-from vkc_pin.motion.world import World
-from vkc_pin.scene.scene import Scene
-from vkc_pin.simulation.contacts import touching_pairs
-from vkc_pin.simulation.grips import latched
+from vkc_pin.simulation.contacts import find_contact_pairs
 from vkc_pin.simulation.model import Builder, PhysicalWorld
-from vkc_pin.simulation.physics import Physics, weigh
+from vkc_pin.simulation.physics import Physics, complete_inertias
 from vkc_pin.simulation.result import SimulationResult
-from vkc_pin.simulation.servos import servos
+from vkc_pin.simulation.servos import make_servos
+from vkc_pin.simulation.welds import find_latches
+from vkc_pin.world.models.dynamics.joint_resistance import Resistance
+from vkc_pin.world.models.shapes import triangulate
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.world_model import World
 
 
-def built(scene: Scene, *, guessed: bool = False) -> PhysicalWorld:
+def build_model(scene: Scene, *, has_notes: bool = False) -> PhysicalWorld:
     physics, world, holds = Physics(), World(scene), scene.holds
-    assert bool(weigh(world, physics)) == guessed
-    driven = servos(world, world.positions(still(scene)), physics)
-    latches = [(joint, at) for joint, at, _, _ in latched(scene)]
-    return Builder(world, physics).built(touching_pairs(world, holds), driven, holds, latches)
+    assert bool(complete_inertias(world, physics)) == has_notes
+    driven = make_servos(world, world.compute_positions(still(scene)), physics)
+    latches = [(joint, at) for joint, at, _, _ in find_latches(scene)]
+    return Builder(world, physics).build(find_contact_pairs(world, holds), driven, holds, latches)
 
 
 def random_rows(world: World, count: int) -> np.ndarray:
-    rows = world.start + np.random.default_rng(1).uniform(-2.0, 2.0, (count, world.coordinates.size))
+    rows = world.start + np.random.default_rng(1).uniform(
+        -2.0, 2.0, (count, world.coordinates.size)
+    )
     for name, placed in world.scene.objects.items():
         if placed.object.free:
-            columns = world.placement_columns(name)
+            columns = world.get_placement_columns(name)
             turns = rows[:, columns.start + 3 : columns.stop]
             turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     return rows
 
 
 @pytest.mark.parametrize("name", ["door", "drawer", "household", "init_1", "tray", "coupled"])
-def test_bodies_and_shapes_are_where_pinocchio_has_them(name: str, tmp_path: Path) -> None:
+def test_placements_agree_with_pinocchio(name: str, tmp_path: Path) -> None:
     coupled = name == "coupled"
     scene = coupled_scene(tmp_path) if coupled else vkc.load_scene(name)
-    physical = built(scene, guessed=coupled)
+    physical = build_model(scene, has_notes=coupled)
     world, model = physical.world, physical.model
     data, tree = mujoco.MjData(model), world.model.createData()
     for row in random_rows(world, 5):
-        data.qpos[:] = physical.qpos(row)
+        data.qpos[:] = physical.to_qpos(row)
         mujoco.mj_kinematics(model, data)
         pin.forwardKinematics(world.model, tree, world.coordinates.q(row))
         for joint in range(1, world.model.njoints):
             body = physical.bodies[joint]
             np.testing.assert_allclose(data.xpos[body], tree.oMi[joint].translation, atol=1e-9)
-            np.testing.assert_allclose(data.xmat[body].reshape(3, 3), tree.oMi[joint].rotation, atol=1e-9)
-        np.testing.assert_allclose(physical.row(data.qpos), row, atol=1e-12)
+            np.testing.assert_allclose(
+                data.xmat[body].reshape(3, 3), tree.oMi[joint].rotation, atol=1e-9
+            )
+        np.testing.assert_allclose(physical.from_qpos(data.qpos), row, atol=1e-12)
         for number, shape in enumerate(world.shapes):
             geom = int(physical.geoms[number])
-            where = tree.oMi[shape.parentJoint] * shape.placement if shape.parentJoint else shape.placement
-            place, turn = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
+            expected = (
+                tree.oMi[shape.parentJoint] * shape.placement
+                if shape.parentJoint
+                else shape.placement
+            )
+            place, rotation = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
             if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
-                np.testing.assert_allclose(place, where.translation, atol=1e-9)
+                np.testing.assert_allclose(place, expected.translation, atol=1e-9)
                 continue
             mesh = int(model.geom_dataid[geom])  # MuJoCo turns meshes into their principal axes
             first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-            seen = model.mesh_vert[first : first + count] @ turn.T + place
-            points = triangles(shape.geometry)[0] @ where.rotation.T + where.translation
-            np.testing.assert_allclose(seen.min(axis=0), points.min(axis=0), atol=1e-5)
-            np.testing.assert_allclose(seen.max(axis=0), points.max(axis=0), atol=1e-5)
+            vertices = model.mesh_vert[first : first + count] @ rotation.T + place
+            points = triangulate(shape.geometry)[0] @ expected.rotation.T + expected.translation
+            np.testing.assert_allclose(vertices.min(axis=0), points.min(axis=0), atol=1e-5)
+            np.testing.assert_allclose(vertices.max(axis=0), points.max(axis=0), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["door", "household", "tray"])
-def test_masses_agree(name: str) -> None:
-    physical = built(vkc.load_scene(name))
+def test_masses_agree_with_pinocchio(name: str) -> None:
+    physical = build_model(vkc.load_scene(name))
     tree = World(physical.world.scene).model  # as the files have it
     for joint in range(1, tree.njoints):
         inertia, body = tree.inertias[joint], int(physical.bodies[joint])
         assert physical.model.body_mass[body] == pytest.approx(inertia.mass)
         np.testing.assert_allclose(physical.model.body_ipos[body], inertia.lever, atol=1e-9)
         principal = np.sort(np.linalg.eigvalsh(np.asarray(inertia.inertia)))
-        principal += max(0.0, principal[2] - principal[0] - principal[1])  # the cabinet's are rounded
+        principal += max(
+            0.0, principal[2] - principal[0] - principal[1]
+        )  # the cabinet's are rounded
         np.testing.assert_allclose(np.sort(physical.model.body_inertia[body]), principal, rtol=1e-3)
 
 
-def test_a_coordinate_moves_the_masses_of_all_its_joints(tmp_path: Path) -> None:
-    """By MuJoCo's inertia of independent joints, of which the motor of one moves several; and nothing weighs on any of them."""
-    physical = built(coupled_scene(tmp_path), guessed=True)
+def test_coupled_joints_contribute_to_the_mass_matrix(tmp_path: Path) -> None:
+    """MuJoCo's inertia of independent joints agrees when one motor moves several of them."""
+    physical = build_model(coupled_scene(tmp_path), has_notes=True)
     world, model = physical.world, physical.model
     data, robot = mujoco.MjData(model), world.scene.robot.coordinates
     slopes = np.zeros((model.nv, robot.size))
     for move in robot.moves:
-        own = model.body_dofadr[physical.bodies[move.joint]] + (move.coordinate if move.coordinate < 3 else 0)
+        own = model.body_dofadr[physical.bodies[move.joint]] + (
+            move.coordinate if move.coordinate < 3 else 0
+        )
         slopes[own, move.coordinate] = move.factor
     for row in random_rows(world, 5):
-        data.qpos[:] = physical.qpos(row)
+        data.qpos[:] = physical.to_qpos(row)
         mujoco.mj_forward(model, data)
         assert np.abs(data.efc_pos[: data.ne]).max() < 1e-9
         masses = np.zeros((model.nv, model.nv))
@@ -111,18 +123,20 @@ def test_a_coordinate_moves_the_masses_of_all_its_joints(tmp_path: Path) -> None
         np.testing.assert_allclose(slopes.T @ masses @ slopes, expected, atol=1e-9)
 
 
-def test_joints_of_objects_resist_as_their_description_says() -> None:
-    """A drawer with friction takes so much more force at the same motion, and a spring pulls it back where nobody holds it."""
+def test_objects_have_the_described_joint_resistance() -> None:
+    """Joint friction adds to the pulling force, and a spring pulls the drawer back."""
     plan = drawer_plan()
     placed = plan.scene.objects["drawer"]
 
-    def executed(**resistance: float) -> SimulationResult:
+    def simulate_with(**resistance: float) -> SimulationResult:
         own = {"slide": Resistance(**resistance)}
-        changed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, resistance=own))
+        changed = dataclasses.replace(
+            placed, object=dataclasses.replace(placed.object, resistance=own)
+        )
         actual = dataclasses.replace(plan.scene, objects={**plan.scene.objects, "drawer": changed})
         return plan.simulate(actual=actual)
 
-    plain, rough = executed(), executed(friction=40.0)
+    plain, rough = simulate_with(), simulate_with(friction=40.0)
     assert rough.grips[0].force - plain.grips[0].force == pytest.approx(40.0, rel=0.15)
-    sprung = executed(stiffness=100.0, springref=0.0)
+    sprung = simulate_with(stiffness=100.0, springref=0.0)
     assert sprung.grips[0].force > plain.grips[0].force + 10.0

@@ -1,4 +1,4 @@
-"""Settings are checked; without MuJoCo the error says what to install."""
+"""Physical settings are checked, and missing masses are completed."""
 
 from __future__ import annotations
 
@@ -11,48 +11,57 @@ import pytest
 from helpers.executions import drawer_plan, holding
 
 import vkc_pin as vkc
-from vkc_pin.motion.world import World
-from vkc_pin.simulation.physics import engine, weigh
+from vkc_pin.simulation.physics import complete_inertias, import_mujoco
+from vkc_pin.world.trajectory.world_model import World
 
 
-def test_without_mujoco_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_mujoco_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = drawer_plan()
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    for call in (engine, plan.simulate):
+    for call in (import_mujoco, plan.simulate):
         with pytest.raises(vkc.InputError, match="mujoco") as caught:
             call()
         assert caught.value.expected == 'pip install "vkc-pin[sim]"'
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("timestep", 0.0), ("timestep", 0.05), ("friction", -1.0), ("grasp_force", float("nan")), ("balanced", 1)]
+    ("name", "value"),
+    [
+        ("timestep", 0.0),
+        ("timestep", 0.05),
+        ("friction", -1.0),
+        ("grasp_force", float("nan")),
+        ("balanced", 1),
+    ],
 )
-def test_values_out_of_range_are_named(name: str, value: object) -> None:
+def test_out_of_range_setting_is_named(name: str, value: object) -> None:
     with pytest.raises(vkc.InputError) as caught:
         vkc.Physics(**{name: value})
     assert caught.value.field == f"Physics.{name}"
 
 
-def test_settings_are_kept_as_numbers() -> None:
+def test_settings_are_converted_to_floats() -> None:
     assert vkc.Physics(settle=1).settle == 1.0
     assert vkc.Physics(balanced=False).balanced is False
 
 
-def test_an_inertia_that_no_body_has_is_made_one_and_that_is_said() -> None:
+def test_impossible_inertia_is_corrected_with_a_note() -> None:
     world = World(holding())
     joint = world.model.getJointId("stick.placement")
     world.model.inertias[joint] = pin.Inertia(1.0, np.zeros(3), np.diag([0.01, 0.01, 0.04]))
-    (note,) = weigh(world, vkc.Physics())
-    np.testing.assert_allclose(np.asarray(world.model.inertias[joint].inertia), np.diag([0.03, 0.03, 0.06]), rtol=1e-4)
+    (note,) = complete_inertias(world, vkc.Physics())
+    np.testing.assert_allclose(
+        np.asarray(world.model.inertias[joint].inertia), np.diag([0.03, 0.03, 0.06]), rtol=1e-4
+    )
     assert "stick.placement" in note
     assert "50 %" in note
 
 
-def test_what_has_no_mass_is_given_one_by_its_volume_and_that_is_said() -> None:
+def test_missing_mass_is_estimated_from_volume_with_a_note() -> None:
     world = World(holding())
     joint = world.model.getJointId("base")
     world.model.inertias[joint] = pin.Inertia.Zero()
-    (note,) = weigh(world, vkc.Physics(density=500.0))
+    (note,) = complete_inertias(world, vkc.Physics(density=500.0))
     solids = [shape for shape in world.bodies.geometryObjects if shape.parentJoint == joint]
     volume = sum(shape.geometry.computeVolume() for shape in solids)
     assert any(isinstance(shape.geometry, coal.ShapeBase) for shape in solids)

@@ -1,4 +1,4 @@
-"""A page shows what happened, and what was planned beside it."""
+"""Web pages show the executed motion beside the plan."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.replay import Replay
 
 
-def test_replays_go_where_things_went() -> None:
+def test_replay_reproduces_executed_coordinates() -> None:
     scene = holding()
     result = simulate(scene, [vkc.Grasp("stick")], still(scene))
     world = Replay(scene, result.trajectory.times, result.rows)
-    rows = world.positions(result.trajectory, result.trajectory.times)
+    rows = world.compute_positions(result.trajectory, result.trajectory.times)
     np.testing.assert_allclose(np.abs(rows), np.abs(result.rows), atol=1e-12)
     assert np.abs(np.diff(rows, axis=0)).max() < 0.1  # quaternions keep their sign
 
 
-def test_a_page_has_the_motion_and_a_ghost(tmp_path: Path) -> None:
+def test_page_contains_motion_and_ghost(tmp_path: Path) -> None:
     result = drawer_plan().simulate()
     text = result.to_html(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "drawer in physics: ok" in text

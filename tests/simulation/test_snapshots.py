@@ -1,4 +1,4 @@
-"""Snapshots show the robot and what it moves."""
+"""Snapshots and videos show the robot and moving objects."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from helpers.executions import drawer_plan
 
 import vkc_pin as vkc
 from vkc_pin.simulation import snapshots
-from vkc_pin.simulation.snapshots import Stage
+from vkc_pin.simulation.snapshots import RenderedScene
 
 
-def test_snapshots_differ_where_things_move(tmp_path: Path) -> None:
+def test_snapshots_differ_where_objects_move(tmp_path: Path) -> None:
     result = drawer_plan().simulate()
-    stage = Stage(result)
+    stage = RenderedScene(result)
     try:
-        first, again, last = stage.pictures(np.array([0.0, 0.0, result.trajectory.times[-1]]), stage.viewpoint())
+        first, again, last = stage.render(
+            np.array([0.0, 0.0, result.trajectory.times[-1]]), stage.find_viewpoint()
+        )
     except vkc.VkcError as error:  # no OpenGL on this machine
         pytest.skip(str(error))
     np.testing.assert_array_equal(first, again)
@@ -29,7 +31,7 @@ def test_snapshots_differ_where_things_move(tmp_path: Path) -> None:
     assert picture.startswith(b"\x89PNG")
 
 
-def test_without_opengl_the_error_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_opengl_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     result = drawer_plan().simulate()
     monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
     with pytest.raises(vkc.VkcError, match="EGL or OSMesa"):
@@ -39,7 +41,7 @@ def test_without_opengl_the_error_says_so(monkeypatch: pytest.MonkeyPatch, tmp_p
         result.plot(tmp_path / "strip.png", count=1)
 
 
-def test_a_video_lasts_as_long_as_what_happened(tmp_path: Path) -> None:
+def test_video_has_the_duration_of_the_motion(tmp_path: Path) -> None:
     result = drawer_plan().simulate()
     try:
         file = result.to_mp4(tmp_path / "deep" / "film.mp4", rate=5.0)
@@ -53,7 +55,7 @@ def test_a_video_lasts_as_long_as_what_happened(tmp_path: Path) -> None:
     assert duration / ticks == pytest.approx(times[-1] - times[0], abs=0.25)
 
 
-def test_without_ffmpeg_the_error_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_ffmpeg_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     result = drawer_plan().simulate()
     monkeypatch.setattr(snapshots.shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)

@@ -13,9 +13,9 @@ from helpers.judging import names, only, until_the_grasp, with_object
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.scene import Scene
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -45,24 +45,46 @@ def test_grasp(door_plan: vkc.Plan) -> None:
     loose = dataclasses.replace(door_plan.options)
     for step in (vkc.Grasp("door"), vkc.Grasp("door", "handle"), vkc.Grasp("door", "handle_free")):
         report = validate(door_plan.scene, [step], motion, loose)
-        assert {found.constraint for found in report.violations} <= {"acceleration"}, "\n".join(report.lines())
+        assert {found.constraint for found in report.violations} <= {"acceleration"}, "\n".join(
+            report.lines()
+        )
     here = door_plan.scene.objects["door"].placement
-    away = with_object(door_plan.scene, placement=pin.SE3(here.rotation, here.translation + np.array([0.0, 0.0, 0.003])))
-    found = next(v for v in validate(away, [vkc.Grasp("door")], motion, loose).violations if v.constraint == "goal")
-    assert (found.subject, found.unit, found.waypoint) == ("door.handle", "m", len(motion.times) - 1)
+    away = with_object(
+        door_plan.scene,
+        placement=pin.SE3(here.rotation, here.translation + np.array([0.0, 0.0, 0.003])),
+    )
+    found = next(
+        v
+        for v in validate(away, [vkc.Grasp("door")], motion, loose).violations
+        if v.constraint == "goal"
+    )
+    assert (found.subject, found.unit, found.waypoint) == (
+        "door.handle",
+        "m",
+        len(motion.times) - 1,
+    )
     assert found.amount == pytest.approx(0.003 - loose.goal_position, abs=5e-4)
 
 
 def test_the_grasp_that_is_used_is_the_one_that_is_meant(door_plan: vkc.Plan) -> None:
     """Without a name, holding it anywhere will do."""
     grasps = door_plan.scene.objects["door"].object.attachments
-    elsewhere = pin.SE3(grasps["handle"].placement.rotation, grasps["handle"].placement.translation + np.array([0.0, 0.05, 0.0]))
-    first = {"decoy": dataclasses.replace(grasps["handle"], name="decoy", placement=elsewhere), **grasps}
+    elsewhere = pin.SE3(
+        grasps["handle"].placement.rotation,
+        grasps["handle"].placement.translation + np.array([0.0, 0.05, 0.0]),
+    )
+    first = {
+        "decoy": dataclasses.replace(grasps["handle"], name="decoy", placement=elsewhere),
+        **grasps,
+    }
     scene = with_object(door_plan.scene, attachments=first)
     steps = [vkc.Grasp("door"), *door_plan.steps]
     assert validate(scene, steps, door_plan.trajectory, door_plan.options).ok
     steps = [vkc.Grasp("door", "decoy"), *door_plan.steps]
-    assert {v.constraint for v in validate(scene, steps, door_plan.trajectory, door_plan.options).violations} == {"goal"}
+    assert {
+        v.constraint
+        for v in validate(scene, steps, door_plan.trajectory, door_plan.options).violations
+    } == {"goal"}
 
 
 def tool_at_the_end(scene: Scene, motion: Trajectory, frame: str) -> pin.SE3:
@@ -83,18 +105,35 @@ def test_reach(empty: Scene, drive: Trajectory, frame: str | None) -> None:
     assert found.amount == pytest.approx(0.005 - 1e-3)
     turned = pose * pin.SE3(pin.exp3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
     found = only(validate(empty, [vkc.Reach(turned, frame)], drive))
-    assert (found.constraint, found.subject, found.waypoint, found.unit) == ("goal", name, 40, "rad")
+    assert (found.constraint, found.subject, found.waypoint, found.unit) == (
+        "goal",
+        name,
+        40,
+        "rad",
+    )
     assert found.amount == pytest.approx(0.01 - 1e-3)
     half_round = pose * pin.SE3(pin.exp3(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
-    assert only(validate(empty, [vkc.Reach(half_round, frame)], drive)).amount == pytest.approx(np.pi - 1e-3, abs=1e-6)
+    assert only(validate(empty, [vkc.Reach(half_round, frame)], drive)).amount == pytest.approx(
+        np.pi - 1e-3, abs=1e-6
+    )
 
 
 def test_go_to(empty: Scene, drive: Trajectory) -> None:
     found = only(validate(empty, [vkc.GoTo(2.003, 0.004, np.pi / 2)], drive))
-    assert (found.constraint, found.subject, found.waypoint, found.unit) == ("goal", "base", 40, "m")
+    assert (found.constraint, found.subject, found.waypoint, found.unit) == (
+        "goal",
+        "base",
+        40,
+        "m",
+    )
     assert found.amount == pytest.approx(0.005 - 1e-3)
     found = only(validate(empty, [vkc.GoTo(2.0, 0.0, np.pi / 2 + 2 * np.pi - 0.02)], drive))
-    assert (found.constraint, found.subject, found.waypoint, found.unit) == ("goal", "base heading", 40, "rad")
+    assert (found.constraint, found.subject, found.waypoint, found.unit) == (
+        "goal",
+        "base heading",
+        40,
+        "rad",
+    )
     assert found.amount == pytest.approx(0.02 - 1e-3)
 
 
@@ -106,7 +145,9 @@ def test_places_in_the_wrong_order(empty: Scene) -> None:
     found = only(validate(empty, [second, first], motion))
     assert (found.constraint, found.subject) == ("goal", "base")
     assert found.amount == pytest.approx(1.0 - 1e-3)
-    assert ("goal", "base") in names(validate(empty, [vkc.GoTo(0.5, 0.0), second], motion))  # passed, but not at an end
+    assert ("goal", "base") in names(
+        validate(empty, [vkc.GoTo(0.5, 0.0), second], motion)
+    )  # passed, but not at an end
     assert names(validate(empty, [first], motion)) == {("goal", "base")}  # it does not stay there
     further = through(empty, empty.start, one, two, empty.start)
     home = vkc.GoTo(0.0, 0.0)
@@ -124,7 +165,9 @@ def test_the_door_is_opened_before_its_turn(door_plan: vkc.Plan) -> None:
     x, y, yaw = door_plan.trajectory.positions[-1, :3]
     there, open_it = vkc.GoTo(x, y, yaw), door_plan.steps[0]
     assert validate(door_plan.scene, [open_it, there], door_plan.trajectory, door_plan.options).ok
-    found = only(validate(door_plan.scene, [there, open_it], door_plan.trajectory, door_plan.options))
+    found = only(
+        validate(door_plan.scene, [there, open_it], door_plan.trajectory, door_plan.options)
+    )
     assert (found.constraint, found.subject) == ("order", "door")
     assert found.waypoint == door_plan.trajectory.phases[1].first
 
@@ -154,7 +197,9 @@ def test_steps_that_are_done_already(door_plan: vkc.Plan) -> None:
         (vkc.Reach([0.0] * 6, "tol"), "steps[0].frame", "tool"),
     ],
 )
-def test_steps_that_name_what_is_not_there(door_plan: vkc.Plan, step: object, field: str, nearest: str) -> None:
+def test_steps_that_name_what_is_not_there(
+    door_plan: vkc.Plan, step: object, field: str, nearest: str
+) -> None:
     with pytest.raises(UnknownNameError) as caught:
         validate(door_plan.scene, [step], door_plan.trajectory, door_plan.options)
     assert (caught.value.field, caught.value.nearest) == (field, nearest)
@@ -169,4 +214,9 @@ def test_no_steps(door_plan: vkc.Plan) -> None:
 def test_what_is_to_be_let_go_of_is_held_still() -> None:
     """However many steps ask for it, each thing counts once."""
     found = only(validate(holding(), [vkc.Release()], still(holding())))
-    assert (found.constraint, found.subject, found.amount, found.unit) == ("goal", "stick", 1.0, "holds")
+    assert (found.constraint, found.subject, found.amount, found.unit) == (
+        "goal",
+        "stick",
+        1.0,
+        "holds",
+    )

@@ -10,18 +10,18 @@ from helpers.carrying import Script, moved_base, room, stand, table
 from helpers.motions import pair_names, wander
 from helpers.small_problems import door_scene, full_scene, program_of
 
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
 from vkc_pin.options import Options
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import GoTo
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.contact_windows import Window
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.touching import Window
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import GoTo
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 
 @pytest.fixture(scope="module")
@@ -31,13 +31,18 @@ def door() -> Scene:
 
 def test_which_pairs_count(door: Scene) -> None:
     motion = wander(door, 0, size=0.1)
-    table = PairTable(door, Solids(World(door)), motion, 0.02)
+    table = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
     walls = [label for label in door.obstacle_labels if label != FLOOR]
     arm = [shape for shape in robot.geometryObjects if shape.parentJoint > 1]
     leaves = [shape for shape in things if shape.parentJoint > 0]
     bodies = len(robot.geometryObjects)
-    expected = len(robot.collisionPairs) + bodies * (len(things) + len(walls)) + len(arm) + len(leaves) * len(walls)
+    expected = (
+        len(robot.collisionPairs)
+        + bodies * (len(things) + len(walls))
+        + len(arm)
+        + len(leaves) * len(walls)
+    )
     assert len(table.pairs) == expected
     assert len({frozenset(pair) for pair in table.pairs.tolist()}) == expected
 
@@ -45,45 +50,65 @@ def test_which_pairs_count(door: Scene) -> None:
 def test_some_may_be_closer_for_a_while(door: Scene) -> None:
     """Only the pairs that were said to, then alone, and each with its own overlap that counts as contact."""
     motion = wander(door, 0, size=0.1)
-    plain = PairTable(door, Solids(World(door)), motion, 0.02)
+    plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     every = np.arange(len(plain.pairs))
     first, second = plain.pairs[[3]], plain.pairs[[3, 70]]
-    near = [Window(first, 0, 1, 0.005, 1e-4, together=True), Window(second, 1, 3, 0.01, 0.0)]
-    table = PairTable(door, Solids(World(door)), motion, 0.02, windows=near)
+    near = [Window(first, 0, 1, 0.005, 1e-4, moves_together=True), Window(second, 1, 3, 0.01, 0.0)]
+    table = PairTable(door, CollisionShapes(World(door)), motion, 0.02, windows=near)
     np.testing.assert_array_equal(table.pairs, plain.pairs)
-    for waypoint, margins in enumerate([{3: 0.005}, {3: 0.005, 70: 0.01}, {3: 0.01, 70: 0.01}, {3: 0.01, 70: 0.01}]):
+    for waypoint, margins in enumerate(
+        [{3: 0.005}, {3: 0.005, 70: 0.01}, {3: 0.01, 70: 0.01}, {3: 0.01, 70: 0.01}]
+    ):
         at = np.full(len(every), waypoint)
-        found = table.margins_at(every, at)
+        found = table.get_margins(every, at)
         assert {int(k): float(found[k]) for k in np.flatnonzero(found != 0.02)} == margins
-        assert (plain.margins_at(every, at) == 0.02).all()
-        contact = table.contact_at(every, at, at)
-        assert {int(k): float(contact[k]) for k in np.flatnonzero(contact)} == ({3: 1e-4} if waypoint < 2 else {})
+        assert (plain.get_margins(every, at) == 0.02).all()
+        contact = table.get_contact_overlaps(every, at, at)
+        assert {int(k): float(contact[k]) for k in np.flatnonzero(contact)} == (
+            {3: 1e-4} if waypoint < 2 else {}
+        )
     for begin, as_one in ((0, [3]), (1, []), (2, [])):  # all the time between two waypoints
         at = np.full(len(every), begin)
-        np.testing.assert_array_equal(np.flatnonzero(table.together_at(every, at, at + 1)), as_one)
+        np.testing.assert_array_equal(
+            np.flatnonzero(table.find_moving_together(every, at, at + 1)), as_one
+        )
 
 
 def test_a_window_of_pairs_that_are_not_looked_at_is_nobody_elses(door: Scene) -> None:
     """Neighbouring links, or two walls: what is said of them must not end up with another pair."""
     motion = wander(door, 0, size=0.1)
-    plain = PairTable(door, Solids(World(door)), motion, 0.02)
-    known, count = {(min(pair), max(pair)) for pair in plain.pairs.tolist()}, len(plain.group)
-    absent = np.array([(i, j) for i in range(count) for j in range(i + 1, count) if (i, j) not in known])
+    plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
+    known, count = {(min(pair), max(pair)) for pair in plain.pairs.tolist()}, len(plain.groups)
+    absent = np.array(
+        [(i, j) for i in range(count) for j in range(i + 1, count) if (i, j) not in known]
+    )
     assert len(absent) > 10
-    table = PairTable(door, Solids(World(door)), motion, 0.02, windows=[Window(absent, 0, 3, -1.0, 1.0, together=True)])
+    table = PairTable(
+        door,
+        CollisionShapes(World(door)),
+        motion,
+        0.02,
+        windows=[Window(absent, 0, 3, -1.0, 1.0, moves_together=True)],
+    )
     every = np.arange(len(plain.pairs))
-    assert (table.margins_at(every, np.zeros_like(every)) == 0.02).all()
-    assert not table.contact_at(every, np.zeros_like(every), np.ones_like(every)).any()
+    assert (table.get_margins(every, np.zeros_like(every)) == 0.02).all()
+    assert not table.get_contact_overlaps(every, np.zeros_like(every), np.ones_like(every)).any()
 
 
 def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
     """A second door in a cabinet may well be shut next to a wall."""
     scene = full_scene()
     names = (*scene.robot.coordinates.names, "cabinet.slide", "cabinet.swing")
-    positions = np.vstack([np.concatenate([scene.start, values]) for values in ([0.1, 0.3], [0.11, 0.31])])
-    motion = Trajectory(names, np.arange(2.0), positions, (PhaseSpan("all", 0, 1, (Hold("cabinet", "grip"),)),), 9)
-    table = PairTable(scene, Solids(Samples(scene, motion).world), motion, 0.02)
-    paired = {frozenset(table.world.collision_labels[k] for k in pair) for pair in table.pairs.tolist()}
+    positions = np.vstack(
+        [np.concatenate([scene.start, values]) for values in ([0.1, 0.3], [0.11, 0.31])]
+    )
+    motion = Trajectory(
+        names, np.arange(2.0), positions, (PhaseSpan("all", 0, 1, (Hold("cabinet", "grip"),)),), 9
+    )
+    table = PairTable(scene, CollisionShapes(Samples(scene, motion).world), motion, 0.02)
+    paired = {
+        frozenset(table.world.collision_labels[k] for k in pair) for pair in table.pairs.tolist()
+    }
     for still in ("cabinet.lid", "cabinet.case"):
         assert {"forearm_link", still} in paired
         assert {still, "wall_north"} not in paired
@@ -101,7 +126,7 @@ def test_which_pairs_of_free_objects_count() -> None:
     carried = Script(scene).take("stick").go(moved_base(scene.start, y=0.1)).motion()
 
     def paired(motion: Trajectory) -> dict[str, set[str]]:
-        found = PairTable(scene, Solids(World(scene)), motion, 0.02)
+        found = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02)
         names: dict[str, set[str]] = {}
         for first, second in (pair_names(found, k) for k in range(len(found.pairs))):
             for one, other in ((first, second), (second, first)):
@@ -121,32 +146,54 @@ def test_which_pairs_of_free_objects_count() -> None:
 def test_what_does_not_move_in_a_phase_is_not_looked_at_in_it() -> None:
     """A stick that lies on a table, is carried, and lies there again."""
     scene = room(table())
-    script = Script(scene).go(moved_base(scene.start, y=0.1)).take("stick").go(moved_base(scene.start, y=0.3)).let_go()
+    script = (
+        Script(scene)
+        .go(moved_base(scene.start, y=0.1))
+        .take("stick")
+        .go(moved_base(scene.start, y=0.3))
+        .let_go()
+    )
     motion = script.go(moved_base(scene.start, y=0.5)).motion()
     samples = Samples(scene, motion)
-    solids = Solids(samples.world)
+    solids = CollisionShapes(samples.world)
     found = PairTable(scene, solids, motion, 0.02)
-    lies = [k for k in range(len(found.pairs)) if {name.partition(".")[0] for name in pair_names(found, k)} == {"stick", "table"}]
+    lies = [
+        k
+        for k in range(len(found.pairs))
+        if {name.partition(".")[0] for name in pair_names(found, k)} == {"stick", "table"}
+    ]
     assert lies
-    still = np.zeros((1, len(found.group)))
-    placed = solids.at(samples.world.coordinates.q(samples.z[samples.waypoint_rows]))
+    still = np.zeros((1, len(found.groups)))
+    placed = solids.place(samples.world.coordinates.q(samples.z[samples.waypoint_rows]))
     for waypoint in range(61):
         here = np.array([waypoint])
-        _, pairs = found.near(placed, here, here, still, np.inf)
-        assert set(lies) <= set(pairs.tolist()) if 20 < waypoint <= 40 else set(lies).isdisjoint(pairs.tolist())
+        _, pairs = found.find_close_pairs(placed, here, here, still, np.inf)
+        assert (
+            set(lies) <= set(pairs.tolist())
+            if 20 < waypoint <= 40
+            else set(lies).isdisjoint(pairs.tolist())
+        )
         if waypoint < 60:  # and on the way to the next
-            _, pairs = found.near(placed, here, here + 1, still, np.inf)
-            assert set(lies) <= set(pairs.tolist()) if 20 <= waypoint < 40 else set(lies).isdisjoint(pairs.tolist())
+            _, pairs = found.find_close_pairs(placed, here, here + 1, still, np.inf)
+            assert (
+                set(lies) <= set(pairs.tolist())
+                if 20 <= waypoint < 40
+                else set(lies).isdisjoint(pairs.tolist())
+            )
 
 
 def test_links_of_an_object_that_can_meet() -> None:
     scene = load_scene("household")
     names = (*scene.robot.coordinates.names, "dishwasher.rack")
     rows = np.vstack([np.append(scene.start, value) for value in (0.0, 0.2)])
-    motion = Trajectory(names, np.arange(2.0), rows, (PhaseSpan("pull", 0, 1, (Hold("dishwasher", "handle"),)),), 9)
-    table = PairTable(scene, Solids(World(scene)), motion, 0.02)
+    motion = Trajectory(
+        names, np.arange(2.0), rows, (PhaseSpan("pull", 0, 1, (Hold("dishwasher", "handle"),)),), 9
+    )
+    table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02)
     own = {
-        pair for pair in (pair_names(table, k) for k in range(len(table.pairs))) if all("dishwasher." in name for name in pair)
+        pair
+        for pair in (pair_names(table, k) for k in range(len(table.pairs)))
+        if all("dishwasher." in name for name in pair)
     }
     assert own == {("dishwasher.door", "dishwasher.rack")}
 
@@ -155,11 +202,16 @@ def test_links_of_the_robot_have_a_clearance_of_their_own(door: Scene) -> None:
     """As the program has it, also where links are always close."""
     first, second = next(iter(door.robot.own_margins(0.02)))
     one, other = sorted((door.robot.link_of(first), door.robot.link_of(second)))
-    scene = dataclasses.replace(door, robot=dataclasses.replace(door.robot, tight={(one, other): 0.006}))
+    scene = dataclasses.replace(
+        door, robot=dataclasses.replace(door.robot, tight={(one, other): 0.006})
+    )
     motion = wander(scene, 0, size=0.1)
-    table = PairTable(scene, Solids(World(scene)), motion, 0.02, 0.01)
-    margins = table.margins_at(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))
-    by_pair = {frozenset(pair): float(margin) for pair, margin in zip(table.pairs.tolist(), margins, strict=True)}
+    table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02, 0.01)
+    margins = table.get_margins(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))
+    by_pair = {
+        frozenset(pair): float(margin)
+        for pair, margin in zip(table.pairs.tolist(), margins, strict=True)
+    }
     problem = program_of(scene, [GoTo(1.0, 0.0)], options=Options(self_distance=0.01))
     robots = len(scene.robot.collision.geometryObjects)
     part, own = problem.contacts.phases[0], 0

@@ -11,11 +11,27 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.plotting.clearance import clearance_curves
 from vkc_pin.validation.report import Bound, Report, Violation
+from vkc_pin.visualization.plots.clearance import compute_clearance_curves
 
-ONE = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")
-TWO = Violation("penetration", "forearm_link – sofa", waypoint=7, time=1.9, amount=0.01, unit="m", detail="overlap by 10.0 mm")
+ONE = Violation(
+    "limit",
+    "elbow_joint",
+    waypoint=4,
+    time=1.0,
+    amount=0.05,
+    unit="rad",
+    detail="3.2 rad is outside",
+)
+TWO = Violation(
+    "penetration",
+    "forearm_link – sofa",
+    waypoint=7,
+    time=1.9,
+    amount=0.01,
+    unit="m",
+    detail="overlap by 10.0 mm",
+)
 
 
 def test_text() -> None:
@@ -34,7 +50,9 @@ def test_what_nobody_says_is_nothing() -> None:
 
 
 def test_text_names_four_bounds_and_twelve_violations() -> None:
-    every = tuple(Bound(f"joint_{k}", "velocity", share=0.1, begin=k, end=k + 1.0) for k in range(6))
+    every = tuple(
+        Bound(f"joint_{k}", "velocity", share=0.1, begin=k, end=k + 1.0) for k in range(6)
+    )
     (told,) = Report(bounds=every).timing()
     assert [f"joint_{k}" in told for k in range(6)] == [True] * 4 + [False] * 2
     lines = Report((ONE,) * 14).lines()
@@ -47,7 +65,9 @@ def test_reports_that_say_otherwise() -> None:
     one = Report((ONE,), 0.01, closure_error=1e-4, closure_angle=0.0)
     assert one.contradictions(one) == []
     assert one.contradictions(Report((ONE,), 0.010005, closure_error=1e-4)) == []
-    assert one.contradictions(Report((ONE,), 0.02, closure_error=1e-4)) == ["clearance 0.02 m instead of 0.01 m"]
+    assert one.contradictions(Report((ONE,), 0.02, closure_error=1e-4)) == [
+        "clearance 0.02 m instead of 0.01 m"
+    ]
     assert one.contradictions(Report((ONE,), 0.01, closure_error=1e-4, closure_angle=0.5)) == [
         "closure_angle 0.5 rad instead of 0 rad"
     ]
@@ -56,7 +76,14 @@ def test_reports_that_say_otherwise() -> None:
 
 def test_round_trip() -> None:
     for report in (
-        Report((ONE, TWO), -0.01, closure_error=0.001, closure_angle=0.002, states=12, notes=("a wall is in the way",)),
+        Report(
+            (ONE, TWO),
+            -0.01,
+            closure_error=0.001,
+            closure_angle=0.002,
+            states=12,
+            notes=("a wall is in the way",),
+        ),
         Report(),
     ):
         assert Report.from_dict(json.loads(json.dumps(report.to_dict()))) == report
@@ -99,10 +126,16 @@ def test_a_line_for_each_phase_says_when_how_far_and_how_close(door_plan: vkc.Pl
     parts = motion.parts()
     assert sum(part.base_effort() for part in parts) == pytest.approx(motion.base_effort())
     assert sum(part.arm_effort() for part in parts) == pytest.approx(motion.arm_effort())
-    for line, part, phase, close in zip(report.by_phase(motion), parts, motion.phases, report.clearances, strict=True):
-        numbers = [float(number) for number in re.findall(r"-?[\d.]+(?= (?:to|s|m|rad|mm)\b)", line)]
+    for line, part, phase, close in zip(
+        report.by_phase(motion), parts, motion.phases, report.clearances, strict=True
+    ):
+        numbers = [
+            float(number) for number in re.findall(r"-?[\d.]+(?= (?:to|s|m|rad|mm)\b)", line)
+        ]
         first, last = motion.times[[phase.first, phase.last]]
-        np.testing.assert_allclose(numbers, [first, last, part.base_effort(), part.arm_effort(), 1e3 * close], atol=0.06)
+        np.testing.assert_allclose(
+            numbers, [first, last, part.base_effort(), part.arm_effort(), 1e3 * close], atol=0.06
+        )
         assert line.endswith(phase.name)
     assert Report.from_dict(json.loads(json.dumps(report.to_dict()))) == report
 
@@ -112,6 +145,8 @@ def test_each_phase_has_the_clearance_of_its_own_motion(door_plan: vkc.Plan) -> 
     fine = door_plan.trajectory
     for phase, close in zip(fine.phases, door_plan.validation.clearances, strict=True):
         times = fine.times[phase.first + 1 : phase.last + 1]
-        curves = clearance_curves(door_plan.scene, fine, times)
-        least = min(float(curve.distances.min()) for curve in curves if not curve.name.startswith("gripper"))
+        curves = compute_clearance_curves(door_plan.scene, fine, times)
+        least = min(
+            float(curve.distances.min()) for curve in curves if not curve.name.startswith("gripper")
+        )
         assert close <= least + 1e-6

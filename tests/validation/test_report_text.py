@@ -11,10 +11,18 @@ import pytest
 from helpers.drives import hall, moved, of_rows
 
 from vkc_pin.errors import InputError
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.validation.report import SAME, Bound, Report, Violation
+from vkc_pin.validation.report import AGREEMENT_TOLERANCE, Bound, Report, Violation
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
-WRONG = Violation("limit", "elbow_joint", waypoint=4, time=1.0, amount=0.05, unit="rad", detail="3.2 rad is outside")
+WRONG = Violation(
+    "limit",
+    "elbow_joint",
+    waypoint=4,
+    time=1.0,
+    amount=0.05,
+    unit="rad",
+    detail="3.2 rad is outside",
+)
 FAST = Bound("base_x", "velocity", share=0.625, begin=1.0, end=2.5)
 REST = Bound("", "rest", share=0.25, begin=0.0, end=1.0)
 FULL = Report(
@@ -48,7 +56,9 @@ def test_defaults() -> None:
 
 
 def test_lines_of_a_report() -> None:
-    assert Report(states=3).lines() == ["validation  3 configurations checked: every constraint holds"]
+    assert Report(states=3).lines() == [
+        "validation  3 configurations checked: every constraint holds"
+    ]
     assert FULL.lines() == [
         "validation  12 configurations checked: 1 constraint(s) violated",
         "  - limit elbow_joint: 3.2 rad is outside (waypoint 4, 1.00 s)",
@@ -61,10 +71,10 @@ def test_lines_of_what_bounds_a_motion() -> None:
     assert Report().timing() == []
     assert FULL.timing() == [
         "bounded by  base_x velocity 62 % (1.0 to 2.5 s), rest 25 % (0.0 to 1.0 s)",
-        "torques     50 % of what the motors have, at most",
+        "torques     at most 50 % of the motors' limits",
         "unknown     no masses",
     ]
-    assert Report(torque=0.5).timing() == ["torques     50 % of what the motors have, at most"]
+    assert Report(torque=0.5).timing() == ["torques     at most 50 % of the motors' limits"]
     assert FULL.measures() == {"clearance": -0.01, "closure_error": 0.001, "torque": 0.5}
 
 
@@ -77,9 +87,10 @@ def test_lines_of_phases() -> None:
         "   0.0 to    2.0 s: base  1.00 m, arm  0.50 rad,  250.0 mm, one",
         "   2.0 to    4.0 s: base  2.00 m, arm  0.00 rad,  100.0 mm, two",
     ]
-    assert [line.endswith("inf mm, " + name) for line, name in zip(Report().by_phase(motion), ("one", "two"), strict=True)] == [
-        True
-    ] * 2
+    assert [
+        line.endswith("inf mm, " + name)
+        for line, name in zip(Report().by_phase(motion), ("one", "two"), strict=True)
+    ] == [True] * 2
     with pytest.raises(ValueError, match="zip"):
         Report(clearances=(0.25,)).by_phase(motion)  # of another motion
 
@@ -89,13 +100,18 @@ def test_with_reasons_only_the_violations_are_others() -> None:
     assert vars(other) == {**vars(FULL), "violations": (WRONG, WRONG)}
 
 
-@pytest.mark.parametrize(("off", "told"), [(0.9 * SAME, False), (1.5 * SAME, True), (math.nan, True)])
+@pytest.mark.parametrize(
+    ("off", "told"),
+    [(0.9 * AGREEMENT_TOLERANCE, False), (1.5 * AGREEMENT_TOLERANCE, True), (math.nan, True)],
+)
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("field", ["clearance", "closure_error", "closure_angle"])
 def test_numbers_that_are_the_same_or_not(field: str, off: float, sign: float, told: bool) -> None:
-    assert SAME == 1e-5  # [m] or [rad], as the pages say
+    assert AGREEMENT_TOLERANCE == 1e-5  # [m] or [rad], as the pages say
     one = Report(clearance=0.5, closure_error=0.5, closure_angle=0.5)
-    other = Report(**{"clearance": 0.5, "closure_error": 0.5, "closure_angle": 0.5, field: 0.5 + sign * off})
+    other = Report(
+        **{"clearance": 0.5, "closure_error": 0.5, "closure_angle": 0.5, field: 0.5 + sign * off}
+    )
     lines = one.contradictions(other)
     assert len(lines) == told
     assert all(line.startswith(f"{field} ") for line in lines)
@@ -110,7 +126,9 @@ def test_where_nothing_can_collide_two_reports_are_the_same() -> None:
 
 def test_plain_data_and_back() -> None:
     assert Report.from_dict(FULL.to_dict()) == FULL
-    early = Report((Violation("start", "base_x", amount=1.0, unit="m", detail="off"),), states=0, torque=0.0)
+    early = Report(
+        (Violation("start", "base_x", amount=1.0, unit="m", detail="off"),), states=0, torque=0.0
+    )
     assert Report.from_dict(early.to_dict()) == early
 
 
@@ -123,9 +141,20 @@ def test_old_data_lack_what_reports_did_not_say_then() -> None:
 
 
 def test_numpy_and_whole_numbers_are_numbers() -> None:
-    data = {**FULL.to_dict(), "clearance": 1, "clearances": [1, 2.0], "torque": 1, "closure_error": np.float64(0.5)}
+    data = {
+        **FULL.to_dict(),
+        "clearance": 1,
+        "clearances": [1, 2.0],
+        "torque": 1,
+        "closure_error": np.float64(0.5),
+    }
     found = Report.from_dict(data)
-    assert (found.clearance, found.clearances, found.torque, found.closure_error) == (1.0, (1.0, 2.0), 1.0, 0.5)
+    assert (found.clearance, found.clearances, found.torque, found.closure_error) == (
+        1.0,
+        (1.0, 2.0),
+        1.0,
+        0.5,
+    )
 
 
 @pytest.mark.parametrize(

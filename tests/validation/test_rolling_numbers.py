@@ -8,16 +8,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.motion.curve import Curve
 from vkc_pin.validation.report import Violation
-from vkc_pin.validation.rolling import SLIP_TOLERANCE, STEP_TOLERANCE, WHEEL_TOLERANCE, check_rolling
+from vkc_pin.validation.rolling import (
+    SLIP_TOLERANCE,
+    STEP_TOLERANCE,
+    WHEEL_TOLERANCE,
+    check_rolling,
+)
+from vkc_pin.world.trajectory.curve import Curve
 
 WHEELS = SimpleNamespace(rim=2.0, track=0.5)
 TIMES = np.array([0.0, 1.0, 3.0, 4.0])
 
 
 def found(
-    rows: Any, *, base: str = "differential", wheels: Any = None, radius: float = 0.0, rates: Any = None
+    rows: Any,
+    *,
+    base: str = "differential",
+    wheels: Any = None,
+    radius: float = 0.0,
+    rates: Any = None,
 ) -> list[Violation]:
     """Return what is said of a base that is at (x, y, yaw) at `TIMES`; with `rates` it moves along cubics."""
     positions = np.asarray(rows, float)
@@ -39,7 +49,13 @@ def test_a_step_aside_is_named_where_it_begins(step: int, sign: float) -> None:
     rows[:, 0] = [0.0, 1.0, 2.0, 3.0]
     rows[step + 1 :, 1] = sign * 0.01
     (one,) = found(rows)
-    assert (one.constraint, one.subject, one.waypoint, one.time, one.unit) == ("slip", "base", step, TIMES[step], "m")
+    assert (one.constraint, one.subject, one.waypoint, one.time, one.unit) == (
+        "slip",
+        "base",
+        step,
+        TIMES[step],
+        "m",
+    )
     assert one.amount == pytest.approx(0.01)
     assert one.detail == "the base slips sideways by 10.00 mm in a step"
     for base in ("omni", "fixed"):
@@ -70,13 +86,18 @@ def test_a_turn_takes_a_way() -> None:
     (one,) = found(rows, base="ackermann", radius=2.0)
     assert (one.constraint, one.waypoint, one.time, one.unit) == ("turning", 1, 1.0, "m")
     assert one.amount == pytest.approx(1.0)
-    assert one.detail == "the base drives 1000.00 mm in a step less than its turn takes at a radius of 2 m"
+    assert (
+        one.detail
+        == "the base drives 1000.00 mm in a step less than its turn requires at a radius of 2 m"
+    )
     assert found(rows) == []
     rows[2:, 0], rows[2:, 1] = 2.0 * np.sin(0.5), 2.0 * (1.0 - np.cos(0.5))
     short = 2.0 * 0.5 - 2.0 * 2.0 * np.sin(0.25)  # the chord is shorter than the arc
     (one,) = found(rows, base="ackermann", radius=2.0)
     assert one.amount == pytest.approx(short)
-    assert found(rows * [-1.0, 1.0, -1.0], base="ackermann", radius=1.9) == []  # backwards, and turning to the right
+    assert (
+        found(rows * [-1.0, 1.0, -1.0], base="ackermann", radius=1.9) == []
+    )  # backwards, and turning to the right
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from vkc_pin.errors import InputError
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.hold import Hold, holds_of
-from vkc_pin.scene.scene import Scene
-from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MOST, Samples
+from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MAX_SAMPLES, Samples
+from vkc_pin.world.scene.hold import Hold, make_holds
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 VIRTUAL = {
     "grip": (),
@@ -33,11 +33,23 @@ VIRTUAL = {
 
 def motion(scene: Scene, seed: int, *, grasp: str = "grip", number: int = 5) -> Trajectory:
     rng = np.random.default_rng(seed)
-    objects = [f"{name}.{joint}" for name, placed in scene.objects.items() for joint in placed.object.coordinates.names]
-    names = (*scene.robot.coordinates.names, *objects, *(f"cabinet.{name}" for name in VIRTUAL[grasp]))
-    positions = rng.uniform(-1.0, 1.0, (number, len(names))) * rng.choice([0.0, 0.01, 1.0], len(names))
+    objects = [
+        f"{name}.{joint}"
+        for name, placed in scene.objects.items()
+        for joint in placed.object.coordinates.names
+    ]
+    names = (
+        *scene.robot.coordinates.names,
+        *objects,
+        *(f"cabinet.{name}" for name in VIRTUAL[grasp]),
+    )
+    positions = rng.uniform(-1.0, 1.0, (number, len(names))) * rng.choice(
+        [0.0, 0.01, 1.0], len(names)
+    )
     phases = (PhaseSpan("all", 0, number - 1, (Hold("cabinet", grasp),)),)
-    return Trajectory(names, np.cumsum(rng.uniform(0.1, 2.0, number)), positions, phases, len(scene.start))
+    return Trajectory(
+        names, np.cumsum(rng.uniform(0.1, 2.0, number)), positions, phases, len(scene.start)
+    )
 
 
 def test_joints_that_follow_others_are_seen_as_often(tmp_path: Path) -> None:
@@ -46,9 +58,14 @@ def test_joints_that_follow_others_are_seen_as_often(tmp_path: Path) -> None:
     rows = np.tile(scene.start, (3, 1))
     rows[1:, 3:] += [[0.4, 0.0, 0.0], [0.4, 0.1, 0.9]]
     names, phases = scene.robot.coordinates.names, (PhaseSpan("all", 0, 2, ()),)
-    samples = Samples(scene, Trajectory(names, np.array([0.0, 1.0, 2.0]), rows, phases, len(scene.start)))
+    samples = Samples(
+        scene, Trajectory(names, np.array([0.0, 1.0, 2.0]), rows, phases, len(scene.start))
+    )
     steps = np.abs(np.diff(samples.z, axis=0)).max(axis=0)
-    goes = {str(samples.world.model.names[m.joint]): abs(m.factor) * steps[m.coordinate] for m in samples.world.coordinates.moves}
+    goes = {
+        str(samples.world.model.names[m.joint]): abs(m.factor) * steps[m.coordinate]
+        for m in samples.world.coordinates.moves
+    }
     assert goes["roll_joint"] == pytest.approx(ANGLE_STEP, rel=0.05)
     assert goes["pitch_joint"] <= ANGLE_STEP
     assert goes["lift"] == pytest.approx(LENGTH_STEP, rel=0.05)
@@ -61,8 +78,8 @@ def test_a_motion_that_jumps_is_seen_at_its_waypoints(jump: float) -> None:
     positions = trajectory.positions.copy()
     positions[2:, 1] += jump
     samples = Samples(scene, dataclasses.replace(trajectory, positions=positions))
-    assert samples.needed == pytest.approx(jump / LENGTH_STEP, rel=1e-2)
-    assert samples.needed > MOST
+    assert samples.required_count == pytest.approx(jump / LENGTH_STEP, rel=1e-2)
+    assert samples.required_count > MAX_SAMPLES
     np.testing.assert_array_equal(samples.times, trajectory.times)
     np.testing.assert_array_equal(samples.waypoint_rows, np.arange(len(trajectory.times)))
 
@@ -90,11 +107,17 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
     assert np.linalg.norm(steps[:, :2], axis=1).max() <= LENGTH_STEP * (1 + 1e-6)
     assert (LENGTH_STEP, ANGLE_STEP) == (5e-3, 1e-2)
     np.testing.assert_allclose(samples.times[samples.waypoint_rows], trajectory.times, atol=1e-12)
-    np.testing.assert_allclose(samples.z[samples.waypoint_rows], samples.world.positions(trajectory), atol=1e-9)
+    np.testing.assert_allclose(
+        samples.z[samples.waypoint_rows], samples.world.compute_positions(trajectory), atol=1e-9
+    )
     assert (np.diff(samples.times) > 0).all()
-    assert [samples.waypoint(int(row)) for row in samples.waypoint_rows] == list(range(len(trajectory.times)))
-    assert all(samples.waypoint(int(row) - 1) == t for t, row in enumerate(samples.waypoint_rows[1:]))
-    assert [samples.unit(name) == "m" for name in trajectory.names] == lengths.tolist()
+    assert [samples.find_waypoint(int(row)) for row in samples.waypoint_rows] == list(
+        range(len(trajectory.times))
+    )
+    assert all(
+        samples.find_waypoint(int(row) - 1) == t for t, row in enumerate(samples.waypoint_rows[1:])
+    )
+    assert [samples.get_unit(name) == "m" for name in trajectory.names] == lengths.tolist()
 
 
 @settings(max_examples=40, deadline=None)
@@ -111,27 +134,48 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
     value = {name: trajectory.column(f"cabinet.{name}")[0] for name in VIRTUAL[grasp]}
     freedom = pin.SE3.Identity()
     if attachment.joint in ("prismatic", "cylindrical"):
-        freedom.translation = attachment.freedoms[0].axis * value.get("rail", value.get("sleeve_slide", 0.0))
+        freedom.translation = attachment.freedoms[0].axis * value.get(
+            "rail", value.get("sleeve_slide", 0.0)
+        )
     if attachment.joint in ("revolute", "cylindrical"):
         turn = attachment.freedoms[-1].axis * value.get("bar", value.get("sleeve_turn", 0.0))
         freedom.rotation = Rotation.from_rotvec(turn).as_matrix()
     elif attachment.joint == "spherical":
-        freedom.rotation = Rotation.from_euler("XYZ", [value[f"{grasp}_{axis}"] for axis in "xyz"]).as_matrix()
+        freedom.rotation = Rotation.from_euler(
+            "XYZ", [value[f"{grasp}_{axis}"] for axis in "xyz"]
+        ).as_matrix()
     freedom.translation = freedom.translation - attachment.standoff * freedom.rotation[:, 2]
-    state = np.array([trajectory.column(f"cabinet.{joint}")[0] for joint in placed.object.coordinates.names])
+    state = np.array(
+        [trajectory.column(f"cabinet.{joint}")[0] for joint in placed.object.coordinates.names]
+    )
     hand = placed.object.link_placement(attachment.link, state) * attachment.placement * freedom
-    here = with_objects(scene, {"cabinet": dataclasses.replace(placed, placement=tool * hand.inverse())})
-    np.testing.assert_allclose(Samples(here, trajectory).grasp_errors("cabinet", grasp, np.array([0])), 0.0, atol=1e-7)
+    here = with_objects(
+        scene, {"cabinet": dataclasses.replace(placed, placement=tool * hand.inverse())}
+    )
+    np.testing.assert_allclose(
+        Samples(here, trajectory).compute_grasp_errors("cabinet", grasp, np.array([0])),
+        0.0,
+        atol=1e-7,
+    )
     shift, turn = rng.normal(size=3), rng.uniform(-1.0, 1.0, 3)
     off = tool * pin.SE3(pin.exp3(turn), shift)
-    there = with_objects(scene, {"cabinet": dataclasses.replace(placed, placement=off * hand.inverse())})
-    (errors,) = Samples(there, trajectory).grasp_errors("cabinet", grasp, np.array([0]))
+    there = with_objects(
+        scene, {"cabinet": dataclasses.replace(placed, placement=off * hand.inverse())}
+    )
+    (errors,) = Samples(there, trajectory).compute_grasp_errors("cabinet", grasp, np.array([0]))
     assert errors[0] == pytest.approx(np.linalg.norm(shift))
     assert errors[1] == pytest.approx(np.linalg.norm(turn))
 
 
 def test_what_a_hand_moves() -> None:
     samples = Samples(full_scene(), motion(full_scene(), 0))
-    assert samples.moved_by(()) == set()
-    assert samples.moved_by(holds_of({"cabinet": "grip"})) == {"cabinet.swing", "cabinet.slide"}
-    assert samples.moved_by(holds_of({"door": "handle", "drawer": "handle"})) == {"door.hinge", "door.knob", "drawer.slide"}
+    assert samples.find_driven_coordinates(()) == set()
+    assert samples.find_driven_coordinates(make_holds({"cabinet": "grip"})) == {
+        "cabinet.swing",
+        "cabinet.slide",
+    }
+    assert samples.find_driven_coordinates(make_holds({"door": "handle", "drawer": "handle"})) == {
+        "door.hinge",
+        "door.knob",
+        "drawer.slide",
+    }

@@ -14,20 +14,20 @@ from helpers.small_problems import door_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
-from vkc_pin.scene.scene import Scene
 from vkc_pin.validation import sweep as validation_sweep
-from vkc_pin.validation.distances import Solids
+from vkc_pin.validation.contact_windows import Window
+from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.sweep import Hit, sweep
-from vkc_pin.validation.touching import Window
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 
 def swept(scene: Scene, motion: Trajectory) -> tuple[PairTable, Samples, list[Hit]]:
     samples = Samples(scene, motion)
-    table = PairTable(scene, Solids(samples.world), motion, 0.02)
+    table = PairTable(scene, CollisionShapes(samples.world), motion, 0.02)
     return table, samples, list(sweep(table, samples.z, samples.waypoint_rows))
 
 
@@ -40,7 +40,9 @@ def test_no_pair_that_comes_close_is_left_out(seed: int, size: float) -> None:
         patch.setattr(validation_sweep, "RESOLUTION", np.inf)  # at the samples alone
         table, samples, hits = swept(door, motion)
     distances = brute_force(table, samples.z)
-    assert min(hit.distance for hit in hits) == pytest.approx(distances.min(), abs=1e-5)  # as exact as coal is
+    assert min(hit.distance for hit in hits) == pytest.approx(
+        distances.min(), abs=1e-5
+    )  # as exact as coal is
     found = {(hit.row, hit.first, hit.second) for hit in hits}
     for row, k in np.argwhere(distances < -1e-5):
         assert (row, *pair_names(table, k)) in found
@@ -59,9 +61,14 @@ def test_the_closest_pair_of_every_waypoint_is_told() -> None:
     phases = (replace(one.phases[0], last=len(rows) - 1),)
     motion = replace(one, times=np.arange(len(rows)), positions=rows, phases=phases)
     world = World(door)
-    table, z = PairTable(door, Solids(world), motion, 0.02), world.positions(motion, motion.times)
-    robots = np.array([group == "robot" for group in table.group])
-    with_others = np.flatnonzero(robots[table.pairs].sum(axis=1) == 1)  # the robot is close to itself everywhere, as is the door
+    table, z = (
+        PairTable(door, CollisionShapes(world), motion, 0.02),
+        world.compute_positions(motion, motion.times),
+    )
+    robots = np.array([group == "robot" for group in table.groups])
+    with_others = np.flatnonzero(
+        robots[table.pairs].sum(axis=1) == 1
+    )  # the robot is close to itself everywhere, as is the door
     table.pairs, table.margins = table.pairs[with_others], table.margins[with_others]
     least = np.full(len(z), np.inf)
     for hit in sweep(table, z, np.arange(len(z))):
@@ -78,8 +85,10 @@ def test_nothing_slips_through_between_two_samples(seed: int, size: float) -> No
     door = door_scene()
     motion = wander(door, seed, size=size)
     table, samples, hits = swept(door, motion)
-    fine = np.unique(np.concatenate([np.linspace(a, b, 11) for a, b in itertools.pairwise(samples.times)]))
-    distances = brute_force(table, samples.world.positions(motion, fine))
+    fine = np.unique(
+        np.concatenate([np.linspace(a, b, 11) for a, b in itertools.pairwise(samples.times)])
+    )
+    distances = brute_force(table, samples.world.compute_positions(motion, fine))
     found = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     deep = {pair_names(table, k) for k in np.flatnonzero(distances.min(axis=0) < -1.001e-3)}
     assert deep <= found
@@ -93,7 +102,7 @@ def test_nothing_slips_through_even_without_samples(seed: int, size: float) -> N
     door = door_scene()
     motion = wander(door, seed, size=size)
     samples = Samples(door, motion)
-    table = PairTable(door, Solids(samples.world), motion, 0.02)
+    table = PairTable(door, CollisionShapes(samples.world), motion, 0.02)
     found = {
         (hit.row, hit.first, hit.second)
         for hit in sweep(table, samples.z[samples.waypoint_rows], np.arange(4))
@@ -108,11 +117,17 @@ def test_nothing_slips_through_even_without_samples(seed: int, size: float) -> N
 
 def test_a_wire_that_is_passed_between_two_samples() -> None:
     """Neither sample touches it, and they are far apart."""
-    wire = {"name": "wire", "type": "cylinder", "radius": 0.001, "length": 0.2, "position": [2.0, 0.0, 0.1]}
+    wire = {
+        "name": "wire",
+        "type": "cylinder",
+        "radius": 0.001,
+        "length": 0.2,
+        "position": [2.0, 0.0, 0.1],
+    }
     scene = hall(obstacles=[wire])
     motion = of_rows(scene, np.vstack([scene.start, moved(scene.start, x=4.0)]), dt=20.0)
     samples = Samples(scene, motion)
-    table = PairTable(scene, Solids(samples.world), motion, 0.02)
+    table = PairTable(scene, CollisionShapes(samples.world), motion, 0.02)
     hits = list(sweep(table, samples.z[[0, -1]], np.array([0, 1])))
     assert ("base_link", "wire") in {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     assert all(hit.distance > 1.0 for hit in hits if hit.at_waypoint and hit.second == "wire")
@@ -124,8 +139,10 @@ def test_nothing_carried_that_comes_close_is_left_out(seed: int, size: float) ->
     """Whatever overlaps by more than a millimetre anywhere, five times as finely seen, is found."""
     scene, motion = whirl(seed, size=size)
     table, samples, hits = swept(scene, motion)
-    fine = np.unique(np.concatenate([np.linspace(a, b, 6) for a, b in itertools.pairwise(samples.times)]))
-    distances = brute_force(table, samples.world.positions(motion, fine))
+    fine = np.unique(
+        np.concatenate([np.linspace(a, b, 6) for a, b in itertools.pairwise(samples.times)])
+    )
+    distances = brute_force(table, samples.world.compute_positions(motion, fine))
     found = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     deep = {pair_names(table, k) for k in np.flatnonzero(distances.min(axis=0) < -1.001e-3)}
     assert deep <= found
@@ -133,21 +150,30 @@ def test_nothing_carried_that_comes_close_is_left_out(seed: int, size: float) ->
 
 
 @pytest.mark.parametrize(
-    ("overlap", "together", "before"), [(None, False, 0), (0.0, True, 0), (0.0, True, 1), (0.0, False, 0), (1e-4, False, 0)]
+    ("overlap", "together", "before"),
+    [(None, False, 0), (0.0, True, 0), (0.0, True, 1), (0.0, False, 0), (1e-4, False, 0)],
 )
-def test_what_may_touch_is_not_passed_through_between_two_samples(overlap: float | None, together: bool, before: int) -> None:
+def test_what_may_touch_is_not_passed_through_between_two_samples(
+    overlap: float | None, together: bool, before: int
+) -> None:
     """A stick through a fence that it lay beside; neither sample touches it. Only a hand is known to move with what it holds."""
     fence = box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
     scene = room(fence)
     down = reaching(tool_at(STICK), above(STICK))
-    motion = Script(scene).go(down).take("stick").go(moved_base(down, y=1.0), steps=1).motion(dt=10.0)
+    motion = (
+        Script(scene).go(down).take("stick").go(moved_base(down, y=1.0), steps=1).motion(dt=10.0)
+    )
     world = World(scene)
     labels = world.collision_labels
     post = labels.index("fence")
     pairs = np.array([(i, post) for i in range(post) if labels[i] in ("stick.stick", "stick.tip")])
-    near = [] if overlap is None else [Window(pairs, 0, len(motion.times) - 1 - before, 0.0, overlap, together)]
-    table = PairTable(scene, Solids(world), motion, 0.02, windows=near)
-    hits = list(sweep(table, world.positions(motion), np.arange(len(motion.times))))
+    near = (
+        []
+        if overlap is None
+        else [Window(pairs, 0, len(motion.times) - 1 - before, 0.0, overlap, together)]
+    )
+    table = PairTable(scene, CollisionShapes(world), motion, 0.02, windows=near)
+    hits = list(sweep(table, world.compute_positions(motion), np.arange(len(motion.times))))
     assert all(hit.distance > 0.0 for hit in hits if hit.at_waypoint and hit.second == "fence")
     through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}
     if together and not before:  # as for a hand and what it grasps, until it lets go
@@ -165,7 +191,11 @@ def test_what_stands_in_something_is_told_of_at_every_sample() -> None:
     _, samples, hits = swept(scene, motion)
     first, last = samples.waypoint_rows[1:3]
     assert last - first > 3, "there is nothing to look at: turn the arm further"
-    rows = {hit.row for hit in hits if (hit.first, hit.second) == ("base_link", "box") and hit.distance < 0}
+    rows = {
+        hit.row
+        for hit in hits
+        if (hit.first, hit.second) == ("base_link", "box") and hit.distance < 0
+    }
     assert rows >= set(range(first, last + 1))
 
 
@@ -173,7 +203,14 @@ def test_what_lies_still_is_not_looked_at_again() -> None:
     """A stick that is put down on its table goes on touching it while the robot drives away."""
     scene = room(table(gap=5e-4))
     down = reaching(tool_at(STICK), above(STICK))
-    script = Script(scene).go(down).take("stick").go(moved_base(down, y=0.05), steps=1).go(down, steps=1).let_go("stick")
+    script = (
+        Script(scene)
+        .go(down)
+        .take("stick")
+        .go(moved_base(down, y=0.05), steps=1)
+        .go(down, steps=1)
+        .let_go("stick")
+    )
     motion = script.go(moved_base(down, x=-1.0), steps=3).motion()
     resting = swept(scene, motion)[2]
     last = motion.phases[-1]
@@ -183,4 +220,6 @@ def test_what_lies_still_is_not_looked_at_again() -> None:
     assert pair, "it touches nothing: choose another way of putting it down"
     samples = Samples(scene, motion)
     begin = samples.waypoint_rows[last.first]
-    assert not [hit for hit in resting if hit.row > begin and frozenset((hit.first, hit.second)) in pair]
+    assert not [
+        hit for hit in resting if hit.row > begin and frozenset((hit.first, hit.second)) in pair
+    ]

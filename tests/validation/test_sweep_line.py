@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from vkc_pin.validation import sweep as module
-from vkc_pin.validation.sweep import RESOLUTION, Hit, _least, sweep
+from vkc_pin.validation.sweep import RESOLUTION, Hit, _find_group_minima, sweep
 
 
 class Line:
-    """Stands for `PairTable` and its `Solids`: a point at z[:, 0], another at z[:, 1], and balls that stand at some places.
+    """Fake of `PairTable` and `CollisionShapes`: points at z[:, 0] and z[:, 1], and fixed balls.
 
     Attributes:
         asked: At which states distances were asked for, in turn, and of which pairs.
@@ -29,14 +29,20 @@ class Line:
     ) -> None:
         self.balls = balls
         self.pairs = np.array([(point, 2 + k) for k in range(len(balls)) for point in (0, 1)])
-        self.margins, self.group = np.full(len(self.pairs), margin), [""] * (2 + len(balls))
-        self.own, self.contact, self.together = margins or {}, contact or {}, together or set()
+        self.margins, self.groups = np.full(len(self.pairs), margin), [""] * (2 + len(balls))
+        self.own, self.contact, self.moves_together = (
+            margins or {},
+            contact or {},
+            together or set(),
+        )
         labels = ["one", "two", *(f"ball_{k}" for k in range(len(balls)))]
-        self.world = SimpleNamespace(coordinates=SimpleNamespace(q=lambda z: z), collision_labels=labels)
+        self.world = SimpleNamespace(
+            coordinates=SimpleNamespace(q=lambda z: z), collision_labels=labels
+        )
         self.solids: Any = self
         self.asked: list[tuple[float, ...]] = []
 
-    def at(self, q: np.ndarray) -> Any:
+    def place(self, q: np.ndarray) -> Any:
         def distances(states: np.ndarray, pairs: np.ndarray) -> np.ndarray:
             point, ball = pairs[:, 0], pairs[:, 1] - 2
             where = q[states, point]
@@ -44,41 +50,52 @@ class Line:
             balls = np.array(self.balls)
             return np.abs(where - balls[ball, 0]) - balls[ball, 1]
 
-        class Placed:
+        class PlacedShapes:
             __len__ = staticmethod(lambda: len(q))
 
-        placed: Any = Placed()
-        placed.distances = distances
+        placed: Any = PlacedShapes()
+        placed.compute_distances = distances
         return placed
 
-    def near(self, placed: Any, first: np.ndarray, last: np.ndarray, moved: np.ndarray, limit: float) -> Any:
+    def find_close_pairs(
+        self, placed: Any, first: np.ndarray, last: np.ndarray, moved: np.ndarray, limit: float
+    ) -> Any:
         k = np.repeat(np.arange(len(first)), len(self.pairs))
         return k, np.tile(np.arange(len(self.pairs)), len(first))
 
-    def margins_at(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
-        return np.array([self.own.get((int(p), int(t)), self.margins[p]) for p, t in zip(pairs, at, strict=True)])
+    def get_margins(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return np.array(
+            [
+                self.own.get((int(p), int(t)), self.margins[p])
+                for p, t in zip(pairs, at, strict=True)
+            ]
+        )
 
-    def contact_at(self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    def get_contact_overlaps(
+        self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray
+    ) -> np.ndarray:
         spans = zip(pairs.tolist(), first.tolist(), last.tolist(), strict=True)
         return np.array([self.contact.get(span, 0.0) for span in spans])
 
-    def exempt_at(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def find_exempt(self, pairs: np.ndarray, at: np.ndarray) -> np.ndarray:
         return np.zeros(len(pairs), bool)
 
-    def together_at(self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    def find_moving_together(
+        self, pairs: np.ndarray, first: np.ndarray, last: np.ndarray
+    ) -> np.ndarray:
         spans = zip(pairs.tolist(), first.tolist(), last.tolist(), strict=True)
-        return np.array([span in self.together for span in spans], bool)
+        return np.array([span in self.moves_together for span in spans], bool)
 
 
 @pytest.fixture(autouse=True)
 def _as_far_as_they_go(monkeypatch: pytest.MonkeyPatch) -> None:
     """How far shapes move at most: the points as far as they do, balls not at all."""
 
-    def travelled(line: Line, z: np.ndarray) -> np.ndarray:
+    def bound_displacements(line: Line, z: np.ndarray) -> np.ndarray:
         way = np.cumsum(np.abs(np.diff(z, axis=0, prepend=z[:1])), axis=0)
         return np.column_stack([way, np.zeros((len(z), len(line.balls)))])
 
-    monkeypatch.setattr(module, "travelled", travelled)
+    monkeypatch.setattr(module, "bound_displacements", bound_displacements)
 
 
 def swept(line: Line, z: Any, waypoints: list[int], aside: float = 50.0) -> list[Hit]:
@@ -119,8 +136,12 @@ def test_between_waypoints_overlaps_are_told_at_every_sample() -> None:
     line = Line((1.0, 0.05))
     z = np.linspace(0.0, 2.0, 201)
     hits = [hit for hit in swept(line, z, [0, 200]) if not hit.at_waypoint]
-    inside = {round(float(z[hit.row]), 2): round(hit.distance, 6) for hit in hits if hit.distance < -1e-9}
-    assert inside == {round(x, 2): round(abs(x - 1.0) - 0.05, 6) for x in np.arange(0.96, 1.045, 0.01)}
+    inside = {
+        round(float(z[hit.row]), 2): round(hit.distance, 6) for hit in hits if hit.distance < -1e-9
+    }
+    assert inside == {
+        round(x, 2): round(abs(x - 1.0) - 0.05, 6) for x in np.arange(0.96, 1.045, 0.01)
+    }
     assert {hit.second for hit in hits} == {"ball_0"}
 
 
@@ -165,7 +186,10 @@ def test_nothing_slips_between_a_sample_and_the_next(radius: float, told: bool |
         inside = [hit for hit in hits if hit.distance < 0.0]
         if told:
             assert inside
-            assert all((hit.row, hit.at_waypoint, hit.first, hit.second) == (0, False, "one", "ball_0") for hit in inside)
+            assert all(
+                (hit.row, hit.at_waypoint, hit.first, hit.second) == (0, False, "one", "ball_0")
+                for hit in inside
+            )
             assert len(inside) == 1  # one place says so
         assert all(hit.distance >= -radius - 1e-12 for hit in hits)
 
@@ -180,7 +204,11 @@ def test_what_is_in_contact_or_moves_as_one_may_be_in_between() -> None:
     touching = Line((0.5, 0.1), contact={(0, 0, 1): 0.05})
     hits = [hit for hit in swept(touching, [0.44, 0.56], [0, 1]) if not hit.at_waypoint]
     assert [(hit.row, round(hit.distance, 9), hit.contact) for hit in hits] == [(0, -0.1, 0.05)]
-    assert [hit for hit in swept(Line(thin, together={(0, 0, 1)}), [0.0, 1.0, 2.0], [0, 1, 2]) if hit.distance < 0.0] == []
+    assert [
+        hit
+        for hit in swept(Line(thin, together={(0, 0, 1)}), [0.0, 1.0, 2.0], [0, 1, 2])
+        if hit.distance < 0.0
+    ] == []
     other = Line(thin, together={(0, 1, 2), (0, 0, 0)})
     assert [hit for hit in swept(other, [0.0, 1.0, 2.0], [0, 1, 2]) if hit.distance < 0.0] != []
 
@@ -199,6 +227,6 @@ def test_at_a_waypoint_the_contact_is_that_of_the_waypoint_and_between_that_of_b
 def test_of_each_group_the_smallest_and_of_these_the_first() -> None:
     groups = np.array([3, 1, 3, 1, 0, 3])
     values = np.array([0.5, 0.2, 0.1, 0.2, 9.0, 0.1])
-    assert _least(groups, values).tolist() == [4, 1, 2]
-    assert _least(np.zeros(0, int), np.zeros(0)).tolist() == []
-    assert _least(np.array([1, 1]), np.array([1.0, 0.0])).tolist() == [1]
+    assert _find_group_minima(groups, values).tolist() == [4, 1, 2]
+    assert _find_group_minima(np.zeros(0, int), np.zeros(0)).tolist() == []
+    assert _find_group_minima(np.array([1, 1]), np.array([1.0, 0.0])).tolist() == [1]

@@ -5,7 +5,9 @@ import pytest
 
 from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
 
-MOTION = np.array([[x, y, z] for x in np.linspace(-1, 3, 9) for y in (-0.5, 0.5) for z in (0.0, 1.5)])
+MOTION = np.array(
+    [[x, y, z] for x in np.linspace(-1, 3, 9) for y in (-0.5, 0.5) for z in (0.0, 1.5)]
+)
 
 
 def test_all_of_the_motion_is_in_the_picture() -> None:

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.visualization.room import Room
+from vkc_pin.world.scene.scene import Scene, load_scene
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,12 @@ def test_what_counts_as_a_wall(room: Room) -> None:
 
 def test_walls_show_their_side_towards_the_room(room: Room) -> None:
     inside = {part.name: part for part in room.parts() if part.name.endswith("/inside")}
-    normals = {"wall_west": [1, 0, 0], "wall_south": [0, 1, 0], "wall_north": [0, -1, 0], "hall_wall": [-1, 0, 0]}
+    normals = {
+        "wall_west": [1, 0, 0],
+        "wall_south": [0, 1, 0],
+        "wall_north": [0, -1, 0],
+        "hall_wall": [-1, 0, 0],
+    }
     for name, normal in normals.items():
         part = inside[f"walls/{name}/inside"]
         assert np.allclose(part.solid.normals, normal)

@@ -20,10 +20,10 @@ from helpers.fake_plan import HINGE, fake_plan
 from helpers.pages import clips, commands_of
 
 from vkc_pin.errors import InputError
-from vkc_pin.motion.world import World
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.scene import Scene, load_scene
 from vkc_pin.visualization import viewer as visualization
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.trajectory.world_model import World
 
 needs_chromium = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
 
@@ -51,8 +51,13 @@ def shots(page: Path) -> dict[float, np.ndarray]:
 def picture(page: Path, moment: float) -> np.ndarray:
     from PIL import Image
 
-    for budget in (6.0, 20.0):  # see browser.document: on a busy machine the first may end before anything is drawn
-        file = browser.screenshot(page, page.with_name(f"{moment}.png"), time=moment, size=(800, 500), budget=budget)
+    for budget in (
+        6.0,
+        20.0,
+    ):  # see browser.document: on a busy machine the first may end before anything is drawn
+        file = browser.screenshot(
+            page, page.with_name(f"{moment}.png"), time=moment, size=(800, 500), budget=budget
+        )
         pixels = np.asarray(Image.open(file).convert("RGB"), int)
         if len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100:
             break
@@ -73,10 +78,20 @@ def vertices(item: dict[str, Any]) -> np.ndarray:
 
 def test_page_has_robot_door_walls_paths_and_ghosts(commands: list[dict[str, Any]]) -> None:
     things = drawn(commands)
-    robot, door = ("forearm_link", "gripper_link", "base_link"), ("door/frame", "hinge/panel", "knob/lever")
+    robot, door = (
+        ("forearm_link", "gripper_link", "base_link"),
+        ("door/frame", "hinge/panel", "knob/lever"),
+    )
     for part in (*robot, *door, "wall_west", "sofa", "floor", "grid"):
         assert any(part in path for path in things), part
-    for path in ("paths/tool", "paths/base", "ghosts/start/robot", "ghosts/end/robot", "ghosts/start/door", "ghosts/end/door"):
+    for path in (
+        "paths/tool",
+        "paths/base",
+        "ghosts/start/robot",
+        "ghosts/end/robot",
+        "ghosts/start/door",
+        "ghosts/end/door",
+    ):
         assert f"/meshcat/{path}" in things
     arm = [vertices(item) for path, item in things.items() if "forearm_link" in path]
     assert sum(len(points) for points in arm) > 3000, "the arm's real meshes"
@@ -84,7 +99,16 @@ def test_page_has_robot_door_walls_paths_and_ghosts(commands: list[dict[str, Any
 
 def test_robot_is_drawn_in_several_colours(commands: list[dict[str, Any]]) -> None:
     things = drawn(commands)
-    assert len({item["materials"][0]["color"] for path, item in things.items() if path.startswith("/meshcat/robot/")}) >= 5
+    assert (
+        len(
+            {
+                item["materials"][0]["color"]
+                for path, item in things.items()
+                if path.startswith("/meshcat/robot/")
+            }
+        )
+        >= 5
+    )
 
 
 def test_walls_let_one_look_in(commands: list[dict[str, Any]]) -> None:
@@ -93,11 +117,17 @@ def test_walls_let_one_look_in(commands: list[dict[str, Any]]) -> None:
         outside = things[f"/meshcat/room/walls/{name}/outside"]["materials"][0]
         assert outside["transparent"]
         assert outside["opacity"] < 0.2
-        assert things[f"/meshcat/room/walls/{name}/inside"]["materials"][0]["side"] == 0, "seen from the room only"
-    assert things["/meshcat/room/walls/wall_left_of_door/sides"]["materials"][0]["opacity"] < 0.5, "stands between two rooms"
+        assert things[f"/meshcat/room/walls/{name}/inside"]["materials"][0]["side"] == 0, (
+            "seen from the room only"
+        )
+    assert things["/meshcat/room/walls/wall_left_of_door/sides"]["materials"][0]["opacity"] < 0.5, (
+        "stands between two rooms"
+    )
 
 
-def test_ghosts_stand_where_the_motion_starts_and_ends(commands: list[dict[str, Any]], plan: Plan) -> None:
+def test_ghosts_stand_where_the_motion_starts_and_ends(
+    commands: list[dict[str, Any]], plan: Plan
+) -> None:
     things = drawn(commands)
     for name, row in (("start", 0), ("end", -1)):
         middle = vertices(things[f"/meshcat/ghosts/{name}/robot"]).mean(axis=0)
@@ -154,9 +184,13 @@ def test_names_that_look_alike_are_drawn_apart(tmp_path: Path) -> None:
 
 def test_frames_are_drawn_where_they_are(tmp_path: Path) -> None:
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.4, 2.0), np.array([1.0, -0.5, 0.8]))
-    file = visualization.to_html(load_scene("door"), tmp_path / "frames.html", frames={"door.hinge": placement})
+    file = visualization.to_html(
+        load_scene("door"), tmp_path / "frames.html", frames={"door.hinge": placement}
+    )
     commands = commands_of(file.read_text(encoding="utf-8"))
-    things = {path: item for path, item in drawn(commands).items() if path.startswith("/meshcat/frames/")}
+    things = {
+        path: item for path, item in drawn(commands).items() if path.startswith("/meshcat/frames/")
+    }
     assert set(things) == {f"/meshcat/frames/door.hinge/{axis}" for axis in "xyz"}
     for axis, item in things.items():
         column = "xyz".index(axis[-1])
@@ -166,7 +200,11 @@ def test_frames_are_drawn_where_they_are(tmp_path: Path) -> None:
         red, green, blue = (item["materials"][0]["color"] >> shift & 255 for shift in (16, 8, 0))
         assert int(np.argmax([red, green, blue])) == column
         assert item["materials"][0]["depthTest"] is False
-    (stands,) = (c["matrix"] for c in commands if c["type"] == "set_transform" and c["path"] == "/meshcat/frames/door.hinge")
+    (stands,) = (
+        c["matrix"]
+        for c in commands
+        if c["type"] == "set_transform" and c["path"] == "/meshcat/frames/door.hinge"
+    )
     assert np.allclose(np.reshape(stands, (4, 4)).T, placement.homogeneous)
 
 
@@ -180,26 +218,42 @@ def test_animation_takes_as_long_as_the_motion(commands: list[dict[str, Any]], p
             assert (np.diff(times) > 0).all()
 
 
-def test_interpolated_frames_are_the_motion_itself(commands: list[dict[str, Any]], plan: Plan) -> None:
+def test_interpolated_frames_are_the_motion_itself(
+    commands: list[dict[str, Any]], plan: Plan
+) -> None:
     """Joint by joint as three.js does it: positions linear, quaternions along the great circle."""
     world = World(plan.scene)
     data = world.model.createData()
-    moving, still = clips(commands), {c["path"]: c["matrix"] for c in commands if c["type"] == "set_transform"}
+    moving, still = (
+        clips(commands),
+        {c["path"]: c["matrix"] for c in commands if c["type"] == "set_transform"},
+    )
     shift = pin.SE3(np.array(still["/meshcat"]).reshape(4, 4).T)
     for moment in (0.0, 0.33, 2.9, 3.05, 4.4, 5.9, 6.0):
-        (row,) = world.positions(plan.trajectory, [moment])
+        (row,) = world.compute_positions(plan.trajectory, [moment])
         pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
-        for path in (p for p in moving if p.startswith(("/meshcat/robot/", "/meshcat/objects/")) and "<object>" not in p):
+        for path in (
+            p
+            for p in moving
+            if p.startswith(("/meshcat/robot/", "/meshcat/objects/")) and "<object>" not in p
+        ):
             nodes = path.split("/")
             placement = pin.SE3.Identity()
             for depth in range(2, len(nodes) + 1):
-                placement = placement * local_placement("/".join(nodes[:depth]), moment, moving, still)
+                placement = placement * local_placement(
+                    "/".join(nodes[:depth]), moment, moving, still
+                )
             name = nodes[-1] if nodes[2] == "robot" else f"{nodes[3]}.{nodes[-1]}"
             expected = shift * data.oMi[world.model.getJointId(name)]
-            assert np.allclose(placement.homogeneous, expected.homogeneous, atol=1e-5), (name, moment)
+            assert np.allclose(placement.homogeneous, expected.homogeneous, atol=1e-5), (
+                name,
+                moment,
+            )
 
 
-def local_placement(path: str, moment: float, moving: dict[str, Any], still: dict[str, Any]) -> pin.SE3:
+def local_placement(
+    path: str, moment: float, moving: dict[str, Any], still: dict[str, Any]
+) -> pin.SE3:
     placement = pin.SE3(np.array(still.get(path, np.eye(4).ravel())).reshape(4, 4).T)
     for track in moving.get(path, {"tracks": []})["tracks"]:
         times = np.array([key["time"] for key in track["keys"]])
@@ -209,7 +263,9 @@ def local_placement(path: str, moment: float, moving: dict[str, Any], still: dic
         if track["name"] == ".position":
             placement.translation = (1 - part) * values[i] + part * values[i + 1]
         elif track["name"] == ".quaternion":
-            placement.rotation = pin.Quaternion(values[i]).slerp(part, pin.Quaternion(values[i + 1])).matrix()
+            placement.rotation = (
+                pin.Quaternion(values[i]).slerp(part, pin.Quaternion(values[i + 1])).matrix()
+            )
     return placement
 
 
@@ -222,11 +278,17 @@ def test_ghosts_hide_while_the_real_thing_is_there(commands: list[dict[str, Any]
 
 
 def test_offending_links_turn_red_at_that_time(commands: list[dict[str, Any]]) -> None:
-    red = {path: clip["tracks"][0] for path, clip in clips(commands).items() if clip["tracks"][0]["type"] == "color"}
+    red = {
+        path: clip["tracks"][0]
+        for path, clip in clips(commands).items()
+        if clip["tracks"][0]["type"] == "color"
+    }
     assert red
     assert all("forearm_link" in path for path in red)
     for track in red.values():
-        alarms = [key["time"] for key in track["keys"] if key["value"][0] > 0.85 and key["value"][1] < 0.1]
+        alarms = [
+            key["time"] for key in track["keys"] if key["value"][0] > 0.85 and key["value"][1] < 0.1
+        ]
         assert alarms
         assert all(abs(moment - 4.0) < 0.5 for moment in alarms)
 
@@ -253,7 +315,9 @@ def test_page_says_what_the_motion_is(page: Path, plan: Plan) -> None:
     assert "rejected" in film["headline"]
 
 
-def test_page_is_written_whole_or_not_at_all(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_is_written_whole_or_not_at_all(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     target = tmp_path / "door.html"
     target.write_text("before")
     monkeypatch.setattr("vkc_pin.visualization.viewer._packed", lambda data: 1 / 0)
@@ -272,7 +336,10 @@ def test_names_cannot_break_out_of_the_page() -> None:
 
 
 def test_what_cannot_be_shown(plan: Plan, tmp_path: Path) -> None:
-    for call in (lambda: visualization.show("door"), lambda: visualization.to_html(None, tmp_path / "x.html")):  # type: ignore[arg-type]
+    for call in (
+        lambda: visualization.show("door"),
+        lambda: visualization.to_html(None, tmp_path / "x.html"),
+    ):  # type: ignore[arg-type]
         with pytest.raises(InputError, match="Plan or a Scene"):
             call()
     with pytest.raises(InputError, match="Plan"):
@@ -285,7 +352,10 @@ def test_what_cannot_be_shown(plan: Plan, tmp_path: Path) -> None:
 def test_in_a_notebook_the_view_is_part_of_it(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(visualization, "in_notebook", lambda: True)
     cell = visualization.show(plan, height=300)._repr_html_()
-    match = re.fullmatch(r'<div><iframe srcdoc="([^"]*)" style="[^"]*height: 300px[^"]*" title="door"></iframe></div>', cell)
+    match = re.fullmatch(
+        r'<div><iframe srcdoc="([^"]*)" style="[^"]*height: 300px[^"]*" title="door"></iframe></div>',
+        cell,
+    )
     assert match
     assert len(drawn(commands_of(html.unescape(match[1])))) > 50
 
@@ -300,8 +370,16 @@ def viewer(plan: Plan) -> Iterator[Any]:
 
 def listening(port: int) -> set[str]:
     """Return the local addresses, as hexadecimal numbers, at which somebody listens on `port`."""
-    lines = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]]
-    return {where for where, at in (line[1].split(":") for line in lines if line[3] == "0A") if int(at, 16) == port}
+    lines = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
+    ]
+    return {
+        where
+        for where, at in (line[1].split(":") for line in lines if line[3] == "0A")
+        if int(at, 16) == port
+    }
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").is_file(), reason="needs /proc")
@@ -312,9 +390,18 @@ def test_server_listens_on_loopback_only(viewer: Any) -> None:
         assert listening(port) == {"0100007F"}, address
 
 
-def answer(port: int, host: str | None, *more: str, path: str = "/static/", version: str = "1.1") -> int:
+def answer(
+    port: int, host: str | None, *more: str, path: str = "/static/", version: str = "1.1"
+) -> int:
     """Return the status that the server answers a request with."""
-    lines = [f"GET {path} HTTP/{version}", *([] if host is None else [f"Host: {host}"]), "Connection: close", *more, "", ""]
+    lines = [
+        f"GET {path} HTTP/{version}",
+        *([] if host is None else [f"Host: {host}"]),
+        "Connection: close",
+        *more,
+        "",
+        "",
+    ]
     if more:
         lines.remove("Connection: close")
     with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
@@ -335,9 +422,19 @@ def test_server_is_for_this_machine_only_by_whatever_name_it_is_asked(viewer: An
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
     )
     assert answer(port, f"localhost:{port}", *upgrade, path="/") == 101
-    assert answer(port, f"localhost:{port}", *upgrade, f"Origin: http://localhost:{port}", path="/") == 101
-    for origin in ("http://evil.example", f"http://evil.example:{port}", "http://localhost:1", "null"):
-        assert answer(port, f"localhost:{port}", *upgrade, f"Origin: {origin}", path="/") == 403, origin
+    assert (
+        answer(port, f"localhost:{port}", *upgrade, f"Origin: http://localhost:{port}", path="/")
+        == 101
+    )
+    for origin in (
+        "http://evil.example",
+        f"http://evil.example:{port}",
+        "http://localhost:1",
+        "null",
+    ):
+        assert answer(port, f"localhost:{port}", *upgrade, f"Origin: {origin}", path="/") == 403, (
+            origin
+        )
     for host in (
         "evil.example",
         f"evil.example:{port}",
@@ -436,11 +533,18 @@ def test_browser_shows_each_thing_where_it_is_at_that_time(page: Path, plan: Pla
     assert told["sun"]
     world = World(plan.scene)
     data = world.model.createData()
-    (row,) = world.positions(plan.trajectory, [moment])
+    (row,) = world.compute_positions(plan.trajectory, [moment])
     pin.forwardKinematics(world.model, data, world.coordinates.q(row))
-    for name, joint in (("wrist_3_joint", "wrist_3_joint"), ("base", "base"), ("hinge", "door.hinge"), ("knob", "door.knob")):
+    for name, joint in (
+        ("wrist_3_joint", "wrist_3_joint"),
+        ("base", "base"),
+        ("hinge", "door.hinge"),
+        ("knob", "door.knob"),
+    ):
         seen = np.array(told["seen"][name]).reshape(4, 4).T
-        assert np.allclose(seen, data.oMi[world.model.getJointId(joint)].homogeneous, atol=1e-4), name
+        assert np.allclose(seen, data.oMi[world.model.getJointId(joint)].homogeneous, atol=1e-4), (
+            name
+        )
     assert 0.1 < row[world.coordinates.index("door.hinge")] < HINGE
 
 

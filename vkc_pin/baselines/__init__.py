@@ -1,4 +1,4 @@
-"""Planners that treat base and arm one after the other: what the virtual kinematic chain is compared with."""
+"""Plans base and arm separately, by the methods B1 and B2 of the paper."""
 
 from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 

@@ -1,6 +1,7 @@
 """Inverse kinematics of the arm alone: base and object stand where they were planned to, and the hand must close the chain.
 
-By the differential inverse kinematics of Pink (https://github.com/stephane-caron/pink), with joint limits.
+By the differential inverse kinematics of Pink (https://github.com/stephane-caron/pink), with joint
+limits.
 """
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats, Ints
-from vkc_pin.budget import spend
-from vkc_pin.chain.inverse_kinematics import LONGEST_STEP
-from vkc_pin.program.merit import TOLERANCE
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.seeds.knots import Knots
+from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler
+from vkc_pin.planning.nlp.merit import TOLERANCE
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
 
 __all__ = ["QP", "ArmKinematics"]
 
@@ -32,22 +33,24 @@ class ArmKinematics:
         columns: The coordinates that it decides: the arm's joints, and the freedoms of its grasps.
     """
 
-    def __init__(self, problem: TrajectoryProblem, knots: Knots) -> None:
+    def __init__(self, problem: TrajectoryProblem, knots: KeyframeSampler) -> None:
         self.problem, self.knots = problem, knots
         chain = problem.chain
         virtual = [chain.index(name) for names in chain.virtual.values() for name in names]
-        self.columns = np.array([*range(3, knots.robot), *virtual], int)
+        self.columns = np.array([*range(3, knots.robot_size), *virtual], int)
         self._models: dict[int, pin.Model] = {}
 
     def solve(self, z: Floats, waypoint: int) -> tuple[Floats, bool]:
         """Return the configuration that iterations from `z`, shape (n,), lead to, and whether it closes the chain there."""
         import pink
 
-        pose = self.knots.pose_at(waypoint)
+        pose = self.knots.find_pose(waypoint)
         if pose is None:
             return z, True
         model, chain = self._model(pose), self.problem.chain
-        task = pink.tasks.FrameTask(_FRAME, position_cost=1.0, orientation_cost=1.0, lm_damping=1e-3)
+        task = pink.tasks.FrameTask(
+            _FRAME, position_cost=1.0, orientation_cost=1.0, lm_damping=1e-3
+        )
         task.set_target(self.problem.targets[pose])
         box = _Box(self.columns, chain.lower, chain.upper, z.copy())
         configuration = pink.Configuration(model, model.createData(), chain.coordinates.q(box.z))
@@ -56,7 +59,9 @@ class ArmKinematics:
             if np.abs(task.compute_error(configuration)).max() < TOLERANCE:
                 return box.z, True
             try:
-                step = pink.solve_ik(configuration, [task], 1.0, QP, damping=1e-9, limits=[box], safety_break=False)
+                step = pink.solve_ik(
+                    configuration, [task], 1.0, QP, damping=1e-9, limits=[box], safety_break=False
+                )
             except pink.exceptions.NoSolutionFound:
                 break
             box.take(step)
@@ -66,7 +71,10 @@ class ArmKinematics:
     def _model(self, pose: int) -> pin.Model:
         """Return the chain's model with a frame for what must be at the target of a pose."""
         if pose not in self._models:
-            row, model = self.problem.transcription.structure.poses[pose], pin.Model(self.problem.chain.model)
+            row, model = (
+                self.problem.transcription.structure.poses[pose],
+                pin.Model(self.problem.chain.model),
+            )
             model.addFrame(pin.Frame(_FRAME, row.joint, row.local, pin.FrameType.OP_FRAME))
             self._models[pose] = model
         return self._models[pose]
@@ -89,6 +97,6 @@ class _Box:
         """Return G and h of G·δz ≤ h, shapes (2n, n) and (2n,)."""
         most, least = np.zeros(len(self.z)), np.zeros(len(self.z))
         at = self.columns
-        most[at] = np.clip(self.upper[at] - self.z[at], 0.0, LONGEST_STEP)
-        least[at] = np.clip(self.lower[at] - self.z[at], -LONGEST_STEP, 0.0)
+        most[at] = np.clip(self.upper[at] - self.z[at], 0.0, MAX_STEP)
+        least[at] = np.clip(self.lower[at] - self.z[at], -MAX_STEP, 0.0)
         return self._rows, np.concatenate([most, -least])

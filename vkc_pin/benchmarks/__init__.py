@@ -1,1 +1,1 @@
-"""The experiments, each with every trial on record."""
+"""Runs the experiments and records every trial."""

@@ -9,17 +9,21 @@ from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Compari
 from vkc_pin.benchmarks.comparison_report import compared_methods
 from vkc_pin.benchmarks.harness.charts import criteria_chart
 from vkc_pin.benchmarks.harness.record import Record
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.task.steps import Actuate
 
 __all__ = ["COMPARED_PLANNERS", "TASKS", "plan_trial", "report", "run"]
 
 TASKS = {
     "door": Assignment("corridor_door", (Actuate("door", {"hinge": 1.5}),), "push a door open"),
-    "drawer": Assignment("aisle_drawer", (Actuate("drawer", {"slide": 0.6}),), "pull a drawer open"),
+    "drawer": Assignment(
+        "aisle_drawer", (Actuate("drawer", {"slide": 0.6}),), "pull a drawer open"
+    ),
 }
 
 
-def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+def _draw(
+    records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]
+) -> list[str]:
     """Draw the criteria of every task as bars, <task>.png: success, efforts and planning time."""
     compared = compared_methods(methods)
     for task, name in tasks.items():

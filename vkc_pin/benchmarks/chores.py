@@ -19,11 +19,11 @@ from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, Solve, distribution, trial, values
 from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
 from vkc_pin.options import Options
-from vkc_pin.planning.chore import plan_chore
 from vkc_pin.planning.plan import Plan
-from vkc_pin.scene.rooms.clutter import cluttered
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, Grasp, Place, Step
+from vkc_pin.planning.planner import plan
+from vkc_pin.procedural.rooms.clutter import add_clutter
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 
 __all__ = ["CHORES", "Chore", "cluttered_home", "fetch", "home", "plan_trial", "report", "run"]
 
@@ -31,7 +31,10 @@ WINDOW = 2
 ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
 THINGS = 300  # in the cluttered home
 _AROUND = 0.2  # [m] around what the chore is about that stays free there
-_LIMITS = {**LIMITS, "effort": 4 * LIMITS["effort"]}  # eighteen steps take half a million units and more
+_LIMITS = {
+    **LIMITS,
+    "effort": 4 * LIMITS["effort"],
+}  # eighteen steps take half a million units and more
 
 _METHODS = {ONE_CALL: "in one call", STEP_BY_STEP: "step by step"}
 _SEEDS_ABOUT = (
@@ -89,23 +92,44 @@ def fetch(scene: Scene) -> list[Step]:
 
 def _box(name: str, *sides: tuple[float, float], colour: str = "white") -> dict[str, Any]:
     """Return a box as an obstacle, by where it begins and ends along x, y and z [m]."""
-    size, middle = [round(high - low, 4) for low, high in sides], [round((low + high) / 2.0, 5) for low, high in sides]
+    size, middle = (
+        [round(high - low, 4) for low, high in sides],
+        [round((low + high) / 2.0, 5) for low, high in sides],
+    )
     return {"name": name, "type": "box", "size": size, "position": middle, "colour": colour}
 
 
 TIGHT: tuple[dict[str, Any], ...] = (
-    # The narrow door's leaf stands 50 mm in the wall above it, and 20 mm in that beside its hinge, wherever it is.
+    # The narrow door's leaf stands 50 mm in the wall above it, and 20 mm in that beside its hinge,
+    # wherever it is.
     _box("casing_above", (1.105, 2.01), (1.2, 1.3), (1.945, 2.07), colour="wall"),
     _box("casing_beside", (1.105, 1.22), (1.2, 1.3), (0.0, 2.07), colour="wall"),
-    # The refrigerator's door touches the panel on its hinge's side, and is 9 mm from that beside the kitchen.
+    # The refrigerator's door touches the panel on its hinge's side, and is 9 mm from that beside
+    # the kitchen.
     _box("panel_east", (-1.255, -1.235), (3.354, 4.0), (0.0, 2.1)),
     _box("panel_west", (-1.889, -1.859), (3.3, 4.0), (0.0, 2.1)),
-    # 10 mm from the narrow door's levers: a bag that hangs from its frame, and a wardrobe, once the door is open as far as asked.
+    # 10 mm from the narrow door's levers: a bag that hangs from its frame, and a wardrobe, once the
+    # door is open as far as asked.
     _box("bag", (1.875, 1.985), (1.11, 1.19), (0.8, 1.04), colour="teal"),
     _box("wardrobe", (0.2, 1.099), (1.3, 1.9), (0.0, 2.0), colour="oak"),
-    # 10 mm from what is carried: a bottle behind the cup in the refrigerator, a mop between broom and wall.
-    {"name": "bottle", "type": "cylinder", "radius": 0.035, "length": 0.25, "position": [-1.55, 3.64, 1.105], "colour": "green"},
-    {"name": "mop", "type": "cylinder", "radius": 0.0125, "length": 1.0, "position": [2.4, -3.935, 0.62], "colour": "blue"},
+    # 10 mm from what is carried: a bottle behind the cup in the refrigerator, a mop between broom
+    # and wall.
+    {
+        "name": "bottle",
+        "type": "cylinder",
+        "radius": 0.035,
+        "length": 0.25,
+        "position": [-1.55, 3.64, 1.105],
+        "colour": "green",
+    },
+    {
+        "name": "mop",
+        "type": "cylinder",
+        "radius": 0.0125,
+        "length": 1.0,
+        "position": [2.4, -3.935, 0.62],
+        "colour": "blue",
+    },
 )
 """What the home lacks to be as tight as real ones, as obstacles."""
 
@@ -114,9 +138,13 @@ TIGHT: tuple[dict[str, Any], ...] = (
 def cluttered_home() -> Scene:
     """Return the scene `household` as full as homes are: with `TIGHT` and 300 things more there are 561 convex shapes."""
     home, places = load_scene("household"), (BAR_TABLE, DESK, CLEAR, BIN)
-    with warnings.catch_warnings(action="ignore", category=UserWarning):  # of leaves in their walls, which are meant
-        tight = Scene.from_document({**home.document, "obstacles": [*home.document["obstacles"], *TIGHT]}, home.folder)
-        return cluttered(tight, THINGS, clear=[(place, _AROUND) for place in places])
+    with warnings.catch_warnings(
+        action="ignore", category=UserWarning
+    ):  # of leaves in their walls, which are meant
+        tight = Scene.from_document(
+            {**home.document, "obstacles": [*home.document["obstacles"], *TIGHT]}, home.folder
+        )
+        return add_clutter(tight, THINGS, clear=[(place, _AROUND) for place in places])
 
 
 @dataclass(frozen=True)
@@ -149,7 +177,14 @@ CHORES = {
 def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
     """Plan the chore of one trial."""
     chore = CHORES[spec["scene"]]
-    return plan_chore(scene, chore.steps(scene), window=WINDOW, options=chore.options, seed=spec["seed"], **_LIMITS)
+    return plan(
+        scene,
+        chore.steps(scene),
+        window=WINDOW,
+        options=chore.options,
+        seed=spec["seed"],
+        **_LIMITS,
+    )
 
 
 def run(
@@ -172,10 +207,12 @@ def run(
         seed: Of the starts and of planning.
         out: The folder; if it has trials of the same settings already, they are not run again.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         chores: Some of `CHORES`.
         seeds: How many seeds of planning there are to each start: `seed` and those that follow it.
-        step_by_step: Whether to plan the steps one by one as well, each from where the one before ends.
+        step_by_step: Whether to plan the steps one by one as well, each from where the one before
+            ends.
         progress: Whether to show a progress bar.
         solve: What plans a trial in one call.
 
@@ -196,9 +233,29 @@ def run(
             base = (scene.sample_start(rng) if number else scene).start[:3].tolist()
             for own, method in itertools.product(range(seed, seed + seeds), methods):
                 key = f"{chore}/{number:04d}/{own:04d}/{method}"
-                specs.append({"key": key, "scene": chore, "number": number, "base": base, "seed": own, "method": method})
-    settings = {"benchmark": "chores", "seed": seed, "starts": trials, "seeds": seeds, "methods": methods, "chores": chores}
-    settings |= {"window": WINDOW, **_LIMITS, "steps": {name: list(map(str, CHORES[name].planned())) for name in chores}}
+                specs.append(
+                    {
+                        "key": key,
+                        "scene": chore,
+                        "number": number,
+                        "base": base,
+                        "seed": own,
+                        "method": method,
+                    }
+                )
+    settings = {
+        "benchmark": "chores",
+        "seed": seed,
+        "starts": trials,
+        "seeds": seeds,
+        "methods": methods,
+        "chores": chores,
+    }
+    settings |= {
+        "window": WINDOW,
+        **_LIMITS,
+        "steps": {name: list(map(str, CHORES[name].planned())) for name in chores},
+    }
     settings |= {"dist_safe": {name: CHORES[name].options.dist_safe for name in chores}}
     return runner.run(
         specs,
@@ -217,19 +274,39 @@ def report(result: Mapping[str, Any]) -> str:
     about, rows = result["meta"], []
     seeds, methods = about.get("seeds", 1), about.get("methods", [ONE_CALL])
     for chore in about["chores"]:
-        own = [record for record in result["trials"] if (record["scene"], record["method"]) == (chore, ONE_CALL)]
+        own = [
+            record
+            for record in result["trials"]
+            if (record["scene"], record["method"]) == (chore, ONE_CALL)
+        ]
         good = [record for record in own if record["success"]]
         planning, late = distribution(own, "planning_time")
         wall, _ = distribution(own, "wall_time")
-        efforts = (decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort", "duration"))
+        efforts = (
+            decimal(distribution(good, field)[0])
+            for field in ("base_effort", "arm_effort", "duration")
+        )
         number = str(len(about["steps"][chore]))
         times = (decimal(value) for value in (wall, planning, late))
         rows.append([chore, number, f"{len(good)} of {len(own)}", *times, *efforts, failures(own)])
-    head = ["chore", "steps", "success", "in all, median [s]", "planning, median [s]", "95th percentile [s]"]
+    head = [
+        "chore",
+        "steps",
+        "success",
+        "in all, median [s]",
+        "planning, median [s]",
+        "95th percentile [s]",
+    ]
     head += ["base [m]", "arm [rad]", "duration [s]", "failures"]
     fields = ("wall_time", "planning_time", "base_effort", "arm_effort")
     every = [
-        [record["scene"], str(record["number"]), str(record["seed"]), _METHODS[record["method"]], record["status"]]
+        [
+            record["scene"],
+            str(record["number"]),
+            str(record["seed"]),
+            _METHODS[record["method"]],
+            record["status"],
+        ]
         + [decimal(record.get(field) or float("nan")) for field in fields]
         for record in result["trials"]
     ]
@@ -246,7 +323,19 @@ def report(result: Mapping[str, Any]) -> str:
     parts += [
         "## Every trial",
         markdown(
-            ["chore", "start", "seed", "planned", "status", "in all [s]", "planning [s]", "base [m]", "arm [rad]"], every, text=5
+            [
+                "chore",
+                "start",
+                "seed",
+                "planned",
+                "status",
+                "in all [s]",
+                "planning [s]",
+                "base [m]",
+                "arm [rad]",
+            ],
+            every,
+            text=5,
         ),
         foot(about),
     ]
@@ -260,14 +349,29 @@ def _seeds_table(result: Mapping[str, Any]) -> str:
         groups.setdefault((record["scene"], record["number"], record["method"]), []).append(record)
     rows = []
     for (chore, number, method), own in groups.items():
-        good, steps = [record for record in own if record["success"]], len(result["meta"]["steps"][chore])
-        done = ", ".join("all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")) or "–"
+        good, steps = (
+            [record for record in own if record["success"]],
+            len(result["meta"]["steps"][chore]),
+        )
+        done = (
+            ", ".join("all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")) or "–"
+        )
         spent, spreads = values(own, "cpu_time"), list[str]()
         for effort in ("base_effort", "arm_effort"):
             found = values(good, effort)
             spreads += _apart(min(found), max(found)) if found else ["–"] * 3
         cpu = (decimal(float(np.median(spent))), decimal(max(spent))) if spent else ("–", "–")
-        rows.append([chore, str(number), _METHODS[method], f"{len(good)} of {len(own)}", done, *cpu, *spreads])
+        rows.append(
+            [
+                chore,
+                str(number),
+                _METHODS[method],
+                f"{len(good)} of {len(own)}",
+                done,
+                *cpu,
+                *spreads,
+            ]
+        )
     head = ["chore", "start", "planned", "success", "steps done", "CPU, median [s]", "most [s]"]
     head += ["base [m]", "spread [%]", "±[%]", "arm [rad]", "spread [%]", "±[%]"]
     return markdown(head, rows, text=3)
@@ -276,7 +380,10 @@ def _seeds_table(result: Mapping[str, Any]) -> str:
 def _apart(low: float, high: float) -> list[str]:
     """Return a range, by how much its end is more than its begin, and half of it over its middle, both in percent."""
     shares = (high / low - 1.0, (high - low) / (high + low)) if low > 0.0 else (np.nan, np.nan)
-    return [f"{low:.1f}–{high:.1f}", *("–" if np.isnan(share) else f"{100.0 * share:.0f}" for share in shares)]
+    return [
+        f"{low:.1f}–{high:.1f}",
+        *("–" if np.isnan(share) else f"{100.0 * share:.0f}" for share in shares),
+    ]
 
 
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
@@ -292,5 +399,8 @@ def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
         return {**stepwise.combined(plans, len(steps), **about, **more), "scene": spec["scene"]}
     plan = solve(scene, spec)
     more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
-    more |= {"duration": plan.trajectory.metrics()["duration"], "steps_done": len(steps) if plan.success else None}
+    more |= {
+        "duration": plan.trajectory.metrics()["duration"],
+        "steps_done": len(steps) if plan.success else None,
+    }
     return {**trial(plan, **about, **more), "scene": spec["scene"]}

@@ -23,12 +23,12 @@ from vkc_pin.benchmarks.harness.charts import motions_chart
 from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
 from vkc_pin.benchmarks.harness.record import Record, Solve, peaks, trial
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import write_atomically
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
-from vkc_pin.scene.poses import as_placement
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, GoTo, Place, Step
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.poses import as_placement
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, GoTo, Place, Step
 
 __all__ = ["COLD", "COMPARED_PLANNERS", "METHODS", "Assignment", "Comparison"]
 
@@ -49,7 +49,8 @@ class Assignment:
         scene: The scene's name.
         steps: What should change in it.
         name: To show.
-        scatter: Draws where objects stand, by name, (x, y, z, roll, pitch, yaw) [m, rad] each; None: all is as in the scene.
+        scatter: Draws where objects stand, by name, (x, y, z, roll, pitch, yaw) [m, rad] each;
+            None: all is as in the scene.
     """
 
     scene: str
@@ -79,32 +80,54 @@ class Comparison:
     def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
         """Plan the task of one trial: `scene` (the task's name), `method`, `seed`, `effort` and `planner` say how."""
         steps = self.tasks[spec["scene"]].steps
-        how: dict[str, Any] = {**LIMITS, **{key: spec[key] for key in ("effort", "planner") if key in spec}, "seed": spec["seed"]}
+        how: dict[str, Any] = {
+            **LIMITS,
+            **{key: spec[key] for key in ("effort", "planner") if key in spec},
+            "seed": spec["seed"],
+        }
         if spec["method"] == "VKC":
             return plan(scene, steps, **how)
         method, finer = WAYPOINTS.get(spec["method"], (spec["method"], FINER))
         return plan_separately(scene, steps, method=method, finer=finer, **how)
 
     def specify(
-        self, *, trials: int, seed: int, tasks: Sequence[str], methods: Sequence[str], effort: int = EFFORT
+        self,
+        *,
+        trials: int,
+        seed: int,
+        tasks: Sequence[str],
+        methods: Sequence[str],
+        effort: int = EFFORT,
     ) -> list[dict[str, Any]]:
         """Return the trials: every task, method and start, in this order, in which a process can keep what it has built.
 
-        A task's starts, and where its objects stand, depend on the seed and the task alone; start i is planned from with the
-        random seed `seed` + i.
+        A task's starts, and where its objects stand, depend on the seed and the task alone; start i
+        is planned from with the random seed `seed` + i.
         """
         specs = []
         for name in tasks:
             task = self.tasks[name]
-            rng, scene = np.random.default_rng([seed, list(self.tasks).index(name)]), _scene(self.load, task.scene)
+            rng, scene = (
+                np.random.default_rng([seed, list(self.tasks).index(name)]),
+                _scene(self.load, task.scene),
+            )
             starts: list[dict[str, Any]] = []
             for _ in range(trials):
                 more = {"placed": task.scatter(scene, rng)} if task.scatter else {}
-                starts.append({"base": placed(scene, more).sample_start(rng).start[:3].tolist(), **more})
+                starts.append(
+                    {"base": placed(scene, more).sample_start(rng).start[:3].tolist(), **more}
+                )
             for method in methods:
                 for number, start in enumerate(starts):
                     key = f"{name}/{number:04d}/{method}"
-                    spec = {"key": key, "scene": name, "method": method, "number": number, **start, "seed": seed + number}
+                    spec = {
+                        "key": key,
+                        "scene": name,
+                        "method": method,
+                        "number": number,
+                        **start,
+                        "seed": seed + number,
+                    }
                     specs.append({**spec, "effort": effort})
         return specs
 
@@ -125,8 +148,9 @@ class Comparison:
     ) -> dict[str, Any]:
         """Run the experiment, or what is left of it, and write its results, table and pictures to `out`.
 
-        They are results.json, results.csv and table.md; the experiment's charts; for every task <task>_joints.png (the motions of
-        one trial over time); the plans of that trial in shown/, and those of failures in failures/ if asked for.
+        They are results.json, results.csv and table.md; the experiment's charts; for every task
+        <task>_joints.png (the motions of one trial over time); the plans of that trial in shown/,
+        and those of failures in failures/ if asked for.
 
         Args:
             trials: Number of random starts per task, at least 1.
@@ -134,11 +158,13 @@ class Comparison:
             out: The folder; if it has trials of the same settings already, they are not run again.
             solve: What plans a trial; None: `plan_trial`.
             jobs: Number of processes.
-            scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+            scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+                `engine.results`.
             tasks: Some of the tasks; None: all.
             methods: Some of `METHODS`.
             effort: What each trial may take at most, in units of effort.
-            save_failures: Save the plan of every failure; those that ran before without this are planned once more.
+            save_failures: Save the plan of every failure; those that ran before without this are
+                planned once more.
             progress: Whether to show progress bars.
 
         Returns:
@@ -153,21 +179,42 @@ class Comparison:
         methods = runner.chosen("method", methods, METHODS)
         if trials < 1:
             raise InputError("out of range", field="trials", expected="at least 1", got=trials)
-        specs, out = self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods, effort=effort), Path(out)
-        settings = {"benchmark": self.benchmark, "seed": seed, "starts": trials, "tasks": tasks, "methods": methods}
+        specs, out = (
+            self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods, effort=effort),
+            Path(out),
+        )
+        settings = {
+            "benchmark": self.benchmark,
+            "seed": seed,
+            "starts": trials,
+            "tasks": tasks,
+            "methods": methods,
+        }
         settings["scenes"] = {name: self.tasks[name].scene for name in tasks}
         settings["goals"] = {name: goals(self.tasks[name].steps) for name in tasks}
         settings |= {**LIMITS, "effort": effort, "retries": RETRIES}
         trials_of = _Trials(self, out, solve or self.plan_trial, timed=solve is None)
         record = functools.partial(trials_of.record, save_failures=save_failures)
-        result = runner.run(specs, record, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
+        result = runner.run(
+            specs, record, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress
+        )
         saved = trials_of.saved(result["trials"], specs, again=save_failures, progress=progress)
         names = {name: self.tasks[name].name for name in tasks}
-        pictures = self.draw(result["trials"], out, names, methods) + trials_of.motions(result["trials"], specs)
-        write_atomically(out / "table.md", self.report(result, saved=saved, pictures=pictures).encode())
+        pictures = self.draw(result["trials"], out, names, methods) + trials_of.motions(
+            result["trials"], specs
+        )
+        write_atomically(
+            out / "table.md", self.report(result, saved=saved, pictures=pictures).encode()
+        )
         return result
 
-    def report(self, result: Mapping[str, Any], *, saved: Mapping[str, str] | None = None, pictures: Sequence[str] = ()) -> str:
+    def report(
+        self,
+        result: Mapping[str, Any],
+        *,
+        saved: Mapping[str, str] | None = None,
+        pictures: Sequence[str] = (),
+    ) -> str:
         """Return the tables of a result in Markdown; see `comparison_report.report`."""
         names = {name: self.tasks[name].name for name in result["meta"]["tasks"]}
         return report(result, names, title=self.title, saved=saved, pictures=pictures)
@@ -221,26 +268,56 @@ class _Trials:
         return trial(found, method=spec["method"], seed=spec["seed"], **own)
 
     def saved(
-        self, records: Sequence[Record], specs: Sequence[Mapping[str, Any]], *, again: bool, progress: bool
+        self,
+        records: Sequence[Record],
+        specs: Sequence[Mapping[str, Any]],
+        *,
+        again: bool,
+        progress: bool,
     ) -> dict[str, str]:
         """Return key → file of the failures whose plans are saved; with `again`, those that are not are planned again."""
-        failed = {record["key"] for record in records if not record["success"] and record["status"] != "error"}
-        files = {spec["key"]: self._file(spec, "failures") for spec in specs if spec["key"] in failed}
-        lost = [spec for spec in specs if spec["key"] in failed and not files[spec["key"]].is_file()] if again else []
+        failed = {
+            record["key"]
+            for record in records
+            if not record["success"] and record["status"] != "error"
+        }
+        files = {
+            spec["key"]: self._file(spec, "failures") for spec in specs if spec["key"] in failed
+        }
+        lost = (
+            [spec for spec in specs if spec["key"] in failed and not files[spec["key"]].is_file()]
+            if again
+            else []
+        )
         for spec in tqdm(lost, desc="failures", unit="plan", disable=not (progress and lost)):
             found = self._uninterrupted(spec)
             if not found.success:
                 found.save(files[spec["key"]])
-        return {key: path.relative_to(self.out).as_posix() for key, path in files.items() if path.is_file()}
+        return {
+            key: path.relative_to(self.out).as_posix()
+            for key, path in files.items()
+            if path.is_file()
+        }
 
     def motions(self, records: Sequence[Record], specs: Sequence[Mapping[str, Any]]) -> list[str]:
         """Draw the motions of one trial of every task in which a method succeeds in any; return the pictures in Markdown."""
         methods, pictures = tuple(dict.fromkeys(spec["method"] for spec in specs)), []
         for task in dict.fromkeys(spec["scene"] for spec in specs):
-            own, name = [record for record in records if record["scene"] == task], self.experiment.tasks[task].name
+            own, name = (
+                [record for record in records if record["scene"] == task],
+                self.experiment.tasks[task].name,
+            )
             if (number := shown(own, methods)) is not None:
-                plans = {s["method"]: self._kept(s) for s in specs if (s["scene"], s["number"]) == (task, number)}
-                motions_chart(plans, self.out / f"{task}_joints.png", title=f"{name.capitalize()}, trial {number}")
+                plans = {
+                    s["method"]: self._kept(s)
+                    for s in specs
+                    if (s["scene"], s["number"]) == (task, number)
+                }
+                motions_chart(
+                    plans,
+                    self.out / f"{task}_joints.png",
+                    title=f"{name.capitalize()}, trial {number}",
+                )
                 pictures.append(f"![Motions of trial {number}: {name}]({task}_joints.png)")
         return pictures
 
@@ -271,7 +348,9 @@ class _Trials:
         return found, {"wall_time": times.get("warm_time", 0.0), **times}
 
     def _plan(self, spec: Mapping[str, Any]) -> Plan:
-        scene = placed(_scene(self.experiment.load, self.experiment.tasks[spec["scene"]].scene), spec)
+        scene = placed(
+            _scene(self.experiment.load, self.experiment.tasks[spec["scene"]].scene), spec
+        )
         return self.solve(scene.with_start(base=spec["base"]), spec)
 
     def _file(self, spec: Mapping[str, Any], folder: str) -> Path:
@@ -289,4 +368,8 @@ def shown(records: Sequence[Record], methods: Sequence[str]) -> int | None:
     for record in records:
         if record["success"]:
             good.setdefault(int(record["number"]), set()).add(str(record["method"]))
-    return max(sorted(good), key=lambda k: (len(good[k]) == len(methods), "VKC" in good[k], len(good[k])), default=None)
+    return max(
+        sorted(good),
+        key=lambda k: (len(good[k]) == len(methods), "VKC" in good[k], len(good[k])),
+        default=None,
+    )

@@ -78,7 +78,9 @@ def report(
         *_calls(records, tasks, methods),
         *_budgets(about, records, tasks, methods),
         "## Efforts, peaks and durations where all methods succeed",
-        "Mean ± standard deviation; median. Trials in which all methods succeed: " + _numbers(records, tasks, compared) + ".",
+        "Mean ± standard deviation; median. Trials in which all methods succeed: "
+        + _numbers(records, tasks, compared)
+        + ".",
         _criteria(records, tasks, compared, shared=True),
         *_pairwise(records, tasks, methods),
         "## Efforts, peaks and durations over each method's own successes",
@@ -87,19 +89,35 @@ def report(
         *pictures,
     ]
     if saved:
-        parts += ["## Failures", "`vkc-pin view FILE` shows them, links that come too close in red.", _failed(records, saved)]
+        parts += [
+            "## Failures",
+            "`vkc-pin view FILE` shows them, links that come too close in red.",
+            _failed(records, saved),
+        ]
     return "\n\n".join([*parts, foot(about)]) + "\n"
 
 
 def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
     rows = []
     for task, method in product([*tasks, "all"] if len(tasks) > 1 else tasks, methods):
-        own = [record for record in records if record["method"] == method and task in ("all", record["scene"])]
+        own = [
+            record
+            for record in records
+            if record["method"] == method and task in ("all", record["scene"])
+        ]
         good = sum(bool(record["success"]) for record in own)
         low, high = (f"{100.0 * end:.0f}" for end in wilson(good, len(own)))
         rate = f"{100.0 * good / len(own):.0f}" if own else "–"
         rows.append([task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", *timed_out(own)])
-    head = ["task", "method", "success", "[%]", "95 % interval (Wilson)", "timed out", "failures: cause (violated first)"]
+    head = [
+        "task",
+        "method",
+        "success",
+        "[%]",
+        "95 % interval (Wilson)",
+        "timed out",
+        "failures: cause (violated first)",
+    ]
     return markdown(head, rows, text=2)
 
 
@@ -109,13 +127,30 @@ def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
         for task, method in product(tasks, methods):
             own, reference = (_of(records, task, which, good=good) for which in (method, _OWN))
             (median, late), times = distribution(own, "planning_time"), values(own, "planning_time")
-            cells = (median, late, *mean_and_deviation(times), median / distribution(reference, "planning_time")[0])
+            cells = (
+                median,
+                late,
+                *mean_and_deviation(times),
+                median / distribution(reference, "planning_time")[0],
+            )
             rows.append([name, task, method, str(len(times)), *map(decimal, cells)])
-    head = ["over", "task", "method", "n", "median [s]", "95th percentile [s]", "mean [s]", "deviation [s]", f"to {_OWN}"]
+    head = [
+        "over",
+        "task",
+        "method",
+        "n",
+        "median [s]",
+        "95th percentile [s]",
+        "mean [s]",
+        "deviation [s]",
+        f"to {_OWN}",
+    ]
     return markdown(head, rows, text=3)
 
 
-def _calls(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+def _calls(
+    records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
+) -> list[str]:
     """Return a section on the time from call to plan, if it is on record."""
     rows = []
     for task, method in product(tasks, methods):
@@ -124,7 +159,15 @@ def _calls(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
             first = [decimal(distribution(own, field)[0]) for field in ("cold_time", "warm_time")]
             wall = [decimal(value) for value in distribution(own, "wall_time")]
             rows.append([task, method, str(len(values(own, "cold_time"))), *first, *wall])
-    head = ["task", "method", "calls twice", "cold, median [s]", "warm, median [s]", "all, median [s]", "95th percentile [s]"]
+    head = [
+        "task",
+        "method",
+        "calls twice",
+        "cold, median [s]",
+        "warm, median [s]",
+        "all, median [s]",
+        "95th percentile [s]",
+    ]
     text = (
         "By the clock, with everything. The first trials of a task are planned twice by a planner that has kept nothing: cold, "
         "with writing down the symbolic programs and loading or compiling them, and warm. All: as they come."
@@ -132,7 +175,12 @@ def _calls(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
     return ["## From call to plan", text, markdown(head, rows, text=2)] if rows else []
 
 
-def _budgets(about: Mapping[str, Any], records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+def _budgets(
+    about: Mapping[str, Any],
+    records: Sequence[Record],
+    tasks: Mapping[str, str],
+    methods: Sequence[str],
+) -> list[str]:
     """Return a section on what less effort would have led to, if effort was limited."""
     if "effort" not in about or not values(records, "effort"):
         return []
@@ -144,8 +192,16 @@ def _budgets(about: Mapping[str, Any], records: Sequence[Record], tasks: Mapping
         within = [sum(effort <= limit for effort in good) for _, limit in shares]
         gain = 100.0 * (within[-1] - within[-2]) / max(len(own), 1)
         most = f"{max(good) / about['effort']:.3f}" if good else "–"
-        rows.append([task, method, *(f"{number} of {len(own)}" for number in within), f"{gain:.0f}", most])
-    head = ["task", "method", *(name for name, _ in shares), "half as much again [points]", "most, as a share"]
+        rows.append(
+            [task, method, *(f"{number} of {len(own)}" for number in within), f"{gain:.0f}", most]
+        )
+    head = [
+        "task",
+        "method",
+        *(name for name, _ in shares),
+        "half as much again [points]",
+        "most, as a share",
+    ]
     text = (
         "Successes within shares of the budget. Effort only ends planning, so a success within a share is one with that as the "
         "budget, too; two thirds and half as much again are all of it."
@@ -158,11 +214,15 @@ def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
     numbers = []
     for task in tasks:
         own = [record for record in records if record["scene"] == task]
-        numbers.append(f"{len(common(own, methods))} of {len({record['number'] for record in own})} ({task})")
+        numbers.append(
+            f"{len(common(own, methods))} of {len({record['number'] for record in own})} ({task})"
+        )
     return ", ".join(numbers)
 
 
-def _criteria(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str], *, shared: bool) -> str:
+def _criteria(
+    records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str], *, shared: bool
+) -> str:
     """Return all criteria of all methods, over the trials that they share or over each method's own successes."""
     rows = []
     for task in tasks:
@@ -178,7 +238,9 @@ def _criteria(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequ
     return markdown(["task", "criterion", *methods], rows, text=2)
 
 
-def _pairwise(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+def _pairwise(
+    records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
+) -> list[str]:
     """Return a section on VKC against every other method, if it is one of several."""
     others = [method for method in methods if method != _OWN]
     if _OWN not in methods or not others:
@@ -188,7 +250,9 @@ def _pairwise(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequ
         for task in tasks:
             both = common([record for record in records if record["scene"] == task], (_OWN, other))
             for field, name in {**CRITERIA, "planning_time": "planning time [s]"}.items():
-                medians = (decimal(distribution([row[k] for row in both], field)[0]) for k in (0, 1))
+                medians = (
+                    decimal(distribution([row[k] for row in both], field)[0]) for k in (0, 1)
+                )
                 rows.append([task, name, other, *medians, f"{lower(both, field)} of {len(both)}"])
     head = ["task", "criterion", "other", f"{_OWN}, median", "other, median", f"lower with {_OWN}"]
     text = f"Over the trials in which {_OWN} and the other method succeed, whatever the third does."
@@ -200,7 +264,14 @@ def _failed(records: Sequence[Record], saved: Mapping[str, str]) -> str:
     for record in records:
         if record["key"] in saved:
             violated = record["violations"][0] if record["violations"] else "–"
-            cells = [record["scene"], record["number"], record["method"], record["status"], violated, f"`{saved[record['key']]}`"]
+            cells = [
+                record["scene"],
+                record["number"],
+                record["method"],
+                record["status"],
+                violated,
+                f"`{saved[record['key']]}`",
+            ]
             rows.append([str(cell) for cell in cells])
     return markdown(["task", "trial", "method", "cause", "violated first", "file"], rows, text=6)
 

@@ -1,7 +1,8 @@
 """Tasks at the door from random starts: reach its handle, the whole task, and pushing alone with the grasp given.
 
-The grasp is given twice: as the whole task's plan reaches it ("push"), and as a plan reaches it that only wants to grasp
-the turned lever ("push blind"), where the base stands wherever that was cheapest.
+The grasp is given twice: as the whole task's plan reaches it ("push"), and as a plan reaches it
+that only wants to grasp the turned lever ("push blind"), where the base stands wherever that was
+cheapest.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from vkc_pin.benchmarks.harness.record import distribution, meta, peak_memory, t
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, Grasp, Reach
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, Grasp, Reach
 
 __all__ = ["TASKS", "run", "table"]
 
@@ -58,8 +59,8 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}, one object a trial; the first trial of a task also pays for the symbolic build,
-        which is not part of its planning time.
+        {"meta": ..., "trials": [...]}, one object a trial; the first trial of a task also pays for
+        the symbolic build, which is not part of its planning time.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed.
@@ -82,7 +83,10 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
         record("push", push(start, seed, whole_plan) if whole_plan.success else whole_plan)
         grasp = plan(start.with_state("door", {"knob": TURNED}), [Grasp("door")], seed=seed)
         record("push blind", push(start, seed, grasp) if grasp.success else grasp)
-    return {"meta": meta(benchmark="door", seed=seed, trials=trials, peak_memory_mb=peak_memory()), "trials": records}
+    return {
+        "meta": meta(benchmark="door", seed=seed, trials=trials, peak_memory_mb=peak_memory()),
+        "trials": records,
+    }
 
 
 def table(result: dict[str, Any]) -> str:
@@ -97,7 +101,10 @@ def table(result: dict[str, Any]) -> str:
             continue
         good = sum(t["success"] for t in rows)
         time, late = distribution(rows, "planning_time")
-        split = (distribution(rows, f"time_{part}")[0] for part in ("initialization", "coal", "casadi", "ipopt", "validation"))
+        split = (
+            distribution(rows, f"time_{part}")[0]
+            for part in ("initialization", "coal", "casadi", "ipopt", "validation")
+        )
         lines.append(
             f"{task:12}{f'{good}/{len(rows)}':>10}{time:>18.3f}{late:>8.3f}"
             + "".join(f"{part:>8.3f}" for part in split)
@@ -107,5 +114,7 @@ def table(result: dict[str, Any]) -> str:
     lines.append(f"peak memory {result['meta']['peak_memory_mb']:.0f} MB")
     for t in result["trials"]:
         if not t["success"]:
-            lines.append(f"start {t['number']}, {t['task']}: {t['status']}; {'; '.join(t['violations']) or 'no violation'}")
+            lines.append(
+                f"start {t['number']}, {t['task']}: {t['status']}; {'; '.join(t['violations']) or 'no violation'}"
+            )
     return "\n".join(lines)

@@ -15,8 +15,8 @@ from vkc_pin.benchmarks.problems.ablation import SUMMARY, every_trial, summary
 from vkc_pin.benchmarks.problems.poses import random_start
 from vkc_pin.benchmarks.problems.trials import tried
 from vkc_pin.errors import InputError
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Reach
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Reach
 
 __all__ = ["POSE", "SCENE", "report", "run", "started"]
 
@@ -36,7 +36,13 @@ def started(seed: int, number: int) -> Scene:
 
 
 def run(
-    *, out: str | Path, trials: int = 50, seed: int = 0, jobs: int = 1, scheduler: str | None = None, progress: bool = True
+    *,
+    out: str | Path,
+    trials: int = 50,
+    seed: int = 0,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
 
@@ -45,7 +51,8 @@ def run(
         trials: Number of random starts, at least 1.
         seed: Of the starts and of planning.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -59,7 +66,16 @@ def run(
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     settings = {"benchmark": "gap", "seed": seed, "starts": trials, "pose": POSE, **LIMITS}
     specs = [{"key": f"{number:04d}", "number": number, "seed": seed} for number in range(trials)]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        _record,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:
@@ -80,4 +96,6 @@ def report(result: Mapping[str, Any]) -> str:
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     number, seed = spec["number"], spec["seed"]
-    return tried(started(seed, number), (Reach(POSE),), seed=seed, number=number, problem=f"{SCENE} {number}")
+    return tried(
+        started(seed, number), (Reach(POSE),), seed=seed, number=number, problem=f"{SCENE} {number}"
+    )

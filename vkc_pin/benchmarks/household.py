@@ -13,9 +13,9 @@ from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Compari
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import means_chart, success_chart
 from vkc_pin.benchmarks.harness.record import Record
-from vkc_pin.files.documents import read_yaml
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, GoTo, Place
+from vkc_pin.world.files.documents import read_yaml
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, GoTo, Place
 
 __all__ = [
     "COMPARED_PLANNERS",
@@ -37,63 +37,101 @@ _EDGE = 0.05  # [m] from the cup's axis, whose radius is 0.035, to the plate's e
 def on_the_coffee_table(scene: Scene, rng: np.random.Generator) -> dict[str, list[float]]:
     """Return the cup somewhere on the coffee table, as high as it stands in the scene, at any heading."""
     x, y = (float(rng.uniform(low + _EDGE, high - _EDGE)) for low, high in TABLE_TOP)
-    height, yaw = float(scene.objects["cup"].placement.translation[2]), float(rng.uniform(-np.pi, np.pi))
+    height, yaw = (
+        float(scene.objects["cup"].placement.translation[2]),
+        float(rng.uniform(-np.pi, np.pi)),
+    )
     return {"cup": [x, y, height, 0.0, 0.0, yaw]}
 
 
 TASKS = {
     "cup": Assignment(
-        "household", (Place("cup", (-0.6, -1.6, 0.751)),), "carry a cup to the dining table", scatter=on_the_coffee_table
+        "household",
+        (Place("cup", (-0.6, -1.6, 0.751)),),
+        "carry a cup to the dining table",
+        scatter=on_the_coffee_table,
     ),
     "door": Assignment(
         "household",
         (Actuate("door", {"hinge": 1.52}, attachment="handle_free"), GoTo(1.6, 2.5)),
         "push a narrow door open and drive through",
     ),
-    "drawer": Assignment("household", (Actuate("drawer", {"slide": 0.22}),), "pull a low drawer open in a corner"),
-    "dishwasher": Assignment("household", (Actuate("dishwasher", {"rack": 0.5}),), "pull a dishwasher's rack out"),
-    "refrigerator": Assignment("household", (Actuate("refrigerator", {"hinge": 1.57}),), "pull a refrigerator open"),
-    "cabinet": Assignment("household", (Actuate("cabinet", {"hinge": 0.4}),), "pull a cabinet open behind a chair"),
+    "drawer": Assignment(
+        "household", (Actuate("drawer", {"slide": 0.22}),), "pull a low drawer open in a corner"
+    ),
+    "dishwasher": Assignment(
+        "household", (Actuate("dishwasher", {"rack": 0.5}),), "pull a dishwasher's rack out"
+    ),
+    "refrigerator": Assignment(
+        "household", (Actuate("refrigerator", {"hinge": 1.57}),), "pull a refrigerator open"
+    ),
+    "cabinet": Assignment(
+        "household", (Actuate("cabinet", {"hinge": 0.4}),), "pull a cabinet open behind a chair"
+    ),
 }
 
 
-def _draw(records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]) -> list[str]:
+def _draw(
+    records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]
+) -> list[str]:
     """Draw success.png, base_effort.png, arm_effort.png and planning_time.png, each with all tasks and methods."""
     shown = {task: task for task in tasks}
     success_chart(records, out / "success.png", shown, methods, title="Success")
     pictures = ["![Success, with Wilson's intervals of 95 % confidence](success.png)"]
     for name, unit in (("base effort", "m"), ("arm effort", "rad"), ("planning time", "s")):
-        how: Any = {"field": name.replace(" ", "_"), "label": f"{name} [{unit}]", "shared": name.endswith("effort")}
+        how: Any = {
+            "field": name.replace(" ", "_"),
+            "label": f"{name} [{unit}]",
+            "shared": name.endswith("effort"),
+        }
         means_chart(records, out / f"{how['field']}.png", shown, methods, **how)
-        pictures.append(f"![{name.capitalize()}: means and standard deviations]({how['field']}.png)")
+        pictures.append(
+            f"![{name.capitalize()}: means and standard deviations]({how['field']}.png)"
+        )
     return pictures
 
 
 COMPARISON = Comparison("household", "Six tasks in a home", TASKS, _draw)
 
-# --- with the numbers of the paper's code -------------------------------------------------------------------------------
+# --- with the numbers of the paper's code
+# -------------------------------------------------------------------------------
 
 _PAPERS = "household, the paper's numbers"
 _TOP = 1.109  # [m] the dining table's upper face, 1 mm below the cup
-_RAIL = 0.8  # [m] by which the rack comes out. It is 0.4 deep, and begins 0.15 behind the face: at the end it hangs free
+# [m] by which the rack comes out. It is 0.4 deep, and begins 0.15 behind the face: at the end it
+# hangs free
+_RAIL = 0.8
 
 
 def papers_home() -> Scene:
     """Return the scene `household` with a table as high as the paper's code puts the cup down, and a rack that comes out as far.
 
-    A table of 1.11 is a bar table: it has the measures of that in the kitchen, 1.2 x 0.6. On one as deep as the dining table,
-    0.8, a level hand would find no place at its middle: the forearm would have to go through the plate.
+    A table of 1.11 is a bar table: it has the measures of that in the kitchen, 1.2 x 0.6. On one as
+    deep as the dining table, 0.8, a level hand would find no place at its middle: the forearm would
+    have to go through the plate.
     """
     home = load_scene("household")
     document = home.document
     (table,) = (item for item in document["obstacles"] if item["name"] == "dining_table")
     x, y, _ = table["position"]
-    shapes: list[dict[str, Any]] = [{"type": "box", "size": [1.2, 0.6, 0.03], "position": [x, y, _TOP - 0.015]}]
+    shapes: list[dict[str, Any]] = [
+        {"type": "box", "size": [1.2, 0.6, 0.03], "position": [x, y, _TOP - 0.015]}
+    ]
     for column in (x - 0.35, x + 0.35):
         height = _TOP - 0.03
-        shapes.append({"type": "cylinder", "radius": 0.035, "length": height, "position": [column, y, height / 2.0]})
+        shapes.append(
+            {
+                "type": "cylinder",
+                "radius": 0.035,
+                "length": height,
+                "position": [column, y, height / 2.0],
+            }
+        )
         shapes.append({"type": "box", "size": [0.2, 0.44, 0.02], "position": [column, y, 0.01]})
-    higher = [{"name": f"dining_table_{number}", **shape, "colour": "oak"} for number, shape in enumerate(shapes)]
+    higher = [
+        {"name": f"dining_table_{number}", **shape, "colour": "oak"}
+        for number, shape in enumerate(shapes)
+    ]
     document["obstacles"] = [item for item in document["obstacles"] if item is not table] + higher
     (dishwasher,) = (item for item in document["objects"] if item["name"] == "dishwasher")
     description = read_yaml(home.folder / "objects" / "dishwasher.yaml").data
@@ -136,7 +174,8 @@ def run(*, variant: str | None = None, **how: Any) -> dict[str, Any]:
     """Run the experiment, or what is left of it.
 
     Args:
-        variant: "paper": the tasks whose numbers are other than in the paper's code, with those; None: the tasks as they are.
+        variant: "paper": the tasks whose numbers are other than in the paper's code, with those;
+            None: the tasks as they are.
         **how: See `Comparison.run`; without `tasks`, the variant's are those that differ.
 
     Raises:
@@ -145,4 +184,6 @@ def run(*, variant: str | None = None, **how: Any) -> dict[str, Any]:
     if variant is None:
         return COMPARISON.run(**how)
     runner.chosen("variant", [variant], ["paper"])
-    return PAPER.run(**{"tasks": [name for name, task in PAPER.tasks.items() if task.scene == _PAPERS], **how})
+    return PAPER.run(
+        **{"tasks": [name for name, task in PAPER.tasks.items() if task.scene == _PAPERS], **how}
+    )

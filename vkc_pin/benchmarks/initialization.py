@@ -1,7 +1,7 @@
 """Methods of initialising the trajectory, compared at a task with a tool: take a stick and touch a cube under a table with it.
 
-Three scenes of growing difficulty, the same random starts for every method. For comparison, the same steps are planned one after
-the other instead of as one problem.
+Three scenes of growing difficulty, the same random starts for every method. For comparison, the
+same steps are planned one after the other instead of as one problem.
 """
 
 from __future__ import annotations
@@ -19,13 +19,22 @@ from vkc_pin.benchmarks.harness.charts import success_chart
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Solve, trial
 from vkc_pin.benchmarks.harness.tables import comparison_table, foot, methods_table
-from vkc_pin.files.writing import write_atomically
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Grasp, Touch
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Grasp, Touch
 
-__all__ = ["COMPARED_INITIALIZATIONS", "SCENES", "STEPWISE", "TARGET", "plan_trial", "report", "run", "specify"]
+__all__ = [
+    "COMPARED_INITIALIZATIONS",
+    "SCENES",
+    "STEPWISE",
+    "TARGET",
+    "plan_trial",
+    "report",
+    "run",
+    "specify",
+]
 
 SCENES = ("init_1", "init_2", "init_3")
 COMPARED_INITIALIZATIONS = ("stationary", "interpolated", "astar", "rrt", "auto")
@@ -41,17 +50,22 @@ def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
     """Plan the task of one trial: `method`, `perturbation` and `seed` say how."""
     how: dict[str, Any] = {
         "initialization": "auto" if spec["method"] == STEPWISE else spec["method"],
-        "joint": spec["method"] != STEPWISE,
+        "simultaneous": spec["method"] != STEPWISE,
         "perturbation": spec["perturbation"],
     }
-    return plan(scene, [Grasp("stick"), Touch("stick.tip", TARGET)], seed=spec["seed"], **LIMITS, **how)
+    return plan(
+        scene, [Grasp("stick"), Touch("stick.tip", TARGET)], seed=spec["seed"], **LIMITS, **how
+    )
 
 
-def specify(*, starts: int, repeats: int, seed: int, scenes: Sequence[str], methods: Sequence[str]) -> list[dict[str, Any]]:
+def specify(
+    *, starts: int, repeats: int, seed: int, scenes: Sequence[str], methods: Sequence[str]
+) -> list[dict[str, Any]]:
     """Return the trials: every scene, start, repeat and method, in this order.
 
-    A scene's starts depend on the seed and the scene alone. Repeat 0 starts from the seed trajectory as it is, the others from
-    perturbed ones. With "auto", the steps are also planned one after the other, once per start.
+    A scene's starts depend on the seed and the scene alone. Repeat 0 starts from the seed
+    trajectory as it is, the others from perturbed ones. With "auto", the steps are also planned one
+    after the other, once per start.
     """
     trials = []
     for scene in scenes:
@@ -60,10 +74,26 @@ def specify(*, starts: int, repeats: int, seed: int, scenes: Sequence[str], meth
         for start in range(starts):
             base = loaded.sample_start(rng).start[:3].tolist()
             for repeat in range(repeats):
-                for method in (*methods, *([STEPWISE] if "auto" in methods and repeat == 0 else [])):
+                for method in (
+                    *methods,
+                    *([STEPWISE] if "auto" in methods and repeat == 0 else []),
+                ):
                     key = f"{scene}/{start:04d}/{repeat:03d}/{method}"
-                    spec = {"key": key, "scene": scene, "method": method, "number": start, "repeat": repeat, "base": base}
-                    trials.append({**spec, "seed": seed + repeat, "perturbation": PERTURBATION if repeat else 0.0})
+                    spec = {
+                        "key": key,
+                        "scene": scene,
+                        "method": method,
+                        "number": start,
+                        "repeat": repeat,
+                        "base": base,
+                    }
+                    trials.append(
+                        {
+                            **spec,
+                            "seed": seed + repeat,
+                            "perturbation": PERTURBATION if repeat else 0.0,
+                        }
+                    )
     return trials
 
 
@@ -84,15 +114,18 @@ def run(
 
     Args:
         starts: Number of random starts per scene.
-        repeats: How often each start is tried, at least 1; all but the first with a perturbed seed trajectory.
+        repeats: How often each start is tried, at least 1; all but the first with a perturbed seed
+            trajectory.
         seed: Of the starts and of planning.
         out: The folder; if it has trials of the same settings already, they are not run again.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         scenes: Some of `SCENES`.
         methods: Some of `COMPARED_INITIALIZATIONS`.
         progress: Whether to show a progress bar.
-        solve: What plans a trial; another one may be given for other tasks, and then scenes may be any.
+        solve: What plans a trial; another one may be given for other tasks, and then scenes may be
+            any.
 
     Returns:
         {"meta": ..., "trials": [...]}; see `runner.run`.
@@ -105,10 +138,18 @@ def run(
     scenes = runner.chosen("scene", scenes, SCENES if solve is plan_trial else scenes)
     methods = runner.chosen("method", methods, COMPARED_INITIALIZATIONS)
     trials = specify(starts=starts, repeats=repeats, seed=seed, scenes=scenes, methods=methods)
-    settings = {"benchmark": "initialization", "seed": seed, "starts": starts, "repeats": repeats, "scenes": scenes}
+    settings = {
+        "benchmark": "initialization",
+        "seed": seed,
+        "starts": starts,
+        "repeats": repeats,
+        "scenes": scenes,
+    }
     settings |= {"methods": methods, "target": TARGET, **LIMITS, "perturbation": PERTURBATION}
     function = functools.partial(_record, solve=solve)
-    result = runner.run(trials, function, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
+    result = runner.run(
+        trials, function, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress
+    )
     write_atomically(Path(out) / "table.md", report(result).encode())
     title = f"Success by initialisation, {starts} starts{f', {repeats} trials from each' if repeats > 1 else ''}"
     success_chart(result["trials"], Path(out) / "success.png", _shown(scenes), methods, title=title)
@@ -119,7 +160,9 @@ def report(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown, with versions and machine at the foot."""
     about, records = result["meta"], result["trials"]
     scenes, methods = _shown(about["scenes"]), about["methods"]
-    several = f", {about['repeats']} trials from each, all but the first with a perturbed seed trajectory"
+    several = (
+        f", {about['repeats']} trials from each, all but the first with a perturbed seed trajectory"
+    )
     parts = [
         "# Initialising the trajectory",
         f"{about['starts']} random starts per scene{several if about['repeats'] > 1 else ''}; seed {about['seed']}, "

@@ -15,13 +15,13 @@ from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.tables import TIMES, decimal, foot, markdown, quartiles
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import write_atomically
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,28 +45,46 @@ class Axis:
 
 
 AXES = {
-    "obstacles": Axis((10, 30, 100, 300, 1000), 30, "Opening the door among more and more obstacles"),
+    "obstacles": Axis(
+        (10, 30, 100, 300, 1000), 30, "Opening the door among more and more obstacles"
+    ),
     "segments": Axis((20, 40, 80, 160, 320), 80, "Opening the door in more and more segments"),
 }
 """By the field of a trial's record."""
-_OPENED = {"obstacles": 1.2, "segments": 0.6}  # [rad] of the hinge: in 20 segments a hand does not hold a handle on a longer way
-_WEST, _EAST, _SOUTH, _NORTH, _HALL, _CEILING = -2.5, 2.5, -2.0, 2.0, 5.1, 2.4  # [m]: faces of the walls
+_OPENED = {
+    "obstacles": 1.2,
+    "segments": 0.6,
+}  # [rad] of the hinge: in 20 segments a hand does not hold a handle on a longer way
+_WEST, _EAST, _SOUTH, _NORTH, _HALL, _CEILING = (
+    -2.5,
+    2.5,
+    -2.0,
+    2.0,
+    5.1,
+    2.4,
+)  # [m]: faces of the walls
 
 
 def crowded(count: int, *, seed: int = 0) -> Scene:
     """Return scenes/door.yaml with so many obstacles: its walls, then its furniture, then small boxes that obstruct nobody.
 
-    These hang on walls and ceiling, stand along the walls or outside of the room. More of them come after the same ones.
+    These hang on walls and ceiling, stand along the walls or outside of the room. More of them come
+    after the same ones.
 
     Args:
         count: Number of obstacles, without the floor.
         seed: Of where they are.
     """
     scene = load_scene("door")
-    own = sorted(scene.document["obstacles"], key=lambda item: "wall" not in item["name"])  # keeps the order otherwise
+    own = sorted(
+        scene.document["obstacles"], key=lambda item: "wall" not in item["name"]
+    )  # keeps the order otherwise
     rng = np.random.default_rng(seed)
     boxes = [_box(rng, number) for number in range(count - len(own))]
-    return Scene.from_document({**scene.document, "name": f"door_{count}", "obstacles": [*own, *boxes][:count]}, scene.folder)
+    return Scene.from_document(
+        {**scene.document, "name": f"door_{count}", "obstacles": [*own, *boxes][:count]},
+        scene.folder,
+    )
 
 
 def _box(rng: np.random.Generator, number: int) -> dict[str, Any]:
@@ -85,20 +103,33 @@ def _box(rng: np.random.Generator, number: int) -> dict[str, Any]:
         (flat, (x, y, _CEILING - depth / 2)),
         (in_y, outside),
     )[rng.integers(7)]
-    return {"name": f"box_{number}", "type": "box", "size": list(map(float, size)), "position": list(map(float, position))}
+    return {
+        "name": f"box_{number}",
+        "type": "box",
+        "size": list(map(float, size)),
+        "position": list(map(float, position)),
+    }
 
 
 def refined(segments: int) -> Options:
     """Return options with which the task at the door has so many segments, 4 at least, and least times as the usual ones have."""
     usual = Options()
     whole = usual.reach_waypoints + usual.turn_waypoints + usual.move_waypoints
-    turn, move = (max(1, round(part / whole * segments)) for part in (usual.turn_waypoints, usual.move_waypoints))
+    turn, move = (
+        max(1, round(part / whole * segments))
+        for part in (usual.turn_waypoints, usual.move_waypoints)
+    )
     return Options(
-        reach_waypoints=segments - turn - move, turn_waypoints=turn, move_waypoints=move, dt=usual.dt * whole / segments
+        reach_waypoints=segments - turn - move,
+        turn_waypoints=turn,
+        move_waypoints=move,
+        dt=usual.dt * whole / segments,
     )
 
 
-def specify(*, starts: int, seed: int, counts: Sequence[int], of: str = "obstacles") -> list[dict[str, Any]]:
+def specify(
+    *, starts: int, seed: int, counts: Sequence[int], of: str = "obstacles"
+) -> list[dict[str, Any]]:
     """Return the trials: from every start all numbers of one of `AXES` in turn, so that they meet the same machine.
 
     A start is free among as many obstacles as there are in any trial.
@@ -107,7 +138,13 @@ def specify(*, starts: int, seed: int, counts: Sequence[int], of: str = "obstacl
     rng, scene = np.random.default_rng(seed), _crowded(most)
     bases = [scene.sample_start(rng).start[:3].tolist() for _ in range(starts)]
     return [
-        {"key": f"{number:04d}/{count:06d}", of: count, "number": number, "base": base, "seed": seed}
+        {
+            "key": f"{number:04d}/{count:06d}",
+            of: count,
+            "number": number,
+            "base": base,
+            "seed": seed,
+        }
         for number, base in enumerate(bases)
         for count in counts
     ]
@@ -126,23 +163,28 @@ def run(
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and scale.png to `out`.
 
-    It is the whole task at the door: drive up, grasp, turn the knob, push, by 1.2 rad among obstacles and by 0.6 rad in segments.
+    It is the whole task at the door: drive up, grasp, turn the knob, push, by 1.2 rad among
+    obstacles and by 0.6 rad in segments.
 
     Args:
         starts: Number of random starts, the same for all numbers.
         seed: Of the starts and of planning.
         out: The folder; if it has trials of the same settings already, they are not run again.
         jobs: Number of processes. Several slow each other down, and times are what this is about.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
-        of: What there is more and more of, "obstacles" or "segments"; the latter among 30 obstacles.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
+        of: What there is more and more of, "obstacles" or "segments"; the latter among 30
+            obstacles.
         counts: How many; None: those of `AXES`.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}, each trial with its number of `obstacles` or `segments`; see `runner.run`.
+        {"meta": ..., "trials": [...]}, each trial with its number of `obstacles` or `segments`; see
+        `runner.run`.
 
     Raises:
-        InputError: `of` is unknown, a number is less than 1 (of segments: less than 4), or `out` has trials of other settings.
+        InputError: `of` is unknown, a number is less than 1 (of segments: less than 4), or `out`
+            has trials of other settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
     if of not in AXES:
@@ -150,10 +192,21 @@ def run(
     counts = sorted(set(AXES[of].counts if counts is None else counts))
     least = 4 if of == "segments" else 1
     if not counts or counts[0] < least:
-        raise InputError("out of range", field="counts", expected=f"numbers of at least {least}", got=counts)
+        raise InputError(
+            "out of range", field="counts", expected=f"numbers of at least {least}", got=counts
+        )
     trials = specify(starts=starts, seed=seed, counts=counts, of=of)
-    settings = {"benchmark": "scale", "of": of, "seed": seed, "starts": starts, "counts": counts, **LIMITS}
-    result = runner.run(trials, _record, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress)
+    settings = {
+        "benchmark": "scale",
+        "of": of,
+        "seed": seed,
+        "starts": starts,
+        "counts": counts,
+        **LIMITS,
+    }
+    result = runner.run(
+        trials, _record, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress
+    )
     write_atomically(Path(out) / "table.md", report(result).encode())
     scale_chart(result["trials"], Path(out) / "scale.png", of=of, title=AXES[of].title)
     return result
@@ -164,13 +217,25 @@ def report(result: Mapping[str, Any]) -> str:
     about = result["meta"]
     of = about["of"]
     usual = AXES[of].usual
-    timed = [record for record in result["trials"] if record.get("planning_time") is not None]  # all but errors
+    timed = [
+        record for record in result["trials"] if record.get("planning_time") is not None
+    ]  # all but errors
     few = {record["number"]: record["planning_time"] for record in timed if record[of] == usual}
     rows = []
     for count in about["counts"]:
-        everyone, own = ([r for r in records if r[of] == count] for records in (result["trials"], timed))
-        ratios = [record["planning_time"] / few[record["number"]] for record in own if record["number"] in few]
-        numbers = (*distribution(own, "planning_time"), quartiles(ratios)[1], *(distribution(own, part)[0] for part in TIMES))
+        everyone, own = (
+            [r for r in records if r[of] == count] for records in (result["trials"], timed)
+        )
+        ratios = [
+            record["planning_time"] / few[record["number"]]
+            for record in own
+            if record["number"] in few
+        ]
+        numbers = (
+            *distribution(own, "planning_time"),
+            quartiles(ratios)[1],
+            *(distribution(own, part)[0] for part in TIMES),
+        )
         success = f"{sum(record['success'] for record in everyone)} of {len(everyone)}"
         iterations = f"{distribution(own, 'iterations')[0]:.0f}" if own else "–"
         rows.append([str(count), success, *map(decimal, numbers), iterations])
@@ -188,11 +253,14 @@ def report(result: Mapping[str, Any]) -> str:
     return "\n\n".join([*parts, foot(about)]) + "\n"
 
 
-def scale_chart(records: Sequence[Record], path: str | Path | None, *, of: str = "obstacles", title: str = "") -> Figure:
+def scale_chart(
+    records: Sequence[Record], path: str | Path | None, *, of: str = "obstacles", title: str = ""
+) -> Figure:
     """Draw planning time against the number of something, and what it is spent on: medians, and quartiles of the whole.
 
     Args:
-        records: Records as `record.trial` makes them, with the field `of`; those without a planning time are left out.
+        records: Records as `record.trial` makes them, with the field `of`; those without a planning
+            time are left out.
         path: The file to write, .png, .svg or .pdf; None writes nothing.
         of: What there is more and more of, one of `AXES`.
         title: Written above.
@@ -206,19 +274,48 @@ def scale_chart(records: Sequence[Record], path: str | Path | None, *, of: str =
 
     def medians(*fields: str) -> list[float]:
         """Return, for each number of obstacles, the median of the first field less the others."""
-        return [float(np.median([record[fields[0]] - sum(record[f] for f in fields[1:]) for record in own])) for own in rows]
+        return [
+            float(
+                np.median(
+                    [record[fields[0]] - sum(record[f] for f in fields[1:]) for record in own]
+                )
+            )
+            for own in rows
+        ]
 
-    low, middle, high = np.array([quartiles([record["planning_time"] for record in own]) for own in rows]).reshape(-1, 3).T
-    parts = {name: medians(field) for field, name in TIMES.items()} | {"setting up": medians("planning_time", *TIMES)}
-    with styled():
+    low, middle, high = (
+        np.array([quartiles([record["planning_time"] for record in own]) for own in rows])
+        .reshape(-1, 3)
+        .T
+    )
+    parts = {name: medians(field) for field, name in TIMES.items()} | {
+        "setting up": medians("planning_time", *TIMES)
+    }
+    with use_style():
         figure = new_figure(6.4, 4.0)
         axes = figure.subplots()
         colours = [*COLOURS[: len(TIMES)], "0.7"]
         axes.stackplot(counts, *parts.values(), labels=[*parts], colors=colours, alpha=0.55)
         error = [middle - low, high - middle]
-        axes.errorbar(counts, middle, error, color="0.15", marker="o", markersize=4.0, capsize=2.5, label="planning time")
+        axes.errorbar(
+            counts,
+            middle,
+            error,
+            color="0.15",
+            marker="o",
+            markersize=4.0,
+            capsize=2.5,
+            label="planning time",
+        )
         for count, height, value in zip(counts, high, middle, strict=True):
-            axes.annotate(f"{value:.2f}", (count, height), (0, 5), textcoords="offset points", ha="center", fontsize=8)
+            axes.annotate(
+                f"{value:.2f}",
+                (count, height),
+                (0, 5),
+                textcoords="offset points",
+                ha="center",
+                fontsize=8,
+            )
         axes.set_xscale("log")
         axes.set_xticks(counts, [str(count) for count in counts])
         axes.minorticks_off()
@@ -246,7 +343,10 @@ def _solve(scene: Scene, seed: int, hinge: float, options: Options) -> Plan:
 @functools.cache
 def _warm(seed: int) -> None:
     """Plan once in this process, which pays for what is loaded and built only once."""
-    if _solve(_crowded(AXES["obstacles"].counts[0]), seed, _OPENED["obstacles"], Options()).status == "interrupted":
+    if (
+        _solve(_crowded(AXES["obstacles"].counts[0]), seed, _OPENED["obstacles"], Options()).status
+        == "interrupted"
+    ):
         raise KeyboardInterrupt
 
 

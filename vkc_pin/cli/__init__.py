@@ -1,4 +1,4 @@
-"""The command line `vkc-pin`."""
+"""Implements the command line `vkc-pin`."""
 
 from vkc_pin.cli.process import main
 

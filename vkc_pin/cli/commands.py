@@ -18,14 +18,17 @@ from vkc_pin.cli.datasets import add_datasets
 from vkc_pin.cli.importing import add_importing
 from vkc_pin.cli.simulating import add_simulate
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.files.writing import check_outputs, write_atomically
-from vkc_pin.motion.formats.rosbag import bag_library
-from vkc_pin.motion.formats.tables import GROUPS
+from vkc_pin.world.files.writing import check_outputs, write_atomically
+from vkc_pin.world.trajectory.formats.rosbag import import_rosbags
+from vkc_pin.world.trajectory.formats.tables import GROUPS
 
 __all__ = ["EXIT_MISUSE", "make_parser", "parse_settings", "run"]
 
 EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
-_FAILURES = {"infeasible": EXIT_INFEASIBLE, "interrupted": EXIT_INTERRUPTED}  # by a plan's status; others have failed
+_FAILURES = {
+    "infeasible": EXIT_INFEASIBLE,
+    "interrupted": EXIT_INTERRUPTED,
+}  # by a plan's status; others have failed
 _CODES = """exit codes:
   0    success: a motion that the validation finds nothing wrong with, and all that was asked for is written and printed
   1    failed: no valid motion came out, a saved one is none or not what its file says, or a scene has a fault
@@ -42,7 +45,7 @@ def parse_settings(settings: Sequence[str]) -> list[Any]:
     Raises:
         InputError: A text is not of that form.
     """
-    from vkc_pin.task.steps import Actuate
+    from vkc_pin.world.task.steps import Actuate
 
     grouped: list[tuple[str, dict[str, float]]] = []
     for text in settings:
@@ -54,7 +57,9 @@ def parse_settings(settings: Sequence[str]) -> list[Any]:
         try:
             number = float(value)
         except ValueError:
-            raise InputError("not a number after '='", field="--set", expected=expected, got=repr(text)) from None
+            raise InputError(
+                "not a number after '='", field="--set", expected=expected, got=repr(text)
+            ) from None
         if grouped and grouped[-1][0] == owner and joint not in grouped[-1][1]:
             grouped[-1][1][joint] = number
         else:
@@ -71,12 +76,14 @@ def _progress(row: Any) -> None:
 
 def _plan(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
-    from vkc_pin.plotting.plots import PICTURES
+    from vkc_pin.visualization.plots.plots import PICTURES
 
     steps, outputs = parse_settings(arguments.set), _options(_chosen(arguments, _FILES))
     if (folder := arguments.plots) is not None:
         if Path(folder).suffix.lower() in PICTURES:
-            raise InputError("this is the name of a picture", field="--plots", expected="a folder", got=folder)
+            raise InputError(
+                "this is the name of a picture", field="--plots", expected="a folder", got=folder
+            )
         outputs["--plots"] = Path(folder, "joints.png")
     check_outputs(outputs | _new_folders(arguments), kept={"SCENE": arguments.scene})
     scene = vkc.load_scene(arguments.scene)
@@ -106,7 +113,9 @@ def _plan(arguments: argparse.Namespace) -> int:
 
 def _chosen(arguments: argparse.Namespace, options: Sequence[str]) -> dict[str, str]:
     """Return what options name, of those that are given."""
-    return {option: value for option in options if (value := getattr(arguments, option)) is not None}
+    return {
+        option: value for option in options if (value := getattr(arguments, option)) is not None
+    }
 
 
 def _new_folders(arguments: argparse.Namespace) -> dict[str, str | Path]:
@@ -114,8 +123,10 @@ def _new_folders(arguments: argparse.Namespace) -> dict[str, str | Path]:
     folders = _chosen(arguments, _FOLDERS)
     for option, path in folders.items():
         if Path(path).exists():
-            raise InputError("this is there already", file=path, field=f"--{option}", expected="a new folder")
-        bag_library()
+            raise InputError(
+                "this is there already", file=path, field=f"--{option}", expected="a new folder"
+            )
+        import_rosbags()
     return {f"--{option}": Path(path, "metadata.yaml") for option, path in folders.items()}
 
 
@@ -123,7 +134,9 @@ def _options(files: Mapping[str, str]) -> dict[str, str | Path]:
     return {f"--{option}": path for option, path in files.items()}
 
 
-def _write(files: Mapping[str, str], writers: Mapping[str, Callable[[str], object]], report: str = "") -> bool:
+def _write(
+    files: Mapping[str, str], writers: Mapping[str, Callable[[str], object]], report: str = ""
+) -> bool:
     """Write files by option, then print a report and what was written; return whether all of them were."""
     said, failed = [report], []
     for option, path in files.items():
@@ -152,7 +165,11 @@ def _export(arguments: argparse.Namespace) -> int:
         expected = "--ros FILE or --rosbag FOLDER as well"
         raise InputError("only ROS' points can be resampled", field="--rate", expected=expected)
     if arguments.joints is not None and files.keys() == {"rosbag"}:
-        raise InputError("recordings have all joints", field="--joints", expected="--csv FILE or --ros FILE as well")
+        raise InputError(
+            "recordings have all joints",
+            field="--joints",
+            expected="--csv FILE or --ros FILE as well",
+        )
     plain = {option: path for option, path in files.items() if option not in _FOLDERS}
     check_outputs(_options(plain) | _new_folders(arguments), kept={"PLAN": arguments.plan})
     plan = vkc.Plan.load(arguments.plan)
@@ -177,9 +194,17 @@ def _view(arguments: argparse.Namespace) -> int:
 
     files = _chosen(arguments, ("html",))
     check_outputs(_options(files), kept={"SCENE|PLAN": arguments.what})
-    shown: Any = vkc.Plan.load(arguments.what) if str(arguments.what).endswith(".npz") else vkc.load_scene(arguments.what)
+    shown: Any = (
+        vkc.Plan.load(arguments.what)
+        if str(arguments.what).endswith(".npz")
+        else vkc.load_scene(arguments.what)
+    )
     if files:
-        return EXIT_OK if _write(files, {"html": functools.partial(visualization.to_html, shown)}) else EXIT_MISUSE
+        return (
+            EXIT_OK
+            if _write(files, {"html": functools.partial(visualization.to_html, shown)})
+            else EXIT_MISUSE
+        )
     visualization.show(shown)
     sys.stdout.write("press Enter to end\n")
     sys.stdout.flush()
@@ -189,11 +214,16 @@ def _view(arguments: argparse.Namespace) -> int:
 
 
 def _srdf(arguments: argparse.Namespace) -> int:
-    from vkc_pin.models.robot_file import load_robot
-    from vkc_pin.models.self_collisions import write_srdf
+    from vkc_pin.world.models.robot_file import load_robot
+    from vkc_pin.world.models.self_collisions import write_srdf
 
     check_outputs({"--output": arguments.output}, kept={"ROBOT": arguments.robot})
-    written = write_srdf(load_robot(arguments.robot), arguments.output, samples=arguments.samples, seed=arguments.seed)
+    written = write_srdf(
+        load_robot(arguments.robot),
+        arguments.output,
+        samples=arguments.samples,
+        seed=arguments.seed,
+    )
     sys.stdout.write(f"wrote {written}\n")
     return EXIT_OK
 
@@ -208,24 +238,63 @@ def make_parser() -> argparse.ArgumentParser:
         epilog=_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    listed = ", ".join(f"{name} {number}" for name, number in {**versions(), "Python": platform.python_version()}.items())
-    parser.add_argument("--version", action="version", version=listed, help="show versions, also of what motions depend on")
+    listed = ", ".join(
+        f"{name} {number}"
+        for name, number in {**versions(), "Python": platform.python_version()}.items()
+    )
+    parser.add_argument(
+        "--version",
+        action="version",
+        version=listed,
+        help="show versions, also of what motions depend on",
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    plan = commands.add_parser("plan", help="plan a motion", description="Plan a motion that brings joints of objects to values.")
-    plan.add_argument("scene", metavar="SCENE", help="name of a scene that comes with the package, or a YAML file")
+    plan = commands.add_parser(
+        "plan",
+        help="plan a motion",
+        description="Plan a motion that brings joints of objects to values.",
+    )
+    plan.add_argument(
+        "scene", metavar="SCENE", help="name of a scene that comes with the package, or a YAML file"
+    )
     form = "OBJECT.JOINT=VALUE"
-    plan.add_argument("--set", action="append", required=True, metavar=form, help="what should change, in this order")
+    plan.add_argument(
+        "--set",
+        action="append",
+        required=True,
+        metavar=form,
+        help="what should change, in this order",
+    )
     plan.add_argument("--html", metavar="FILE", help="write the animation, one self-contained page")
     plan.add_argument("--save", metavar="FILE", help="save the plan (.npz)")
     plan.add_argument("--json", metavar="FILE", help="write trajectory, metrics and report as JSON")
-    plan.add_argument("--csv", metavar="FILE", help="write the motion as a table, a line a waypoint")
-    plan.add_argument("--ros", metavar="FILE", help="write base and arm with the fields of trajectory_msgs/JointTrajectory")
-    plan.add_argument("--rosbag", metavar="FOLDER", help="write a recording of ROS 2 (rosbag2); needs the extra `ros`")
+    plan.add_argument(
+        "--csv", metavar="FILE", help="write the motion as a table, a line a waypoint"
+    )
+    plan.add_argument(
+        "--ros",
+        metavar="FILE",
+        help="write base and arm with the fields of trajectory_msgs/JointTrajectory",
+    )
+    plan.add_argument(
+        "--rosbag",
+        metavar="FOLDER",
+        help="write a recording of ROS 2 (rosbag2); needs the extra `ros`",
+    )
     plan.add_argument("--plots", metavar="FOLDER", help="write plots")
-    plan.add_argument("--initialization", default="auto", metavar="METHOD", help="auto, interpolated, astar, rrt or stationary")
-    plan.add_argument("--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then")
-    plan.add_argument("--effort", type=int, metavar="UNITS", help="return the best motion found with so much work")
+    plan.add_argument(
+        "--initialization",
+        default="auto",
+        metavar="METHOD",
+        help="auto, interpolated, astar, rrt or stationary",
+    )
+    plan.add_argument(
+        "--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then"
+    )
+    plan.add_argument(
+        "--effort", type=int, metavar="UNITS", help="return the best motion found with so much work"
+    )
     plan.add_argument("--seed", type=natural, default=0, help="of the random numbers (default 0)")
     plan.add_argument("--quiet", action="store_true", help="no progress")
     plan.set_defaults(run=_plan)
@@ -233,21 +302,33 @@ def make_parser() -> argparse.ArgumentParser:
     add_check(commands)
     add_simulate(commands)
 
-    view = commands.add_parser("view", help="look at a scene or plan", description="Show a scene or a saved plan in the browser.")
+    view = commands.add_parser(
+        "view",
+        help="look at a scene or plan",
+        description="Show a scene or a saved plan in the browser.",
+    )
     view.add_argument("what", metavar="SCENE|PLAN")
     view.add_argument("--html", metavar="FILE", help="write a page instead of starting a server")
     view.set_defaults(run=_view)
 
     about = "Write the motion of a saved plan for other programs."
-    export = commands.add_parser("export", help="write a saved plan for other programs", description=about)
+    export = commands.add_parser(
+        "export", help="write a saved plan for other programs", description=about
+    )
     export.add_argument("plan", metavar="PLAN", help="a plan saved with --save or Plan.save")
     export.add_argument("--csv", metavar="FILE", help="a table, a line a waypoint")
     export.add_argument("--json", metavar="FILE", help="trajectory, metrics and report as JSON")
-    export.add_argument("--ros", metavar="FILE", help="JSON with the fields of trajectory_msgs/JointTrajectory")
-    export.add_argument("--rosbag", metavar="FOLDER", help="a recording of ROS 2 (rosbag2); needs the extra `ros`")
+    export.add_argument(
+        "--ros", metavar="FILE", help="JSON with the fields of trajectory_msgs/JointTrajectory"
+    )
+    export.add_argument(
+        "--rosbag", metavar="FOLDER", help="a recording of ROS 2 (rosbag2); needs the extra `ros`"
+    )
     which = f"{', '.join(GROUPS)}, or names of coordinates with commas between; without it all in a table, robot for ROS"
     export.add_argument("--joints", metavar="WHICH", help=which)
-    export.add_argument("--rate", type=float, metavar="HZ", help="points a second for ROS; without it the waypoints")
+    export.add_argument(
+        "--rate", type=float, metavar="HZ", help="points a second for ROS; without it the waypoints"
+    )
     export.set_defaults(run=_export)
 
     add_datasets(commands)

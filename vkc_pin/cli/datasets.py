@@ -8,7 +8,7 @@ from typing import Any
 
 from vkc_pin.benchmarks.commands import EXIT_OK, natural, positive, stopped
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.interrupt import raising
+from vkc_pin.utils.interrupt import raising
 
 __all__ = ["add_datasets"]
 
@@ -21,31 +21,63 @@ def add_datasets(commands: Any) -> None:
         "Make a dataset of a recipe: episodes, each a scene with a timed motion that the independent validation accepts. The "
         "same command goes on where it was stopped, and with more episodes adds to them."
     )
-    generate = commands.add_parser("generate", help="make a dataset of checked motions", description=about)
-    generate.add_argument("recipe", metavar="RECIPE", help="name of a recipe that comes with the package, or a YAML file")
+    generate = commands.add_parser(
+        "generate", help="make a dataset of checked motions", description=about
+    )
+    generate.add_argument(
+        "recipe",
+        metavar="RECIPE",
+        help="name of a recipe that comes with the package, or a YAML file",
+    )
     # Looked at by generate(), which says what is wrong with it as with the recipe.
-    generate.add_argument("--episodes", type=int, required=True, metavar="N", help="how many episodes")
+    generate.add_argument(
+        "--episodes", type=int, required=True, metavar="N", help="how many episodes"
+    )
     generate.add_argument("--out", required=True, metavar="DIR", help="folder of the dataset")
-    generate.add_argument("--jobs", type=int, default=1, metavar="J", help="processes on this machine (default 1)")
+    generate.add_argument(
+        "--jobs", type=int, default=1, metavar="J", help="processes on this machine (default 1)"
+    )
     shown = "address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead"
     generate.add_argument("--scheduler", metavar="ADDRESS", help=shown)
-    generate.add_argument("--variants", type=int, metavar="K", help="motions for each problem, instead of the recipe's number")
+    generate.add_argument(
+        "--variants",
+        type=int,
+        metavar="K",
+        help="motions for each problem, instead of the recipe's number",
+    )
     shown = "keep only episodes that physics confirms (needs the extra `sim`)"
     generate.add_argument("--simulate", action="store_true", default=None, help=shown)
     shown = "keep what cameras on the robot see of it, those of the recipe or of the head and the hand (with --simulate)"
     generate.add_argument("--cameras", action="store_true", help=shown)
-    generate.add_argument("--lerobot", action="store_true", help="write LeRobot's layout as well, a dataset for each robot")
+    generate.add_argument(
+        "--lerobot",
+        action="store_true",
+        help="write LeRobot's layout as well, a dataset for each robot",
+    )
     generate.add_argument("--quiet", action="store_true", help="no progress bar")
     generate.set_defaults(run=_generate)
 
-    dataset = commands.add_parser("dataset", help="look at a dataset", description="Look at a dataset that `generate` has made.")
+    dataset = commands.add_parser(
+        "dataset",
+        help="look at a dataset",
+        description="Look at a dataset that `generate` has made.",
+    )
     inner = dataset.add_subparsers(required=True, metavar="WHAT")
     about = "Validate every episode again, from the files alone, and write a page of statistics."
     check = inner.add_parser("check", help="validate every episode again", description=about)
     check.add_argument("folder", metavar="DIR", help="folder of the dataset")
-    check.add_argument("--jobs", type=positive, default=1, metavar="J", help="processes (default 1)")
-    check.add_argument("--html", metavar="FILE", help="where to write the page (default: DIR/statistics.html)")
-    check.add_argument("--seed", type=natural, default=0, help="of the ten episodes that the page shows (default 0)")
+    check.add_argument(
+        "--jobs", type=positive, default=1, metavar="J", help="processes (default 1)"
+    )
+    check.add_argument(
+        "--html", metavar="FILE", help="where to write the page (default: DIR/statistics.html)"
+    )
+    check.add_argument(
+        "--seed",
+        type=natural,
+        default=0,
+        help="of the ten episodes that the page shows (default 0)",
+    )
     check.add_argument("--quiet", action="store_true", help="no progress bar")
     check.set_defaults(run=_check)
 
@@ -74,7 +106,9 @@ def _generate(arguments: argparse.Namespace) -> int:
             raise
         sys.stderr.write(f"vkc-pin: {error}\n")
         return _FAILED
-    sys.stdout.write(f"{len(dataset.numbers())} episodes are in {dataset.folder}; README.md there says what they are\n")
+    sys.stdout.write(
+        f"{len(dataset.numbers())} episodes are in {dataset.folder}; README.md there says what they are\n"
+    )
     return EXIT_OK
 
 
@@ -83,7 +117,11 @@ def _check(arguments: argparse.Namespace) -> int:
 
     with raising():
         found = vkc.check_dataset(
-            arguments.folder, jobs=arguments.jobs, page=arguments.html, seed=arguments.seed, progress=not arguments.quiet
+            arguments.folder,
+            jobs=arguments.jobs,
+            page=arguments.html,
+            seed=arguments.seed,
+            progress=not arguments.quiet,
         )
     sys.stdout.write(f"{found}\n")
     return EXIT_OK if found.ok else _FAILED

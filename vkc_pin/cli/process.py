@@ -22,15 +22,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; `vkc-pin --help` lists them.
 
     Args:
-        argv: The command's words; nothing else is then changed in this process. None: those that the process was started with,
-            which belongs to the command: Ctrl-C ends it at once and without a word, unless the command has a better idea, and
-            what cannot be printed is no reason not to go on.
+        argv: The command's words; nothing else is then changed in this process. None: those that
+            the process was started with, which belongs to the command: Ctrl-C ends it at once and
+            without a word, unless the command has a better idea, and what cannot be printed is no
+            reason not to go on.
     """
     if argv is not None:
         from vkc_pin.cli.commands import run
 
         return run(argv)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored, as behind "&" in scripts
+    if (
+        signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    ):  # else it is ignored, as behind "&" in scripts
         signal.signal(signal.SIGINT, _leave)
     _open_all()
     sys.stdout, printed = _forgiving(sys.stdout, 1)
@@ -62,7 +65,9 @@ def _open_all() -> None:
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free
+            os.set_inheritable(
+                os.open(os.devnull, os.O_RDWR), True
+            )  # the lowest number that is free
     if sys.stdin is None:
         sys.stdin = open(0, closefd=False)  # noqa: SIM115
 
@@ -85,6 +90,12 @@ class _Forgiving(io.FileIO):
 def _forgiving(stream: TextIO | None, number: int) -> tuple[TextIO, _Forgiving]:
     """Return a text stream like `stream` on the file of that number which writing to never fails, and its raw file."""
     raw = _Forgiving(number, "w", closefd=False)
-    like = stream if isinstance(stream, io.TextIOWrapper) else io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
-    how: dict[str, Any] = {name: getattr(like, name) for name in ("encoding", "line_buffering", "write_through")}
+    like = (
+        stream
+        if isinstance(stream, io.TextIOWrapper)
+        else io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    )
+    how: dict[str, Any] = {
+        name: getattr(like, name) for name in ("encoding", "line_buffering", "write_through")
+    }
     return io.TextIOWrapper(io.BufferedWriter(raw), errors="backslashreplace", **how), raw

@@ -1,1 +1,1 @@
-"""Datasets of checked motions: recipes, what makes episodes of them on many processes, files, and what is to be said of these."""
+"""Generates, writes and checks datasets of validated trajectories."""

@@ -1,4 +1,4 @@
-"""check_dataset(): every episode of a dataset validated again, from its files alone."""
+"""Validates every episode of a dataset again from its files."""
 
 from __future__ import annotations
 
@@ -13,36 +13,40 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arguments import whole
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.diversity import Seen, homotopy, way
-from vkc_pin.datasets.episode import Episode, scene_name
-from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of
-from vkc_pin.datasets.problems import terms_of
+from vkc_pin.datasets.diversity import (
+    DuplicateFinder,
+    compute_winding_numbers,
+    sample_coarse_trajectory,
+)
+from vkc_pin.datasets.episode import Episode, compute_scene_name
+from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers
+from vkc_pin.datasets.problems import resolve_episode_terms
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
-from vkc_pin.datasets.statistics import statistics_page
+from vkc_pin.datasets.statistics import make_statistics_page
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.files.documents import read_text
-from vkc_pin.files.writing import check_inside, check_writable, write_atomically
-from vkc_pin.running.engine import Died, clustered, results
+from vkc_pin.utils.arguments import whole
+from vkc_pin.utils.parallel.engine import Died, clustered, results
+from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
 
 __all__ = ["DatasetCheck", "check_dataset"]
 
-_SHOWN = 20  # problems that the text names
-_PICTURES = 10  # episodes on the page of statistics
+_LISTED = 20  # problems in the text
+_PICTURES = 10  # episodes on the statistics page
 
 
 @dataclass(frozen=True)
 class DatasetCheck:
-    """What a check of a dataset found.
+    """Result of the check of a dataset.
 
     Attributes:
-        folder: Whose.
-        episodes: How many there are.
-        refused: Number of an episode → what the validation says against it.
-        problems: What else is wrong, a line each: damaged files, numbers that occur twice, near-duplicates.
-        records: What is known of every episode, see `statistics`.
-        page: The page of statistics.
+        folder: Folder of the dataset.
+        episodes: Number of episodes.
+        refused: Maps the number of each invalid episode to the reason.
+        problems: Other problems, one line each: damaged files, repeated numbers, near-duplicates.
+        records: A record of every episode, see `statistics`.
+        page: The statistics page.
     """
 
     folder: Path
@@ -54,20 +58,22 @@ class DatasetCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether there is nothing against any episode."""
+        """Whether no episode is invalid and there is no other problem."""
         return not self.refused and not self.problems
 
     def lines(self) -> list[str]:
-        """Return it as lines of text."""
-        sure = self.episodes - len(self.refused)
-        found = [f"{self.folder}: {sure} of {self.episodes} episodes are valid"]
-        told = [f"episode {number}: {text}" for number, text in self.refused.items()]
-        told += self.problems
-        found += [f"  - {line}" for line in told[:_SHOWN]]
-        found += [f"  ... and {len(told) - _SHOWN} more"] if len(told) > _SHOWN else []
-        wound = Counter(tuple(sorted(record["winding"])) != () for record in self.records)
+        """Return the result as lines of text."""
+        valid = self.episodes - len(self.refused)
+        found = [f"{self.folder}: {valid} of {self.episodes} episodes are valid"]
+        problems = [f"episode {number}: {text}" for number, text in self.refused.items()]
+        problems += self.problems
+        found += [f"  - {line}" for line in problems[:_LISTED]]
+        found += [f"  ... and {len(problems) - _LISTED} more"] if len(problems) > _LISTED else []
+        winding = Counter(tuple(sorted(record["winding"])) != () for record in self.records)
         if self.records:
-            found.append(f"  paths of the base that go round something: {wound[True]} of {len(self.records)}")
+            found.append(
+                f"  base paths that wind around an obstacle: {winding[True]} of {len(self.records)}"
+            )
         if self.page is not None:
             found.append(f"  statistics: {self.page}")
         return found
@@ -77,19 +83,24 @@ class DatasetCheck:
 
 
 def check_dataset(
-    folder: str | Path, *, jobs: int = 1, page: str | Path | None = None, seed: int = 0, progress: bool = False
+    folder: str | Path,
+    *,
+    jobs: int = 1,
+    page: str | Path | None = None,
+    seed: int = 0,
+    progress: bool = False,
 ) -> DatasetCheck:
     """Validate every episode of a dataset again, and write a page of statistics.
 
-    Nothing is taken from planning: scenes are built anew from the files by their content, motions are read from the shards, and
-    the independent validation looks at both.
+    The check is independent of planning: scenes are built from their files by content, trajectories
+    are read from the shards, and the independent validation checks both.
 
     Args:
         folder: The dataset.
         jobs: Processes on this machine.
-        page: The file of the page; None: `statistics.html` in the folder.
-        seed: Of which ten episodes are drawn.
-        progress: Show a progress bar.
+        page: File of the page; defaults to `statistics.html` in the folder.
+        seed: Random seed of the ten episodes that are shown.
+        progress: Whether to show a progress bar.
 
     Raises:
         InputError: There is no dataset, or the page cannot be written.
@@ -104,49 +115,68 @@ def check_dataset(
     check_writable(target, field="page")
     shards = dataset.shards
     recipe = dataset.recipe.document
-    tasks = ((str(k), (str(shard), str(dataset.folder / "scenes"), recipe)) for k, shard in enumerate(shards))
+    tasks = (
+        (str(k), (str(shard), str(dataset.folder / "scenes"), recipe))
+        for k, shard in enumerate(shards)
+    )
     found: dict[int, tuple[list[dict[str, Any]], list[str]]] = {}
     with tqdm(total=len(shards), unit="shard", disable=not progress) as bar:
-        for key, result in results(checked_shard, tasks, jobs=jobs, dask=clustered()):
-            found[int(key)] = ([], [f"{shards[int(key)]}: {result.reason}"]) if isinstance(result, Died) else result
+        for key, result in results(check_shard, tasks, jobs=jobs, dask=clustered()):
+            found[int(key)] = (
+                ([], [f"{shards[int(key)]}: {result.reason}"])
+                if isinstance(result, Died)
+                else result
+            )
             bar.update()
     records = [record for k in sorted(found) for record in found[k][0]]
     problems = [text for k in sorted(found) for text in found[k][1]]
-    problems += _together(dataset, records)
+    problems += _check_consistency(dataset, records)
     refused = {record["number"]: record["refused"] for record in records if record["refused"]}
-    failures = _table(dataset.folder / "failures.csv")
+    failures = _read_table(dataset.folder / "failures.csv")
     chosen = np.random.default_rng(seed).permutation(len(records))[:_PICTURES]
-    whole_ones = [shard for k, shard in enumerate(shards) if not found[k][1]]
-    pictured = _named(dataset, whole_ones, {records[k]["number"] for k in chosen})
-    text = statistics_page(dataset.recipe, records, failures, pictured, refused, problems)
+    intact_shards = [shard for k, shard in enumerate(shards) if not found[k][1]]
+    shown_episodes = _read_selected(dataset, intact_shards, {records[k]["number"] for k in chosen})
+    text = make_statistics_page(
+        dataset.recipe, records, failures, shown_episodes, refused, problems
+    )
     write_atomically(target, text.encode())
-    return DatasetCheck(dataset.folder, len(records), refused, tuple(problems), tuple(records), target)
+    return DatasetCheck(
+        dataset.folder, len(records), refused, tuple(problems), tuple(records), target
+    )
 
 
-def checked_shard(task: tuple[str, str, Mapping[str, Any]]) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return what is known of the episodes of a shard, by its scenes' folder and its recipe, and what is wrong with the file."""
+def check_shard(
+    task: tuple[str, str, Mapping[str, Any]],
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return records of a shard's episodes, and problems of its file.
+
+    Args:
+        task: The shard, the folder of its scenes, and its recipe's document.
+    """
     shard, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2])
     records: list[dict[str, Any]] = []
     try:
-        for episode in episodes_of(shard, scenes):
-            records.append(_looked_at(episode, recipe))
+        for episode in read_episodes(shard, scenes):
+            records.append(_check_episode(episode, recipe))
     except (VkcError, OSError) as error:
         return records, [f"{shard.name}: {error}"]
     return records, []
 
 
-def _looked_at(episode: Episode, recipe: Recipe) -> dict[str, Any]:
-    """Return what is known of an episode; "refused" says what the validation says against it, "" if nothing."""
+def _check_episode(episode: Episode, recipe: Recipe) -> dict[str, Any]:
+    """Return the record of an episode; "refused" is the reason if it is invalid, else ""."""
     about = dict(episode.about)
     motion = episode.trajectory
     refused, winding, start = "", {}, motion.positions[0]
     try:
         scene = episode.scene()
         report = episode.validate()
-        said = [str(violation) for violation in report.violations] + report.contradictions(episode.claimed)
-        if episode.terms != terms_of(recipe, scene, about):
-            said.append("its own terms are not those of the recipe")
-        refused, winding = "; ".join(said[:3]), homotopy(scene, motion)
+        reasons = [str(violation) for violation in report.violations] + report.contradictions(
+            episode.claimed
+        )
+        if episode.terms != resolve_episode_terms(recipe, scene, about):
+            reasons.append("its terms differ from those of the recipe")
+        refused, winding = "; ".join(reasons[:3]), compute_winding_numbers(scene, motion)
         start = scene.start
     except VkcError as error:
         refused = str(error)
@@ -154,40 +184,44 @@ def _looked_at(episode: Episode, recipe: Recipe) -> dict[str, Any]:
         **{key: value for key, value in about.items() if key != "metrics"},
         **about.get("metrics", {}),
         "number": episode.number,
-        "scene": scene_name(episode.document),
+        "scene": compute_scene_name(episode.document),
         "start": np.asarray(start).round(4).tolist(),
-        "way": way(motion),
+        "way": sample_coarse_trajectory(motion),
         "winding": sorted(winding.items()),
         "refused": refused,
     }
 
 
-def _together(dataset: Dataset, records: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield what is wrong with the episodes as a whole."""
+def _check_consistency(dataset: Dataset, records: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield problems of the episodes as a whole."""
     counts = Counter(record["number"] for record in records)
-    yield from (f"episode {number} is there {count} times" for number, count in counts.items() if count > 1)
-    seen = Seen()
+    yield from (
+        f"episode {number} occurs {count} times" for number, count in counts.items() if count > 1
+    )
+    finder = DuplicateFinder()
     for record in sorted(records, key=lambda record: int(record["number"])):
-        twin = seen.twin(record)
-        if twin is not None and twin != record["number"]:
-            yield f"episode {record['number']} is nearly the same as {twin}"
-    table = {int(row["number"]) for row in _table(dataset.folder / "episodes.csv")}
+        duplicate = finder.find_duplicate(record)
+        if duplicate is not None and duplicate != record["number"]:
+            yield f"episode {record['number']} is nearly the same as {duplicate}"
+    table = {int(row["number"]) for row in _read_table(dataset.folder / "episodes.csv")}
     if table != set(counts):
         yield f"episodes.csv names {len(table)} episodes, the shards have {len(counts)}"
 
 
-def _table(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a table that generating has written."""
+def _read_table(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a table that `generate` wrote."""
     if not path.is_file():
         return []
     try:
         return list(csv.DictReader(io.StringIO(read_text(path, "CSV"))))
     except csv.Error as error:
-        raise InputError("not a table", file=path, got=str(error)) from error
+        raise InputError("the file is not a CSV table", file=path, got=str(error)) from error
 
 
-def _named(dataset: Dataset, shards: Iterable[Path], numbers: set[int]) -> list[Episode]:
-    """Return the episodes of some numbers, reading only the shards that have them."""
-    shards = (shard for shard in shards if numbers & set(numbers_of(shard)))
-    every = itertools.chain.from_iterable(episodes_of(shard, dataset.folder / "scenes") for shard in shards)
+def _read_selected(dataset: Dataset, shards: Iterable[Path], numbers: set[int]) -> list[Episode]:
+    """Return the episodes with some numbers, from the shards that contain them."""
+    shards = (shard for shard in shards if numbers & set(read_numbers(shard)))
+    every = itertools.chain.from_iterable(
+        read_episodes(shard, dataset.folder / "scenes") for shard in shards
+    )
     return [episode for episode in every if episode.number in numbers]

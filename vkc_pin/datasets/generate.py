@@ -1,4 +1,4 @@
-"""generate(): episodes of a recipe on any number of processes, kept as they come, in a folder that is a dataset at the end."""
+"""Generates episodes of a recipe in parallel processes and writes them as a dataset."""
 
 from __future__ import annotations
 
@@ -15,30 +15,35 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from vkc_pin.arguments import flag, whole
 from vkc_pin.datasets.dataset import Dataset, Register
-from vkc_pin.datasets.episode import Made, work_file
+from vkc_pin.datasets.episode import Made, get_work_file
 from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
-from vkc_pin.datasets.formats.card import card
-from vkc_pin.datasets.formats.parts import parts
+from vkc_pin.datasets.formats.card import make_card
+from vkc_pin.datasets.formats.parts import make_parts
 from vkc_pin.datasets.recipes.recipe import CAMERAS, Recipe, load_recipe
-from vkc_pin.datasets.recipes.terms import as_entries
-from vkc_pin.datasets.robots import check_frames, ready_robots
+from vkc_pin.datasets.recipes.terms import make_entries
+from vkc_pin.datasets.robots import check_frames, prepare_robots
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.files.resources import file_path
-from vkc_pin.files.writing import check_links, check_replaceable, check_writable, write_atomically
-from vkc_pin.running.engine import Died, needs_dask, results
-from vkc_pin.running.journal import Journal
-from vkc_pin.running.machine import process_name, versions
-from vkc_pin.simulation.physics import engine
-from vkc_pin.task.terms import Term
+from vkc_pin.simulation.physics import import_mujoco
+from vkc_pin.utils.arguments import flag, whole
+from vkc_pin.utils.parallel.engine import Died, needs_dask, results
+from vkc_pin.utils.parallel.journal import Journal
+from vkc_pin.utils.parallel.machine import process_name, versions
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.writing import (
+    check_links,
+    check_replaceable,
+    check_writable,
+    write_atomically,
+)
+from vkc_pin.world.task.terms import Term
 
 __all__ = ["generate"]
 
-_PATIENCE = 4  # attempts for each episode that is asked for, before there is no point
-_LEAST = 40  # attempts that are made in any case
-_WATCHED = 3.0  # times the limit of planning by the clock, after which the process is ended
+_MAX_ATTEMPTS_PER_EPISODE = 4  # attempts per requested episode, after which generation fails
+_MIN_ATTEMPTS = 40  # attempts before generation may fail
+_WATCHDOG = 3.0  # multiple of the planning time limit after which a process is terminated
 
 
 def generate(
@@ -55,83 +60,96 @@ def generate(
     lerobot: bool = False,
     progress: bool = False,
 ) -> Dataset:
-    """Make a dataset of episodes, each a scene with a motion that the independent validation accepts; or go on making it.
+    """Generate a dataset of episodes, each a scene with a validated trajectory, or continue one.
 
-    The recipe and a number determine an episode; the dataset consists of the first `episodes` numbers, from 0, that become one.
-    The rest is in failures.csv with its reason. Neither `jobs` nor stops make a difference to what is in shards and scenes. Every
-    attempt that ends is in the journal at once; the same call goes on where one was stopped, and with more `episodes` adds some.
+    The recipe and a number determine an episode; the dataset consists of the first `episodes`
+    numbers, from 0, that succeed. All others are in failures.csv with their reasons. Neither `jobs`
+    nor interruptions affect the contents of shards and scenes. Every finished attempt is in the
+    journal at once; the same call continues an interrupted run, and with more `episodes` extends
+    it.
 
     Args:
-        recipe: The name or path of a recipe, or what such a file says.
-        episodes: How many, at least 1.
-        out: The folder, made if need be.
-        jobs: Processes on this machine; more than 1 are Dask's (the extra `cluster`), started anew when they die.
+        recipe: Name or path of a recipe, or the contents of such a file.
+        episodes: Number of episodes, at least 1.
+        out: Output folder, created if necessary.
+        jobs: Processes on this machine; more than 1 run with Dask (the extra `cluster`), and are
+            restarted when they die.
         scheduler: Address of a Dask scheduler whose workers are used instead, "tcp://host:8786".
-        variants: Motions for each problem, instead of the recipe's number.
-        simulate: Whether only episodes count that physics confirms (the extra `sim`), instead of what the recipe says.
-        cameras: Keep what cameras on the robot see of it as well: those of the recipe, or one above the base and one beside the
-            fingers. Only of what is simulated. Recipes that name cameras need not be asked.
-        terms: Own constraints and costs that every motion keeps to, beside those of the recipe, whose part they become. Frames
-            are "base", "hand", "object" (the link that the hand takes hold of), or those of every robot of the recipe;
-            `holding="object"` is while it is held.
-        lerobot: Write LeRobot's layout as well.
-        progress: Show a progress bar with the time left.
+        variants: Trajectories for each problem, instead of the recipe's number.
+        simulate: Whether episodes must also succeed in simulation (the extra `sim`), instead of the
+            recipe's choice.
+        cameras: Record images of cameras on the robot in simulated episodes: those of the recipe,
+            or one above the base and one beside the fingers. Recipes with cameras record images
+            anyway.
+        terms: Additional constraints and costs for all trajectories, which become part of the
+            recipe. Frames are "base", "hand", "object" (the grasped link), or those of all robots
+            of the recipe; `holding="object"` means while it is grasped.
+        lerobot: Whether to write LeRobot's layout as well.
+        progress: Whether to show a progress bar.
 
     Raises:
-        UnknownNameError: The recipe names something that does not exist.
-        InputError: The recipe is wrong, `out` holds something else, or what is needed is not installed; nothing is written then.
-        VkcError: Hardly any attempt becomes an episode; or there are cameras, and no OpenGL without a screen.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        UnknownNameError: The recipe refers to an unknown name.
+        InputError: The recipe is invalid, `out` holds other files, or a dependency is not
+            installed; nothing is written then.
+        VkcError: Hardly any attempt succeeds; or there are cameras, and OpenGL is not available
+            without a display.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call continues the run.
     """
     wanted, jobs = whole(episodes, "episodes", low=1), whole(jobs, "jobs", low=1, high=4096)
-    made = load_recipe(recipe, variants=variants, simulate=simulate)
-    if flag(cameras, "cameras") and not made.fields.cameras:
-        made = load_recipe(made, cameras=CAMERAS)
-    if own := as_entries(terms):
-        made = load_recipe(made, terms=[*made.document["terms"], *own])
-    hdf5.needed()
+    loaded = load_recipe(recipe, variants=variants, simulate=simulate)
+    if flag(cameras, "cameras") and not loaded.fields.cameras:
+        loaded = load_recipe(loaded, cameras=CAMERAS)
+    if entries := make_entries(terms):
+        loaded = load_recipe(loaded, terms=[*loaded.document["terms"], *entries])
+    hdf5.require_h5py()
     if flag(lerobot, "lerobot"):
-        lerobot_layout.needed(made.fields.rate)
-    if made.fields.simulate:
-        engine()
-    check_frames(made)
+        lerobot_layout.require_pyarrow(loaded.fields.rate)
+    if loaded.fields.simulate:
+        import_mujoco()
+    check_frames(loaded)
     if jobs > 1 or scheduler is not None:
         needs_dask(scheduler)
     folder = file_path(out, "out", "a folder")
-    with _journal(folder, made) as journal:
+    with _open_journal(folder, loaded) as journal:
         if lerobot and (folder / "lerobot").is_dir():
             for robot in (folder / "lerobot").iterdir():
                 check_replaceable(robot)
-        _at_work(folder, made)
-        dataset = Dataset(folder, made)
+        _prepare_folder(folder, loaded)
+        dataset = Dataset(folder, loaded)
         numbers = dataset.numbers()
-        if (there := len(numbers)) > wanted:
+        if (existing := len(numbers)) > wanted:
             raise InputError(
-                "there are more episodes already", file=folder, field="episodes", expected=f"at least {there}", got=wanted
+                "the dataset already has more episodes",
+                file=folder,
+                field="episodes",
+                expected=f"at least {existing}",
+                got=wanted,
             )
         register = Register(dataset, wanted)
-        for key in _lost(dataset, journal, set(numbers)):
-            del journal.lines[key]  # a number is all that it takes to make them again
+        for key in _find_lost(dataset, journal, set(numbers)):
+            del journal.lines[key]  # they are generated again
         for key in sorted(journal.lines, key=int):
-            register.add(_kept(journal, key))
+            register.add(_get_record(journal, key))
         if not register.full:
-            _run(dataset, register, journal, jobs, scheduler, progress)
+            _run_attempts(dataset, register, journal, jobs, scheduler, progress)
         register.finish()
-        _describe(dataset, register)
+        _write_card(dataset, register)
         if lerobot:
-            _as_lerobot(dataset)
+            _write_lerobot(dataset)
     return dataset
 
 
 @contextlib.contextmanager
-def _journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
-    """Lend the journal of a folder; refuse a folder that has something else, before anything is written."""
+def _open_journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
+    """Open the journal of a folder; refuse folders with other files before anything is written."""
     file = folder / "journal.jsonl"
     if folder.exists() and not folder.is_dir():
-        raise InputError("this is no folder", file=folder, field="out")
+        raise InputError("`out` is not a folder", file=folder, field="out")
     if folder.is_dir() and not file.is_file() and any(folder.iterdir()):
         expected = "a new or empty folder, or one with episodes of this recipe"
-        raise InputError("there is something else in this folder", file=folder, field="out", expected=expected)
+        raise InputError(
+            "the folder holds other files", file=folder, field="out", expected=expected
+        )
     if folder.is_dir():
         check_links(folder)
     check_writable(file)
@@ -141,81 +159,112 @@ def _journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
         yield Journal(file, stream, header, "episodes")
 
 
-def _at_work(folder: Path, recipe: Recipe) -> None:
-    """Write what the folder has from the first moment on."""
+def _prepare_folder(folder: Path, recipe: Recipe) -> None:
+    """Write the files that a dataset has from the start."""
     (folder / "work").mkdir(exist_ok=True)
-    write_atomically(folder / "recipe.yaml", yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True).encode())
+    write_atomically(
+        folder / "recipe.yaml",
+        yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True).encode(),
+    )
 
 
-def _kept(journal: Journal, key: str) -> dict[str, Any]:
+def _get_record(journal: Journal, key: str) -> dict[str, Any]:
+    """Return the record of an attempt in the journal."""
     (record,) = journal.lines[key]
     return record
 
 
-def _lost(dataset: Dataset, journal: Journal, there: Set[int]) -> list[str]:
-    """Return which episodes somebody has removed: the journal says that they succeeded, and neither shard nor file has them."""
-    good = [key for key in journal.lines if int(key) not in there and _kept(journal, key)["success"]]
-    return [key for key in good if not work_file(dataset.folder, int(key)).is_file()]
+def _find_lost(dataset: Dataset, journal: Journal, existing: Set[int]) -> list[str]:
+    """Return successful episodes of the journal that neither a shard nor a work file holds."""
+    succeeded = [
+        key
+        for key in journal.lines
+        if int(key) not in existing and _get_record(journal, key)["success"]
+    ]
+    return [key for key in succeeded if not get_work_file(dataset.folder, int(key)).is_file()]
 
 
-def _run(dataset: Dataset, register: Register, journal: Journal, jobs: int, scheduler: str | None, progress: bool) -> None:
-    """Make attempts, lowest numbers first, until there are enough episodes."""
+def _run_attempts(
+    dataset: Dataset,
+    register: Register,
+    journal: Journal,
+    jobs: int,
+    scheduler: str | None,
+    progress: bool,
+) -> None:
+    """Run attempts in the order of their numbers until there are enough episodes."""
     document, fields = dataset.recipe.document, dataset.recipe.fields
-    clock, most = _Clock(), max(_LEAST, _PATIENCE * register.wanted)
-    size, again = fields.rooms.episodes * fields.variants, deque[int]()
-    robots = ready_robots(dataset.recipe, dataset.folder / "robots")
+    clock, max_attempts = _Clock(), max(_MIN_ATTEMPTS, _MAX_ATTEMPTS_PER_EPISODE * register.wanted)
+    size, retried = fields.rooms.episodes * fields.variants, deque[int]()
+    robots = prepare_robots(dataset.recipe, dataset.folder / "robots")
 
     def tasks() -> Iterator[tuple[str, Any]]:
-        clock.start()  # processes are there now
+        clock.start()  # the processes are running now
         for block in itertools.count():
-            while again:
-                number = again.popleft()
+            while retried:
+                number = retried.popleft()
                 yield str(number), (document, [number], robots)
-            if register.full or register.decided >= most:
+            if register.full or register.decided >= max_attempts:
                 return
             numbers = range(block * size, (block + 1) * size)
-            left = [number for number in numbers if str(number) not in journal.lines]
-            if left:
-                yield ",".join(map(str, left)), (document, left, robots)
+            missing = [number for number in numbers if str(number) not in journal.lines]
+            if missing:
+                yield ",".join(map(str, missing)), (document, missing, robots)
 
     journal.append({"session": {"jobs": jobs}})
-    bar = tqdm(total=register.wanted, initial=len(register.accepted), unit="episode", smoothing=0.05, disable=not progress)
-    found = results(
-        parts,
+    bar = tqdm(
+        total=register.wanted,
+        initial=len(register.accepted),
+        unit="episode",
+        smoothing=0.05,
+        disable=not progress,
+    )
+    outcomes = results(
+        make_parts,
         tasks(),
         jobs=jobs,
         scheduler=scheduler,
         dask=True,
-        limit=_WATCHED * size * fields.time_limit,
+        limit=_WATCHDOG * size * fields.time_limit,
         tell=(lambda line: tqdm.write(line, file=sys.stderr)) if progress else None,
     )
     try:
-        with bar, contextlib.closing(found) as lines:
+        with bar, contextlib.closing(outcomes) as lines:
             for key, result in lines:
                 numbers = [int(number) for number in key.split(",")]
-                if isinstance(result, Died) and len(numbers) > 1:  # which of them it was shows when they are alone
-                    again.extend(numbers)
+                # Run each number alone to find the one that ended the process.
+                if isinstance(result, Died) and len(numbers) > 1:
+                    retried.extend(numbers)
                     continue
-                for record, data in [_died(numbers[0], result)] if isinstance(result, Died) else result:
+                for record, data in (
+                    [_make_failure(numbers[0], result)] if isinstance(result, Died) else result
+                ):
                     if record["status"] == "interrupted":
                         raise KeyboardInterrupt
-                    _keep(dataset, journal, record, data, clock)
+                    _save(dataset, journal, record, data, clock)
                     register.add(record)
                 bar.update(len(register.accepted) - bar.n)
                 bar.set_postfix(failed=len(register.failures), refresh=False)
                 if register.full:
                     break
     except KeyboardInterrupt:
-        text = f"{len(register.accepted)} of {register.wanted} episodes are made and kept in {dataset.folder}"
+        text = f"{len(register.accepted)} of {register.wanted} episodes are in {dataset.folder}"
         raise KeyboardInterrupt(text) from None
     if not register.full:
-        reasons = "; ".join(dict.fromkeys(str(record["reason"]) for record in register.failures[-200:]))[:500]
-        problem = f"{register.decided} attempts gave {len(register.accepted)} episodes of {register.wanted}"
-        raise VkcError(f"{problem}, which are kept in {dataset.folder}; the last ones failed because: {reasons}")
+        reasons = "; ".join(
+            dict.fromkeys(str(record["reason"]) for record in register.failures[-200:])
+        )[:500]
+        problem = (
+            f"{register.decided} attempts gave {len(register.accepted)} "
+            f"of {register.wanted} episodes"
+        )
+        raise VkcError(
+            f"{problem}, which are kept in {dataset.folder}; the latest failures: {reasons}"
+        )
 
 
 class _Clock:
-    """The time since some moment, and what of its processor time this process did not spend on attempts of its own."""
+    """Measures wall time, and this process's CPU time outside of its own attempts."""
 
     def __init__(self) -> None:
         self.start()
@@ -223,33 +272,39 @@ class _Clock:
     def start(self) -> None:
         self._began, self._worked = time.perf_counter(), time.process_time()
 
-    def attempted(self, record: Mapping[str, Any]) -> None:
-        """Take note of an attempt, perhaps of this process."""
+    def subtract(self, record: Mapping[str, Any]) -> None:
+        """Subtract the CPU time of an attempt that this process ran."""
         if record.get("process") == process_name():
             self._worked += float(record["cpu_time"])
 
     @property
     def now(self) -> dict[str, float]:
-        """Both times, as the journal has them [s]."""
+        """Wall and client times, as in the journal [s]."""
         seconds, client = time.perf_counter() - self._began, time.process_time() - self._worked
         return {"seconds": round(seconds, 3), "client_seconds": round(client, 4)}
 
 
-def _keep(dataset: Dataset, journal: Journal, record: dict[str, Any], data: bytes, clock: _Clock) -> None:
-    """Write an attempt down: first the episode, then the line that says that it is there."""
+def _save(
+    dataset: Dataset, journal: Journal, record: dict[str, Any], data: bytes, clock: _Clock
+) -> None:
+    """Save an attempt: first the episode, then the journal line that refers to it."""
     if data:
-        write_atomically(work_file(dataset.folder, record["number"]), data)
-    clock.attempted(record)
-    memory: dict[str, Any] = {name: record.pop(name) for name in ("memory_mb", "resident_mb", "process") if name in record}
-    journal.append({"key": str(record["number"]), "records": [record], "memory_mb": 0.0, **memory, **clock.now})
+        write_atomically(get_work_file(dataset.folder, record["number"]), data)
+    clock.subtract(record)
+    memory: dict[str, Any] = {
+        name: record.pop(name) for name in ("memory_mb", "resident_mb", "process") if name in record
+    }
+    journal.append(
+        {"key": str(record["number"]), "records": [record], "memory_mb": 0.0, **memory, **clock.now}
+    )
 
 
-def _died(number: int, died: Died) -> Made:
-    return {"number": number, "success": False, "status": "died", "reason": died.reason}, b""
+def _make_failure(number: int, outcome: Died) -> Made:
+    return {"number": number, "success": False, "status": "died", "reason": outcome.reason}, b""
 
 
-def _describe(dataset: Dataset, register: Register) -> None:
-    """Write the data card."""
+def _write_card(dataset: Dataset, register: Register) -> None:
+    """Write the dataset card."""
     recipe = dataset.recipe
     about = {
         "name": recipe.fields.name,
@@ -259,19 +314,27 @@ def _describe(dataset: Dataset, register: Register) -> None:
         "versions": versions(),
         "recipe": yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True),
     }
-    write_atomically(dataset.folder / "README.md", card(about, register.accepted, register.failures).encode())
+    write_atomically(
+        dataset.folder / "README.md",
+        make_card(about, register.accepted, register.failures).encode(),
+    )
 
 
-def _as_lerobot(dataset: Dataset) -> None:
-    """Write every robot's episodes in LeRobot's layout."""
+def _write_lerobot(dataset: Dataset) -> None:
+    """Write the episodes of every robot in LeRobot's layout."""
     for shards in sorted((dataset.folder / "shards").iterdir()):
-        own = (
-            episode for shard in sorted(shards.glob("*.hdf5")) for episode in hdf5.episodes_of(shard, dataset.folder / "scenes")
+        entries = (
+            episode
+            for shard in sorted(shards.glob("*.hdf5"))
+            for episode in hdf5.read_episodes(shard, dataset.folder / "scenes")
         )
-        first = next(own)
+        first = next(entries)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             robot = first.scene().robot
         lerobot_layout.write_lerobot(
-            dataset.folder / "lerobot" / shards.name, itertools.chain([first], own), robot, dataset.recipe.fields.rate
+            dataset.folder / "lerobot" / shards.name,
+            itertools.chain([first], entries),
+            robot,
+            dataset.recipe.fields.rate,
         )

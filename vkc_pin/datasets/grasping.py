@@ -7,24 +7,29 @@ from collections.abc import Sequence
 import numpy as np
 
 from vkc_pin.options import Options
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, compute_shortfall
+from vkc_pin.planning.nlp.merit import TOLERANCE
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.planner import Planner
-from vkc_pin.program.merit import TOLERANCE
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.scene import Scene
-from vkc_pin.seeds.knots import Knots, depth
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.steps import Actuate
-from vkc_pin.task.terms import Term, traced
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.steps import Actuate
+from vkc_pin.world.task.terms import Term, trace_terms
 
-__all__ = ["grasped"]
+__all__ = ["find_grasping_start"]
 
 _BATCH = 48  # random configurations that inverse kinematics brings to the grasp at once
 _DRAWS = 6  # batches before there is none
 
 
-def grasped(
-    scene: Scene, step: Actuate, rng: np.random.Generator, options: Options, planner: Planner, terms: Sequence[Term] = ()
+def find_grasping_start(
+    scene: Scene,
+    step: Actuate,
+    rng: np.random.Generator,
+    options: Options,
+    planner: Planner,
+    terms: Sequence[Term] = (),
 ) -> Scene | None:
     """Return the scene with the robot at a random free configuration that holds what a step moves; None if none is found.
 
@@ -39,27 +44,44 @@ def grasped(
         terms: What the motion must keep to, for the program; the start need not.
     """
     name, attachment = step.object, str(step.attachment)
-    holding = scene.with_held({name: attachment})  # wherever the hand is: the chain does not depend on it
-    with planner.lent() as cache:
-        problem = TrajectoryProblem(holding, compile_task(holding, [step], options), options, traced(scene, terms), cache=cache)
+    holding = scene.with_held(
+        {name: attachment}
+    )  # wherever the hand is: the chain does not depend on it
+    with planner.acquire() as cache:
+        problem = TrajectoryProblem(
+            holding,
+            compile_task(holding, [step], options),
+            options,
+            trace_terms(scene, terms),
+            cache=cache,
+        )
         chain, robot = problem.chain, scene.robot.coordinates.size
-        search = Knots(problem, rng)
-        pose = search.pose_at(1)
-        freedoms = [chain.index(f"{name}.{own}") for own in scene.objects[name].object.attachments[attachment].coordinates]
+        search = KeyframeSampler(problem, rng)
+        pose = search.find_pose(1)
+        freedoms = [
+            chain.index(f"{name}.{own}")
+            for own in scene.objects[name].object.attachments[attachment].coordinates
+        ]
         if pose is None:
             return None
-        solver, target = search.solver(pose)
+        solver, target = search.get_pose_solver(pose)
         for _ in range(_DRAWS):
             z = np.tile(problem.start, (_BATCH, 1))
-            z[:, freedoms] = rng.uniform(chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms)))
-            z, _ = search.knot(z, 1, "scatter")
-            z[:, search.driven] = problem.start[search.driven]  # as it is at the start, not a step later
+            z[:, freedoms] = rng.uniform(
+                chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms))
+            )
+            z, _ = search.sample(z, 1, "scatter")
+            z[:, search.object_columns] = problem.start[
+                search.object_columns
+            ]  # as it is at the start, not a step later
             lower, upper = np.tile(chain.lower, (_BATCH, 1)), np.tile(chain.upper, (_BATCH, 1))
-            fixed = [*freedoms, *search.driven.tolist()]
+            fixed = [*freedoms, *search.object_columns.tolist()]
             lower[:, fixed] = upper[:, fixed] = z[:, fixed]
-            z, found = solver.solve(z, target, lower=lower, upper=upper, weights=search.weights, tolerance=_EXACT)
+            z, found = solver.solve(
+                z, target, lower=lower, upper=upper, weights=search.weights, tolerance=_EXACT
+            )
             z = z[found]
-            z = z[depth(problem, z, 0) <= 0.0] if len(z) else z
+            z = z[compute_shortfall(problem, z, 0) <= 0.0] if len(z) else z
             if len(z):
                 row = z[int(rng.integers(len(z)))]
                 there = scene.with_start(base=row[:3], arm=row[3:robot])

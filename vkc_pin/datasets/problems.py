@@ -1,4 +1,4 @@
-"""What is asked for in an episode: a scene, a start and steps, drawn from what the recipe says."""
+"""Samples the problem of an episode from a recipe: scene, start and steps."""
 
 from __future__ import annotations
 
@@ -11,46 +11,46 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
-from vkc_pin.datasets.grasping import grasped
-from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe, robot_name
-from vkc_pin.datasets.recipes.terms import meant
+from vkc_pin.datasets.grasping import find_grasping_start
+from vkc_pin.datasets.recipes.recipe import Recipe, get_robot_name, load_recipe
+from vkc_pin.datasets.recipes.terms import resolve_terms
 from vkc_pin.errors import VkcError
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner
-from vkc_pin.scene.rooms.parts import CARRIED, Part
-from vkc_pin.scene.rooms.random_room import Layout, random_layout
-from vkc_pin.scene.rooms.settings import RoomSettings
-from vkc_pin.scene.scene import START_CLEARANCE, Scene, load_scene
-from vkc_pin.task.goals import goals
-from vkc_pin.task.steps import Actuate, Grasp, Place, Step
-from vkc_pin.task.terms import Term
+from vkc_pin.procedural.rooms.parts import CARRIED, Part
+from vkc_pin.procedural.rooms.random_room import Layout, sample_layout
+from vkc_pin.procedural.rooms.settings import RoomSettings
+from vkc_pin.procedural.tasks import goals
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
+from vkc_pin.world.task.terms import Term
 
-__all__ = ["NoProblemError", "Problem", "problem", "terms_of"]
+__all__ = ["NoProblemError", "Problem", "resolve_episode_terms", "sample_problem"]
 
-_KEPT = 48  # rooms that a process keeps
-_STARTS = 300  # places that are tried for the robot
+_CACHED_ROOMS = 48  # rooms in a process's cache
+_STARTS = 300  # sampled start poses
 _TABLES = 2
-_ON = 0.001  # [m] of air below what is put on a table
-_MARGIN = 0.12  # [m] from the ends of a table to the middle of what is put there
+_GAP = 0.001  # [m] gap between a placed object and its table
+_MARGIN = 0.12  # [m] from the ends of a table to the centre of a placed object
 
 
 class NoProblemError(VkcError):
-    """The recipe's ranges leave nothing to do: no place to start from, no grasp. The message says which."""
+    """The recipe's ranges admit no problem, e.g. no free start or no free grasp."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is asked for in one episode.
+    """Problem of one episode.
 
     Attributes:
-        number: Of the episode.
-        scene: Where, with the start.
-        steps: What.
-        options: How to plan.
-        seed: Of planning.
-        about: What was drawn, as plain data: task, robot, room, object, kind, attachment, goal.
-        terms: What the motion must keep to beside that.
+        number: Episode number.
+        scene: Scene with its start.
+        steps: Steps of the task.
+        options: Planning options.
+        seed: Random seed of planning.
+        about: Sampled values as plain data: task, robot, room, object, kind, attachment, goal.
+        terms: Additional terms of the recipe.
     """
 
     number: int
@@ -64,57 +64,84 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Where episodes happen: a scene, and the layout of a random room."""
+    """A scene, and the layout if it is a random room."""
 
     scene: Scene
     layout: Layout | None
 
 
-def problem(recipe: Recipe, number: int, robots: Mapping[str, str], planner: Planner) -> Problem:
-    """Return what episode `number` of a recipe asks for; the same in every run.
+def sample_problem(
+    recipe: Recipe, number: int, robots: Mapping[str, str], planner: Planner
+) -> Problem:
+    """Return the problem of episode `number` of a recipe, which is the same in every run.
 
     Args:
         recipe: The recipe.
-        number: From 0. Numbers that share a quotient by `variants` share all but the seed of planning.
-        robots: Name of a robot in the recipe → what to load, where that is something else; see `robots`.
-        planner: Keeps what looking for grasps builds.
+        number: Episode number, from 0. Numbers with the same quotient by `variants` differ only in
+            the random seed of planning.
+        robots: Maps robot names in the recipe to files that replace them; see `robots`.
+        planner: Planner whose caches are used in the search for grasps.
 
     Raises:
-        NoProblemError: The ranges leave nothing: no room has a place for everything, no start is free, no grasp is.
+        NoProblemError: The ranges admit no problem: no room fits all objects, no start is free, or
+            no grasp is.
     """
     fields = recipe.fields
-    asked, variant = divmod(number, fields.variants)
-    rng, block = recipe.rng("episode", asked), asked // fields.rooms.episodes
+    group, variant = divmod(number, fields.variants)
+    rng, block = recipe.rng("episode", group), group // fields.rooms.episodes
     task = str(rng.choice(fields.tasks))
-    said = json.dumps(recipe.document, sort_keys=True)
+    recipe_json = json.dumps(recipe.document, sort_keys=True)
     if fields.scenes:
-        place = _Place(_scene(fields.scenes[block % len(fields.scenes)]), None)
+        place = _Place(_load_scene(fields.scenes[block % len(fields.scenes)]), None)
         robot = place.scene.robot.name
     else:
         rooms = fields.rooms.count or block + 1
-        entry = fields.robots[(block + block // rooms) % len(fields.robots)]  # in turn, and another one every time round
-        place = _place(said, fields.rooms.first + block % rooms, robots.get(entry.name, entry.name), entry.height)
+        entry = fields.robots[
+            (block + block // rooms) % len(fields.robots)
+        ]  # robots alternate, with an offset after each pass over the rooms
+        place = _make_place(
+            recipe_json,
+            fields.rooms.first + block % rooms,
+            robots.get(entry.name, entry.name),
+            entry.height,
+        )
         robot = entry.name
-    about: dict[str, Any] = {"task": task, "robot": robot_name(robot), "room": place.scene.name}
-    scene, steps, more = (_fetch if task == "fetch-place" else _open)(recipe, place, rng, task == "given-open", planner)
-    about |= {**more, "variant": variant}
-    return Problem(number, scene, steps, recipe.options, variant, about, terms_of(recipe, scene, about))
+    about: dict[str, Any] = {"task": task, "robot": get_robot_name(robot), "room": place.scene.name}
+    scene, steps, sampled = (_sample_fetch_task if task == "fetch-place" else _sample_open_task)(
+        recipe, place, rng, task == "given-open", planner
+    )
+    about |= {**sampled, "variant": variant}
+    return Problem(
+        number,
+        scene,
+        steps,
+        recipe.options,
+        variant,
+        about,
+        resolve_episode_terms(recipe, scene, about),
+    )
 
 
-def terms_of(recipe: Recipe, scene: Scene, about: Mapping[str, Any]) -> tuple[Term, ...]:
-    """Return what the motion of an episode about something must keep to; see `Episode.about`."""
-    return meant(recipe.terms_of(about["task"]), scene, about["object"], about["attachment"])
+def resolve_episode_terms(
+    recipe: Recipe, scene: Scene, about: Mapping[str, Any]
+) -> tuple[Term, ...]:
+    """Return the recipe's terms for an episode; see `Episode.about`."""
+    return resolve_terms(
+        recipe.select_terms(about["task"]), scene, about["object"], about["attachment"]
+    )
 
 
-_scene = functools.lru_cache(maxsize=_KEPT)(load_scene)
+_load_scene = functools.lru_cache(maxsize=_CACHED_ROOMS)(load_scene)
 
 
-@functools.lru_cache(maxsize=_KEPT)
-def _layout(said: str, room: int) -> Layout:
-    """Return a random room, whatever robot it is for; processes keep the last ones."""
-    recipe = load_recipe(json.loads(said))
+@functools.lru_cache(maxsize=_CACHED_ROOMS)
+def _sample_layout(recipe_json: str, room: int) -> Layout:
+    """Return the layout of a random room, independent of the robot; cached."""
+    recipe = load_recipe(json.loads(recipe_json))
     rng, fields = recipe.rng("room", room), recipe.fields
-    kinds = rng.choice(fields.objects, min(fields.rooms.objects, len(fields.objects)), replace=False)
+    kinds = rng.choice(
+        fields.objects, min(fields.rooms.objects, len(fields.objects)), replace=False
+    )
     fetched = "fetch-place" in fields.tasks
     settings = RoomSettings(
         clutter=round(float(rng.uniform(*fields.rooms.clutter)), 3),
@@ -124,114 +151,149 @@ def _layout(said: str, room: int) -> Layout:
         width=fields.rooms.width,
         front=fields.rooms.front,
     )
-    return random_layout(room, settings)
+    return sample_layout(room, settings)
 
 
-@functools.lru_cache(maxsize=_KEPT)
-def _place(said: str, room: int, robot: str, height: float | None) -> _Place:
-    """Return a random room with a robot in it; processes keep the last ones."""
+@functools.lru_cache(maxsize=_CACHED_ROOMS)
+def _make_place(recipe_json: str, room: int, robot: str, height: float | None) -> _Place:
+    """Return a random room with a robot; cached."""
     try:
-        layout = _layout(said, room)
-        scene = layout.scene()
+        layout = _sample_layout(recipe_json, room)
+        scene = layout.make_scene()
         document = scene.document
         if robot != scene.robot.name or height is not None:
             document["robot"] = {"name": robot}
-            document["start"] = {"base": document["start"]["base"], **({} if height is None else {"z": height})}
+            document["start"] = {
+                "base": document["start"]["base"],
+                **({} if height is None else {"z": height}),
+            }
             scene = Scene.from_document(document, scene.folder)
         return _Place(scene, layout)
     except VkcError as error:
-        raise NoProblemError(f"room {room} for {robot_name(robot)}: {error}") from error
+        raise NoProblemError(f"room {room} for {get_robot_name(robot)}: {error}") from error
 
 
-def _open(
+def _sample_open_task(
     recipe: Recipe, place: _Place, rng: np.random.Generator, given: bool, planner: Planner
 ) -> tuple[Scene, tuple[Step, ...], dict[str, Any]]:
-    """Return scene, steps and what was drawn, to open or to close something."""
+    """Return scene, steps and sampled values of a task that opens or closes something."""
     scene, fields = place.scene, recipe.fields
     share = round(float(rng.uniform(*fields.goal.share)), 4)
     offered = [step for step in goals(scene, share=share) if isinstance(step, Actuate)]
     if not offered:
-        raise NoProblemError(f"nothing can be opened in {scene.name}")
+        raise NoProblemError(f"{scene.name} has nothing to open")
     names = sorted({step.object for step in offered})
     name = str(rng.choice(names))
-    own = [step for step in offered if step.object == name]
-    step = own[int(rng.integers(len(own)))]
+    object_steps = [step for step in offered if step.object == name]
+    step = object_steps[int(rng.integers(len(object_steps)))]
     item = scene.objects[name].object
     attachment = str(step.attachment)
     if fields.grasps == "any":
         link = item.attachments[attachment].link
-        same = [one.name for one in item.attachments.values() if one.link == link and one.contact == "grasp"]
-        attachment = str(rng.choice(sorted(same)))
+        names_on_link = [
+            one.name
+            for one in item.attachments.values()
+            if one.link == link and one.contact == "grasp"
+        ]
+        attachment = str(rng.choice(sorted(names_on_link)))
     step = Actuate(name, step.joints, attachment)
     ((joint, goal),) = step.joints.items()
     if given:
-        terms = meant(recipe.terms_of("given-open"), scene, name, attachment)
-        found = grasped(scene, step, rng, recipe.options, planner, terms)
+        terms = resolve_terms(recipe.select_terms("given-open"), scene, name, attachment)
+        found = find_grasping_start(scene, step, rng, recipe.options, planner, terms)
         if found is None:
             raise NoProblemError(f"no free grasp of {name}.{attachment} in {scene.name} was found")
         scene = found
     else:
-        scene = _started(recipe, place, rng, scene.objects[name].placement.translation)
-    kind = _kind(recipe, item.name)
-    return scene, (step,), {"object": name, "kind": kind, "attachment": attachment, "joint": joint, "goal": goal}
+        scene = _sample_start(recipe, place, rng, scene.objects[name].placement.translation)
+    kind = _get_kind(recipe, item.name)
+    return (
+        scene,
+        (step,),
+        {"object": name, "kind": kind, "attachment": attachment, "joint": joint, "goal": goal},
+    )
 
 
-def _fetch(
+def _sample_fetch_task(
     recipe: Recipe, place: _Place, rng: np.random.Generator, given: bool, planner: Planner
 ) -> tuple[Scene, tuple[Step, ...], dict[str, Any]]:
-    """Return scene, steps and what was drawn, to take something from its table to another."""
+    """Return scene, steps and sampled values of a task that moves an object to another table."""
     scene, layout, fields = place.scene, place.layout, recipe.fields
     assert layout is not None  # recipes of scene files do not fetch
     free = [name for name, placed in scene.objects.items() if placed.object.free]
     name = str(rng.choice(sorted(free)))
     placed = scene.objects[name]
     attachments = sorted(placed.object.attachments)
-    attachment = str(rng.choice(attachments)) if fields.grasps == "any" else next(iter(placed.object.attachments))
-    others = [part for part in layout.parts if part.name.startswith("table_") and part.name != "table_1"]
-    on = others[int(rng.integers(len(others)))]
-    target = _on_table(on, placed.object.name, rng, fields.goal.edge)
-    scene = _started(recipe, place, rng, placed.placement.translation)
-    drawn = {"object": name, "kind": placed.object.name, "attachment": attachment, "joint": "", "goal": list(target)}
-    return scene, (Grasp(name, attachment), Place(name, target)), drawn
+    attachment = (
+        str(rng.choice(attachments))
+        if fields.grasps == "any"
+        else next(iter(placed.object.attachments))
+    )
+    others = [
+        part for part in layout.parts if part.name.startswith("table_") and part.name != "table_1"
+    ]
+    table = others[int(rng.integers(len(others)))]
+    target = _sample_position_on_table(table, placed.object.name, rng, fields.goal.edge)
+    scene = _sample_start(recipe, place, rng, placed.placement.translation)
+    values = {
+        "object": name,
+        "kind": placed.object.name,
+        "attachment": attachment,
+        "joint": "",
+        "goal": list(target),
+    }
+    return scene, (Grasp(name, attachment), Place(name, target)), values
 
 
-def _on_table(on: Part, kind: str, rng: np.random.Generator, edge: tuple[float, float]) -> tuple[float, float, float]:
-    """Return a place on a table, near the side at which a robot can stand, in the world frame [m]."""
-    depth, width, height = on.size
+def _sample_position_on_table(
+    table: Part, kind: str, rng: np.random.Generator, edge: tuple[float, float]
+) -> tuple[float, float, float]:
+    """Return a position on a table near the side where robots can stand, in the world [m]."""
+    depth, width, height = table.size
     x = -depth / 2.0 + min(float(rng.uniform(*edge)), depth - _MARGIN)
     y = float(rng.uniform(-1.0, 1.0)) * (width / 2.0 - _MARGIN)
-    return *on.frame.point(x, y), round(height + CARRIED[kind] + _ON, 4)
+    return *table.frame.transform_point(x, y), round(height + CARRIED[kind] + _GAP, 4)
 
 
-def _started(recipe: Recipe, place: _Place, rng: np.random.Generator, goal: Floats) -> Scene:
-    """Return the scene with the robot at a random place from which it gets to everything, and its arm about home."""
+def _sample_start(recipe: Recipe, place: _Place, rng: np.random.Generator, goal: Floats) -> Scene:
+    """Return the scene with a random start pose connected to all goals, and the arm near home."""
     scene, start = place.scene, recipe.fields.start
     low, high = scene.robot.start_limits
     x, y = np.array(scene.arena).reshape(2, 2)
     anywhere = (rng.uniform([x[0], y[0], -np.pi], [x[1], y[1], np.pi]) for _ in range(_STARTS))
-    for base in itertools.islice(scene.start_region.draws(rng) if scene.start_region else anywhere, _STARTS):
+    for base in itertools.islice(
+        scene.start_region.sample_poses(rng) if scene.start_region else anywhere, _STARTS
+    ):
         base = np.round(base, 4)
-        if not start.distance[0] <= np.linalg.norm(base[:2] - goal[:2]) <= start.distance[1] or not _connected(place, base):
+        if not start.distance[0] <= np.linalg.norm(base[:2] - goal[:2]) <= start.distance[
+            1
+        ] or not _is_connected(place, base):
             continue
         arm = scene.robot.home + rng.uniform(-1.0, 1.0, len(scene.robot.home)) * start.arm
-        there = scene.with_start(base=base, arm=np.clip(np.round(arm, 4), low[3:], high[3:]))
-        if there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
-            return there
-    raise NoProblemError(f"no free start in {scene.name} within {list(start.distance)} m of the goal")
+        candidate = scene.with_start(base=base, arm=np.clip(np.round(arm, 4), low[3:], high[3:]))
+        if candidate.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
+            return candidate
+    raise NoProblemError(
+        f"no free start in {scene.name} within {list(start.distance)} m of the goal"
+    )
 
 
-def _connected(place: _Place, base: Floats) -> bool:
-    """Return whether the robot gets from a place in a random room to wherever it has to stand."""
+def _is_connected(place: _Place, base: Floats) -> bool:
+    """Return whether the robot can drive from a pose to all places where it has to stand."""
     if place.layout is None:
         return True
     standing = [part.footprint for part in place.layout.parts if part.size != (0.0, 0.0, 0.0)]
     where = (float(base[0]), float(base[1]))
-    if not place.layout.floor.free(standing, place.layout.radius, [where])[0]:
+    if not place.layout.floor.find_free(standing, place.layout.radius, [where])[0]:
         return False
-    spots = [part.spot for part in place.layout.parts if part.spot is not None]
-    return place.layout.floor.connected(standing, place.layout.radius, [*spots, where])
+    standing_places = [
+        part.standing_place for part in place.layout.parts if part.standing_place is not None
+    ]
+    return place.layout.floor.is_connected(standing, place.layout.radius, [*standing_places, where])
 
 
-def _kind(recipe: Recipe, called: str) -> str:
-    """Return what kind of thing an object is, by the name in its description."""
-    return called.rpartition("_")[0] if called.rpartition("_")[2].isdigit() else called
+def _get_kind(recipe: Recipe, object_name: str) -> str:
+    """Return the kind of an object from the name in its description."""
+    return (
+        object_name.rpartition("_")[0] if object_name.rpartition("_")[2].isdigit() else object_name
+    )

@@ -7,20 +7,21 @@ from pathlib import Path
 
 import yaml
 
-from vkc_pin.datasets.recipes.recipe import Recipe, robot_name
+from vkc_pin.datasets.recipes.recipe import Recipe, get_robot_name
 from vkc_pin.datasets.recipes.terms import check_robot
-from vkc_pin.files.documents import read_text
-from vkc_pin.files.writing import check_name, write_atomically
 from vkc_pin.importing.robots.robot_import import import_robot
-from vkc_pin.models.robot_file import find_robot, load_robot
-from vkc_pin.scene.scene import load_scene
 from vkc_pin.simulation.cameras.mount import check_frame
-from vkc_pin.simulation.physics import engine
-from vkc_pin.simulation.snapshots import drawing_context
+from vkc_pin.simulation.physics import import_mujoco
+from vkc_pin.simulation.snapshots import open_gl_context
+from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.writing import check_name, write_atomically
+from vkc_pin.world.models.robot_file import find_robot, load_robot
+from vkc_pin.world.scene.scene import load_scene
 
-__all__ = ["check_frames", "ready_robots"]
+__all__ = ["check_frames", "prepare_robots"]
 
-_SAMPLES = 1000  # configurations for pairs that need no check, as of robots that are loaded without an SRDF
+# configurations for pairs that need no check, as of robots that are loaded without an SRDF
+_SAMPLES = 1000
 
 
 def check_frames(recipe: Recipe) -> None:
@@ -34,8 +35,8 @@ def check_frames(recipe: Recipe) -> None:
     if not recipe.cameras and not recipe.terms:
         return
     if recipe.cameras:
-        engine()
-        with drawing_context((8, 8)):
+        import_mujoco()
+        with open_gl_context((8, 8)):
             pass
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is said of robots is said when they are made ready
@@ -47,13 +48,14 @@ def check_frames(recipe: Recipe) -> None:
             check_robot(robot, recipe.terms)
 
 
-def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
+def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     """Return name in the recipe → path of what to load, for the robots that are imported or given by path.
 
     Args:
         recipe: The recipe.
-        folder: Where folders are made; what is there is not made again. On a cluster, all workers must see it. Of a robot by path
-            that says what its hand is, there is what points to its URDF.
+        folder: Where folders are made; what is there is not made again. On a cluster, all workers
+            must see it. Of a robot by path that says what its hand is, there is what points to its
+            URDF.
 
     Raises:
         InputError: A robot cannot be imported.
@@ -62,7 +64,7 @@ def ready_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is guessed is in the robot's folder
         for entry in () if recipe.fields.scenes else recipe.fields.robots:
-            made = folder / check_name(robot_name(entry.name), "robots")
+            made = folder / check_name(get_robot_name(entry.name), "robots")
             if not (made / "robot.yaml").is_file():
                 if not load_robot(entry.name).touch_links:
                     import_robot(find_robot(entry.name), made, samples=_SAMPLES)
@@ -81,4 +83,6 @@ def _point(source: Path, folder: Path) -> None:
     for field in ("urdf", "srdf"):
         if field in said:
             said[field] = str((beside.parent / said[field]).resolve())
-    write_atomically(folder / "robot.yaml", yaml.safe_dump(said, sort_keys=False, allow_unicode=True).encode())
+    write_atomically(
+        folder / "robot.yaml", yaml.safe_dump(said, sort_keys=False, allow_unicode=True).encode()
+    )

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.datasets.diversity import spread
+from vkc_pin.datasets.diversity import compute_coverage
 from vkc_pin.datasets.episode import Episode
 from vkc_pin.datasets.recipes.recipe import Recipe
-from vkc_pin.motion.world import World
-from vkc_pin.plotting.style import COLOURS, new_figure, styled
-from vkc_pin.plotting.top_view import draw_top_view
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, use_style
+from vkc_pin.visualization.plots.top_view import draw_top_view
+from vkc_pin.world.trajectory.world_model import World
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["statistics_page"]
+__all__ = ["make_statistics_page"]
 
 _STYLE = (
     "body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:70em;padding:0 1em;color:#222}"
@@ -34,7 +34,7 @@ _LISTED = 15  # rows of a table
 _CELLS = 10  # of every interval, whose share with an episode is the coverage
 
 
-def statistics_page(
+def make_statistics_page(
     recipe: Recipe,
     records: Sequence[Mapping[str, Any]],
     failures: Sequence[Mapping[str, str]],
@@ -54,11 +54,17 @@ def statistics_page(
     """
     name, attempts = recipe.fields.name, len(records) + len(failures)
     seconds = sum(float(record["duration"]) for record in records)
-    verdict = "All of them are valid." if not refused else f'<span class="bad">{len(refused)} of them are refused.</span>'
+    verdict = (
+        "All of them are valid."
+        if not refused
+        else f'<span class="bad">{len(refused)} of them are refused.</span>'
+    )
     parts = [
         f"<h1>{html.escape(name)}</h1>",
         f"<p>{len(records)} episodes, {seconds / 3600.0:.2f} h, of {attempts} attempts; recipe {recipe.digest}. {verdict}</p>",
-        _list("What is wrong", [*(f"episode {n}: {text}" for n, text in refused.items()), *problems]),
+        _list(
+            "What is wrong", [*(f"episode {n}: {text}" for n, text in refused.items()), *problems]
+        ),
         "<h2>What there is</h2>",
         *(_counts(field, records) for field in ("task", "robot", "kind")),
         "<h2>Coverage</h2>",
@@ -86,7 +92,11 @@ def _list(title: str, lines: Sequence[str]) -> str:
 def _rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     top = "".join(f"<th>{html.escape(text)}</th>" for text in head)
     body = "".join(
-        "<tr>" + "".join(f'<td class="{"n" if k else ""}">{html.escape(text)}</td>' for k, text in enumerate(row)) + "</tr>"
+        "<tr>"
+        + "".join(
+            f'<td class="{"n" if k else ""}">{html.escape(text)}</td>' for k, text in enumerate(row)
+        )
+        + "</tr>"
         for row in rows
     )
     return f"<table><tr>{top}</tr>{body}</table>"
@@ -99,7 +109,15 @@ def _counts(field: str, records: Sequence[Mapping[str, Any]]) -> str:
         own = [record for record in records if str(record[field]) == name]
         duration = float(np.median([float(record["duration"]) for record in own]))
         gone = float(np.median([float(record["base_effort"]) for record in own]))
-        rows.append([name, str(count), f"{duration:.1f}", f"{gone:.2f}", str(len({record["scene"] for record in own}))])
+        rows.append(
+            [
+                name,
+                str(count),
+                f"{duration:.1f}",
+                f"{gone:.2f}",
+                str(len({record["scene"] for record in own})),
+            ]
+        )
     return _rows([field, "episodes", "duration, median [s]", "base, median [m]", "scenes"], rows)
 
 
@@ -111,14 +129,22 @@ def _coverage(recipe: Recipe, records: Sequence[Mapping[str, Any]]) -> str:
     starts = np.array([record["start"][:2] for record in records])
     cells = {tuple(cell) for cell in np.floor(starts / 0.5).astype(int).tolist()}
     rows = [
-        ["headings of the base at the start, in 10 equal sectors", f"{100.0 * spread(headings, 0.0, 2.0 * np.pi, _CELLS):.0f} %"],
+        [
+            "headings of the base at the start, in 10 equal sectors",
+            f"{100.0 * compute_coverage(headings, 0.0, 2.0 * np.pi, _CELLS):.0f} %",
+        ],
         ["cells of 0.5 m on the floor that something starts in", str(len(cells))],
         ["rooms", str(len({record["room"] for record in records}))],
-        ["objects that differ", str(len({(record["scene"], record["object"]) for record in records}))],
+        [
+            "objects that differ",
+            str(len({(record["scene"], record["object"]) for record in records})),
+        ],
         ["attachments", str(len({(record["kind"], record["attachment"]) for record in records}))],
     ]
     wanted = set(recipe.fields.tasks) - {str(record["task"]) for record in records}
-    rows += [["tasks of the recipe without an episode", ", ".join(sorted(wanted))]] if wanted else []
+    rows += (
+        [["tasks of the recipe without an episode", ", ".join(sorted(wanted))]] if wanted else []
+    )
     return _rows(["what", "found"], rows)
 
 
@@ -131,7 +157,8 @@ def _windings(records: Sequence[Mapping[str, Any]]) -> str:
         f"{len(classes)} pairs of a room and a class, in {len({record['room'] for record in records})} rooms."
     )
     rows = [
-        [f"round {number} things" if number else "as the straight line", str(count)] for number, count in sorted(counted.items())
+        [f"round {number} things" if number else "as the straight line", str(count)]
+        for number, count in sorted(counted.items())
     ]
     return f"<p>{text}</p>" + _rows(["path of the base", "episodes"], rows)
 
@@ -139,24 +166,41 @@ def _windings(records: Sequence[Mapping[str, Any]]) -> str:
 def _failures(failures: Sequence[Mapping[str, str]]) -> str:
     if not failures:
         return "<p>There are none.</p>"
-    counted = Counter((row["task"] or "–", row["status"], re.sub(r"[-\d.]+", "#", row["reason"])[:140]) for row in failures)
-    return _rows(["task", "status", "reason", "attempts"], [[*key, str(count)] for key, count in counted.most_common(_LISTED)])
+    counted = Counter(
+        (row["task"] or "–", row["status"], re.sub(r"[-\d.]+", "#", row["reason"])[:140])
+        for row in failures
+    )
+    return _rows(
+        ["task", "status", "reason", "attempts"],
+        [[*key, str(count)] for key, count in counted.most_common(_LISTED)],
+    )
 
 
 def _histograms(records: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw how durations, ways, clearances, goals and starts are spread."""
     tasks = sorted({str(record["task"]) for record in records})
-    with styled():
+    with use_style():
         figure = new_figure(10.0, 5.6)
         axes = figure.subplots(2, 3).ravel()
-        fields = (("duration", "duration [s]"), ("base_effort", "way of the base [m]"), ("arm_effort", "way of the arm [rad]"))
-        for own, (field, label) in zip(axes, (*fields, ("clearance", "least clearance [m]")), strict=False):
-            columns = [[float(r[field]) for r in records if r["task"] == task and field in r] for task in tasks]
+        fields = (
+            ("duration", "duration [s]"),
+            ("base_effort", "way of the base [m]"),
+            ("arm_effort", "way of the arm [rad]"),
+        )
+        for own, (field, label) in zip(
+            axes, (*fields, ("clearance", "least clearance [m]")), strict=False
+        ):
+            columns = [
+                [float(r[field]) for r in records if r["task"] == task and field in r]
+                for task in tasks
+            ]
             own.hist(columns, bins=24, stacked=True, color=COLOURS[: len(tasks)], label=tasks)
             own.set_xlabel(label)
             own.set_ylabel("episodes")
         axes[0].legend(fontsize=8)
-        goals = [float(record["goal"]) for record in records if not isinstance(record["goal"], list)]
+        goals = [
+            float(record["goal"]) for record in records if not isinstance(record["goal"], list)
+        ]
         axes[4].hist(goals, bins=24, color=COLOURS[0])
         axes[4].set_xlabel("goal of what is opened [rad] or [m]")
         axes[4].set_ylabel("episodes")
@@ -181,11 +225,13 @@ def _svg(figure: Figure) -> str:
 def _picture(episode: Episode) -> str:
     """Return an episode from above, with what it does."""
     scene = episode.scene()
-    with styled():
+    with use_style():
         figure = new_figure(5.2, 4.6)
         draw_top_view(figure, World(scene), episode.trajectory)
         drawn = _svg(figure)
     about = episode.about
-    said = f"{episode.number}: {about['task']}, {about['robot']}, {about['kind']} in {about['room']}, "
+    said = (
+        f"{episode.number}: {about['task']}, {about['robot']}, {about['kind']} in {about['room']}, "
+    )
     seconds = float(episode.trajectory.times[-1] - episode.trajectory.times[0])
     return f"<figure>{drawn}<figcaption>{html.escape(said)}{seconds:.1f} s</figcaption></figure>"

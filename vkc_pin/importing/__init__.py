@@ -1,1 +1,1 @@
-"""Robots, objects and homes from files that were made for other programs."""
+"""Imports robots, objects and homes from files of other programs, and proposes attachments."""

@@ -1,7 +1,8 @@
-"""Convex pieces of concave meshes, by CoACD (Wei et al., SIGGRAPH 2022), and how much more than the mesh they fill.
+"""Decomposes concave meshes into convex pieces with CoACD (Wei et al., SIGGRAPH 2022).
 
-What a piece does not cover would be driven through, so the pieces contain the surface that they are made from. CoACD takes closed
-meshes of few triangles; others are cut by planes, see `slicing`.
+Pieces contain the surface that they are made from, since planning would drive through whatever they
+leave uncovered. CoACD takes closed meshes of few triangles; other meshes are cut by planes, see
+`slicing`.
 """
 
 from __future__ import annotations
@@ -16,34 +17,38 @@ from typing import TYPE_CHECKING, Any
 import coal
 import numpy as np
 
-from vkc_pin.arguments import number, quantity, whole
-from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.files.hulls import compute_hull, outer_hull
-from vkc_pin.files.meshes import MeshPart, coarser, load_mesh, to_bvh
-from vkc_pin.files.resources import file_path
-from vkc_pin.importing.slicing import flat, slices, thickened
-from vkc_pin.kept import record
-from vkc_pin.needed import optional_package
+from vkc_pin.importing.slicing import is_flat, slice_mesh, thicken
+from vkc_pin.utils.arguments import number, quantity, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.disk_cache import record
+from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.world.files.hulls import compute_hull, outer_hull
+from vkc_pin.world.files.meshes import MeshPart, coarser, load_mesh, to_bvh
+from vkc_pin.world.files.resources import file_path
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["ERROR", "PIECES", "Pieces", "concavity", "decompose", "solid_volume"]
+__all__ = ["ERROR", "PIECES", "Pieces", "compute_concavity", "compute_solid_volume", "decompose"]
 
 ERROR = 0.02
-"""How far pieces may stand out over the surface before more of them are made, [m]: about the margin that motions keep anyway."""
+"""Largest protrusion of pieces over the surface [m], about the clearance margin of motions."""
 PIECES = 12
-"""The most pieces of one mesh: the time of a plan grows with their number."""
-_VERSION = 1  # of what is kept on disk: another one whenever the same mesh would be cut otherwise
-_MOST_TRIANGLES = 2000  # that CoACD is given: with more it takes minutes
-_CORNERS = 40  # of a piece, at most; as in the collision geometry that comes with the package
-_SPARE = 1.5  # times as many corners as asked for are left alone: making them fewer takes a second
-_PER_CELL, _MOST_SAMPLES = 16, 4_000_000  # points by which cells of that grid are found that the skin passes
-_SAMPLES = 1000  # points on a surface, beside its corners
-_SPECK = 1e-6  # [m] radius of what distances are measured to
-_CELLS = 96  # of the longest edge, in which volumes of open meshes are counted
-_SEARCH = {"resolution": 1000}  # points by which CoACD judges a cut: half its default takes half the time
+"""Largest number of pieces of one mesh: planning time grows with their number."""
+_VERSION = 1  # of the disk cache: increase it whenever the same mesh would be cut differently
+_MAX_TRIANGLES = 2000  # of a mesh for CoACD, which takes minutes for larger ones
+_CORNERS = 40  # largest number of vertices of a piece, as in the packaged collision geometry
+# Pieces are simplified only above this multiple of the vertex limit: simplifying takes a second.
+_CORNER_TOLERANCE = 1.5
+_SAMPLES_PER_CELL = 16  # surface samples that detect the grid cells of a mesh's skin
+_MAX_SAMPLES = 4_000_000
+_SAMPLES = 1000  # samples on a surface in addition to its vertices
+_POINT_RADIUS = 1e-6  # [m] radius of the sphere that stands for a point in distance queries
+_CELLS = 96  # grid cells along the longest edge, for volumes of open meshes
+_SEARCH = {
+    "resolution": 1000
+}  # samples with which CoACD rates cuts: half its default, half the time
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +56,10 @@ class Pieces:
     """Convex pieces that together contain a mesh.
 
     Attributes:
-        meshes: The pieces, closed, in the frame of the mesh, [m].
-        solid: Volume of the mesh itself [m³], of which everything is part that cannot be reached from outside.
-        error: How far the pieces stand out over the mesh's surface at most [m], measured at points.
+        meshes: The pieces, closed, in the frame of the mesh [m].
+        solid: Volume of the mesh itself [m³], including cavities that are not reachable from
+            outside.
+        error: Largest protrusion of the pieces over the mesh's surface [m], measured at samples.
     """
 
     meshes: tuple[trimesh.Trimesh, ...]
@@ -62,12 +68,12 @@ class Pieces:
 
     @property
     def volume(self) -> float:
-        """Volume of the pieces [m³]; where they overlap, it counts twice."""
+        """Total volume of the pieces [m³]; overlaps count twice."""
         return float(sum(piece.volume for piece in self.meshes))
 
     @property
     def overhead(self) -> float:
-        """How much more than the mesh the pieces fill, relative to it: 0.25 for a quarter more."""
+        """Volume of the pieces in excess of the mesh, relative to it: 0.25 for a quarter more."""
         return self.volume / self.solid - 1.0
 
 
@@ -80,21 +86,26 @@ def decompose(
     corners: int = _CORNERS,
     seed: int = 0,
 ) -> Pieces:
-    """Return convex pieces that contain a mesh.
+    """Decompose a mesh into convex pieces that contain it.
 
-    That is its hull where this is close to it, else the hulls of the bodies that it consists of, else the parts that CoACD cuts
-    it into. The same mesh gives the same pieces; the parts of one that had to be cut are kept on disk.
+    The result is the convex hull if it is close to the mesh, else the hulls of its connected
+    bodies, else those of the parts into which CoACD cuts it. The same mesh gives the same pieces;
+    the parts of meshes that had to be cut are cached on disk.
 
     Args:
         mesh: A mesh file in [m], or a mesh; it need not be closed.
-        most_pieces: The largest number of pieces.
-        error: How far the pieces may stand out over the mesh's surface [m]; unless that takes more pieces.
-        overhead: A hull that fills no more than this share more than the mesh is left whole, wherever it stands out.
-        corners: A piece with half as many again, or more, becomes a polytope around it that has no more than these.
-        seed: Of the random numbers.
+        most_pieces: Largest number of pieces.
+        error: Largest protrusion of the pieces over the mesh's surface [m], unless it takes more
+            pieces.
+        overhead: A hull whose excess volume, relative to the mesh, is no larger than this is kept
+            whole, wherever it protrudes.
+        corners: Largest number of vertices. A piece with half as many again is replaced by an
+            enclosing polytope.
+        seed: Random seed.
 
     Raises:
-        InputError: The mesh cannot be read, is empty or flat, or CoACD is not installed and would be needed.
+        InputError: The mesh cannot be read, is empty or flat, or has to be cut and CoACD is not
+            installed.
     """
     import trimesh
 
@@ -102,42 +113,59 @@ def decompose(
     whole(corners, "corners", low=8)
     error, overhead = quantity(error, "error"), number(overhead, "overhead", low=0.0)
     if error <= 0.0:
-        raise InputError("not a distance", field="error", expected="a number above 0 [m]", got=error)
+        raise InputError(
+            "`error` must be positive", field="error", expected="a number above 0 [m]", got=error
+        )
     if isinstance(mesh, trimesh.Trimesh):
-        file, given = None, mesh
+        file, loaded = None, mesh
     else:
         file = file_path(mesh, "mesh", "a mesh or a mesh file")
-        given = load_mesh(file)
-    hull = _hull(given.vertices, file)
-    found, solid = [hull], min(solid_volume(given), float(hull.volume))
-    if most_pieces > 1 and hull.volume > (1.0 + overhead) * solid and _standing_out(found, given) > error:
-        found = _bodies(given, most_pieces)
-        if not found or _standing_out(found, given) > error:
+        loaded = load_mesh(file)
+    hull = _make_hull(loaded.vertices, file)
+    hulls, solid = [hull], min(compute_solid_volume(loaded), float(hull.volume))
+    if (
+        most_pieces > 1
+        and hull.volume > (1.0 + overhead) * solid
+        and _measure_protrusion(hulls, loaded) > error
+    ):
+        hulls = _make_body_hulls(loaded, most_pieces)
+        if not hulls or _measure_protrusion(hulls, loaded) > error:
 
-            def cut() -> list[list[list[float]]]:
-                parts = _cut(given, most_pieces, error, seed, file) or [np.asarray(hull.vertices)]
-                return [piece.vertices.tolist() for piece in _simple(_containing(parts, _surface(given)), corners)]
+            def cut_pieces() -> list[list[list[float]]]:
+                """Return the vertices of each piece."""
+                parts = _cut_mesh(loaded, most_pieces, error, seed, file) or [
+                    np.asarray(hull.vertices)
+                ]
+                return [
+                    piece.vertices.tolist()
+                    for piece in _simplify(
+                        _enclose_surface(parts, _sample_surface(loaded)), corners
+                    )
+                ]
 
-            parts = record(_key(given, most_pieces, error, corners, seed), cut)
-            found = [compute_hull(np.array(part)) for part in parts]
-    pieces = tuple(_simple(found, corners))
-    solid = min(solid, float(sum(piece.volume for piece in pieces)))  # which contain it: of open meshes, it is but measured
-    return Pieces(pieces, solid, _standing_out(pieces, given))
+            parts = record(_make_cache_key(loaded, most_pieces, error, corners, seed), cut_pieces)
+            hulls = [compute_hull(np.array(part)) for part in parts]
+    pieces = tuple(_simplify(hulls, corners))
+    # The volume of an open mesh is only measured, and the pieces contain the mesh.
+    solid = min(solid, float(sum(piece.volume for piece in pieces)))
+    return Pieces(pieces, solid, _measure_protrusion(pieces, loaded))
 
 
-def concavity(mesh: trimesh.Trimesh) -> float:
-    """Return how far the convex hull of a mesh stands out over its surface at most [m], measured at points.
+def compute_concavity(mesh: trimesh.Trimesh) -> float:
+    """Return the largest protrusion of a mesh's convex hull over its surface [m], sampled.
 
     Raises:
         InputError: The mesh is flat.
     """
-    return _standing_out([_hull(mesh.vertices, None)], mesh)
+    return _measure_protrusion([_make_hull(mesh.vertices, None)], mesh)
 
 
-def solid_volume(mesh: trimesh.Trimesh) -> float:
-    """Return the volume of a mesh [m³]; of one that is not closed, that of the cells of a grid that nothing reaches from outside.
+def compute_solid_volume(mesh: trimesh.Trimesh) -> float:
+    """Return the volume of a mesh [m³].
 
-    Cells that the skin itself passes count half. Holes narrower than a hundredth of the mesh count as closed.
+    For a mesh that is not closed, this is the volume of grid cells that cannot be reached from
+    outside; cells of the surface itself count half. Holes narrower than a hundredth of the mesh
+    count as closed.
     """
     import trimesh
     from scipy import ndimage
@@ -148,7 +176,7 @@ def solid_volume(mesh: trimesh.Trimesh) -> float:
     low = mesh.bounds[0] - 1.5 * pitch
     size = np.ceil((mesh.bounds[1] - low) / pitch).astype(int) + 2
     skin = np.zeros(size, bool)
-    count = int(min(_PER_CELL * mesh.area / pitch**2, _MOST_SAMPLES)) + 1
+    count = int(min(_SAMPLES_PER_CELL * mesh.area / pitch**2, _MAX_SAMPLES)) + 1
     points = np.vstack([mesh.vertices, trimesh.sample.sample_surface(mesh, count, seed=0)[0]])
     skin[tuple(np.floor((points - low) / pitch).astype(int).T)] = True
     regions, _ = ndimage.label(~skin)
@@ -156,96 +184,160 @@ def solid_volume(mesh: trimesh.Trimesh) -> float:
     return float((inside.sum() + 0.5 * skin.sum()) * pitch**3)
 
 
-def _key(mesh: trimesh.Trimesh, *settings: float) -> bytes:
-    """Return all that the pieces of a mesh depend on."""
-    surface = hashlib.sha256(np.asarray(mesh.vertices, float).tobytes() + np.asarray(mesh.faces, np.int64).tobytes())
+def _make_cache_key(mesh: trimesh.Trimesh, *settings: float) -> bytes:
+    """Return a key of everything that the pieces of a mesh depend on."""
+    surface = hashlib.sha256(
+        np.asarray(mesh.vertices, float).tobytes() + np.asarray(mesh.faces, np.int64).tobytes()
+    )
     return json.dumps(("pieces", _VERSION, settings, surface.hexdigest())).encode()
 
 
-def _simple(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.Trimesh]:
-    """Return pieces with few corners: polytopes around those that have many."""
-    return [outer_hull(one.vertices, vertices=corners) if len(one.vertices) > _SPARE * corners else one for one in pieces]
+def _simplify(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.Trimesh]:
+    """Replace pieces with many vertices by enclosing polytopes with few."""
+    return [
+        outer_hull(one.vertices, vertices=corners)
+        if len(one.vertices) > _CORNER_TOLERANCE * corners
+        else one
+        for one in pieces
+    ]
 
 
-def _bodies(mesh: trimesh.Trimesh, most: int) -> list[trimesh.Trimesh]:
-    """Return the hulls of the connected bodies of a mesh; none if it is one body, or more than `most`, or one is flat."""
-    merged = _merged(mesh)
-    if not 1 < merged.body_count <= most:
+def _make_body_hulls(mesh: trimesh.Trimesh, max_parts: int) -> list[trimesh.Trimesh]:
+    """Return the hulls of a mesh's connected bodies.
+
+    The list is empty if there is one body, more than `max_parts`, or a flat one.
+    """
+    merged = _merge_vertices(mesh)
+    if not 1 < merged.body_count <= max_parts:
         return []
-    bodies = [np.asarray(body.vertices) for body in merged.split(only_watertight=False, repair=False)]
-    return [] if any(map(flat, bodies)) else [_hull(body, None) for body in bodies]
+    bodies = [
+        np.asarray(body.vertices) for body in merged.split(only_watertight=False, repair=False)
+    ]
+    return [] if any(map(is_flat, bodies)) else [_make_hull(body, None) for body in bodies]
 
 
-def _cut(mesh: trimesh.Trimesh, most: int, error: float, seed: int, file: Path | None) -> list[Floats]:
-    """Return the corners of parts of a mesh: those that CoACD cuts it into, or slices if it is open or has many triangles."""
+def _cut_mesh(
+    mesh: trimesh.Trimesh, max_parts: int, error: float, seed: int, file: Path | None
+) -> list[Floats]:
+    """Return the vertices of parts of a mesh.
+
+    CoACD cuts it; open meshes and those with many triangles are sliced.
+    """
     import trimesh
 
-    merged = _merged(mesh)
-    if not merged.is_volume or len(merged.faces) > _MOST_TRIANGLES:
-        coarse = coarser(MeshPart(np.asarray(merged.vertices), np.asarray(merged.faces)), merged.extents.max() / _CELLS)
-        return [thickened(part) for part in slices(trimesh.Trimesh(coarse.vertices, coarse.faces), most)]
-    coacd = optional_package("coacd", "import", what="cutting a concave mesh into convex pieces", file=file)
-    coacd.set_log_level("off")
-    given = coacd.Mesh(merged.vertices, merged.faces)
-    parts = coacd.run_coacd(
-        given, threshold=error, real_metric=True, max_convex_hull=most, seed=seed, preprocess_mode="off", **_SEARCH
+    merged = _merge_vertices(mesh)
+    if not merged.is_volume or len(merged.faces) > _MAX_TRIANGLES:
+        coarse = coarser(
+            MeshPart(np.asarray(merged.vertices), np.asarray(merged.faces)),
+            merged.extents.max() / _CELLS,
+        )
+        return [
+            thicken(part)
+            for part in slice_mesh(trimesh.Trimesh(coarse.vertices, coarse.faces), max_parts)
+        ]
+    coacd = optional_package(
+        "coacd", "import", what="cutting a concave mesh into convex pieces", file=file
     )
-    return [corners for vertices, _ in parts if not flat(corners := np.asarray(vertices))]
+    coacd.set_log_level("off")
+    loaded = coacd.Mesh(merged.vertices, merged.faces)
+    parts = coacd.run_coacd(
+        loaded,
+        threshold=error,
+        real_metric=True,
+        max_convex_hull=max_parts,
+        seed=seed,
+        preprocess_mode="off",
+        **_SEARCH,
+    )
+    return [corners for vertices, _ in parts if not is_flat(corners := np.asarray(vertices))]
 
 
-def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a mesh whose triangles share corners that are at one place."""
+def _merge_vertices(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a copy of a mesh in which coincident vertices are merged."""
     merged = mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     return merged
 
 
-def _hull(points: Any, file: Path | None) -> trimesh.Trimesh:
+def _make_hull(points: Any, file: Path | None) -> trimesh.Trimesh:
+    """Return the convex hull of points, which must not be flat."""
     points = np.asarray(points, float)
-    if flat(points):
-        raise InputError("the mesh is flat", file=file, expected="triangles around a volume", got="triangles in one plane")
+    if is_flat(points):
+        raise InputError(
+            "the mesh is flat",
+            file=file,
+            expected="triangles that enclose a volume",
+            got="triangles in one plane",
+        )
     return compute_hull(points)
 
 
-def _surface(mesh: trimesh.Trimesh) -> Floats:
-    """Return points on a mesh, shape (n, 3): its corners, and some spread evenly by area."""
+def _sample_surface(mesh: trimesh.Trimesh) -> Floats:
+    """Return points on a mesh, shape (n, 3): its vertices, and samples uniform by area."""
     import trimesh
 
     samples, _ = trimesh.sample.sample_surface(mesh, 4 * _SAMPLES, seed=0)
     return np.vstack([np.asarray(mesh.vertices), np.asarray(samples)])
 
 
-def _standing_out(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> float:
-    """Return how far the outer surface of pieces lies from a mesh at most [m], measured at points."""
+def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> float:
+    """Return the largest distance of the pieces' outer surface from a mesh [m], sampled."""
     import trimesh
 
-    triangles, here, request, result = to_bvh(mesh), coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult()
+    triangles, here, request, result = (
+        to_bvh(mesh),
+        coal.Transform3s(),
+        coal.DistanceRequest(),
+        coal.DistanceResult(),
+    )
     triangles.computeLocalAABB()
-    speck, furthest = coal.Sphere(_SPECK), 0.0
+    point_shape, furthest = coal.Sphere(_POINT_RADIUS), 0.0
     for piece in pieces:
-        points = np.vstack([piece.triangles_center, trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)[0]])
-        hidden = np.zeros(len(points), bool)
+        points = np.vstack(
+            [piece.triangles_center, trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)[0]]
+        )
+        is_covered = np.zeros(len(points), bool)
         for other in pieces:
             if other is not piece:
-                hidden |= _outside(other, points) < -_SPECK
-        for point in points[~hidden]:
+                is_covered |= _measure_outside(other, points) < -_POINT_RADIUS
+        for point in points[~is_covered]:
             result.clear()
-            furthest = max(furthest, coal.distance(speck, coal.Transform3s(np.eye(3), point), triangles, here, request, result))
+            furthest = max(
+                furthest,
+                coal.distance(
+                    point_shape,
+                    coal.Transform3s(np.eye(3), point),
+                    triangles,
+                    here,
+                    request,
+                    result,
+                ),
+            )
     return furthest
 
 
-def _outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
-    """Return how far points, shape (n, 3), lie beyond the faces of a convex piece, shape (n,) [m]; negative inside."""
+def _measure_outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
+    """Return the signed distances of points, shape (n, 3), from a convex piece, shape (n,) [m].
+
+    They are negative inside.
+    """
     normals = np.asarray(piece.face_normals)
-    return np.asarray((points @ normals.T - np.einsum("ij,ij->i", normals, np.asarray(piece.triangles)[:, 0])).max(axis=1))
+    return np.asarray(
+        (
+            points @ normals.T - np.einsum("ij,ij->i", normals, np.asarray(piece.triangles)[:, 0])
+        ).max(axis=1)
+    )
 
 
-def _containing(parts: list[Floats], surface: Floats) -> list[trimesh.Trimesh]:
-    """Return the hulls of parts, each widened by the points of a surface that lie in none and are nearest to it."""
+def _enclose_surface(parts: list[Floats], surface: Floats) -> list[trimesh.Trimesh]:
+    """Return the hulls of parts, extended to contain a surface.
+
+    Each point of the surface that lies in no part is added to the nearest one.
+    """
     hulls = [compute_hull(part) for part in parts]
-    beyond = np.array([_outside(hull, surface) for hull in hulls])
-    nearest, missing = beyond.argmin(axis=0), beyond.min(axis=0) > 1e-9
+    beyond = np.array([_measure_outside(hull, surface) for hull in hulls])
+    nearest, is_outside = beyond.argmin(axis=0), beyond.min(axis=0) > 1e-9
     return [
-        compute_hull(np.vstack([np.asarray(hull.vertices), surface[missing & (nearest == k)]]))
+        compute_hull(np.vstack([np.asarray(hull.vertices), surface[is_outside & (nearest == k)]]))
         for k, hull in enumerate(hulls)
     ]

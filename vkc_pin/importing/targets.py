@@ -6,13 +6,14 @@ from pathlib import Path
 
 from vkc_pin.errors import InputError
 
-__all__ = ["check_target", "format_comment", "made_by"]
+__all__ = ["check_target", "format_comment", "get_origin_marker"]
 
-_FIRST = 4096  # characters of a first line: names of files have up to 255 bytes, escaped up to 1530
+# Characters to read of a first line: file names have up to 255 bytes, or 1530 when escaped.
+_FIRST_LINE_LENGTH = 4096
 
 
-def made_by(command: str) -> str:
-    """Return what the first line of a YAML file says by which a folder is known to be made by a command, e.g. "import-home"."""
+def get_origin_marker(command: str) -> str:
+    """Return the marker in a YAML file's first line that names the command that wrote it."""
     return f"by vkc-pin {command}"
 
 
@@ -31,29 +32,42 @@ def format_comment(text: str) -> str:
 
 
 def check_target(folder: Path, command: str, *, force: bool) -> None:
-    """Check that an import may write a folder, so that nobody loses one of another kind.
+    """Check that an import may write to a folder, so that it does not overwrite other files.
 
     Args:
         folder: The folder.
-        command: What imports, e.g. "import-home".
-        force: Whether to replace what it made before.
+        command: Name of the command, e.g. "import-home".
+        force: Whether the command may replace its own earlier output.
 
     Raises:
-        InputError: Something else is there, or it may not be replaced.
+        InputError: The folder holds other files, or may not be replaced.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
-    own = folder.is_dir() and any(made_by(command) in _first_line(file) for file in folder.glob("*.yaml"))
+    own = folder.is_dir() and any(
+        get_origin_marker(command) in _read_first_line(file) for file in folder.glob("*.yaml")
+    )
     if force and own:
         return
-    expected = "a new or an empty folder" + (", or force=True (--force) to replace it" if own else "")
-    got = "a file" if not folder.is_dir() else f"what {command} made before" if own else "other files"
-    raise InputError("there is something already", file=folder, field="folder", expected=expected, got=got)
+    expected = "a new or an empty folder" + (
+        ", or force=True (--force) to replace it" if own else ""
+    )
+    got = (
+        "a file"
+        if not folder.is_dir()
+        else f"an earlier output of {command}"
+        if own
+        else "other files"
+    )
+    raise InputError(
+        "the target already exists", file=folder, field="folder", expected=expected, got=got
+    )
 
 
-def _first_line(file: Path) -> str:
+def _read_first_line(file: Path) -> str:
+    """Return the first line of a file, or "" if it cannot be read."""
     try:
         with file.open(errors="replace") as stream:
-            return stream.readline(_FIRST)
+            return stream.readline(_FIRST_LINE_LENGTH)
     except OSError:
         return ""

@@ -1,1 +1,1 @@
-"""Tries seeds until the validation accepts a motion: steps one by one, all at once, or in a window that slides along."""
+"""Plans whole-body trajectories, from scene and steps to a validated plan."""

@@ -1,4 +1,4 @@
-"""plan(): from steps to a checked motion; and a `Planner`, which keeps what can be used again."""
+"""Plans the trajectory of steps, with the entry point `plan` and the caches of a `Planner`."""
 
 from __future__ import annotations
 
@@ -7,33 +7,36 @@ import dataclasses
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
-from vkc_pin.arguments import flag, instance, number, whole
-from vkc_pin.cache import Cache, CacheInfo
+from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.progress import shown
-from vkc_pin.planning.settings import Settings, settings_for
-from vkc_pin.planning.stepwise import all_at_once, step_by_step
-from vkc_pin.scene.scene import Scene
-from vkc_pin.solver.solution import Iteration
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.phases import stretches
-from vkc_pin.task.steps import Step
-from vkc_pin.task.terms import Term, check_active
+from vkc_pin.planning.request import make_budget, make_request
+from vkc_pin.planning.sequential import plan_sequentially, plan_simultaneously
+from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.planning.window import plan_with_window
+from vkc_pin.utils.arguments import flag, instance, number, whole
+from vkc_pin.utils.cache import Cache, CacheInfo
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.actions import compile_each_step
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import Task, summarize_phases
+from vkc_pin.world.task.steps import Step, as_steps
+from vkc_pin.world.task.terms import Term, check_terms_active
 
-__all__ = ["Planner", "borrowed", "guarded", "plan"]
+__all__ = ["Planner", "acquire_cache", "plan"]
 
 
 class Planner:
-    """Keeps what planning builds and can use again: symbolic programs with their solvers, kinematics, tables of shapes.
+    """Owns the caches of planning: symbolic programs with their solvers, kinematics, shape tables.
 
-    Pass one as `planner=` to keep apart what different parts of a program build, or to bound it; without one, all calls share
-    the process's own. It makes no difference to a motion what a planner has kept. Threads may plan with one planner at once: each
-    plan borrows a cache of its own, and at the end leaves it to the next.
+    Pass one as `planner=` to separate or to bound the caches of parts of a program; without one,
+    all calls share the process's own. Cached values make no difference to a trajectory. Threads may
+    plan with one planner at once: each call acquires a cache of its own and releases it at the end.
 
     Args:
-        entries: How many objects are kept at most.
-        megabytes: How much memory they take at most, as estimated [MB]. While plans run they may take more.
+        entries: Largest number of cached objects.
+        megabytes: Largest memory of all caches, as estimated [MB]. Running calls may exceed it.
     """
 
     def __init__(self, *, entries: int = 512, megabytes: float = 128.0) -> None:
@@ -44,10 +47,11 @@ class Planner:
 
     def __repr__(self) -> str:
         info = self.info()
-        return f"<Planner: {info.entries} of {self.entries} entries, {info.nbytes / 1e6:.1f} of {self.megabytes:g} MB>"
+        entries = f"{info.entries} of {self.entries} entries"
+        return f"<Planner: {entries}, {info.nbytes / 1e6:.1f} of {self.megabytes:g} MB>"
 
     def info(self) -> CacheInfo:
-        """Return how much is kept, and how often something was there when it was asked for; not of plans that are running."""
+        """Return entries, memory, hits and misses of all caches that no call uses at present."""
         with self._lock:
             return self._total()
 
@@ -56,22 +60,23 @@ class Planner:
         return CacheInfo(*(sum(column) for column in zip(*every, strict=True)))
 
     def clear(self) -> None:
-        """Forget all that is kept; plans that are running go on with what they have."""
+        """Evict everything; running calls keep their caches."""
         with self._lock:
             self._idle.clear()
 
     @contextlib.contextmanager
-    def lent(self) -> Iterator[Cache]:
-        """Lend a cache that nobody else has, the one that was used last if it is free; at the end make room."""
+    def acquire(self) -> Iterator[Cache]:
+        """Acquire a cache for exclusive use, the most recently used if possible; evict at the end."""
         with self._lock:
-            cache = self._idle.pop() if self._idle else Cache(entries=self.entries, nbytes=1e6 * self.megabytes)
+            new = None if self._idle else Cache(entries=self.entries, nbytes=1e6 * self.megabytes)
+            cache = self._idle.pop() if new is None else new
         try:
             yield cache
         finally:
             cache.trim()
             with self._lock:
                 self._idle.append(cache)
-                while len(self._idle) > 1:  # those go first that were used longest ago
+                while len(self._idle) > 1:  # the least recently used go first
                     total = self._total()
                     if total.entries <= self.entries and total.nbytes <= 1e6 * self.megabytes:
                         break
@@ -81,9 +86,9 @@ class Planner:
 _shared = Planner()
 
 
-def borrowed(planner: Planner | None) -> contextlib.AbstractContextManager[Cache]:
-    """Return what lends a cache of a planner, or of the process's own if there is none; see `Planner.lent`."""
-    return (_shared if planner is None else instance(planner, Planner, "planner")).lent()
+def acquire_cache(planner: Planner | None) -> contextlib.AbstractContextManager[Cache]:
+    """Acquire a cache of a planner, or of the process's own; see `Planner.acquire`."""
+    return (_shared if planner is None else instance(planner, Planner, "planner")).acquire()
 
 
 def plan(
@@ -96,68 +101,90 @@ def plan(
     time_limit: float | None = None,
     effort: int | None = None,
     seed: int = 0,
-    joint: bool = True,
+    simultaneous: bool = True,
+    window: int | None = None,
     perturbation: float = 0.0,
     progress: bool = False,
     terms: Sequence[Term] = (),
     planner: Planner | None = None,
 ) -> Plan:
-    """Plan one coordinated motion of base, arm and objects that brings about `steps`.
+    """Plan one coordinated trajectory of base, arm and objects that achieves `steps`.
 
     Args:
-        scene: Robot, objects and obstacles; the motion starts at the scene's start.
-        steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `Touch`, `Place`, `Release`, `GoTo`.
-        initialization: "auto", "interpolated", "astar", "rrt" or "stationary"; see `initialization.initialize`.
-        options: How to plan; `Options()` if left out.
-        callback: Called after every round of the solver with an `Iteration`, whose fields are named columns.
-        time_limit: Seconds by the clock, from the call on and with all that is built and checked, after which the best motion so
-            far is returned, with status "time limit". What succeeds within it depends on the machine and on what else runs there.
-        effort: The same as a count of work, with status "effort spent": how many configurations may be looked at, by searches for
-            seeds, and in every iteration of Ipopt at each waypoint. The same call succeeds with it on every machine, or fails.
-            What a plan took is in `metrics["effort"]`; 100 000 take some ten seconds.
-        seed: Of the random numbers. The same call gives the same trajectory on the same machine, bit for bit, whatever was
-            planned before; only `time_limit` can make a difference.
-        joint: Plan all steps as one problem; otherwise each from where the one before it ends, for comparison.
-        perturbation: Standard deviation of smooth noise on the seeds, [m] and [rad], to see how much hangs on them.
-        progress: Show one line that changes in its place: in a notebook or a terminal; elsewhere nothing is shown.
-        terms: Own constraints and costs, beside those of every motion; see `Constraint` and `Cost`.
-        planner: Keeps what can be used again; None: the process's own.
+        scene: Robot, objects and obstacles; the trajectory starts at the scene's start.
+        steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `Touch`,
+            `Place`, `Release`, `GoTo`.
+        initialization: Initialization method: "auto", "interpolated", "astar", "rrt" or
+            "stationary".
+        options: Options of planning; `Options()` by default.
+        callback: Called with an `Iteration` after every round of the solver.
+        time_limit: Wall-clock limit of the call [s], after which the best trajectory so far is
+            returned with status "time limit". Success then depends on the machine and its load.
+        effort: Limit on evaluated configurations, by searches for initial guesses and by every
+            iteration of Ipopt at each waypoint; the status is then "effort spent". It has the same
+            effect on every machine. 100 000 evaluations take some ten seconds;
+            `plan.statistics.evaluations` counts them.
+        seed: Random seed. The result is reproducible bit for bit on the same machine, unless
+            `time_limit` stops planning early.
+        simultaneous: Plan all steps in one problem; otherwise each from the end of the one before,
+            for comparison.
+        window: Number of actions in one problem, for long lists of steps; None: all. An action is
+            everything done with one object, from grasping it on. The window slides along the list
+            by one action at a time, so that no grasp and no base pose is chosen from which the next
+            action is infeasible.
+        perturbation: Standard deviation of smooth noise on initial guesses, [m] and [rad].
+        progress: Show a progress line in a notebook or terminal.
+        terms: Additional constraints and costs; see `Constraint` and `Cost`.
+        planner: Planner whose caches are used. Defaults to one per process.
 
     Returns:
-        A plan, in every case: `plan.success` is true only if the independent `validation` found nothing wrong, and
-        `plan.report()` names what is violated otherwise. Ctrl-C, or interrupting a notebook's kernel, ends planning with the best
-        iterate so far and status "interrupted"; a second Ctrl-C raises KeyboardInterrupt.
+        A plan in every case: `plan.success` is true only if the independent `validation` finds no
+        violation. Ctrl-C, or interrupting a notebook's kernel, ends planning with the best
+        trajectory so far and status "interrupted"; a second Ctrl-C raises KeyboardInterrupt. If a
+        step of a window fails, the plan contains the steps before it and its best trajectory.
 
     Raises:
-        InputError: The steps or terms name something that is not there or cannot be done, or an argument is wrong.
+        InputError: An argument is invalid, or a step or term names an unknown or impossible goal.
     """
-    settings = settings_for(
+    budget = make_budget(time_limit, effort)
+    request = make_request(
         scene,
         initialization=initialization,
         options=options,
         callback=callback,
-        time_limit=time_limit,
-        effort=effort,
         seed=seed,
         perturbation=perturbation,
         terms=terms,
     )
-
-    joint = flag(joint, "joint")
-
-    def run(settings: Settings) -> Plan:
-        task = compile_task(scene, steps, settings.options)
-        ready = scene.with_approaches((hold for hold in task.holds if hold.by is not None), stacklevel=5)
-        task = task if ready is scene else compile_task(ready, steps, settings.options)
-        check_active(settings.terms, stretches(task))
-        return all_at_once(ready, task, settings) if joint else step_by_step(ready, task, settings)
-
-    return guarded(run, settings, progress, planner)
-
-
-def guarded(run: Callable[[Settings], Plan], settings: Settings, progress: bool, planner: Planner | None = None) -> Plan:
-    """Return what `run` returns, whose settings' budget runs, and which is lent a cache; show its progress."""
-    with borrowed(planner) as cache, shown(progress) as line, settings.budget.running():
-        found = run(dataclasses.replace(settings, progress=line, cache=cache))
+    simultaneous = flag(simultaneous, "simultaneous")
+    if window is not None:
+        window, steps = whole(window, "window", low=1), as_steps(steps)
+        if not simultaneous:
+            problem = "cannot be combined with `simultaneous=False`"
+            raise InputError(problem, field="window", expected="None", got=window)
+    with acquire_cache(planner) as cache, shown(progress) as line, budget.running():
+        request = dataclasses.replace(request, progress=line, cache=cache)
+        tasks = _compile(scene, steps, request.options, each=window is not None)
+        holds = dict.fromkeys(hold for task in tasks for hold in task.holds if hold.by is not None)
+        # Attachments that would be approached from inside the object are reversed, with a warning.
+        ready = scene.with_approaches(holds, stacklevel=3)
+        check_terms_active(
+            request.terms, [stretch for task in tasks for stretch in summarize_phases(task)]
+        )
+        if window is not None:
+            found = plan_with_window(ready, steps, window, request)
+        else:
+            (task,) = tasks if ready is scene else _compile(ready, steps, request.options)
+            solve = plan_simultaneously if simultaneous else plan_sequentially
+            found = solve(ready, task, request)
         line.end(found)
     return found
+
+
+def _compile(
+    scene: Scene, steps: Sequence[Step], options: Options, *, each: bool = False
+) -> list[Task]:
+    """Return the task of all steps, or with `each` the task of every action."""
+    return (
+        compile_each_step(scene, steps, options) if each else [compile_task(scene, steps, options)]
+    )

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from vkc_pin.errors import InputError
 from vkc_pin.errors import shown as told
-from vkc_pin.notebook import in_notebook
+from vkc_pin.utils.notebook import in_notebook
 
 if TYPE_CHECKING:
     from vkc_pin.planning.plan import Plan
-    from vkc_pin.solver.solution import Iteration
+    from vkc_pin.planning.solver.solution import Iteration
 
 __all__ = ["Progress", "shown"]
 
@@ -24,7 +24,8 @@ class Progress:
     """The line. It says nothing if nobody shows it.
 
     Attributes:
-        write: Shows a text instead of the one before; the second argument is whether it is the last.
+        write: Shows a text instead of the one before; the second argument is whether it is the
+            last.
     """
 
     def __init__(self, write: Callable[[str, bool], None] | None = None) -> None:
@@ -35,7 +36,11 @@ class Progress:
 
     def part(self, first: int, count: int, total: int) -> None:
         """Tell which of many steps are planned next: `count` from number `first`, counted from 1, of `total`."""
-        self._part = f"step {first} of {total}" if count == 1 else f"steps {first} to {first + count - 1} of {total}"
+        self._part = (
+            f"step {first} of {total}"
+            if count == 1
+            else f"steps {first} to {first + count - 1} of {total}"
+        )
 
     def begin(self, phases: Sequence[str]) -> None:
         """Tell what the motion does that is planned next."""
@@ -67,7 +72,9 @@ class Progress:
     def _show(self) -> None:
         if not self._ended and self.write is not None:
             passed = f"{time.perf_counter() - self._began:.0f} s"
-            self._write(" · ".join(filter(None, [passed, self._part, self._doing, self._what])), False)
+            self._write(
+                " · ".join(filter(None, [passed, self._part, self._doing, self._what])), False
+            )
 
     def _last(self, text: str) -> None:
         if not self._ended and self.write is not None:
@@ -86,14 +93,16 @@ def shown(progress: object) -> Iterator[Progress]:
     """Yield the line, and see to it that one is left whatever happens.
 
     Args:
-        progress: Whether to show it: in a notebook in the cell's output, in a terminal as a line of standard error; where
-            neither is there, as in a pipe, nothing is shown.
+        progress: Whether to show it: in a notebook in the cell's output, in a terminal as a line of
+            standard error; where neither is there, as in a pipe, nothing is shown.
 
     Raises:
         InputError: `progress` is neither True nor False.
     """
     if not isinstance(progress, bool):
-        raise InputError("wrong kind of argument", field="progress", expected="True or False", got=told(progress))
+        raise InputError(
+            "wrong kind of argument", field="progress", expected="True or False", got=told(progress)
+        )
     line = Progress(_screen() if progress else None)
     try:
         yield line
@@ -106,7 +115,9 @@ def _screen() -> Callable[[str, bool], None] | None:
     if in_notebook():
         return _Line(sys.stdout, None)
     if sys.stderr is not None and sys.stderr.isatty():
-        return _Line(sys.stderr, shutil.get_terminal_size().columns - 1)  # a longer one would go over two lines, and stay
+        return _Line(
+            sys.stderr, shutil.get_terminal_size().columns - 1
+        )  # a longer one would go over two lines, and stay
     return None
 
 
@@ -119,7 +130,9 @@ class _Line:
 
     def __call__(self, text: str, last: bool) -> None:
         if self.bar is None:
-            from tqdm import tqdm  # not tqdm.auto, which has no words in a notebook without ipywidgets but a warning
+            from tqdm import (
+                tqdm,
+            )  # not tqdm.auto, which has no words in a notebook without ipywidgets but a warning
 
             # Asked for its size, a terminal that has none, as some do, would be shown nothing.
             self.bar = tqdm(file=self.stream, bar_format="{desc}", ncols=self.width or 80, nrows=20)

@@ -9,20 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arguments import instance, whole
-from vkc_pin.arrays import Floats
-from vkc_pin.cache import Cache
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.reasons.diagnosis import explain, impossible
-from vkc_pin.plotting.scene_view import Approach, plot_scene
-from vkc_pin.program.merit import TOLERANCE
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.neighbours import Allowance, Close, allowances, close_pairs
-from vkc_pin.scene.scene import Scene
-from vkc_pin.seeds.knots import scatter
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.steps import Grasp, Reach
+from vkc_pin.planning.diagnosis.diagnosis import diagnose_goals, find_impossible_conditions
+from vkc_pin.planning.initialization.keyframes import sample_goal_configurations
+from vkc_pin.planning.nlp.merit import TOLERANCE
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arguments import instance, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.scene.clearance_exemptions import (
+    ClearanceExemption,
+    ClosePair,
+    find_clearance_exemptions,
+    find_close_pairs,
+)
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.steps import Grasp, Reach
 
 __all__ = ["ReachableAttachment", "SceneCheck", "check_scene"]
 
@@ -35,9 +39,11 @@ class ReachableAttachment:
 
     Attributes:
         object, attachment: Where.
-        approach: The direction in which the hand comes, in the world frame, shape (3,); at zero of the grasp's freedoms.
+        approach: The direction in which the hand comes, in the world frame, shape (3,); at zero of
+            the grasp's freedoms.
         closing: The line along which its fingers close, shape (3,).
-        configuration: The robot's coordinates of the clearest grasp that was found, shape (n,); None: none was found.
+        configuration: The robot's coordinates of the clearest grasp that was found, shape (n,);
+            None: none was found.
         clearance: The smallest distance there of what must keep `dist_safe`, at most 0.25 [m].
         because: Why none was found.
     """
@@ -56,7 +62,11 @@ class ReachableAttachment:
         if self.configuration is None:
             return f"{head}: not reached, {self.because}"
         x, y, yaw = self.configuration[:3]
-        least = f"{1e3 * self.clearance:.0f} mm" if self.clearance < _FAR else f"more than {1e3 * _FAR:.0f} mm"
+        least = (
+            f"{1e3 * self.clearance:.0f} mm"
+            if self.clearance < _FAR
+            else f"more than {1e3 * _FAR:.0f} mm"
+        )
         return f"{head}: reached from ({x:.2f}, {y:.2f}) at {yaw:.2f} rad, with {least} of air"
 
 
@@ -67,7 +77,8 @@ class SceneCheck:
     Attributes:
         scene: The scene.
         dist_safe: What counts as close [m].
-        robot: What the robot, with what it holds, is close to at the start: itself, objects and obstacles.
+        robot: What the robot, with what it holds, is close to at the start: itself, objects and
+            obstacles.
         close: What else can move and is close to something.
         allowed: Which pairs of links may be close, as the scene says or as they are built.
         attachments: Of all objects that are not in the hand.
@@ -76,9 +87,9 @@ class SceneCheck:
 
     scene: Scene
     dist_safe: float
-    robot: tuple[Close, ...]
-    close: tuple[Close, ...]
-    allowed: tuple[Allowance, ...]
+    robot: tuple[ClosePair, ...]
+    close: tuple[ClosePair, ...]
+    allowed: tuple[ClearanceExemption, ...]
     attachments: tuple[ReachableAttachment, ...]
     problems: tuple[str, ...]
 
@@ -91,8 +102,13 @@ class SceneCheck:
     def lines(self) -> list[str]:
         """Return it as lines of text."""
         scene = self.scene
-        found = [f"{scene.name}: {scene.robot.name}, {len(scene.objects)} objects, {len(scene.obstacle_names)} obstacles"]
-        near, stuck = ([pair for pair in self.close if (pair.distance < 0.0) == inside] for inside in (False, True))
+        found = [
+            f"{scene.name}: {scene.robot.name}, {len(scene.objects)} objects, {len(scene.obstacle_names)} obstacles"
+        ]
+        near, stuck = (
+            [pair for pair in self.close if (pair.distance < 0.0) == inside]
+            for inside in (False, True)
+        )
         for title, entries in (
             ("nothing can be planned, because", self.problems),
             (f"the robot is closer than {1e3 * self.dist_safe:g} mm to", self.robot),
@@ -123,14 +139,23 @@ class SceneCheck:
         Raises:
             InputError: The name's end is none of a picture.
         """
+        from vkc_pin.visualization.plots.scene_view import Approach, plot_scene
+
         arrows = []
         for one in self.attachments:
             placed = self.scene.objects[one.object]
             grasp = placed.object.attachments[one.attachment]
             tool = placed.link_placement(grasp.link) * grasp.tool(np.zeros(len(grasp.freedoms)))
             base = None if one.configuration is None else one.configuration[:3]
-            arrows.append(Approach(f"{one.object}.{one.attachment}", tool.translation, one.approach, base))
-        stuck = [label for pair in (*self.robot, *self.close) if pair.distance < 0.0 for label in (pair.first, pair.second)]
+            arrows.append(
+                Approach(f"{one.object}.{one.attachment}", tool.translation, one.approach, base)
+            )
+        stuck = [
+            label
+            for pair in (*self.robot, *self.close)
+            if pair.distance < 0.0
+            for label in (pair.first, pair.second)
+        ]
         return plot_scene(self.scene, arrows, stuck, path)
 
 
@@ -143,7 +168,8 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
         seed: Of the random configurations with which attachments are tried, as for `plan`.
 
     Returns:
-        What was found. It promises nothing: what is reached need not be on any path, and what is not may be all the same.
+        What was found. It promises nothing: what is reached need not be on any path, and what is
+        not may be all the same.
 
     Raises:
         InputError: An argument is wrong.
@@ -152,8 +178,12 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
     options = Options() if options is None else instance(options, Options, "options")
     seed, cache = whole(seed, "seed", low=0), Cache()
     reach = [Reach(scene.tool_placement())]
-    problem = TrajectoryProblem(scene, compile_task(scene, reach, options, nothing=True), options, (), cache=cache)
-    contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=options.dist_safe)
+    problem = TrajectoryProblem(
+        scene, compile_task(scene, reach, options, nothing=True), options, (), cache=cache
+    )
+    contacts = problem.contacts.evaluate(
+        problem.start[None], np.array([0]), reach=options.dist_safe
+    )
     labels = problem.contacts.phases[0].labels
     pairs: dict[tuple[str, str], float] = {}
     for (i, j), distance in zip(contacts.pair.tolist(), contacts.distance.tolist(), strict=True):
@@ -162,21 +192,35 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
     return SceneCheck(
         scene=scene,
         dist_safe=options.dist_safe,
-        robot=tuple(sorted((Close(*key, distance) for key, distance in pairs.items()), key=lambda pair: pair.distance)),
-        close=tuple(close_pairs(scene, options.dist_safe)),
-        allowed=allowances(scene, options.dist_safe),
+        robot=tuple(
+            sorted(
+                (ClosePair(*key, distance) for key, distance in pairs.items()),
+                key=lambda pair: pair.distance,
+            )
+        ),
+        close=tuple(find_close_pairs(scene, options.dist_safe)),
+        allowed=find_clearance_exemptions(scene, options.dist_safe),
         attachments=tuple(_attachments(scene, options, seed, cache)),
-        problems=tuple(f"{one.subject}: {one.detail}" for one in impossible(problem)),
+        problems=tuple(
+            f"{one.subject}: {one.detail}" for one in find_impossible_conditions(problem)
+        ),
     )
 
 
-def _attachments(scene: Scene, options: Options, seed: int, cache: Cache) -> Iterator[ReachableAttachment]:
+def _attachments(
+    scene: Scene, options: Options, seed: int, cache: Cache
+) -> Iterator[ReachableAttachment]:
     """Yield what can be said of all attachments."""
     empty = scene.with_held({})
     for name, placed in scene.objects.items():
-        for attachment, grasp in placed.object.attachments.items() if name not in scene.held else ():
+        for attachment, grasp in (
+            placed.object.attachments.items() if name not in scene.held else ()
+        ):
             turned = (placed.link_placement(grasp.link) * grasp.placement).rotation
-            about: dict[str, Any] = {"approach": turned[:, 2].copy(), "closing": turned[:, 0].copy()}
+            about: dict[str, Any] = {
+                "approach": turned[:, 2].copy(),
+                "closing": turned[:, 0].copy(),
+            }
             try:
                 task = compile_task(empty, [Grasp(name, attachment)], options, nothing=True)
             except InputError as error:
@@ -190,7 +234,7 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
     """Return the clearest grasp among random ones, and its clearance, or why there is none."""
     end, safe = int(problem.ends[-1]), problem.options.dist_safe
     for draw in range(3):
-        tried = scatter(problem, end, np.random.default_rng((seed, draw)))
+        tried = sample_goal_configurations(problem, end, np.random.default_rng((seed, draw)))
         z = np.zeros((0, problem.chain.size)) if tried is None else tried[0][tried[1] < TOLERANCE]
         if not len(z):
             continue
@@ -198,17 +242,20 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
         clearance = np.full(len(z), _FAR)
         full = contacts.margin >= safe
         np.minimum.at(clearance, contacts.waypoint[full], contacts.distance[full])
-        clearance[contacts.shortfall(len(z)) > 0.0] = -np.inf
+        clearance[contacts.compute_shortfall(len(z)) > 0.0] = -np.inf
         best = int(np.argmax(clearance))
         if clearance[best] > -np.inf:
             robot = problem.chain.robot.coordinates.size
             return {"configuration": z[best, :robot].copy(), "clearance": float(clearance[best])}
-    blocked = explain(problem, seed)
+    blocked = diagnose_goals(problem, seed)
     return {"because": blocked[0].text if blocked else "no free configuration was found"}
 
 
-def _said(one: Allowance) -> str:
+def _said(one: ClearanceExemption) -> str:
     kept = "at any distance" if one.margin == -np.inf else f"down to {1e3 * one.margin:.4g} mm"
-    ends = {name: [f"{end:.3g}" if np.isfinite(end) else "its limit" for end in both] for name, both in one.ranges.items()}
+    ends = {
+        name: [f"{end:.3g}" if np.isfinite(end) else "its limit" for end in both]
+        for name, both in one.ranges.items()
+    }
     while_ = ", ".join(f"{name} from {low} to {high}" for name, (low, high) in ends.items())
     return f"{one} {kept}, " + (f"with {while_}" if while_ else "as the scene says")

@@ -1,166 +1,201 @@
-"""A window that slides along a list of steps: what a chore is planned in, action after action."""
+"""Plans a long list of steps in a window of actions that slides along it."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from vkc_pin.budget import ENDINGS
 from vkc_pin.errors import InputError
-from vkc_pin.motion.splicing import cut
-from vkc_pin.motion.world import scene_after
 from vkc_pin.options import Options
-from vkc_pin.planning.one_problem import OneProblem
-from vkc_pin.planning.outcome import FINAL, joined
+from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, make_initial_guess
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.settings import Settings
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.scene import Scene
-from vkc_pin.seeds.seed import PhaseWaypoints, Seed, seed_of
-from vkc_pin.task.actions import actions_of, alternatives
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.handling import clash
-from vkc_pin.task.phases import Task
-from vkc_pin.task.steps import Step
+from vkc_pin.planning.request import PlanningRequest
+from vkc_pin.planning.results import FINAL, concatenate_plans
+from vkc_pin.planning.solve_task import Guess, TaskResult, solve_task
+from vkc_pin.planning.statistics import PlanningStatistics
+from vkc_pin.utils.budget import ENDINGS, current_ending, reserve_time
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.actions import generate_alternatives, group_into_actions
+from vkc_pin.world.task.actuation import find_shared_coordinate
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import Task
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.splicing import extract_phases
+from vkc_pin.world.trajectory.world_model import compute_final_scene
 
-__all__ = ["SlidingWindow"]
+__all__ = ["plan_with_window"]
 
 _NOTHING = PhaseWaypoints((), (), (), "")
 
 
+def plan_with_window(
+    scene: Scene, steps: Sequence[Step], window: int, request: PlanningRequest
+) -> Plan:
+    """Plan action after action, each together with the next ones.
+
+    An action is everything done with one object, from grasping it on. `window` consecutive actions
+    are planned as one problem; the trajectory of the first is accepted, and the window moves on by
+    one, from the state in which that trajectory ends. So no grasp and no base pose is chosen from
+    which the next action is infeasible. If it is all the same, the last decision is revoked and
+    planned again with one more action in the window.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: What should change in the world, in this order.
+        window: Number of actions planned together.
+        request: Arguments of planning.
+    """
+    return _SlidingWindow(scene, tuple(steps), window, request).run()
+
+
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One action's part of a motion.
+    """Trajectory of one action.
 
     Attributes:
-        plan: The motion of the action alone, from the scene in which it begins; None if nothing is to be done.
-        piece: Its waypoints.
-        after: The scene in which it ends.
-        rests: Whether the robot stands still at its end.
-        checking: How long it took to check [s].
+        plan: Plan of the action alone, from the scene in which it starts; None if nothing is to be
+            done.
+        waypoints: Its waypoints.
+        after: Scene at its end.
+        is_at_rest: Whether the robot is at rest at its end.
+        check_time: Time of its validation [s].
     """
 
     plan: Plan | None
-    piece: PhaseWaypoints
+    waypoints: PhaseWaypoints
     after: Scene
-    rests: bool = True
-    checking: float = 0.0
+    is_at_rest: bool = True
+    check_time: float = 0.0
 
 
-class SlidingWindow:
-    """A list of steps that is being planned.
+class _SlidingWindow:
+    """State of planning a list of steps.
 
     Attributes:
-        actions: The steps of each action, by the attachments that lead there.
-        kept: What is decided: parts of the first actions.
-        ahead: Parts of the actions after those, from which the next problem starts.
-        spent, history: What every problem took, and every round of the solver.
+        actions: Steps of each action, with the attachments that lead to success.
+        decided: Parts of the first actions, which are accepted.
+        ahead: Parts of the next actions, from which the next problem starts.
+        statistics, history: Statistics of every problem, and every round of the solver.
     """
 
-    def __init__(self, scene: Scene, steps: tuple[Step, ...], window: int, settings: Settings) -> None:
-        self.scene, self.steps, self.window, self.settings = scene, steps, window, settings
-        self.actions = actions_of(steps)
-        self.kept: list[_Part] = []
+    def __init__(
+        self, scene: Scene, steps: tuple[Step, ...], window: int, request: PlanningRequest
+    ) -> None:
+        self.scene, self.steps, self.window, self.request = scene, steps, window, request
+        self.actions = group_into_actions(steps)
+        self.decided: list[_Part] = []
         self.ahead: list[_Part] = []
-        self.spent: list[Mapping[str, float]] = []
+        self.statistics: list[PlanningStatistics] = []
         self.history: list[Mapping[str, float]] = []
         self.began = time.perf_counter()
 
     def run(self) -> Plan:
-        """Plan action after action, until all is done, one fails or the budget is at its end."""
-        window, back, failed = self.window, self._searches, None
-        while len(self.kept) < len(self.actions):
+        """Plan action after action until all are planned, one fails or the budget ends."""
+        window, revocations, failed = self.window, self._attempts, None
+        while len(self.decided) < len(self.actions):
             failed = self._plan_window(window)
-            if self.settings.budget.ended:
-                self.kept, self.ahead = self.kept + self.ahead, []
+            if current_ending():
+                self.decided, self.ahead = self.decided + self.ahead, []
                 break
             if failed is None:
                 window = self.window
-            elif self.kept and back and failed.status not in FINAL:
-                self.kept.pop()
-                while self.kept and not self.kept[-1].rests:
-                    self.kept.pop()
-                self.ahead, window, back = [], window + 1, back - 1
+            elif self.decided and revocations and failed.status not in FINAL:
+                self.decided.pop()
+                while self.decided and not self.decided[-1].is_at_rest:
+                    self.decided.pop()
+                self.ahead, window, revocations = [], window + 1, revocations - 1
             else:
-                self.kept, self.ahead = self.kept + self.ahead, []
+                self.decided, self.ahead = self.decided + self.ahead, []
                 break
-        return self._joined(failed)
+        return self._concatenate(failed)
 
     @property
-    def _searches(self) -> int:
-        """How often a motion is searched for, from different random numbers, and how often, in all, a decision is given up."""
-        return self.settings.options.max_restarts
+    def _attempts(self) -> int:
+        """Number of attempts with other random seeds, and of decisions that may be revoked in all."""
+        return self.request.options.max_restarts
 
     @property
-    def _now(self) -> Scene:
-        return self.kept[-1].after if self.kept else self.scene
+    def _current_scene(self) -> Scene:
+        return self.decided[-1].after if self.decided else self.scene
 
     def _plan_window(self, window: int) -> Plan | None:
-        """Decide on the next action with those after it in mind.
+        """Decide on the next action together with those after it.
 
-        If that is not possible, return the plan of the first action that could not be planned, from where those ahead end.
+        If that fails, return the plan of the first action that could not be planned, from the end of
+        those ahead.
         """
-        first = len(self.kept)
-        last = self._last(first, window)
+        first = len(self.decided)
+        last = self._find_last(first, window)
         self.ahead = self.ahead[: last - first]
-        alone = None
-        while alone is None and first + len(self.ahead) < last and not self.settings.budget.ended:
-            alone = self._look_ahead()
-        if self.settings.budget.ended:
-            return alone
-        if alone is None and sum(part.plan is not None for part in self.ahead) > 1:
-            pieces = [part.piece for part in self.ahead]
-            one = self._problem(self._now, first, last)
-            plan = self._solved(first, one, lambda problem: seed_of(problem, pieces))
-            if plan.success:
-                self.ahead = self._parts(one, plan, first, last)
-        for attempt in range(1, 1 + self._searches):
-            if alone is None or alone.status in ENDINGS:
+        failed = None
+        while failed is None and first + len(self.ahead) < last and not current_ending():
+            failed = self._look_ahead()
+        if current_ending():
+            return failed
+        task = self._compile(self._current_scene, first, last)
+        if failed is None and sum(part.plan is not None for part in self.ahead) > 1:
+            pieces = [part.waypoints for part in self.ahead]
+            result = self._solve(
+                first,
+                self._current_scene,
+                task,
+                guess=lambda problem: make_initial_guess(problem, pieces),
+            )
+            if result.plan.success:
+                self.ahead = self._divide(result, first, last)
+        for attempt in range(1, 1 + self._attempts):
+            if failed is None or failed.status in ENDINGS:
                 break
-            one = self._problem(self._now, first, last, attempt)
-            together = self._solved(first, one)
-            alone = None if together.success else dataclasses.replace(alone, status=together.status)
-            if together.success:
-                self.ahead = self._parts(one, together, first, last)
-            elif together.status in FINAL:
-                break
-        if alone is None:
-            self.kept.append(self.ahead.pop(0))
-            while not self.kept[-1].rests:
-                self.kept.append(self.ahead.pop(0))
-        return alone
+            result = self._solve(first, self._current_scene, task, attempt)
+            if result.plan.success:
+                failed, self.ahead = None, self._divide(result, first, last)
+            else:
+                failed = dataclasses.replace(failed, status=result.plan.status)
+                if result.plan.status in FINAL:
+                    break
+        if failed is None:
+            self.decided.append(self.ahead.pop(0))
+            while not self.decided[-1].is_at_rest:
+                self.decided.append(self.ahead.pop(0))
+        return failed
 
-    def _last(self, first: int, window: int) -> int:
-        """Return the end of a window: as wide as it may be.
+    def _find_last(self, first: int, window: int) -> int:
+        """Return the end of the window.
 
-        But without what can be said only once the rest is planned, or has no place in one chain with it.
+        It ends before actions that can be compiled only once the others are planned, and before
+        holds that cannot be in one chain with theirs.
         """
         last = first + 1
         while last < min(first + window, len(self.actions)):
             try:
-                holds = self._task(self._now, first, last + 1, self.settings.options).holds
+                holds = self._compile(self._current_scene, first, last + 1).holds
             except InputError:
                 break
-            if clash(self._now, holds) is not None:
+            if find_shared_coordinate(self._current_scene, holds) is not None:
                 break
             last += 1
         return last
 
     def _look_ahead(self) -> Plan | None:
-        """Plan one more action alone, from where those planned ahead end; return the plan if it fails.
+        """Plan one more action alone, from the end of those ahead; return its plan if it fails.
 
-        What fails is tried by the other attachments that it leaves open; the one that leads there is the action's from then on.
+        If it fails, it is planned with the other attachments that it leaves open; the first success
+        determines the attachment from then on.
         """
-        number, scene = len(self.kept) + len(self.ahead), self.ahead[-1].after if self.ahead else self._now
-        failed, chosen = self._alone(number, scene), self.actions[number]
+        number = len(self.decided) + len(self.ahead)
+        scene = self.ahead[-1].after if self.ahead else self._current_scene
+        task, chosen = self._compile(scene, number, number + 1), self.actions[number]
+        failed = self._plan_alone(number, scene, task)
         if failed is None or failed.status in ENDINGS:
             return failed
-        for _, steps in alternatives(scene, self._task(scene, number, number + 1, self.settings.options)):
+        for _, steps in generate_alternatives(scene, task):
             self.actions[number] = steps
-            held_twice = clash(scene, self._task(scene, number, number + 1, self.settings.options).holds) is not None
-            other = failed if held_twice else self._alone(number, scene, goals_first=True)
+            task = self._compile(scene, number, number + 1)
+            other: Plan | None = failed
+            if find_shared_coordinate(scene, task.holds) is None:
+                other = self._plan_alone(number, scene, task, check_goals_first=True)
             if other is None:
                 return None
             self.actions[number] = chosen
@@ -168,92 +203,124 @@ class SlidingWindow:
                 return other
         return failed
 
-    def _alone(self, number: int, scene: Scene, *, goals_first: bool = False) -> Plan | None:
-        """Plan an action alone; return the plan if it fails."""
-        for attempt in range(self._searches):
-            one = self._problem(scene, number, number + 1, attempt, goals_first=goals_first)
-            if not one.task.phases:
-                self.ahead.append(_Part(None, _NOTHING, scene))
+    def _plan_alone(
+        self, number: int, scene: Scene, task: Task, *, check_goals_first: bool = False
+    ) -> Plan | None:
+        """Plan an action alone; return its plan if it fails."""
+        if not task.phases:
+            self.ahead.append(_Part(None, _NOTHING, scene))
+            return None
+        for attempt in range(self._attempts):
+            result = self._solve(number, scene, task, attempt, check_goals_first=check_goals_first)
+            if result.plan.success:
+                self.ahead += self._divide(result, number, number + 1)
                 return None
-            plan = self._solved(number, one)
-            if plan.success:
-                self.ahead += self._parts(one, plan, number, number + 1)
-                return None
-            if plan.status in FINAL:
+            if result.plan.status in FINAL:
                 break
-        return plan
+        return result.plan
 
-    def _solved(self, first: int, one: OneProblem, seed: Callable[[TrajectoryProblem], Seed] | None = None) -> Plan:
-        """Return the plan of a problem that begins with the action `first`."""
+    def _solve(
+        self,
+        first: int,
+        scene: Scene,
+        task: Task,
+        attempt: int = 0,
+        *,
+        guess: Guess | None = None,
+        check_goals_first: bool = False,
+    ) -> TaskResult:
+        """Return the result of a task that begins with the action `first`.
+
+        Each attempt has few initial guesses: where an action is infeasible from the end of the one
+        before, all of them fail slowly, and planning both together is the solution.
+
+        Args:
+            first: Number of its first action.
+            scene: Scene in which it starts.
+            task: The task.
+            attempt: Added to the random seed.
+            guess: See `solve_task`.
+            check_goals_first: See `solve_task`.
+        """
+        request = dataclasses.replace(
+            self.request,
+            options=self._options,
+            random_seed=self.request.random_seed + attempt,
+        )
         done = len(self._steps(0, first))
-        self.settings.progress.part(done + 1, len(one.task.steps), len(self.steps))
-        self.settings.budget.decided = sum(part.checking for part in (*self.kept, *self.ahead))
-        plan = one.run(seed)
-        self.spent.append(plan.metrics)
-        self.history += plan.history
-        return plan
+        request.progress.part(done + 1, len(task.steps), len(self.steps))
+        reserved = sum(part.check_time for part in (*self.decided, *self.ahead))
+        reserve_time("planned actions", reserved)
+        result = solve_task(scene, task, request, guess=guess, check_goals_first=check_goals_first)
+        self.statistics.append(result.plan.statistics)
+        self.history += result.plan.history
+        return result
 
-    def _parts(self, one: OneProblem, plan: Plan, first: int, last: int) -> list[_Part]:
-        """Return the parts of a solved problem's motion in which the actions from `first` to before `last` are done."""
-        scene, begin, parts, whole = one.scene, 0, [], one.piece()
-        ahead = dict(enumerate(self.ahead, start=len(self.kept)))
+    def _divide(self, result: TaskResult, first: int, last: int) -> list[_Part]:
+        """Return the parts of a result in which the actions from `first` to before `last` are done."""
+        problem = result.problem
+        assert problem is not None
+        scene, begin, parts, whole = result.scene, 0, list[_Part](), result.phase_waypoints()
+        ahead = dict(enumerate(self.ahead, start=len(self.decided)))
         for number in range(first, last):
-            task = one.task.until(len(self._steps(first, number + 1)))
+            task = result.task.truncate(len(self._steps(first, number + 1)))
             end = len(task.phases)
-            names = [*one.scene.robot.coordinates.names, *(name for hold in task.holds for name in one.problem.chain.added[hold])]
-            part, piece, rests = None, _NOTHING, True
+            names = [
+                *result.scene.robot.coordinates.names,
+                *(name for hold in task.holds for name in problem.chain.added[hold]),
+            ]
+            part, waypoints, is_at_rest = None, _NOTHING, True
             if end > begin:
-                trajectory = cut(plan.trajectory, names, begin, end if end < len(one.task.phases) else None)
-                steps = self._steps(number, number + 1)
-                seed = ahead[number].piece.seed if number in ahead else one.initialization  # where it came from at first
-                part = dataclasses.replace(plan, scene=scene, steps=steps, trajectory=trajectory, initialization=seed)
-                piece = PhaseWaypoints(whole.phases[begin:end], whole.names, whole.waypoints[begin:end], seed)
-                ends = one.problem.ends
-                rests = end == len(ends) or ends[end - 1] in one.problem.transcription.structure.stops
-                scene = scene_after(scene, trajectory, task.after)
-            parts.append(_Part(part, piece, scene, rests, one.checking / (last - first)))
+                until = end if end < len(result.task.phases) else None
+                trajectory = extract_phases(result.plan.trajectory, names, begin, until)
+                # The initial guess that the action was planned from at first.
+                known = ahead[number].waypoints.initialization if number in ahead else None
+                name = result.plan.initialization if known is None else known
+                part = dataclasses.replace(
+                    result.plan,
+                    scene=scene,
+                    steps=self._steps(number, number + 1),
+                    trajectory=trajectory,
+                    initialization=name,
+                )
+                waypoints = PhaseWaypoints(
+                    whole.phases[begin:end], whole.names, whole.waypoints[begin:end], name
+                )
+                ends, stops = problem.ends, problem.transcription.structure.stops
+                is_at_rest = end == len(ends) or ends[end - 1] in stops
+                scene = compute_final_scene(scene, trajectory, task.after)
+            check_time = result.check_time / (last - first)
+            parts.append(_Part(part, waypoints, scene, is_at_rest, check_time))
             begin = end
         return parts
 
     def _steps(self, first: int, last: int) -> tuple[Step, ...]:
         return tuple(step for action in self.actions[first:last] for step in action)
 
-    def _task(self, scene: Scene, first: int, last: int, options: Options) -> Task:
-        """Compile actions anew: from where in the world they begin is known only once those before them are planned."""
-        return compile_task(scene, self._steps(first, last), options, nothing=True)
+    @property
+    def _options(self) -> Options:
+        return dataclasses.replace(self.request.options, max_restarts=1)
 
-    def _problem(self, scene: Scene, first: int, last: int, attempt: int = 0, *, goals_first: bool = False) -> OneProblem:
-        """Return the problem of the actions from `first` to before `last`.
+    def _compile(self, scene: Scene, first: int, last: int) -> Task:
+        """Compile actions, whose scene is known only once those before them are planned."""
+        return compile_task(scene, self._steps(first, last), self._options, nothing=True)
 
-        There are few seeds to an attempt: where an action cannot be done from where the last one ends, all others fail as well,
-        slowly, and to plan the two together is the way out.
-
-        Args:
-            scene: Where they begin.
-            first: Their number.
-            last: That of what follows.
-            attempt: Other random numbers for each.
-            goals_first: See `OneProblem`.
-        """
-        options = dataclasses.replace(self.settings.options, max_restarts=1)
-        settings = dataclasses.replace(self.settings, options=options, random_seed=self.settings.random_seed + attempt)
-        return OneProblem(scene, self._task(scene, first, last, options), settings, goals_first=goals_first)
-
-    def _joined(self, failed: Plan | None) -> Plan:
-        """Return one plan of all that is decided, and of what failed."""
-        parts = [part.plan for part in self.kept if part.plan is not None]
-        notes = []
+    def _concatenate(self, failed: Plan | None) -> Plan:
+        """Return one plan of all decided actions and of the one that failed."""
+        parts = [part.plan for part in self.decided if part.plan is not None]
+        notes, steps = [], self._steps(0, len(self.actions))
         if failed is not None:
             parts.append(failed)
-            number = len(self._steps(0, len(self.kept)))
-            notes.append(f"steps[{number}], {self._steps(0, len(self.actions))[number]}, could not be planned: {failed.status}")
-        return joined(
+            number = len(self._steps(0, len(self.decided)))
+            step = f"steps[{number}], {steps[number]}"
+            notes.append(f"{step}, could not be planned: {failed.status}")
+        return concatenate_plans(
             self.scene,
-            self._steps(0, len(self.actions)),
-            self.settings,
+            steps,
+            self.request,
             parts,
             began=self.began,
-            metrics=self.spent,
+            statistics=self.statistics,
             notes=notes,
             history=self.history,
         )

@@ -1,10 +1,10 @@
-"""Executes motions in physics, with MuJoCo: what a plan does to doors with mass and friction."""
+"""Executes plans in physics with MuJoCo."""
 
 from vkc_pin.simulation.contacts import Contact
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.goals import Miss
-from vkc_pin.simulation.grips import Grip
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.result import SimulationResult, Tracking
+from vkc_pin.simulation.welds import Grip
 
 __all__ = ["Contact", "Grip", "Miss", "Physics", "SimulationResult", "Tracking", "simulate"]

@@ -1,4 +1,4 @@
-"""Executes a motion in physics: servos follow it, hands hold what it holds, and everything else goes as it goes."""
+"""Executes a trajectory in MuJoCo."""
 
 from __future__ import annotations
 
@@ -8,33 +8,47 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arguments import instance
-from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
-from vkc_pin.scene.contact import CONTACT
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.scene import Scene
-from vkc_pin.simulation.contacts import Contact, Pairs, touching_pairs, unwanted
-from vkc_pin.simulation.friction.fingers import fingers_of, limited
-from vkc_pin.simulation.friction.pauses import paused
-from vkc_pin.simulation.friction.squeezes import Span, Squeezes, grip_changes, split
-from vkc_pin.simulation.goals import missed
-from vkc_pin.simulation.grips import Grips, Latches, latched, spans
+from vkc_pin.simulation.contacts import Contact, Pairs, find_contact_pairs, find_unplanned_contacts
+from vkc_pin.simulation.friction.fingers import find_fingers, limit_finger_servos
+from vkc_pin.simulation.friction.friction_grasps import (
+    Span,
+    Squeezes,
+    find_grip_changes,
+    split_spans,
+)
+from vkc_pin.simulation.friction.pauses import insert_pauses
+from vkc_pin.simulation.goals import measure_goal_errors
 from vkc_pin.simulation.model import Builder, PhysicalWorld
-from vkc_pin.simulation.physics import Physics, engine, weigh
+from vkc_pin.simulation.physics import Physics, complete_inertias, import_mujoco
 from vkc_pin.simulation.result import SimulationResult, Tracking
-from vkc_pin.simulation.servos import Servo, efforts_for, finger_rows, reference, servos
-from vkc_pin.task.steps import Step, as_list
+from vkc_pin.simulation.servos import (
+    Servo,
+    compute_feedforward,
+    make_servos,
+    sample_fingers,
+    sample_reference,
+)
+from vkc_pin.simulation.welds import Grips, Latches, find_hold_spans, find_latches
+from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Step, as_steps
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["GRASPS", "simulate"]
 
 GRASPS = ("weld", "friction")
-"""How a hand can hold on."""
-_FINE = 5e-4  # [s] the longest step with which fingers hold by friction; see `Builder`
-_CLOSED = 0.2  # [s] for which fingers have closed on what is in the hand at the start, before they carry it
-_FRAME, _LOOK = 0.02, 0.01  # [s] between recorded states, and between two looks at the contacts
+"""Grasp models."""
+_FRICTION_STEP = 5e-4  # [s] longest time step with friction grasps; see `Builder`
+# [s] between the closing of fingers on an object that is in the hand at the start, and the moment
+# when they carry it
+_CLOSED_TIME = 0.2
+_FRAME_PERIOD = 0.02  # [s] between recorded states
+_CONTACT_PERIOD = 0.01  # [s] between two recordings of contacts
 
 
 def simulate(
@@ -46,54 +60,72 @@ def simulate(
     grasp: str = "weld",
     physics: Physics | None = None,
 ) -> SimulationResult:
-    """Execute a motion in MuJoCo.
+    """Execute a trajectory in MuJoCo.
 
     Args:
-        scene: The scene that it was planned in.
-        steps: What it was to bring about.
-        trajectory: The motion.
-        actual: The scene that it happens in, if that is another: something stands elsewhere, or is heavier.
-        grasp: "weld": what is held is welded to the hand as long as the motion says, unless it is pulled too hard. "friction":
-            fingers close on it, and nothing but their friction holds it; the robot waits while they close and open.
-        physics: What to assume; `Physics()` if left out.
+        scene: Scene of the plan.
+        steps: Steps that the trajectory is to complete.
+        trajectory: The trajectory.
+        actual: Scene of the execution, if it differs: objects are displaced or heavier, for
+            example.
+        grasp: "weld": grasped objects are welded to the hand while the plan holds them, unless the
+            load exceeds the hand's strength. "friction": fingers close and hold objects by friction
+            alone; the robot waits while they close and open.
+        physics: Physical settings; defaults to `Physics()`.
 
     Returns:
-        What came of it.
+        The executed motion with its errors, grips and contacts.
 
     Raises:
-        InputError: MuJoCo is not installed, `actual` has another robot or lacks objects, or an argument is
-            none of its kind.
+        InputError: MuJoCo is not installed, `actual` has another robot or lacks objects, or an
+            argument is invalid.
     """
-    mujoco = engine()
+    mujoco = import_mujoco()
     physics = Physics() if physics is None else instance(physics, Physics, "physics")
     if grasp not in GRASPS:
-        raise InputError("unknown", field="grasp", expected=", ".join(GRASPS), got=grasp)
-    steps, here = as_list(steps), scene if actual is None else instance(actual, Scene, "actual")
+        raise InputError(
+            "unknown grasp model", field="grasp", expected=", ".join(GRASPS), got=grasp
+        )
+    steps = as_steps(steps)
+    executed_scene = scene if actual is None else instance(actual, Scene, "actual")
     for name, placed in scene.objects.items():
-        if name not in here.objects or here.objects[name].object.coordinates.names != placed.object.coordinates.names:
+        if (
+            name not in executed_scene.objects
+            or executed_scene.objects[name].object.coordinates.names
+            != placed.object.coordinates.names
+        ):
             raise InputError(
-                "an object of the plan's scene is not there", field="actual", expected=name, got=", ".join(here.objects)
+                f"`actual` lacks the object '{name}' of the plan's scene",
+                field="actual",
+                expected=name,
+                got=", ".join(executed_scene.objects),
             )
-    if here.robot.coordinates.names != scene.robot.coordinates.names:
-        raise InputError("another robot", field="actual", expected=scene.robot.name, got=here.robot.name)
-    run = _Run(here, trajectory, physics, friction=grasp == "friction")
-    mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory; see `diverged`
+    if executed_scene.robot.coordinates.names != scene.robot.coordinates.names:
+        raise InputError(
+            "`actual` has another robot",
+            field="actual",
+            expected=scene.robot.name,
+            got=executed_scene.robot.name,
+        )
+    run = _Run(executed_scene, trajectory, physics, friction=grasp == "friction")
+    # By default MuJoCo logs warnings to a file in the working directory; see `diverged`.
+    mujoco.set_mju_user_warning(lambda text: None)
     try:
-        run.go()
+        run.execute()
     finally:
         mujoco.set_mju_user_warning(None)
-    return run.result(scene, steps)
+    return run.make_result(scene, steps)
 
 
 @dataclass(eq=False)
 class _Run:
-    """One execution.
+    """One execution of a trajectory.
 
     Attributes:
-        scene: Where it happens.
-        trajectory: What the robot follows.
-        physics: What is assumed.
-        friction: Whether the hand holds by the friction of its fingers.
+        scene: Scene of the execution.
+        trajectory: Reference that the robot tracks.
+        physics: Physical settings.
+        friction: Whether the robot's hand grasps by friction.
     """
 
     scene: Scene
@@ -102,123 +134,176 @@ class _Run:
     friction: bool = False
 
     def __post_init__(self) -> None:
-        if self.friction and self.physics.timestep > _FINE:
-            self.physics = replace(self.physics, timestep=_FINE)
+        if self.friction and self.physics.timestep > _FRICTION_STEP:
+            self.physics = replace(self.physics, timestep=_FRICTION_STEP)
         physics = self.physics
-        self.mj, self.tree = engine(), World(self.scene)
-        self.notes = weigh(self.tree, physics)
-        schedule, squeezed = spans(self.scene, self.trajectory), list[Span]()
+        self.mj, self.tree = import_mujoco(), World(self.scene)
+        self.notes = complete_inertias(self.tree, physics)
+        schedule, friction_spans = find_hold_spans(self.scene, self.trajectory), list[Span]()
         holds: list[Hold] = list(dict.fromkeys(hold for hold, _, _ in schedule))
         if self.friction:
-            _, squeezed = split(schedule, float(self.trajectory.times[0]))
-            waits = grip_changes(self.trajectory, squeezed)
-            self.trajectory = paused(self.trajectory, waits, physics.grip_time)
-            schedule, squeezed = split(spans(self.scene, self.trajectory), float(self.trajectory.times[0]))
+            _, friction_spans = split_spans(schedule, float(self.trajectory.times[0]))
+            waits = find_grip_changes(self.trajectory, friction_spans)
+            self.trajectory = insert_pauses(self.trajectory, waits, physics.grip_time)
+            schedule, friction_spans = split_spans(
+                find_hold_spans(self.scene, self.trajectory), float(self.trajectory.times[0])
+            )
         trajectory, welded = self.trajectory, list(dict.fromkeys(hold for hold, _, _ in schedule))
-        self.planned = self.tree.positions(trajectory)
-        self.servos: tuple[Servo, ...] = servos(self.tree, self.planned, physics)
-        self.fingers = fingers_of(self.tree, physics) if squeezed else None
+        self.planned = self.tree.compute_positions(trajectory)
+        self.servos: tuple[Servo, ...] = make_servos(self.tree, self.planned, physics)
+        self.fingers = find_fingers(self.tree, physics) if friction_spans else None
         if self.fingers is not None:
-            self.servos = limited(self.servos, self.fingers, self.tree, physics)
-        squeezing = [hold for hold, _, _ in squeezed]
-        self.pairs: Pairs = touching_pairs(self.tree, [hold for hold in holds if hold not in squeezing])
-        latches = latched(self.scene)
-        shut = [(joint, at) for joint, at, _, _ in latches]
-        builder = Builder(self.tree, physics, gripping=bool(squeezed))
-        more = {} if self.fingers is None else {"before": self.fingers.add_bodies, "more": self.fingers.add_drives}
-        self.physical: PhysicalWorld = builder.built(self.pairs, self.servos, welded, shut, **more)
-        self.grips = Grips(self.physical, welded, schedule, self.pairs, trajectory, physics, touching=squeezing)
+            self.servos = limit_finger_servos(self.servos, self.fingers, self.tree, physics)
+        friction_holds = [hold for hold, _, _ in friction_spans]
+        self.pairs: Pairs = find_contact_pairs(
+            self.tree, [hold for hold in holds if hold not in friction_holds]
+        )
+        latches = find_latches(self.scene)
+        latch_equalities = [(joint, at) for joint, at, _, _ in latches]
+        builder = Builder(self.tree, physics, has_friction_grasps=bool(friction_spans))
+        callbacks = (
+            {}
+            if self.fingers is None
+            else {"add_bodies": self.fingers.add_bodies, "add_extras": self.fingers.add_drives}
+        )
+        self.physical: PhysicalWorld = builder.build(
+            self.pairs, self.servos, welded, latch_equalities, **callbacks
+        )
+        self.grips = Grips(
+            self.physical,
+            welded,
+            schedule,
+            self.pairs,
+            trajectory,
+            physics,
+            touching=friction_holds,
+        )
         self.latches = Latches(self.physical, latches, len(welded), physics)
         self.squeezes: Squeezes | None = None
         if self.fingers is not None:
-            self.squeezes = Squeezes(self.physical, self.fingers, squeezed, trajectory, physics, _LOOK)
-        settle = max(physics.settle, physics.grip_time + _CLOSED if self.scene.holds and squeezed else 0.0)
-        start, end = float(trajectory.times[0]) - settle, float(trajectory.times[-1]) + physics.settle
+            self.squeezes = Squeezes(
+                self.physical, self.fingers, friction_spans, trajectory, physics, _CONTACT_PERIOD
+            )
+        settle = max(
+            physics.settle,
+            physics.grip_time + _CLOSED_TIME if self.scene.holds and friction_spans else 0.0,
+        )
+        start, end = (
+            float(trajectory.times[0]) - settle,
+            float(trajectory.times[-1]) + physics.settle,
+        )
         steps = np.arange(int(np.ceil((end - start) / physics.timestep - 1e-9)) + 1)
         self.times: Floats = np.asarray(start + physics.timestep * steps, float)
         self.diverged: float | None = None
-        self.seen: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        self.contact_samples: dict[tuple[str, str], list[tuple[float, float]]] = {}
 
-    def go(self) -> None:
-        """Execute."""
+    def execute(self) -> None:
+        """Run the simulation."""
         mj, model, physics = self.mj, self.physical.model, self.physics
         data = mj.MjData(model)
-        data.qpos[:] = self.physical.qpos(self.tree.start)
+        data.qpos[:] = self.physical.to_qpos(self.tree.start)
         mj.mj_forward(model, data)
-        motion = reference(self.trajectory, self.times)
-        fingers = finger_rows(self.tree, self.planned, self.trajectory.times, self.times)
-        wanted = np.column_stack([motion[0], fingers])
-        ahead = efforts_for(self.tree, self.servos, wanted, motion)
-        ahead[:, : motion[1].shape[1]] += motion[1] * [servo.damping for servo in self.servos[: motion[1].shape[1]]]
-        commands = wanted + ahead / [servo.stiffness for servo in self.servos]
+        motion = sample_reference(self.trajectory, self.times)
+        fingers = sample_fingers(self.tree, self.planned, self.trajectory.times, self.times)
+        targets = np.column_stack([motion[0], fingers])
+        feedforward = compute_feedforward(self.tree, self.servos, targets, motion)
+        feedforward[:, : motion[1].shape[1]] += motion[1] * [
+            servo.damping for servo in self.servos[: motion[1].shape[1]]
+        ]
+        commands = targets + feedforward / [servo.stiffness for servo in self.servos]
         if self.squeezes is not None and self.fingers is not None:
-            closing, commanded = self.fingers.addresses(self.physical)
-            rest = fingers if self.fingers.sides is None else np.zeros((len(self.times), len(closing)))
-            squeeze = self.squeezes.commands(self.times, rest)
-        driven, dofs = (where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs))
+            finger_columns, finger_motors = self.fingers.find_addresses(self.physical)
+            open_fingers = (
+                fingers
+                if self.fingers.sides is None
+                else np.zeros((len(self.times), len(finger_columns)))
+            )
+            squeeze = self.squeezes.compute_commands(self.times, open_fingers)
+        driven, dofs = (
+            where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs)
+        )
         labels = np.zeros(model.ngeom, int)
         labels[self.physical.geoms] = np.arange(len(self.physical.geoms))
-        look, frame = (max(1, round(span / physics.timestep)) for span in (_LOOK, _FRAME))
+        contact_steps, frame_steps = (
+            max(1, round(span / physics.timestep)) for span in (_CONTACT_PERIOD, _FRAME_PERIOD)
+        )
         self.errors, self.efforts = np.zeros((2, len(self.times), len(self.servos)))
-        kept = [k for k in range(len(self.times)) if k % frame == 0 or k == len(self.times) - 1]
-        self.clocks, records = self.times[kept], list[Floats]()
+        recorded = [
+            k for k in range(len(self.times)) if k % frame_steps == 0 or k == len(self.times) - 1
+        ]
+        self.clocks, records = self.times[recorded], list[Floats]()
         for k, clock in enumerate(self.times.tolist()):
             self.grips.follow(data, clock)
             self.latches.follow(data)
-            if k == kept[len(records)]:
+            if k == recorded[len(records)]:
                 records.append(np.array(data.qpos))
-            self.errors[k] = wanted[k] - data.qpos[driven]
+            self.errors[k] = targets[k] - data.qpos[driven]
             data.ctrl[: len(self.servos)] = commands[k]
             if self.squeezes is not None:
-                data.ctrl[commanded] = squeeze[k]
+                data.ctrl[finger_motors] = squeeze[k]
             mj.mj_step(model, data)
             self.efforts[k] = data.qfrc_actuator[dofs]
             self.grips.measure(data, clock)
-            if k % look == 0 and data.ncon:
-                self._look(data, labels, clock)
-            if k % look == 0 and self.squeezes is not None:
+            if k % contact_steps == 0 and data.ncon:
+                self._record_contacts(data, labels, clock)
+            if k % contact_steps == 0 and self.squeezes is not None:
                 self.squeezes.measure(data, clock)
-            if not np.isfinite(data.qpos).all() or data.warning[mj.mjtWarning.mjWARN_BADQACC].number:
-                self.times, self.errors, self.efforts = self.times[: k + 1], self.errors[: k + 1], self.efforts[: k + 1]
+            if (
+                not np.isfinite(data.qpos).all()
+                or data.warning[mj.mjtWarning.mjWARN_BADQACC].number
+            ):
+                self.times, self.errors, self.efforts = (
+                    self.times[: k + 1],
+                    self.errors[: k + 1],
+                    self.efforts[: k + 1],
+                )
                 self.diverged = clock
                 break
-        records += [records[-1]] * (len(kept) - len(records))  # where it broke down, all stays as it was last
+        # After a divergence the last state is repeated.
+        records += [records[-1]] * (len(recorded) - len(records))
         self.states: Floats = np.array(records)
 
-    def _look(self, data: Any, labels: Any, clock: float) -> None:
-        """Note what touches."""
+    def _record_contacts(self, data: Any, labels: Any, clock: float) -> None:
+        """Record the deepest penetration of each pair of links that touch."""
         names, contacts = self.tree.collision_labels, data.contact
         depths = -np.asarray(contacts.dist)
-        held = set() if self.squeezes is None else self.squeezes.may_touch(clock)
+        allowed = set() if self.squeezes is None else self.squeezes.allowed_contacts(clock)
         deepest: dict[tuple[str, str], float] = {}
-        for i in np.flatnonzero(depths > CONTACT).tolist():
+        for i in np.flatnonzero(depths > CONTACT_DEPTH).tolist():
             one, other = (names[labels[geom]] for geom in np.asarray(contacts.geom)[i])
             pair = (min(one, other), max(one, other))
-            if pair in held:
+            if pair in allowed:
                 continue
             deepest[pair] = max(deepest.get(pair, 0.0), float(depths[i]))
         for pair, depth in deepest.items():
-            self.seen.setdefault(pair, []).append((clock, depth))
+            self.contact_samples.setdefault(pair, []).append((clock, depth))
 
-    def result(self, scene: Scene, steps: Sequence[Step]) -> SimulationResult:
-        """Return what came of it.
+    def make_result(self, scene: Scene, steps: Sequence[Step]) -> SimulationResult:
+        """Return the result of the execution.
 
         Args:
-            scene: What was planned in.
-            steps: What was asked for.
+            scene: Scene of the plan.
+            steps: Steps of the task.
         """
-        rows = self.physical.row(self.states)
-        contacts: tuple[Contact, ...] = unwanted(scene, self.trajectory, self.seen, _LOOK)
+        rows = self.physical.from_qpos(self.states)
+        contacts: tuple[Contact, ...] = find_unplanned_contacts(
+            scene, self.trajectory, self.contact_samples, _CONTACT_PERIOD
+        )
         notes = list(self.notes)
         if self.pairs.overlapping:
-            told = "; ".join(" – ".join(pair) for pair in self.pairs.overlapping)
-            notes.append(f"overlap at the start, and go through each other: {told}")
+            names = "; ".join(" – ".join(pair) for pair in self.pairs.overlapping)
+            notes.append(f"overlap at the start, and therefore do not collide: {names}")
         if self.fingers is not None and self.fingers.sides is not None:
-            notes.append("the hand's fingers do not move in its description: its two sides slide towards each other")
-        grips = [grip for grip in self.grips.grips if grip.end > grip.begin or grip.broken is not None]
+            notes.append(
+                "the hand is described without finger joints: "
+                "its two sides slide towards each other"
+            )
+        grips = [
+            grip for grip in self.grips.grips if grip.end > grip.begin or grip.broken is not None
+        ]
         grips += [] if self.squeezes is None else self.squeezes.grips
-        executed = self._executed(rows)
-        misses = missed(scene, steps, self.trajectory, self.tree, executed.times, rows)
+        executed = self._make_trajectory(rows)
+        misses = measure_goal_errors(scene, steps, self.trajectory, self.tree, executed.times, rows)
         return SimulationResult(
             scene=self.scene,
             steps=tuple(steps),
@@ -226,7 +311,9 @@ class _Run:
             trajectory=executed,
             rows=rows,
             misses=misses,
-            tracking=Tracking.of(self.times, self.errors, self.efforts, self.servos, self.trajectory.robot_size),
+            tracking=Tracking.from_samples(
+                self.times, self.errors, self.efforts, self.servos, self.trajectory.robot_size
+            ),
             grips=tuple(grips),
             contacts=contacts,
             physics=self.physics,
@@ -234,16 +321,23 @@ class _Run:
             diverged=self.diverged,
         )
 
-    def _executed(self, rows: Floats) -> Trajectory:
-        """Return what happened as a trajectory of the plan's coordinates; freedoms of grasps are as planned."""
+    def _make_trajectory(self, rows: Floats) -> Trajectory:
+        """Return the executed motion in the plan's coordinates.
+
+        Degrees of freedom of grasps are as planned.
+        """
         names, own = self.trajectory.names, self.tree.coordinates.names
         positions = self.trajectory.at(self.clocks)
         for column, name in enumerate(names):
             if name in own:
                 positions[:, column] = rows[:, own.index(name)]
-        ends = np.searchsorted(self.clocks, [self.trajectory.times[phase.last] for phase in self.trajectory.phases])
+        ends = np.searchsorted(
+            self.clocks, [self.trajectory.times[phase.last] for phase in self.trajectory.phases]
+        )
         last, before, phases = len(self.clocks) - 1, 0, []
-        for number, (phase, end) in enumerate(zip(self.trajectory.phases, ends.tolist(), strict=True)):
+        for number, (phase, end) in enumerate(
+            zip(self.trajectory.phases, ends.tolist(), strict=True)
+        ):
             left = len(self.trajectory.phases) - 1 - number
             end = last if left == 0 else min(max(end, before + 1), last - left)
             phases.append(replace(phase, first=before, last=end))

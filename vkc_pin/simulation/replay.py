@@ -1,4 +1,4 @@
-"""What happened in physics as a page: the motion, and beside it as a ghost what was planned."""
+"""Replays an executed motion on a web page, with the plan as a translucent ghost."""
 
 from __future__ import annotations
 
@@ -8,70 +8,88 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.motion.carrying import FreeObjects
-from vkc_pin.motion.placements import sample_motion
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
-from vkc_pin.scene.scene import Scene
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.free_objects import FreeObjects
+from vkc_pin.world.trajectory.placements import sample_motion
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Executed", "Replay", "page"]
+__all__ = ["Execution", "Replay", "write_page"]
 
-_RATE = 20.0  # key frames a second in a page
+_RATE = 20.0  # [Hz] key frames of a page
 
 
-class Executed(Protocol):
-    """What happened; see `SimulationResult`."""
+class Execution(Protocol):
+    """An executed motion; see `SimulationResult`."""
 
     @property
     def scene(self) -> Scene:
-        """Where."""
+        """Scene of the execution."""
 
     @property
     def planned(self) -> Trajectory:
-        """What was planned."""
+        """The plan."""
 
     @property
     def trajectory(self) -> Trajectory:
-        """What came of it."""
+        """The executed trajectory."""
 
     @property
     def rows(self) -> Floats:
-        """The same of everything, shape (K, n)."""
+        """World coordinates of the execution, shape (K, n)."""
 
 
 class Replay(World):
-    """A scene's tree along what happened, instead of along a plan.
+    """A scene's tree along an executed motion instead of a plan.
 
     Args:
         scene: The scene.
-        times: When it was looked at, shape (K,) [s].
-        rows: Its coordinates then, shape (K, n).
+        times: Sampling times, shape (K,) [s].
+        rows: World coordinates at these times, shape (K, n).
     """
 
     def __init__(self, scene: Scene, times: Floats, rows: Floats) -> None:
         super().__init__(scene)
         self._times, self._rows = times, rows.copy()
         for name in (name for name, placed in scene.objects.items() if placed.object.free):
-            turns = self._rows[:, self.placement_columns(name)][:, 3:]
-            signs = np.cumprod(np.concatenate([[1.0], np.where(np.einsum("kc,kc->k", turns[1:], turns[:-1]) < 0.0, -1.0, 1.0)]))
-            self._rows[:, self.placement_columns(name)][:, 3:] *= signs[:, None]
+            quaternions = self._rows[:, self.get_placement_columns(name)][:, 3:]
+            signs = np.cumprod(
+                np.concatenate(
+                    [
+                        [1.0],
+                        np.where(
+                            np.einsum("kc,kc->k", quaternions[1:], quaternions[:-1]) < 0.0,
+                            -1.0,
+                            1.0,
+                        ),
+                    ]
+                )
+            )
+            self._rows[:, self.get_placement_columns(name)][:, 3:] *= signs[:, None]
 
-    def positions(self, trajectory: Trajectory, times: Any = None, free: FreeObjects | None = None) -> Floats:
-        """Return where everything was at times [s], shape (K,); see `World.positions`."""
+    def positions(
+        self, trajectory: Trajectory, times: Any = None, free: FreeObjects | None = None
+    ) -> Floats:
+        """Return the world coordinates at times [s], shape (K,); see `World.positions`."""
         moments = trajectory.times if times is None else np.asarray(times, float)
         return np.column_stack([np.interp(moments, self._times, column) for column in self._rows.T])
 
 
-def page(executed: Executed, path: str | Path, *, headline: str, notes: Sequence[tuple[str, float]] = ()) -> Path:
-    """Write one self-contained web page: what happened, and what was planned as a translucent ghost; return its path.
+def write_page(
+    executed: Execution, path: str | Path, *, headline: str, notes: Sequence[tuple[str, float]] = ()
+) -> Path:
+    """Write a self-contained web page with the executed motion and the plan as a ghost.
 
     Args:
-        executed: What happened.
-        path: The file, written whole or not at all.
-        headline: Of the page.
-        notes: Texts to show at times [s].
+        executed: The executed motion.
+        path: Output file, written atomically.
+        headline: Headline of the page.
+        notes: Texts with the times [s] at which they appear.
+
+    Returns:
+        The path.
     """
     import meshcat
 
@@ -83,13 +101,19 @@ def page(executed: Executed, path: str | Path, *, headline: str, notes: Sequence
     world, recorder = Replay(executed.scene, times, executed.rows), Recorder()
     beside = sample_motion(World(executed.scene), executed.planned, moments)
     viewer = meshcat.Visualizer(window=recorder)
-    Drawing(viewer, executed.scene, executed.trajectory, world=world, times=moments, beside=beside).draw(play=False)
+    Drawing(
+        viewer, executed.scene, executed.trajectory, world=world, times=moments, beside=beside
+    ).draw(play=False)
     begin = float(times[0])
     film = {
         "duration": float(times[-1]) - begin,
-        "phases": [{"name": phase.name, "last": float(times[phase.last]) - begin} for phase in phases],
+        "phases": [
+            {"name": phase.name, "last": float(times[phase.last]) - begin} for phase in phases
+        ],
         "notes": [{"text": text, "time": time - begin} for text, time in notes],
         "headline": f"{headline} (translucent: as planned)",
         "ghosts": False,
     }
-    return write_atomically(path, render_page(recorder, title=f"{headline} – vkc_pin", film=film).encode("utf-8"))
+    return write_atomically(
+        path, render_page(recorder, title=f"{headline} – vkc_pin", film=film).encode("utf-8")
+    )

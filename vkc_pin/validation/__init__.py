@@ -1,1 +1,1 @@
-"""The independent check: is a motion right? Knows neither chain nor program."""
+"""Checks trajectories independently of the planner."""

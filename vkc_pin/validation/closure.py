@@ -1,9 +1,9 @@
-"""Bounds the drift of grasps along a motion, at every moment and not at samples alone.
+"""Bounds the drift of grasps continuously along a motion.
 
-A position error e(t) between two moments t₀ and t₁ differs from its linear interpolation by at most
-(t₁ − t₀)²/8 · max |ë|. A bound of |ë| follows from the coordinates' velocities and accelerations, which are
-polynomials, and from the lever arms of the joints. Where that does not prove that the error is small enough,
-the interval is bisected.
+A position error e(t) between times t₀ and t₁ differs from its linear interpolation by at most
+(t₁ − t₀)²/8 · max |ë|. A bound of |ë| follows from the coordinates' velocities and accelerations,
+which are polynomials, and from the lever arms of the joints. Where this bound does not prove that
+the error is small enough, the interval is bisected.
 """
 
 from __future__ import annotations
@@ -13,99 +13,115 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.scene.contact import hand_frame
-from vkc_pin.scene.hold import Hold
-from vkc_pin.validation.samples import LENGTH_STEP, MOST, Samples
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.validation.samples import LENGTH_STEP, MAX_SAMPLES, Samples
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Drift", "find_drift"]
 
 RESOLUTION = 1e-6
-"""A maximum is found up to this [m] or [rad]."""
-PROVEN_SHARE = 0.5
-"""Share of a limit below which errors are bounded, but their maximum is not searched for."""
+"""Accuracy of a maximum [m] or [rad]."""
+PROVEN_FRACTION = 0.5
+"""Fraction of a limit below which errors are only bounded, and not maximized."""
 
 
 class Drift(NamedTuple):
     """The largest error of a grasp in a phase.
 
     Attributes:
-        found: Largest position [m] and angle [rad] that was evaluated, shape (2,).
-        bound: `found` where every error is proven to be within the limit, up to `RESOLUTION`; else the bound that is
-            proven, shape (2,).
-        times: When the largest were evaluated or, where only the bound exceeds the limit, when that does, shape (2,) [s].
+        measured: Largest evaluated position error [m] and angle [rad], shape (2,).
+        bound: `measured` where every error is proven to be within the limit, up to `RESOLUTION`;
+            otherwise the proven bound, shape (2,).
+        times: Times of the largest evaluated errors or, where only the bound exceeds the limit, of
+            the largest bound, shape (2,) [s].
     """
 
-    found: Floats
+    measured: Floats
     bound: Floats
     times: Floats
 
 
 class _Lever(NamedTuple):
-    """How a coordinate of the trajectory moves a frame.
+    """The effect of a trajectory coordinate on a frame.
 
-    `column` is its place in the trajectory, `rate` what its joint moves per unit of it, `arm` the distance [m] of the frame's
-    origin from the joint's axis, or 1 for a joint that slides, and `turns` says whether the joint turns the frame.
+    Attributes:
+        column: Column of the coordinate in the trajectory.
+        rate: Joint motion per unit of the coordinate.
+        arm: Largest distance of the frame's origin from the joint axis [m]; 1 for prismatic joints.
+        is_revolute: Whether the joint rotates the frame.
     """
 
     column: int
     rate: float
     arm: float
-    turns: bool
+    is_revolute: bool
 
 
-def find_drift(samples: Samples, phase: PhaseSpan, hold: Hold, limits: tuple[float, float]) -> Drift:
-    """Return how far a grasp of a phase drifts.
+def find_drift(
+    samples: Samples, phase: PhaseSpan, hold: Hold, limits: tuple[float, float]
+) -> Drift:
+    """Find the largest drift of a grasp in a phase.
 
     Args:
-        samples: The motion.
-        phase: The phase.
-        hold: What is held in it.
-        limits: Of position [m] and angle [rad].
+        samples: Sampled motion.
+        phase: Phase of the motion.
+        hold: Grasp to check.
+        limits: Limits of position error [m] and angle [rad].
     """
-    rows = samples.rows(phase)
+    rows = samples.get_rows(phase)
     times = samples.times[rows]
-    errors = samples.grasp_errors(hold.object, hold.attachment, rows, hold.frame)
-    if samples.scene.objects[hold.object].object.free or samples.truncated:  # it moves rigidly with the hand
+    errors = samples.compute_grasp_errors(hold.object, hold.attachment, rows, hold.frame)
+    if (
+        samples.scene.objects[hold.object].object.free or samples.is_truncated
+    ):  # it moves rigidly with the hand
         return Drift(errors.max(axis=0), errors.max(axis=0), times[errors.argmax(axis=0)])
-    hand, grasp = _hand_levers(samples, phase, hold), _grasp_levers(samples, hold)
+    hand, grasp = _find_hand_levers(samples, phase, hold), _find_grasp_levers(samples, hold)
 
-    def curvature(begin: Floats, end: Floats) -> Floats:
-        speed, acceleration = _rates(samples.trajectory, begin, end)
-        position = sum(_position_bound(chain, speed, acceleration) for chain in (hand, grasp))
-        return np.column_stack([position, _rotation_bound([*hand, *grasp], speed, acceleration)])
+    def bound_curvature(begin: Floats, end: Floats) -> Floats:
+        speed, acceleration = _bound_rates(samples.trajectory, begin, end)
+        position = sum(
+            _bound_position_acceleration(chain, speed, acceleration) for chain in (hand, grasp)
+        )
+        return np.column_stack(
+            [position, _bound_rotation_acceleration([*hand, *grasp], speed, acceleration)]
+        )
 
     def evaluate(moments: Floats) -> Floats:
-        return samples.grasp_errors_at(hold.object, hold.attachment, moments, hold.frame)
+        return samples.compute_grasp_errors_at(hold.object, hold.attachment, moments, hold.frame)
 
-    return _maximize(times, errors, evaluate, curvature, np.array(limits))
+    return _maximize(times, errors, evaluate, bound_curvature, np.array(limits))
 
 
 def _maximize(
     times: Floats,
     errors: Floats,
     evaluate: Callable[[Floats], Floats],
-    curvature: Callable[[Floats, Floats], Floats],
+    bound_curvature: Callable[[Floats, Floats], Floats],
     limits: Floats,
 ) -> Drift:
-    """Return the maxima of errors over an interval by bisection (branch and bound).
+    """Maximize errors over an interval by bisection (branch and bound).
 
     Args:
-        times: Moments that divide the interval, shape (K,) [s].
-        errors: Position and angle errors at these, shape (K, 2).
-        evaluate: Returns the errors at increasing moments, shape (n,): shape (n, 2).
-        curvature: Returns bounds of the second derivatives of position and sine of the angle on intervals, shape (n, 2).
-        limits: Shape (2,).
+        times: Times that divide the interval, shape (K,) [s].
+        errors: Position and angle errors at these times, shape (K, 2).
+        evaluate: Function of increasing times, shape (n,), that returns errors, shape (n, 2).
+        bound_curvature: Function that bounds second derivatives of position and angle sine on
+            intervals, shape (n, 2).
+        limits: Limits of the errors, shape (2,).
     """
     begin, end, left, right = times[:-1], times[1:], errors[:-1], errors[1:]
     found, when = errors.max(axis=0), times[errors.argmax(axis=0)]
-    budget = MOST
+    budget = MAX_SAMPLES
     while True:
-        bound = np.maximum(left, right) + curvature(begin, end) * ((end - begin) ** 2 / 8.0)[:, None]
+        bound = (
+            np.maximum(left, right)
+            + bound_curvature(begin, end) * ((end - begin) ** 2 / 8.0)[:, None]
+        )
         bound[:, 1] = np.arcsin(np.minimum(bound[:, 1], 1.0))
-        proven = np.maximum(found + RESOLUTION, PROVEN_SHARE * limits)
+        proven = np.maximum(found + RESOLUTION, PROVEN_FRACTION * limits)
         open_ = np.flatnonzero((bound > proven).any(axis=1) & (end - begin > 1e-12))
         if not len(open_) or (budget := budget - len(open_)) < 0:
             break
@@ -124,8 +140,8 @@ def _maximize(
     return Drift(found, np.where(unproven, bound.max(axis=0), found), when)
 
 
-def _rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
-    """Return bounds of the coordinates' |velocity| and |acceleration| on intervals without knots inside, shape (N, n) each."""
+def _bound_rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
+    """Bound |velocity| and |acceleration| on N intervals between knots, shape (N, n) each."""
     span = (end - begin)[:, None]
     slope = (trajectory.at(end) - trajectory.at(begin)) / span
     if trajectory.curve is None:
@@ -133,87 +149,111 @@ def _rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Floats, 
     first, last = trajectory.velocity(begin), trajectory.velocity(end)
     at_begin = (6.0 * slope - 4.0 * first - 2.0 * last) / span
     at_end = (-6.0 * slope + 2.0 * first + 4.0 * last) / span
-    control = first + span * at_begin / 2.0  # of the velocity, a parabola in the hull of its control points
+    control = (
+        first + span * at_begin / 2.0
+    )  # of the velocity, a parabola in the hull of its control points
     speed = np.maximum.reduce([np.abs(first), np.abs(control), np.abs(last)])
     return speed, np.maximum(np.abs(at_begin), np.abs(at_end))
 
 
-def _position_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats) -> Floats:
-    """Return a bound of the acceleration of a frame's origin, shape (N,) [m/s²].
+def _bound_position_acceleration(
+    chain: Iterable[_Lever], speed: Floats, acceleration: Floats
+) -> Floats:
+    """Bound the acceleration of a frame's origin, shape (N,) [m/s²].
 
-    With joints counted from the world on, ∂²p/∂i∂j is at most the arm of the later joint of both, and 0 where the earlier slides.
+    With joints numbered from the world on, |∂²p/∂i∂j| is at most the arm of the later joint, and 0
+    if the earlier joint is prismatic.
 
     Args:
-        chain: What moves it, from the world on.
-        speed: Of the coordinates, shape (N, n).
-        acceleration: The same.
+        chain: Levers of the frame, from the world on.
+        speed: Bounds of the coordinates' |velocity|, shape (N, n).
+        acceleration: Bounds of the coordinates' |acceleration|, shape (N, n).
     """
     total, turning = np.zeros(len(speed)), np.zeros(len(speed))
     for lever in chain:
         v, a = lever.rate * speed[:, lever.column], lever.rate * acceleration[:, lever.column]
-        own = v if lever.turns else 0.0
+        own = v if lever.is_revolute else 0.0
         total += lever.arm * (a + v * (2.0 * turning + own))
         turning += own
     return total
 
 
-def _rotation_bound(chain: Iterable[_Lever], speed: Floats, acceleration: Floats) -> Floats:
-    """Return a bound of the second derivative of the sine of the angle between two frames, as a vector along its axis.
+def _bound_rotation_acceleration(
+    chain: Iterable[_Lever], speed: Floats, acceleration: Floats
+) -> Floats:
+    """Bound the second derivative of the sine of the angle between two frames, shape (N,).
 
-    The axial vector of a rotation R with R̈ = ([ω̇] + [ω]²) R grows by at most |ω̇| + |ω|², with |ω| ≤ Σ|v| and
-    |ω̇| ≤ Σ|a| + ½ (Σ|v|)².
+    The sine is the norm of the axial vector of the rotation R. With R̈ = ([ω̇] + [ω]²) R, the second
+    derivative of that vector is at most |ω̇| + |ω|², where |ω| ≤ Σ|v| and |ω̇| ≤ Σ|a| + ½ (Σ|v|)².
 
     Args:
-        chain: What moves either frame.
-        speed: Of the coordinates, shape (N, n).
-        acceleration: The same.
+        chain: Levers of both frames.
+        speed: Bounds of the coordinates' |velocity|, shape (N, n).
+        acceleration: Bounds of the coordinates' |acceleration|, shape (N, n).
     """
     turning, change = np.zeros(len(speed)), np.zeros(len(speed))
     for lever in chain:
-        if lever.turns:
+        if lever.is_revolute:
             turning += lever.rate * speed[:, lever.column]
             change += lever.rate * acceleration[:, lever.column]
     return np.asarray(change + 1.5 * turning**2)
 
 
-def _hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]:
-    """Return what moves the frame that holds an object, from the world on."""
+def _find_hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]:
+    """Return the levers of the grasping frame, from the world on."""
     scene = samples.scene
-    tip = hand_frame(scene.robot, scene.objects[hold.object].object.attachments[hold.attachment])
+    tip = compute_hand_frame(
+        scene.robot, scene.objects[hold.object].object.attachments[hold.attachment]
+    )
     reach, backwards = float(np.linalg.norm(tip.translation)), list[_Lever]()
     frame, through = hold.frame, hold.by
-    while frame is not None and through is not None:  # a link of a free object, rigidly with what holds that but for freedoms
+    # A link of a grasped object moves rigidly with the holder, except for the grasp's freedoms.
+    while frame is not None and through is not None:
         holder = through.frame or scene.robot.tool_frame
-        ends = zip(*(samples.placements(samples.rows(phase), name) for name in (frame, holder)), strict=True)
-        reach += max(float(np.linalg.norm(one.translation - other.translation)) for one, other in ends)
+        ends = zip(
+            *(
+                samples.compute_placements(samples.get_rows(phase), name)
+                for name in (frame, holder)
+            ),
+            strict=True,
+        )
+        reach += max(
+            float(np.linalg.norm(one.translation - other.translation)) for one, other in ends
+        )
         attachment = scene.objects[through.object].object.attachments[through.attachment]
         for suffix, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True):
             turns = freedom.unit == "rad"
             arm = reach + float(np.linalg.norm(freedom.through)) if turns else 1.0
-            backwards.append(_Lever(samples.trajectory.names.index(f"{through.object}.{suffix}"), 1.0, arm, turns))
+            backwards.append(
+                _Lever(
+                    samples.trajectory.names.index(f"{through.object}.{suffix}"), 1.0, arm, turns
+                )
+            )
         frame, through = through.frame, through.by
-    return [*_levers(samples, scene.robot.tool_frame, reach), *reversed(backwards)]
+    return [*_find_levers(samples, scene.robot.tool_frame, reach), *reversed(backwards)]
 
 
-def _grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
-    """Return what moves the frame at which an object is held, from the world on."""
+def _find_grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
+    """Return the levers of the attachment's frame, from the world on."""
     attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
     reach, backwards = abs(attachment.standoff), list[_Lever]()
-    for suffix, freedom in reversed(list(zip(attachment.coordinates, attachment.freedoms, strict=True))):
+    for suffix, freedom in reversed(
+        list(zip(attachment.coordinates, attachment.freedoms, strict=True))
+    ):
         column = samples.trajectory.names.index(f"{hold.object}.{suffix}")
         if freedom.unit == "rad":
             through = float(np.linalg.norm(freedom.through))
-            backwards.append(_Lever(column, 1.0, reach + through, turns=True))
+            backwards.append(_Lever(column, 1.0, reach + through, is_revolute=True))
             reach += 2.0 * through
         else:
-            backwards.append(_Lever(column, 1.0, 1.0, turns=False))
+            backwards.append(_Lever(column, 1.0, 1.0, is_revolute=False))
             reach += float(np.abs(samples.trajectory.ranges()[1][:, column]).max())
     reach += float(np.linalg.norm(attachment.placement.translation))
-    return [*_levers(samples, f"{hold.object}.{attachment.link}", reach), *reversed(backwards)]
+    return [*_find_levers(samples, f"{hold.object}.{attachment.link}", reach), *reversed(backwards)]
 
 
-def _levers(samples: Samples, frame: str, reach: float) -> list[_Lever]:
-    """Return the coordinates that move a point at most `reach` [m] from a frame's origin, from the world on."""
+def _find_levers(samples: Samples, frame: str, reach: float) -> list[_Lever]:
+    """Return the levers of a point within `reach` [m] of a frame's origin, from the world on."""
     world, names = samples.world, samples.trajectory.names
     model, body = world.model, world.model.frames[world.model.getFrameId(frame)]
     reach += float(np.linalg.norm(body.placement.translation))
@@ -222,7 +262,9 @@ def _levers(samples: Samples, frame: str, reach: float) -> list[_Lever]:
         for move in reversed([move for move in world.coordinates.moves if move.joint == joint]):
             name, rate = world.coordinates.names[move.coordinate], abs(move.factor)
             if name in names:
-                backwards.append(_Lever(names.index(name), rate, 1.0 if move.slides else reach, not move.slides))
+                backwards.append(
+                    _Lever(names.index(name), rate, 1.0 if move.slides else reach, not move.slides)
+                )
             if move.slides and joint != 1:
                 travel = np.abs(move.factor * samples.z[:, move.coordinate] + move.offset)
                 reach += float(travel.max()) + LENGTH_STEP

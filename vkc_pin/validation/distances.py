@@ -1,7 +1,7 @@
-"""How far a world's shapes are from each other at configurations, and how far they move along a motion, at most.
+"""Computes distances of a world's shapes, and bounds their displacements along a motion.
 
-There are lower bounds of distances from boxes, and coal's own. Nothing of it is the planner's, so that what its culling
-overlooked would be found here.
+Lower bounds of distances come from bounding boxes, exact distances from coal. Nothing is shared
+with the planner's culling, so that its errors would be found here.
 """
 
 from __future__ import annotations
@@ -12,50 +12,52 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats, Ints
-from vkc_pin.distances.placements import ShapePlacements, columns_of
-from vkc_pin.distances.shapes import Shapes
-from vkc_pin.distances.world_boxes import WorldBoxes
-from vkc_pin.models.coordinates import Moved
-from vkc_pin.models.shapes import bounding_box, shape_distance
-from vkc_pin.motion.world import World
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.collision.placements import ShapePlacements, flatten_placements
+from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.world_boxes import WorldBoxes
+from vkc_pin.world.models.coordinates import MovedJoint
+from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
+from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Placed", "Solids", "travelled"]
+__all__ = ["CollisionShapes", "PlacedShapes", "bound_displacements"]
 
-POINT = 1e-4  # [m], radius of a point
+POINT_RADIUS = 1e-4  # radius of the sphere that stands for a point [m]
 
 
-class Solids:
+class CollisionShapes:
     """The collision shapes of a world.
 
     Attributes:
         world: The world, with G shapes.
-        bodies: How many of these, the first, belong to the robot or an object; the others are obstacles.
-        center, half: Of a box around each in its own frame, centre and half extents, shape (G, 3) [m].
-        obstacle_corners: See `corners`.
-        asked: The shapes, to ask coal for distances.
+        body_count: Number of leading shapes that belong to the robot or an object; the others are
+            obstacles.
+        center, half: Centres and half extents of the bounding boxes in the shapes' own frames,
+            shape (G, 3) [m].
+        obstacle_corners: Corners of the obstacles' boxes; see `compute_corners`.
+        distance_queries: The shapes, prepared for coal's distance queries.
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.bodies = world, len(world.bodies.geometryObjects)
-        boxes = [bounding_box(shape) for shape in world.shapes]
+        self.world, self.body_count = world, len(world.bodies.geometryObjects)
+        boxes = [compute_bounding_box(shape) for shape in world.shapes]
         self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
-        obstacles = slice(self.bodies, None)
+        obstacles = slice(self.body_count, None)
         where = [shape.placement for shape in world.shapes[obstacles]]
-        self.asked = Shapes([shape.geometry for shape in world.shapes], where)
-        self.obstacle_corners = self.corners(columns_of(where), obstacles)
+        self.distance_queries = Shapes([shape.geometry for shape in world.shapes], where)
+        self.obstacle_corners = self.compute_corners(flatten_placements(where), obstacles)
         self._placements = ShapePlacements(world.model, world.bodies)
 
-    def at(self, q: Floats) -> Placed:
-        """Return the shapes as they are placed at Pinocchio's configurations of the world, shape (W, nq)."""
-        return Placed(self, self._placements.at(q))
+    def place(self, q: Floats) -> PlacedShapes:
+        """Place the shapes at Pinocchio's configurations of the world, shape (W, nq)."""
+        return PlacedShapes(self, self._placements.compute_placements(q))
 
-    def corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
-        """Return lower and upper corners of boxes along the world's axes around some shapes, shape (..., k, 3) each [m].
+    def compute_corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
+        """Compute lower and upper corners of axis-aligned boxes, shape (..., k, 3) each [m].
 
         Args:
-            where: Placements of these shapes in the world, shape (..., k, 12).
+            where: Placements of the shapes in the world, shape (..., k, 12).
             which: The shapes.
         """
         rotation = where[..., :9].reshape(*where.shape[:-1], 3, 3).swapaxes(-1, -2)
@@ -64,114 +66,149 @@ class Solids:
         return middle - extent, middle + extent
 
 
-class Placed:
+class PlacedShapes:
     """The shapes at W configurations.
 
     Args:
         solids: The shapes.
-        where: Where those of robot and objects are in the world, shape (W, M, 12).
+        where: Placements of the robot's and objects' shapes in the world, shape (W, M, 12).
     """
 
-    def __init__(self, solids: Solids, where: Floats) -> None:
+    def __init__(self, solids: CollisionShapes, where: Floats) -> None:
         self._solids, self._where = solids, where
 
     @cached_property
     def corners(self) -> tuple[Floats, Floats]:
-        """Lower and upper corners of boxes along the world's axes around all shapes, shape (W, G, 3) each [m]."""
-        bodies = self._solids.corners(self._where, slice(self._solids.bodies))
-        obstacles = (np.broadcast_to(part, (len(self._where), *part.shape)) for part in self._solids.obstacle_corners)
-        lower, upper = (np.concatenate(parts, axis=1) for parts in zip(bodies, obstacles, strict=True))
+        """Lower and upper corners of all axis-aligned boxes, shape (W, G, 3) each [m]."""
+        bodies = self._solids.compute_corners(self._where, slice(self._solids.body_count))
+        obstacles = (
+            np.broadcast_to(part, (len(self._where), *part.shape))
+            for part in self._solids.obstacle_corners
+        )
+        lower, upper = (
+            np.concatenate(parts, axis=1) for parts in zip(bodies, obstacles, strict=True)
+        )
         return lower, upper
 
     @cached_property
     def boxes(self) -> WorldBoxes:
-        """The same boxes, to ask which of them come near each other."""
-        return WorldBoxes(*self._solids.corners(self._where, slice(self._solids.bodies)), *self._solids.obstacle_corners)
+        """The axis-aligned boxes, prepared for proximity queries."""
+        return WorldBoxes(
+            *self._solids.compute_corners(self._where, slice(self._solids.body_count)),
+            *self._solids.obstacle_corners,
+        )
 
     def __len__(self) -> int:
         """Return W."""
         return len(self._where)
 
-    def bounds(self, states: Ints, pairs: Ints) -> Floats:
-        """Return lower bounds of the distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m].
+    def compute_lower_bounds(self, states: Ints, pairs: Ints) -> Floats:
+        """Compute lower bounds of distances; -inf where the boxes overlap.
 
-        They are -inf where the boxes overlap.
+        Args:
+            states: State of each query, shape (n,).
+            pairs: Pair of shapes of each query, shape (n, 2).
+
+        Returns:
+            Lower bounds, shape (n,) [m].
         """
         lower, upper = self.corners
         first, second = pairs.T
-        gaps = np.maximum(lower[states, second] - upper[states, first], lower[states, first] - upper[states, second])
+        gaps = np.maximum(
+            lower[states, second] - upper[states, first],
+            lower[states, first] - upper[states, second],
+        )
         outside = np.maximum(gaps, 0.0)
-        return np.where(gaps.max(axis=1) > 0.0, np.sqrt(np.einsum("ni,ni->n", outside, outside)), -np.inf)
+        return np.where(
+            gaps.max(axis=1) > 0.0, np.sqrt(np.einsum("ni,ni->n", outside, outside)), -np.inf
+        )
 
-    def distances(self, states: Ints, pairs: Ints) -> Floats:
-        """Return coal's signed distances of pairs, shape (n, 2), at states, shape (n,): shape (n,) [m]."""
-        return self._solids.asked.distances(self._where, states, pairs)
+    def compute_distances(self, states: Ints, pairs: Ints) -> Floats:
+        """Compute signed distances [m] of pairs, shape (n, 2), at states, shape (n,)."""
+        return self._solids.distance_queries.compute_distances(self._where, states, pairs)
 
-    def nearest(self, pairs: Ints) -> tuple[Ints, Floats]:
-        """Return which of pairs, shape (n, 2), is nearest at each state, and its distance [m]: shape (W,) each.
+    def find_nearest(self, pairs: Ints) -> tuple[Ints, Floats]:
+        """Find the nearest of pairs, shape (n, 2), at each state, and its distance [m]: (W,) each.
 
-        Only what may be nearest is asked of coal.
+        Only pairs that could be the nearest are passed to coal.
         """
         states, count = len(self._where), len(pairs)
         at, which = np.repeat(np.arange(states), count), np.tile(np.arange(count), states)
-        bounds = self.bounds(at, pairs[which])
+        bounds = self.compute_lower_bounds(at, pairs[which])
         order = np.lexsort((which, bounds, at))
-        chosen, found = self._solids.asked.shortest(
+        chosen, found = self._solids.distance_queries.find_closest_pairs(
             self._where,
             np.arange(states + 1) * count,
             pairs[which[order]],
-            numbers=np.arange(len(order)),
+            ranks=np.arange(len(order)),
             margins=np.zeros(len(order)),
             bounds=bounds[order],
             reach=np.inf,
-            most=1,
+            max_pairs=1,
             rounding=0.0,
         )
         return which[order[chosen]], found.distance
 
-    def around(self, point: Floats, reach: float) -> list[int]:
-        """Return the shapes that are closer than `reach` [m] to a point, shape (3,) [m], at the first of the states.
+    def find_shapes_near(self, point: Floats, reach: float) -> list[int]:
+        """Return the shapes closer than `reach` [m] to a point, shape (3,) [m], at the first state.
 
-        A point has a size here, 0.1 mm.
+        The point is a sphere with a radius of 0.1 mm.
         """
         lower, upper = (corners[0] for corners in self.corners)
-        near = np.flatnonzero(((lower - point < reach + POINT) & (point - upper < reach + POINT)).all(axis=1)).tolist()
-        ball, here, shapes = coal.Sphere(POINT), pin.SE3(np.eye(3), point), self._solids.world.shapes
-        return [i for i in near if shape_distance(ball, here, shapes[i].geometry, self._placement(i)) < reach]
+        near = np.flatnonzero(
+            ((lower - point < reach + POINT_RADIUS) & (point - upper < reach + POINT_RADIUS)).all(
+                axis=1
+            )
+        ).tolist()
+        ball, here, shapes = (
+            coal.Sphere(POINT_RADIUS),
+            pin.SE3(np.eye(3), point),
+            self._solids.world.shapes,
+        )
+        return [
+            i
+            for i in near
+            if compute_shape_distance(ball, here, shapes[i].geometry, self._placement(i)) < reach
+        ]
 
     def _placement(self, shape: int) -> pin.SE3:
-        if shape >= self._solids.bodies:
+        if shape >= self._solids.body_count:
             return self._solids.world.shapes[shape].placement
         numbers = self._where[0, shape]
         return pin.SE3(numbers[:9].reshape(3, 3).T, numbers[9:])
 
 
-def travelled(solids: Solids, samples: Floats) -> Floats:
-    """Return how far any point of each shape can have moved since the first sample, shape (S, G) [m].
+def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
+    """Bound the displacement of any point of each shape since the first sample, shape (S, G) [m].
 
-    A joint's rotation moves a point by at most the angle times its distance from the axis, and that is at most the sum of the
-    offsets of all joints between, and of the shape itself; a prismatic joint adds its travel.
+    A revolute joint moves a point by at most its rotation times the point's distance from the axis.
+    That distance is at most the sum of the offsets of the shape and of all joints between. A
+    prismatic joint adds its travel.
 
     Args:
-        solids: The shapes, G of them.
-        samples: Configurations of their world, one after the other, shape (S, n).
+        solids: The G shapes.
+        samples: Successive configurations of their world, shape (S, n).
     """
     world = solids.world
     model, steps = world.model, np.abs(np.diff(samples, axis=0))
     spans = np.linalg.norm(steps[:, :2], axis=1)
     offsets = [float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements]
-    of_joint: dict[int, list[Moved]] = {}
+    of_joint: dict[int, list[MovedJoint]] = {}
     for move in world.coordinates.moves:
         of_joint.setdefault(move.joint, []).append(move)
     found = np.zeros((len(samples), len(world.shapes)))
-    for g, shape in enumerate(world.shapes[: solids.bodies]):
-        reach = float(np.linalg.norm(solids.half[g])) + float(np.linalg.norm(shape.placement.act(solids.center[g])))
+    for g, shape in enumerate(world.shapes[: solids.body_count]):
+        reach = float(np.linalg.norm(solids.half[g])) + float(
+            np.linalg.norm(shape.placement.act(solids.center[g]))
+        )
         joint, moved = shape.parentJoint, np.zeros(len(steps))
         while joint:
             moves = of_joint[joint]
             column, share, offset = moves[0].coordinate, abs(moves[0].factor), moves[0].offset
-            if len(moves) == 7:  # the free joint of what can be carried
-                moved += _free(samples[:, [move.coordinate for move in moves]], reach)
+            if len(moves) == 7:  # the free joint of a free object
+                moved += _bound_free_displacements(
+                    samples[:, [move.coordinate for move in moves]], reach
+                )
             elif len(moves) == 3:  # the planar base
                 moved += spans + steps[:, moves[2].coordinate] * reach
             elif moves[0].slides:
@@ -185,8 +222,8 @@ def travelled(solids: Solids, samples: Floats) -> Floats:
     return found
 
 
-def _free(samples: Floats, reach: float) -> Floats:
-    """Return how far a point at `reach` [m] from a free joint moves from each sample to the next, shape (S − 1,) [m]."""
+def _bound_free_displacements(samples: Floats, reach: float) -> Floats:
+    """Bound the motion of points within `reach` [m] of a free joint between samples [m]."""
     turns = samples[:, 3:] / np.linalg.norm(samples[:, 3:], axis=1, keepdims=True)
     half = np.arccos(np.clip(np.abs(np.einsum("kc,kc->k", turns[1:], turns[:-1])), 0.0, 1.0))
     return np.asarray(np.linalg.norm(np.diff(samples[:, :3], axis=0), axis=1) + 2.0 * half * reach)

@@ -1,4 +1,4 @@
-"""Whether a motion brings about what was asked for, step by step and in that order."""
+"""Checks that a motion reaches the goals of its steps in their order."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.models.coordinates import wrapped
 from vkc_pin.options import Options
-from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.models.coordinates import wrap_angle
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 __all__ = ["check_goals", "check_steps"]
 
-MOTION_TOLERANCE = 1e-5  # [m] or [rad]: less is no motion
+MOTION_TOLERANCE = 1e-5  # smaller displacements do not count as motion [m] or [rad]
 
 
-class Miss(NamedTuple):
-    """What of a step is not as it was asked for."""
+class GoalError(NamedTuple):
+    """An unmet part of a step's goal."""
 
     subject: str
     amount: float
@@ -30,7 +30,7 @@ class Miss(NamedTuple):
 
 
 def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
-    """Check that the steps name what there is.
+    """Check that objects, joints, attachments and frames named by steps exist.
 
     Raises:
         UnknownNameError: An object, joint, attachment or frame does not exist.
@@ -50,30 +50,44 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
                 samples.check_frame(step.by, f"{where}.by")
             if step.attachment is not None and step.attachment not in item.attachments:
                 kind = f"attachment of '{step.object}'"
-                raise UnknownNameError(kind, step.attachment, item.attachments, field=f"{where}.attachment")
+                raise UnknownNameError(
+                    kind, step.attachment, item.attachments, field=f"{where}.attachment"
+                )
             for joint in step.joints if isinstance(step, Actuate) else ():
                 if joint not in item.coordinates.names:
-                    raise UnknownNameError(f"joint of '{step.object}'", joint, item.coordinates.names, field=f"{where}.joints")
+                    raise UnknownNameError(
+                        f"joint of '{step.object}'",
+                        joint,
+                        item.coordinates.names,
+                        field=f"{where}.joints",
+                    )
         elif isinstance(step, Touch) and step.frame.partition(".")[0] in objects:
             samples.check_frame(step.frame, f"{where}.frame")
         elif isinstance(step, Reach | Touch):
             frames = [frame.name for frame in samples.scene.robot.model.frames]
             if step.frame is not None and step.frame not in frames:
-                raise UnknownNameError("frame of the robot", step.frame, frames, field=f"{where}.frame")
+                raise UnknownNameError(
+                    "frame of the robot", step.frame, frames, field=f"{where}.frame"
+                )
 
 
 def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> list[Violation]:
-    """Check that every step is done, in their order: "goal" and "order".
+    """Check that the steps are carried out in their order: constraints "goal" and "order".
 
-    There must be a phase for each step at whose end the step's goal holds, with everything in the hand that the steps have
-    put there, the last step's at the end of the motion; and in the phases that lead from one to the next, no object may move
-    but the one that the step actuates, and no free object of a step be carried when it is not to be in the hand.
+    For each step there must be a phase at whose end the goal of the step holds and everything that
+    the steps have grasped so far is still grasped; for the last step it is the last phase. Between
+    the phases of two steps no object may move except the one that the step actuates, and free
+    objects named by steps may be carried only while they should be grasped.
     """
     phases = samples.trajectory.phases
-    ends = [0, *(phase.last for phase in phases)]  # a step may be done before anything begins
-    hands = _in_hand(samples, steps)
+    ends = [0, *(phase.last for phase in phases)]  # a goal may hold at the start
+    hands = _find_grasped_objects(samples, steps)
     misses = [
-        [_misses(samples, step, k, options) + _dropped(samples, steps, hands, number, k) for k in range(len(ends))]
+        [
+            _compute_goal_errors(samples, step, k, options)
+            + _find_missing_grasps(samples, steps, hands, number, k)
+            for k in range(len(ends))
+        ]
         for number, step in enumerate(steps)
     ]
     found, reached = [], 0
@@ -81,52 +95,82 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
         candidates = [len(ends) - 1] if number == len(steps) - 1 else range(reached, len(ends))
         fit = next((k for k in candidates if not misses[number][k]), None)
         if fit is None:
-            best = min((k for k in candidates if k), key=lambda k: max(m.amount for m in misses[number][k]))
-            found += [_violation(samples, "goal", ends[best], miss) for miss in misses[number][best]]
+            best = min(
+                (k for k in candidates if k), key=lambda k: max(m.amount for m in misses[number][k])
+            )
+            found += [
+                _violation(samples, "goal", ends[best], miss) for miss in misses[number][best]
+            ]
         else:
             reached = fit
-    return found or _check_order(samples, steps, hands, [[not missing for missing in row] for row in misses])
+    return found or _check_order(
+        samples, steps, hands, [[not missing for missing in row] for row in misses]
+    )
 
 
-def _in_hand(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
-    """Return which free objects the steps want in the hand before the first and after each of them."""
+def _find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
+    """Return the free objects that must be grasped before the first and after each step."""
     objects = samples.scene.objects
-    held = {hold.object: hold.frame or "" for hold in samples.scene.holds if objects[hold.object].object.free}
+    held = {
+        hold.object: hold.frame or ""
+        for hold in samples.scene.holds
+        if objects[hold.object].object.free
+    }
     hands = [set(held)]
     for step in steps:
-        owner = step.frame.partition(".")[0] if isinstance(step, Touch) else getattr(step, "object", None)
-        if isinstance(step, Grasp | Touch) and owner is not None and owner in objects and objects[owner].object.free:
+        owner = (
+            step.frame.partition(".")[0]
+            if isinstance(step, Touch)
+            else getattr(step, "object", None)
+        )
+        if (
+            isinstance(step, Grasp | Touch)
+            and owner is not None
+            and owner in objects
+            and objects[owner].object.free
+        ):
             held.setdefault(owner, (step.by or "") if isinstance(step, Grasp) else "")
         if isinstance(step, Place | Release):
-            gone = set(held) if owner is None else {owner}
-            while more := {name for name, by in held.items() if by.partition(".")[0] in gone} - gone:
-                gone |= more
-            held = {name: by for name, by in held.items() if name not in gone}
+            released = set(held) if owner is None else {owner}
+            while (
+                more := {name for name, by in held.items() if by.partition(".")[0] in released}
+                - released
+            ):
+                released |= more
+            held = {name: by for name, by in held.items() if name not in released}
         hands.append(set(held))
     return hands
 
 
-def _dropped(samples: Samples, steps: Sequence[Step], hands: list[set[str]], number: int, end: int) -> list[Miss]:
-    """Return what should be in the hand when a step is done, after `end` phases, and is not."""
+def _find_missing_grasps(
+    samples: Samples, steps: Sequence[Step], hands: list[set[str]], number: int, end: int
+) -> list[GoalError]:
+    """Return the objects that are not grasped after `end` phases although the step needs them."""
     phases = samples.trajectory.phases
     near = {owner for phase in phases[max(end - 1, 0) : end + 1] for owner in phase.held}
     near |= set() if end else set(samples.scene.held)
     wanted = set(hands[number + 1])
     step = steps[number]
     if isinstance(step, Grasp) and end == len(phases):
-        wanted.discard(step.object)  # taken hold of as the motion ends, and nothing more
-    return [Miss(name, 1.0, "holds", "is not in the hand") for name in sorted(wanted - near)]
+        wanted.discard(step.object)  # no phase follows the grasp
+    return [GoalError(name, 1.0, "holds", "is not grasped") for name in sorted(wanted - near)]
 
 
-def _check_order(samples: Samples, steps: Sequence[Step], hands: list[set[str]], holds: list[list[bool]]) -> list[Violation]:
-    """Check that nothing moves before its step's turn; `holds[i][k]` says whether step i holds at the start of phase k."""
+def _check_order(
+    samples: Samples, steps: Sequence[Step], hands: list[set[str]], holds: list[list[bool]]
+) -> list[Violation]:
+    """Check the order of object motions; `holds[i][k]`: step i holds when phase k begins."""
     phases = samples.trajectory.phases
     named = set().union(*hands, *({step.object} for step in steps if isinstance(step, Place)))
-    moved = [_moved(samples, k) | _carried(samples, k, named) for k in range(len(phases))]
-    own = [
-        hands[i] | hands[i + 1] | ({step.object} if isinstance(step, Actuate | Place) else set()) for i, step in enumerate(steps)
+    moved = [
+        _measure_joint_motion(samples, k) | _measure_transport(samples, k, named)
+        for k in range(len(phases))
     ]
-    turns = {0}  # which step may be the one that is being done
+    own = [
+        hands[i] | hands[i + 1] | ({step.object} if isinstance(step, Actuate | Place) else set())
+        for i, step in enumerate(steps)
+    ]
+    turns = {0}  # steps that may be in progress
     for k in range(len(phases) + 1):
         for turn in range(len(steps) - 1):
             if turn in turns and holds[turn][k]:
@@ -140,93 +184,124 @@ def _check_order(samples: Samples, steps: Sequence[Step], hands: list[set[str]],
             amount, unit = moved[k][name]
             instead = f"when it is the turn of step {last + 1}, {type(steps[last]).__name__}"
             detail = f"moves by {amount:.4f} {unit} in '{phase.name}', {instead}"
-            return [_violation(samples, "order", phase.first, Miss(name, amount, unit, detail))]
+            return [
+                _violation(samples, "order", phase.first, GoalError(name, amount, unit, detail))
+            ]
         turns = left
     if len(steps) - 1 in turns:
         return []
     first = max(turns)
     detail = f"{type(steps[first]).__name__} is undone before the next step begins"
-    return [_violation(samples, "order", phases[-1].last, Miss(f"step {first + 1}", 1.0, "steps", detail))]
+    return [
+        _violation(
+            samples, "order", phases[-1].last, GoalError(f"step {first + 1}", 1.0, "steps", detail)
+        )
+    ]
 
 
-def _violation(samples: Samples, constraint: str, waypoint: int, miss: Miss) -> Violation:
-    return Violation(constraint, waypoint=waypoint, time=float(samples.trajectory.times[waypoint]), **miss._asdict())
+def _violation(samples: Samples, constraint: str, waypoint: int, miss: GoalError) -> Violation:
+    return Violation(
+        constraint,
+        waypoint=waypoint,
+        time=float(samples.trajectory.times[waypoint]),
+        **miss._asdict(),
+    )
 
 
-def _carried(samples: Samples, number: int, named: set[str]) -> dict[str, tuple[float, str]]:
-    """Return those of some free objects that are in the hand in a phase, and how far they go."""
+def _measure_transport(
+    samples: Samples, number: int, named: set[str]
+) -> dict[str, tuple[float, str]]:
+    """Return the named objects that are grasped in a phase, with their path lengths."""
     phase, world = samples.trajectory.phases[number], samples.world
-    rows = samples.z[samples.rows(phase)]
+    rows = samples.z[samples.get_rows(phase)]
     carried = {}
     for owner in phase.held:
         if owner in named:
-            moves = np.diff(rows[:, world.placement_columns(owner)][:, :3], axis=0)
+            moves = np.diff(rows[:, world.get_placement_columns(owner)][:, :3], axis=0)
             carried[owner] = (float(np.linalg.norm(moves, axis=1).sum()), "m")
     return carried
 
 
-def _moved(samples: Samples, number: int) -> dict[str, tuple[float, str]]:
-    """Return the objects that are moved by the hand in a phase, and how far; what moves by itself is "unheld"."""
+def _measure_joint_motion(samples: Samples, number: int) -> dict[str, tuple[float, str]]:
+    """Return the objects whose joints a hand moves in a phase, with the largest joint motion."""
     phase = samples.trajectory.phases[number]
     moved: dict[str, tuple[float, str]] = {}
-    driven = samples.moved_by(phase.holds)
+    driven = samples.find_driven_coordinates(phase.holds)
     for column, name in enumerate(samples.trajectory.names):
         if name not in driven:
             continue
         owner = name.partition(".")[0]
         values = samples.trajectory.positions[phase.first : phase.last + 1, column]
         if (spread := float(np.ptp(values))) > MOTION_TOLERANCE:
-            moved[owner] = max(moved.get(owner, (0.0, "")), (spread, samples.unit(name)))
+            moved[owner] = max(moved.get(owner, (0.0, "")), (spread, samples.get_unit(name)))
     return moved
 
 
-def _misses(samples: Samples, step: Step, end: int, options: Options) -> list[Miss]:
-    """Return what of a step's goal does not hold after `end` phases."""
+def _compute_goal_errors(
+    samples: Samples, step: Step, end: int, options: Options
+) -> list[GoalError]:
+    """Return the unmet parts of a step's goal after `end` phases."""
     phases = samples.trajectory.phases
     row, misses = int(samples.waypoint_rows[phases[end - 1].last if end else 0]), []
-    held = phases[min(end, len(phases) - 1)].held  # from then on
+    held = phases[min(end, len(phases) - 1)].held  # grasps of the next phase
     tolerance = {"m": options.goal_position, "rad": options.goal_angle}
 
     def expect(subject: str, error: float, unit: str, detail: str) -> None:
         if not error <= tolerance[unit]:
-            misses.append(Miss(subject, error - tolerance[unit], unit, detail))
+            misses.append(GoalError(subject, error - tolerance[unit], unit, detail))
 
     if isinstance(step, Actuate):
         for joint, goal in step.joints.items():
             name = f"{step.object}.{joint}"
-            value, unit = float(samples.z[row, samples.world.coordinates.index(name)]), samples.unit(name)
-            expect(name, abs(value - goal), unit, f"{value:.4f} {unit} instead of {goal:.4f} {unit}")
+            value, unit = (
+                float(samples.z[row, samples.world.coordinates.index(name)]),
+                samples.get_unit(name),
+            )
+            expect(
+                name, abs(value - goal), unit, f"{value:.4f} {unit} instead of {goal:.4f} {unit}"
+            )
     elif isinstance(step, Grasp):
-        name, (distance, turn) = _grasp(samples, step, row)
-        expect(f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp")
-        expect(f"{step.object}.{name}", turn, "rad", f"the tool is turned {turn:.4f} rad from the grasp")
+        name, (distance, turn) = _find_closest_grasp(samples, step, row)
+        expect(
+            f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp"
+        )
+        expect(
+            f"{step.object}.{name}",
+            turn,
+            "rad",
+            f"the tool is turned {turn:.4f} rad from the grasp",
+        )
     elif isinstance(step, Reach | Touch | Place):
-        frame, target, free = _target(samples, step)
-        placement = samples.placements([row], frame)[0]
+        frame, target, free = _get_target(samples, step)
+        placement = samples.compute_placements([row], frame)[0]
         distance = float(np.linalg.norm(placement.translation - target.translation))
-        expect(frame, distance, "m", f"{distance:.4f} m from where it should be")
-        turn = _turn(placement, target, free)
-        expect(frame, turn, "rad", f"turned {turn:.4f} rad from how it should be")
+        expect(frame, distance, "m", f"{distance:.4f} m from its target")
+        turn = _compute_angle_error(placement, target, free)
+        expect(frame, turn, "rad", f"turned {turn:.4f} rad from its target orientation")
     if isinstance(step, Place | Release):
         for name in [step.object] if step.object is not None else list(held):
             if name in held:
-                misses.append(Miss(name, 1.0, "holds", "is held still"))
+                misses.append(GoalError(name, 1.0, "holds", "is still grasped"))
     if isinstance(step, GoTo):
         x, y, yaw = samples.z[row, :3]
         distance = float(np.hypot(x - step.x, y - step.y))
-        expect("base", distance, "m", f"{distance:.4f} m from the place to go to")
+        expect("base", distance, "m", f"{distance:.4f} m from its target")
         if step.yaw is not None:
-            turn = float(abs(wrapped(yaw - step.yaw)))
-            expect("base heading", turn, "rad", f"turned {turn:.4f} rad from the heading asked for")
+            turn = float(abs(wrap_angle(yaw - step.yaw)))
+            expect("base heading", turn, "rad", f"turned {turn:.4f} rad from its target heading")
     return misses
 
 
-def _target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3, str]:
-    """Return the frame that a step brings somewhere, where, and which orientation is left free: "", "heading" or "all"."""
+def _get_target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3, str]:
+    """Return a step's frame, its target and its free orientation: "", "heading" or "all"."""
     if isinstance(step, Reach):
         return step.frame or samples.scene.robot.tool_frame, step.pose, ""
     goal = step.target if isinstance(step, Touch) else step.pose
-    frame = step.frame if isinstance(step, Touch) else f"{step.object}.{samples.scene.objects[step.object].object.base_link}"
+    frame = (
+        step.frame
+        if isinstance(step, Touch)
+        else f"{step.object}.{samples.scene.objects[step.object].object.base_link}"
+    )
     if isinstance(goal, pin.SE3):
         return frame, goal, ""
     if isinstance(step, Touch):
@@ -236,24 +311,31 @@ def _target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3
     return frame, pin.SE3(stands, np.array(goal)), "heading"
 
 
-def _turn(placement: pin.SE3, target: pin.SE3, free: str) -> float:
-    """Return the angle [rad] between two placements in what is not free."""
+def _compute_angle_error(placement: pin.SE3, target: pin.SE3, free: str) -> float:
+    """Compute the angle [rad] between two placements, ignoring the free part."""
     if free == "all":
         return 0.0
-    if free == "heading":  # the angle between the two verticals, seen from the body
+    if free == "heading":  # the angle between the two vertical axes in the body frame
         one, other = placement.rotation[2], target.rotation[2]
         return float(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
     return float(np.linalg.norm(pin.log3(target.rotation.T @ placement.rotation)))
 
 
-def _grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
-    """Return the attachment that a step asks for and how far the tool is from it, [m] and [rad].
+def _find_closest_grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
+    """Return a grasp step's attachment and the tool's distance [m] and angle [rad] from it.
 
-    Without a name it is the one that is used, if there is one: held at the start or in some phase.
+    If the step names no attachment, it is the nearest one that is used at the start or in a phase.
     """
     used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
-    names = [step.attachment] if step.attachment is not None else [held[step.object] for held in used if step.object in held]
+    names = (
+        [step.attachment]
+        if step.attachment is not None
+        else [held[step.object] for held in used if step.object in held]
+    )
     names = names or [samples.scene.objects[step.object].object.attachment().name]
-    errors = {name: samples.grasp_errors(step.object, name, np.array([row]), step.by)[0] for name in names}
+    errors = {
+        name: samples.compute_grasp_errors(step.object, name, np.array([row]), step.by)[0]
+        for name in names
+    }
     name = min(errors, key=lambda key: float(errors[key].max()))
     return name, (float(errors[name][0]), float(errors[name][1]))

@@ -1,4 +1,4 @@
-"""A motion as `validation` looks at it: sampled densely, on the plain tree of robot and objects."""
+"""Samples a motion densely on the plain kinematic tree of robot and objects."""
 
 from __future__ import annotations
 
@@ -8,76 +8,86 @@ from collections.abc import Iterable
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats, Ints
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.models.articulation import Freedom
-from vkc_pin.models.hands.bars import EXACT
-from vkc_pin.motion.carrying import FreeObjects
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
-from vkc_pin.scene.contact import hand_frame
-from vkc_pin.scene.hold import Hold
-from vkc_pin.scene.scene import Scene
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.models.articulated_object import Freedom
+from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.free_objects import FreeObjects
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["ANGLE_STEP", "LENGTH_STEP", "MOST", "Samples"]
+__all__ = ["ANGLE_STEP", "LENGTH_STEP", "MAX_SAMPLES", "Samples"]
 
-LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # [m], [rad] between two configurations that are looked at
-BEND = 0.1  # share of these by which a curve leaves the straight line between the two, at most
-MOST = 100_000
-"""Configurations that are looked at, but for the waypoints: of half a kilometre of the base, or 160 turns of a joint."""
-_LARGEST = 1e12  # [m] or [rad] of a coordinate
+LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # largest step between two samples [m], [rad]
+CHORD_DEVIATION = 0.1  # largest deviation of a curve from its chord, as a fraction of the step
+MAX_SAMPLES = 100_000
+"""Most samples of a motion: half a kilometre of the base, or 160 turns of a joint."""
+_MAX_COORDINATE = 1e12  # [m] or [rad]
 
 
 class Samples:
-    """A motion in a scene, sampled at least every 5 mm of the base and of every sliding joint and every 0.01 rad of the rest.
+    """A motion in a scene, sampled at most 5 mm and 0.01 rad apart.
 
-    Between two samples a curve leaves the straight line by at most a tenth of that.
-    One that is longer than makes sense, as where it jumps, is sampled at its waypoints alone.
+    The steps hold for the base and prismatic joints, and for revolute joints, respectively. Between
+    two samples a curve deviates from its chord by at most a tenth of a step. A motion that would
+    need more than `MAX_SAMPLES` samples is sampled at its waypoints or knots only.
 
     Attributes:
-        scene, trajectory: What it was made of.
+        scene, trajectory: Scene and motion.
         world: The scene as one plain tree.
-        free: Its free objects along the motion.
-        times: When it is looked at, shape (S,) [s]; evenly spaced between two waypoints, or knots of the curve.
-        waypoint_rows: Which of these are the waypoints, shape (T,).
+        free_objects: Free objects along the motion.
+        times: Sample times, shape (S,) [s]; evenly spaced between waypoints, or knots of the curve.
+        waypoint_rows: Rows of `times` that are the waypoints, shape (T,).
         z: Minimal coordinates of the world, shape (S, n).
-        virtual: Coordinate → the freedom of a grasp that it is.
-        needed: How many configurations would have to be looked at; more than `MOST`: only the waypoints are.
-        truncated: Whether it is sampled at its waypoints or knots alone, since it is too long.
+        grasp_freedoms: Coordinate name → freedom of a grasp.
+        required_count: Number of samples required by the steps above.
+        is_truncated: Whether only the waypoints or knots are sampled.
 
     Raises:
-        UnknownNameError: The trajectory names a coordinate, object or attachment that the scene does not have.
-        InputError: It lacks coordinates of the robot, or of a grasp that leaves the hand a freedom, or one is beyond all measure.
+        UnknownNameError: The trajectory names a coordinate, object or attachment that the scene
+            does not have.
+        InputError: The trajectory lacks coordinates of the robot or of a grasp with freedoms, or a
+            coordinate is out of range.
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
         self.scene, self.trajectory = scene, trajectory
         self.world = World(scene)
-        self.virtual: dict[str, Freedom] = {
+        self.grasp_freedoms: dict[str, Freedom] = {
             f"{owner}.{name}": freedom
             for owner, placed in scene.objects.items()
             for attachment in placed.object.attachments.values()
             for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
         }
         self._check_names()
-        self._check_size()
-        self.times, self.waypoint_rows = self._sample()
-        self.free = FreeObjects(scene, trajectory)
-        self.z = self.world.positions(trajectory, self.times, self.free)
+        self._check_magnitudes()
+        self.times, self.waypoint_rows = self._choose_times()
+        self.free_objects = FreeObjects(scene, trajectory)
+        self.z = self.world.compute_positions(trajectory, self.times, self.free_objects)
 
-    def _check_size(self) -> None:
-        far = np.argwhere(np.abs(self.trajectory.positions) > _LARGEST)
+    def _check_magnitudes(self) -> None:
+        far = np.argwhere(np.abs(self.trajectory.positions) > _MAX_COORDINATE)
         if len(far):
-            where, expected = far[0].tolist(), f"numbers up to {_LARGEST:g}"
+            where, expected = far[0].tolist(), f"numbers up to {_MAX_COORDINATE:g}"
             got = self.trajectory.positions[tuple(where)]
-            raise InputError("out of range", field=f"trajectory.positions{where}", expected=expected, got=got)
+            raise InputError(
+                "out of range", field=f"trajectory.positions{where}", expected=expected, got=got
+            )
 
     def _check_names(self) -> None:
         names, robot = self.trajectory.names, self.scene.robot.coordinates.names
         if names[: len(robot)] != robot or self.trajectory.robot_size != len(robot):
-            raise InputError("not this robot's coordinates", field="trajectory.names", expected=robot, got=names[: len(robot)])
-        known = [*self.world.coordinates.names, *self.virtual]
+            raise InputError(
+                "not this robot's coordinates",
+                field="trajectory.names",
+                expected=robot,
+                got=names[: len(robot)],
+            )
+        known = [*self.world.coordinates.names, *self.grasp_freedoms]
         for name in names:
             if name not in known:
                 raise UnknownNameError("coordinate", name, known, field="trajectory.names")
@@ -85,27 +95,39 @@ class Samples:
             if phase.opening is not None:
                 self._check_opening(phase.opening, f"trajectory.phases[{number}].opening")
             for hold in phase.holds:
-                owner, attachment, field = hold.object, hold.attachment, f"trajectory.phases[{number}].held"
+                owner, attachment, field = (
+                    hold.object,
+                    hold.attachment,
+                    f"trajectory.phases[{number}].held",
+                )
                 if owner not in self.scene.objects:
                     raise UnknownNameError("object", owner, self.scene.objects, field=field)
                 attachments = self.scene.objects[owner].object.attachments
                 if attachment not in attachments:
-                    raise UnknownNameError(f"attachment of '{owner}'", attachment, attachments, field=field)
+                    raise UnknownNameError(
+                        f"attachment of '{owner}'", attachment, attachments, field=field
+                    )
                 if hold.frame is not None:
                     self.check_frame(hold.frame, field.replace("held", "by"))
                 for name in attachments[attachment].coordinates:
                     if f"{owner}.{name}" not in names:
                         problem = "this grasp's coordinate is missing"
-                        raise InputError(problem, field="trajectory.names", expected=f"{owner}.{name}")
+                        raise InputError(
+                            problem, field="trajectory.names", expected=f"{owner}.{name}"
+                        )
 
     def _check_opening(self, opening: float, field: str) -> None:
         gripper = self.scene.robot.gripper
         if gripper is None:
             expected = "a `gripper` in its robot.yaml"
-            raise InputError("the robot's gripper does not open", field=field, expected=expected, got=opening)
-        if abs(gripper.nearest(opening) - opening) > EXACT:
-            expected = f"{gripper.narrowest:.4g} to {gripper.widest:.4g} m"
-            raise InputError("the gripper cannot be so far open", field=field, expected=expected, got=opening)
+            raise InputError(
+                "the robot's gripper does not open", field=field, expected=expected, got=opening
+            )
+        if abs(gripper.clamp_opening(opening) - opening) > WIDTH_TOLERANCE:
+            expected = f"{gripper.min_opening:.4g} to {gripper.max_opening:.4g} m"
+            raise InputError(
+                "the gripper cannot be so far open", field=field, expected=expected, got=opening
+            )
 
     def check_frame(self, frame: str, field: str) -> None:
         """Check that "<object>.<link>" exists. Raises `UnknownNameError` if it does not."""
@@ -114,66 +136,97 @@ class Samples:
             raise UnknownNameError("object", owner, self.scene.objects, field=field)
         item = self.scene.objects[owner].object
         if not item.free:
-            raise InputError("it stands fixed in the world", field=field, expected="a link of a free object", got=frame)
+            raise InputError(
+                "it stands fixed in the world",
+                field=field,
+                expected="a link of a free object",
+                got=frame,
+            )
         if link not in item.links:
             raise UnknownNameError(f"link of '{owner}'", link, item.links, field=field)
 
-    def _sample(self) -> tuple[Floats, Ints]:
-        """Return the times to look at, and where among them the waypoints are."""
+    def _choose_times(self) -> tuple[Floats, Ints]:
+        """Return the sample times [s] and the rows of the waypoints."""
         curve, edges = self.trajectory.curve, self.trajectory.times
         if curve is None:
             steps = np.abs(np.diff(self.trajectory.positions, axis=0))
             bends = np.zeros_like(steps)
-        else:  # as far as it would go at the largest speed on each cubic, and leave its chord at the largest acceleration
+        else:  # bounds of the travel and of the chord deviation from the largest rates per cubic
             edges, spans = curve.times, np.diff(curve.times)[:, None]
-            speeds, accelerations = curve.speeds()
+            speeds, accelerations = curve.compute_max_rates()
             steps, bends = speeds * spans, accelerations * spans**2 / 8.0
-        known = dict(zip(self.world.coordinates.names, self.world.coordinates.strides(LENGTH_STEP, ANGLE_STEP), strict=True))
-        units = np.array([known.get(n, LENGTH_STEP if self.unit(n) == "m" else ANGLE_STEP) for n in self.trajectory.names])
+        known = dict(
+            zip(
+                self.world.coordinates.names,
+                self.world.coordinates.compute_max_steps(LENGTH_STEP, ANGLE_STEP),
+                strict=True,
+            )
+        )
+        units = np.array(
+            [
+                known.get(n, LENGTH_STEP if self.get_unit(n) == "m" else ANGLE_STEP)
+                for n in self.trajectory.names
+            ]
+        )
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
-        bent = np.sqrt((bends / (BEND * units)).max(axis=1))
-        counts = np.maximum(1, np.ceil(np.maximum.reduce([planar, (steps / units).max(axis=1), bent]) - 1e-9))
-        self.needed = float(counts.sum())
-        self.truncated = self.needed > max(MOST, len(counts))
-        counts = np.ones(len(counts), int) if self.truncated else counts.astype(int)
-        times = [np.linspace(a, b, n, endpoint=False) for (a, b), n in zip(itertools.pairwise(edges), counts, strict=True)]
+        bent = np.sqrt((bends / (CHORD_DEVIATION * units)).max(axis=1))
+        counts = np.maximum(
+            1, np.ceil(np.maximum.reduce([planar, (steps / units).max(axis=1), bent]) - 1e-9)
+        )
+        self.required_count = float(counts.sum())
+        self.is_truncated = self.required_count > max(MAX_SAMPLES, len(counts))
+        counts = np.ones(len(counts), int) if self.is_truncated else counts.astype(int)
+        times = [
+            np.linspace(a, b, n, endpoint=False)
+            for (a, b), n in zip(itertools.pairwise(edges), counts, strict=True)
+        ]
         rows = np.concatenate([[0], np.cumsum(counts)])
-        return np.concatenate([*times, edges[-1:]]), rows[np.searchsorted(edges, self.trajectory.times)]
+        return np.concatenate([*times, edges[-1:]]), rows[
+            np.searchsorted(edges, self.trajectory.times)
+        ]
 
-    def unit(self, name: str) -> str:
-        """Return a coordinate's unit, "m" or "rad"."""
-        if name in self.virtual:
-            return self.virtual[name].unit
+    def get_unit(self, name: str) -> str:
+        """Return the unit of a coordinate, "m" or "rad"."""
+        if name in self.grasp_freedoms:
+            return self.grasp_freedoms[name].unit
         return self.world.coordinates.units[self.world.coordinates.index(name)]
 
-    def bounds(self, name: str) -> tuple[float, float, float, float]:
-        """Return lower, upper, velocity and acceleration limit of a coordinate of the trajectory."""
+    def get_limits(self, name: str) -> tuple[float, float, float, float]:
+        """Return the lower, upper, velocity and acceleration limit of a trajectory coordinate."""
         robot = self.scene.robot
         if name in robot.coordinates.names:
             i = robot.coordinates.index(name)
             lower, upper = float(robot.lower[i]), float(robot.upper[i])
-            if i < 3 and robot.base == "fixed":  # wherever it stands
+            if i < 3 and robot.base == "fixed":
                 lower = upper = float(self.scene.start[i])
             if i < 2:
-                lower, upper = max(lower, self.scene.arena[2 * i]), min(upper, self.scene.arena[2 * i + 1])
+                lower, upper = (
+                    max(lower, self.scene.arena[2 * i]),
+                    min(upper, self.scene.arena[2 * i + 1]),
+                )
             return lower, upper, float(robot.velocity[i]), float(robot.acceleration[i])
-        if name in self.virtual:
-            return self.virtual[name].lower, self.virtual[name].upper, np.inf, np.inf
+        if name in self.grasp_freedoms:
+            return self.grasp_freedoms[name].lower, self.grasp_freedoms[name].upper, np.inf, np.inf
         owner, _, joint = name.partition(".")
         item = self.scene.objects[owner].object
         i = item.coordinates.index(joint)
-        return float(item.lower[i]), float(item.upper[i]), float(item.velocity[i]), float(item.acceleration[i])
+        return (
+            float(item.lower[i]),
+            float(item.upper[i]),
+            float(item.velocity[i]),
+            float(item.acceleration[i]),
+        )
 
-    def waypoint(self, row: int) -> int:
-        """Return the waypoint of a sample, between two the earlier."""
+    def find_waypoint(self, row: int) -> int:
+        """Return the last waypoint at or before a sample."""
         return int(np.searchsorted(self.waypoint_rows, row, side="right")) - 1
 
-    def rows(self, phase: PhaseSpan) -> Ints:
-        """Return the samples of a phase, both ends among them."""
+    def get_rows(self, phase: PhaseSpan) -> Ints:
+        """Return the rows of a phase's samples, including both ends."""
         return np.arange(self.waypoint_rows[phase.first], self.waypoint_rows[phase.last] + 1)
 
-    def moved_by(self, holds: Iterable[Hold]) -> set[str]:
-        """Return the coordinates of objects that a hand that holds them can move: those between base and attachment."""
+    def find_driven_coordinates(self, holds: Iterable[Hold]) -> set[str]:
+        """Return the object coordinates that holds drive: the joints from base to attachment."""
         model, names = self.world.model, set()
         for hold in holds:
             link = self.scene.objects[hold.object].object.attachments[hold.attachment].link
@@ -183,21 +236,32 @@ class Samples:
                 joint = model.parents[joint]
         return names
 
-    def placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
-        """Return the placements of a frame in the world at some samples."""
-        turns, origins = self._frames(self.z[np.asarray(rows)], frame)
-        return [pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)]
+    def compute_placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
+        """Return the placements of a frame in the world at the given samples."""
+        turns, origins = self._compute_frames(self.z[np.asarray(rows)], frame)
+        return [
+            pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)
+        ]
 
-    def _frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
-        """Return rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames in the world.
+    def _compute_frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
+        """Compute rotations and origins of F frames in the world.
 
         Args:
             z: Minimal coordinates of the world, shape (K, n).
-            *names: The frames.
+            *names: Names of the frames.
+
+        Returns:
+            Rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m].
         """
         model, data = self.world.model, self.world.model.createData()
-        configurations, frames = self.world.coordinates.q(z), [model.getFrameId(name) for name in names]
-        turns, origins = np.empty((len(configurations), len(frames), 3, 3)), np.empty((len(configurations), len(frames), 3))
+        configurations, frames = (
+            self.world.coordinates.q(z),
+            [model.getFrameId(name) for name in names],
+        )
+        turns, origins = (
+            np.empty((len(configurations), len(frames), 3, 3)),
+            np.empty((len(configurations), len(frames), 3)),
+        )
         for k, q in enumerate(configurations):
             pin.forwardKinematics(model, data, q)
             for f, frame in enumerate(frames):
@@ -205,43 +269,57 @@ class Samples:
                 turns[k, f], origins[k, f] = placed.rotation, placed.translation
         return turns, origins
 
-    def grasp_errors(self, owner: str, name: str, rows: Ints, by: str | None = None) -> Floats:
-        """Return how far the tool is from where attachment `name` has it, at some samples, shape (K, 2): [m] and [rad].
+    def compute_grasp_errors(
+        self, owner: str, name: str, rows: Ints, by: str | None = None
+    ) -> Floats:
+        """Compute the errors of a grasp at samples, shape (K, 2): position [m] and angle [rad].
 
         Args:
-            owner: The object.
-            name: Of one of its attachments.
-            rows: Which samples, shape (K,).
-            by: The frame that takes the tool's place, "<object>.<link>".
+            owner: Name of the grasped object.
+            name: Name of the attachment.
+            rows: Rows of the samples, shape (K,).
+            by: Frame that grasps instead of the tool, "<object>.<link>".
         """
-        return self._grasp_errors(owner, name, self.times[rows], self.z[rows], by)
+        return self._compute_grasp_errors(owner, name, self.times[rows], self.z[rows], by)
 
-    def grasp_errors_at(self, owner: str, name: str, times: Floats, by: str | None = None) -> Floats:
-        """Return the same at any moments, increasing, shape (K,) [s]."""
-        z = self.world.positions(self.trajectory, times, self.free)
-        return self._grasp_errors(owner, name, times, z, by)
+    def compute_grasp_errors_at(
+        self, owner: str, name: str, times: Floats, by: str | None = None
+    ) -> Floats:
+        """Compute the errors of a grasp at increasing times, shape (K,) [s]."""
+        z = self.world.compute_positions(self.trajectory, times, self.free_objects)
+        return self._compute_grasp_errors(owner, name, times, z, by)
 
-    def _grasp_errors(self, owner: str, name: str, times: Floats, z: Floats, by: str | None) -> Floats:
+    def _compute_grasp_errors(
+        self, owner: str, name: str, times: Floats, z: Floats, by: str | None
+    ) -> Floats:
         attachment = self.scene.objects[owner].object.attachments[name]
-        hand = hand_frame(self.scene.robot, attachment)
-        turns, origins = self._frames(z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}")
-        positions, own = self.trajectory.at(times), [f"{owner}.{suffix}" for suffix in attachment.coordinates]
+        hand = compute_hand_frame(self.scene.robot, attachment)
+        turns, origins = self._compute_frames(
+            z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}"
+        )
+        positions, own = (
+            self.trajectory.at(times),
+            [f"{owner}.{suffix}" for suffix in attachment.coordinates],
+        )
         values = np.zeros((len(times), len(own)))
         for column, coordinate in enumerate(own):
             if coordinate in self.trajectory.names:
                 values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
-        known, which = np.unique(values, axis=0, return_inverse=True)  # most grasps stay as they are
+        # The freedoms of most grasps are constant.
+        known, which = np.unique(values, axis=0, return_inverse=True)
         held = [attachment.tool(row) for row in known]
-        turn, origin = (np.array([getattr(part, side) for part in held]) for side in ("rotation", "translation"))
+        turn, origin = (
+            np.array([getattr(part, side) for part in held]) for side in ("rotation", "translation")
+        )
         which = which.reshape(-1)
         aimed = origins[:, 1] + np.einsum("kij,kj->ki", turns[:, 1], origin[which])
         off = origins[:, 0] + turns[:, 0] @ hand.translation - aimed
         rotation = np.swapaxes(turns[:, 1] @ turn[which], 1, 2) @ turns[:, 0] @ hand.rotation
-        return np.column_stack([np.linalg.norm(off, axis=1), _angles(rotation)])
+        return np.column_stack([np.linalg.norm(off, axis=1), _compute_angles(rotation)])
 
 
-def _angles(rotations: Floats) -> Floats:
-    """Return by how much rotations turn, shape (K, 3, 3) → (K,) [rad]; as exact near none as near half a turn."""
+def _compute_angles(rotations: Floats) -> Floats:
+    """Compute rotation angles, shape (K, 3, 3) → (K,) [rad]; accurate near 0 and near π."""
     skew = rotations - np.swapaxes(rotations, 1, 2)
     sine = 0.5 * np.linalg.norm(skew[:, [2, 0, 1], [1, 2, 0]], axis=1)
     return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0))

@@ -1,4 +1,4 @@
-"""Pictures with meshcat: in a notebook, in the browser, or as one self-contained page."""
+"""Shows scenes and plans with meshcat and matplotlib."""
 
 from vkc_pin.visualization.viewer import animate, open_viewer, show, to_html
 

@@ -1,4 +1,4 @@
-"""Where to look at a scene from: a camera that sees the motion, not the furniture in front of it."""
+"""Chooses a viewpoint from which obstacles hide as little of a motion as possible."""
 
 from __future__ import annotations
 
@@ -6,23 +6,28 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vkc_pin.arrays import Bools, Floats
+from vkc_pin.utils.arrays import Bools, Floats
 
 __all__ = ["FIELD_OF_VIEW", "choose_viewpoint"]
 
 FIELD_OF_VIEW = 40.0
 """Vertical opening angle of the camera [degrees]."""
-_ASPECT = 1.5  # width over height that the picture is framed for; narrower windows step back
+_ASPECT = 1.5  # assumed width over height of the picture
 _ELEVATION = np.radians(38.0)
-_AZIMUTHS = np.radians(np.arange(-90.0, 270.0, 15.0))  # the first wins where all are as good: x to the right, y away
+_AZIMUTHS = np.radians(
+    np.arange(-90.0, 270.0, 15.0)
+)  # the first wins where all are as good: x to the right, y away
 
 
-def choose_viewpoint(points: Floats, boxes: Sequence[tuple[Floats, Floats, float]]) -> tuple[Floats, Floats]:
-    """Return the point that a camera looks at and is orbited around, and where it stands, shape (3,) each [m], in the world.
+def choose_viewpoint(
+    points: Floats, boxes: Sequence[tuple[Floats, Floats, float]]
+) -> tuple[Floats, Floats]:
+    """Choose the target and position of a camera in the world, shape (3,) each [m].
 
     Args:
-        points: Where the motion is, shape (n, 3) [m]; all of them get into the picture.
-        boxes: What may hide it: lower corner, upper corner, shape (3,) each [m], and opacity from 0 to 1.
+        points: Points of the motion, shape (n, 3) [m]. All of them will be in the picture.
+        boxes: Boxes that may hide them: lower and upper corner, shape (3,) each [m], and opacity
+            from 0 to 1.
     """
     lower, upper = points.min(axis=0), points.max(axis=0)
     target = (lower + upper) / 2.0
@@ -33,32 +38,53 @@ def choose_viewpoint(points: Floats, boxes: Sequence[tuple[Floats, Floats, float
         hidden = np.zeros(len(points))
         last = float((points @ towards).min())
         for low, high, opacity in boxes:
-            if np.maximum(low * towards, high * towards).sum() > last:  # otherwise it stands behind everything
+            if (
+                np.maximum(low * towards, high * towards).sum() > last
+            ):  # otherwise it stands behind everything
                 np.maximum(hidden, opacity * _crosses(flat, towards, low, high), out=hidden)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        breadth = np.ptp(points @ right) / max(1e-9, float(np.linalg.norm(np.ptp(points[:, :2], axis=0))))
+        breadth = np.ptp(points @ right) / max(
+            1e-9, float(np.linalg.norm(np.ptp(points[:, :2], axis=0)))
+        )
         scores.append(breadth - 3.0 * hidden.mean() - 0.10 * (1.0 - np.cos(azimuth - _AZIMUTHS[0])))
     azimuth = float(_AZIMUTHS[int(np.argmax(np.round(scores, 6)))])
     towards = _direction(azimuth)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.cross(towards, right)
     offsets = points - target
-    tangent = np.tan(np.radians(FIELD_OF_VIEW) / 2.0) * 0.80  # some air around, and room for the bar below
+    tangent = (
+        np.tan(np.radians(FIELD_OF_VIEW) / 2.0) * 0.80
+    )  # some air around, and room for the bar below
     depth = offsets @ towards
-    needed = np.maximum(np.abs(offsets @ up) / tangent, np.abs(offsets @ right) / (tangent * _ASPECT)) + depth
+    needed = (
+        np.maximum(np.abs(offsets @ up) / tangent, np.abs(offsets @ right) / (tangent * _ASPECT))
+        + depth
+    )
     return target, target + towards * max(1.0, float(needed.max()))
 
 
 def _direction(azimuth: float) -> Floats:
-    return np.array([np.cos(azimuth) * np.cos(_ELEVATION), np.sin(azimuth) * np.cos(_ELEVATION), np.sin(_ELEVATION)])
+    return np.array(
+        [
+            np.cos(azimuth) * np.cos(_ELEVATION),
+            np.sin(azimuth) * np.cos(_ELEVATION),
+            np.sin(_ELEVATION),
+        ]
+    )
 
 
 def _crosses(points: Floats, direction: Floats, lower: Floats, upper: Floats) -> Bools:
-    """Return for every point, shape (3, n), whether its ray along `direction` meets the box."""
+    """Return which points, shape (3, n), have rays along `direction` that meet the box."""
     enter, leave = np.full(points.shape[1], -np.inf), np.full(points.shape[1], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for values, slope, low, high in zip(points, direction + 0.0, lower, upper, strict=True):  # + 0: no negative zeros
+        for values, slope, low, high in zip(
+            points, direction + 0.0, lower, upper, strict=True
+        ):  # + 0: no negative zeros
             near, far = (low, high) if slope >= 0.0 else (high, low)
-            np.fmax(enter, (near - values) / slope, out=enter)  # in a face that the ray runs along there is no number: no bound
+            np.fmax(
+                enter, (near - values) / slope, out=enter
+            )  # in a face that the ray runs along there is no number: no bound
             np.fmin(leave, (far - values) / slope, out=leave)
-    return np.asarray((leave > enter) & (enter > 0.05))  # what lies in a box or on it is not hidden by it
+    return np.asarray(
+        (leave > enter) & (enter > 0.05)
+    )  # what lies in a box or on it is not hidden by it

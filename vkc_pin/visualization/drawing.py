@@ -1,7 +1,7 @@
-"""Draws a scene and a motion in it with meshcat commands: what `visualization` shows and exports.
+"""Draws a scene and its motion with meshcat commands.
 
-Every joint is a node below its parent joint's node, so that the viewer's interpolation, joint by joint, follows the
-motion exactly, and only a few numbers per joint and key frame travel.
+Every joint is a node below its parent joint's node. The viewer's interpolation of joints then
+follows the motion exactly, from few numbers per joint and key frame.
 """
 
 from __future__ import annotations
@@ -19,34 +19,42 @@ from meshcat.animation import Animation, AnimationClip
 from meshcat.animation import AnimationTrack as Track
 from meshcat.commands import SetAnimation
 
-from vkc_pin.arrays import Bools, Floats
-from vkc_pin.models.robot import Robot
-from vkc_pin.motion.placements import Motion, sample_motion
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.motion.world import World
-from vkc_pin.scene.scene import Scene
+from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
-from vkc_pin.visualization.elements import Ghost, Sun, Triangles, Unshadow, add_node, hexadecimal, material
-from vkc_pin.visualization.room import Part, Room, drawn_parts
-from vkc_pin.visualization.solids import Solid, coarse, merge_solids, to_solid, tube
+from vkc_pin.visualization.room import Part, Room, load_drawn_parts
+from vkc_pin.visualization.threejs import (
+    Ghost,
+    Sun,
+    Triangles,
+    Unshadow,
+    add_node,
+    hexadecimal,
+    material,
+)
+from vkc_pin.visualization.triangles import Solid, coarse, merge_solids, to_solid, tube
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.placements import Motion, sample_motion
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Drawing"]
 
 _START, _END = (0.22, 0.42, 0.78), (0.10, 0.60, 0.38)  # of the ghosts
 _TOOL, _BASE = (0.88, 0.20, 0.35), (0.16, 0.42, 0.72)  # of the paths
 _ALARM = (0.90, 0.05, 0.05)
-_ALARM_TIME = 0.4  # [s] that an offending link stays red before and after
+_ALARM_TIME = 0.4  # duration for which colliding links are red before and after [s]
 _GHOST_DETAIL = 0.007  # [m]
 _AXES = {"x": (0.86, 0.13, 0.13), "y": (0.13, 0.60, 0.16), "z": (0.11, 0.27, 0.90)}  # of frames
 _AXIS_LENGTH, _AXIS_RADIUS = 0.16, 0.007  # [m]
-_BESIDE = "beside"  # where the other motion is in the tree
+_BESIDE = "beside"  # path of the second motion in the tree
 _meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """What to draw: its path in the viewer's tree, joint, placement in the joint's frame, shape, colour and label."""
+    """A drawn shape: path in the viewer's tree, joint, placement in its frame, mesh, colour, label."""
 
     path: str
     joint: int
@@ -62,12 +70,12 @@ class Drawing:
 
     Args:
         viewer: A meshcat viewer, or anything that takes its commands.
-        scene: What to draw, as it is at its start.
-        trajectory: The motion to animate; the start and the end appear as ghosts.
-        report: Links that it says come too close turn red at that time.
-        world: The tree that moves; None: along the trajectory.
-        times: Of the key frames, shape (K,) [s]; None: as many as it takes.
-        beside: Another motion at these times, to appear as a ghost.
+        scene: Scene to draw, at its start.
+        trajectory: Motion to animate. Its start and end appear as ghosts.
+        report: Validation report. Links in collision turn red at that time.
+        world: World of the scene. Default: built from the scene.
+        times: Times of the key frames, shape (K,) [s]. Default: as many as necessary.
+        beside: Second motion at these times, drawn as a ghost.
     """
 
     def __init__(
@@ -81,7 +89,13 @@ class Drawing:
         times: Floats | None = None,
         beside: Motion | None = None,
     ) -> None:
-        self.viewer, self.scene, self.trajectory, self.report, self.beside = viewer, scene, trajectory, report, beside
+        self.viewer, self.scene, self.trajectory, self.report, self.beside = (
+            viewer,
+            scene,
+            trajectory,
+            report,
+            beside,
+        )
         self.world = World(scene) if world is None else world
         self.motion: Motion = sample_motion(self.world, trajectory, times)
         self.room = Room(scene)
@@ -92,11 +106,11 @@ class Drawing:
         self.light: list[Solid | None] = []  # of what moves, for ghosts
 
     def draw(self, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None) -> None:
-        """Draw everything into the viewer, instead of what was there.
+        """Draw everything into the viewer, and replace its content.
 
         Args:
-            play: Start playing at once.
-            frames: Name → placement in the world of a frame to draw; it stays there, whatever moves.
+            play: Whether to start playback at once.
+            frames: Name → placement in the world of static frames to draw.
         """
         self.viewer.delete()
         self._surroundings()
@@ -110,22 +124,38 @@ class Drawing:
             self._solid(replace(part, name=f"room/{part.name}"))
         for name, points, grey in self.room.lines():
             thin = g.LineBasicMaterial(color=hexadecimal((grey, grey, grey)))
-            self._unshadowed(f"room/{name}", g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin))
+            self._unshadowed(
+                f"room/{name}", g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin)
+            )
         self._frames(frames or {}, set())
         if self.trajectory is not None:
             self._paths()
-            moving = np.any([*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0)
-            self.light = [coarse(item.solid, _GHOST_DETAIL) if moving[item.joint] else None for item in self.items]
-            for name, row, colour in (("start", 0, _START), ("end", -1, _END)) if self.beside is None else ():
+            moving = np.any(
+                [*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0
+            )
+            self.light = [
+                coarse(item.solid, _GHOST_DETAIL) if moving[item.joint] else None
+                for item in self.items
+            ]
+            for name, row, colour in (
+                (("start", 0, _START), ("end", -1, _END)) if self.beside is None else ()
+            ):
                 self._ghosts(name, row, colour)
             self._other()
         self.viewer.window.send(SetAnimation(self._animation(), play=play, repetitions=1))
 
     def viewpoint(self) -> tuple[Floats, Floats]:
-        """Return what the camera looks at, and where it is: the motion is in the picture, and objects that it could be about."""
-        motion, around = self.motion, np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
+        """Choose target and position of the camera so that motion and objects are in the picture."""
+        motion, around = (
+            self.motion,
+            np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)]),
+        )
         high = np.array([0.0, 0.0, 1.0])
-        points = [(motion.base[:, None] * (1.0 - high) + around).reshape(-1, 3), motion.base + high, motion.tool]
+        points = [
+            (motion.base[:, None] * (1.0 - high) + around).reshape(-1, 3),
+            motion.base + high,
+            motion.tool,
+        ]
         boxes = self.room.obstructions()
         for item in self.items:
             if item.path.startswith("objects"):
@@ -137,7 +167,7 @@ class Drawing:
         return choose_viewpoint(cloud, boxes)
 
     def _nodes(self) -> list[str]:
-        """Return for every joint its path in the tree."""
+        """Return the path of every joint in the tree."""
         model, nodes = self.world.model, ["robot"]
         for j in range(1, model.njoints):
             owner, _, rest = str(model.names[j]).partition(".")
@@ -152,12 +182,18 @@ class Drawing:
         if robot not in _meshes:
             _meshes[robot] = [to_solid(shape.geometry) for shape in robot.visual.geometryObjects]
         items = []
-        placed = list(self.world.visual.geometryObjects)[: len(_meshes[robot])]  # on the joints of its fingers, too
-        for source, shape, solid in zip(robot.visual.geometryObjects, placed, _meshes[robot], strict=True):
+        placed = list(self.world.visual.geometryObjects)[
+            : len(_meshes[robot])
+        ]  # on the joints of its fingers, too
+        for source, shape, solid in zip(
+            robot.visual.geometryObjects, placed, _meshes[robot], strict=True
+        ):
             link = str(robot.model.frames[source.parentFrame].name)
             path = add_node(self.taken, self.nodes[shape.parentJoint], link, shape.name)
             colour = tuple(map(float, shape.meshColor))
-            items.append(Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=link))
+            items.append(
+                Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=link)
+            )
         return items
 
     def _object_items(self) -> list[Item]:
@@ -168,10 +204,14 @@ class Drawing:
         for shape, label in zip(shapes[first:end], labels[first:end], strict=True):
             owner, _, link = label.partition(".")
             root = self.nodes[shape.parentJoint] if shape.parentJoint else f"objects/{owner}"
-            for k, (solid, colour) in enumerate(drawn_parts(shape)):
+            for k, (solid, colour) in enumerate(load_drawn_parts(shape)):
                 name = shape.name.partition(".")[2] + (f"_{k}" if k else "")
                 path = add_node(self.taken, root, link, name)
-                items.append(Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=label))
+                items.append(
+                    Item(
+                        path, shape.parentJoint, shape.placement, solid, colour=colour, label=label
+                    )
+                )
         return items
 
     def _solid(self, part: Part) -> None:
@@ -187,31 +227,43 @@ class Drawing:
         self.viewer.window.send(Unshadow(self.viewer[path].path))
 
     def _frames(self, frames: Mapping[str, pin.SE3], taken: set[str]) -> None:
-        """Draw axes, red, green and blue, in front of everything: frames of joints are inside of bodies."""
+        """Draw the axes of frames in front of everything, since they may lie inside of bodies."""
         for name, placement in frames.items():
             where = add_node(taken, "frames", name)
             for (axis, colour), end in zip(_AXES.items(), np.eye(3), strict=True):
                 solid = tube(np.stack([np.zeros(3), _AXIS_LENGTH * end]), _AXIS_RADIUS)
                 assert solid is not None
                 # Only what counts as translucent is drawn after the bodies.
-                seen = g.MeshBasicMaterial(color=hexadecimal(colour), transparent=True, depthTest=False)
+                seen = g.MeshBasicMaterial(
+                    color=hexadecimal(colour), transparent=True, depthTest=False
+                )
                 self._unshadowed(f"{where}/{axis}", Triangles(solid), seen)
             self.viewer[where].set_transform(placement.homogeneous)
 
     def _paths(self) -> None:
         assert self.trajectory is not None
-        times = np.linspace(self.trajectory.times[0], self.trajectory.times[-1], max(2, int(20 * self.trajectory.times[-1])))
-        motion = sample_motion(self.world, self.trajectory, np.unique(np.concatenate([times, self.trajectory.times])))
+        times = np.linspace(
+            self.trajectory.times[0],
+            self.trajectory.times[-1],
+            max(2, int(20 * self.trajectory.times[-1])),
+        )
+        motion = sample_motion(
+            self.world, self.trajectory, np.unique(np.concatenate([times, self.trajectory.times]))
+        )
         for name, points, radius, colour in (
             ("tool", motion.tool, 0.008, _TOOL),
             ("base", motion.base * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.006], 0.014, _BASE),
         ):
             solid = tube(points, radius)
             if solid is not None:
-                self._unshadowed(f"paths/{name}", Triangles(solid), g.MeshBasicMaterial(color=hexadecimal(colour)))
+                self._unshadowed(
+                    f"paths/{name}",
+                    Triangles(solid),
+                    g.MeshBasicMaterial(color=hexadecimal(colour)),
+                )
 
     def _ghosts(self, name: str, row: int, colour: tuple[float, float, float]) -> None:
-        """Draw what moves as it is at `row`, the robot and every object for itself."""
+        """Draw moving bodies at `row` as ghosts, one each for the robot and every object."""
         for owner, joints in self.movers.items():
             solids = [
                 light.moved(pin.SE3(self.motion.world[row, item.joint]) * item.placement)
@@ -219,10 +271,12 @@ class Drawing:
                 if light is not None and joints[item.joint]
             ]
             if solids:
-                self.viewer[f"ghosts/{name}/{owner}"].set_object(Ghost(merge_solids(solids), colour))
+                self.viewer[f"ghosts/{name}/{owner}"].set_object(
+                    Ghost(merge_solids(solids), colour)
+                )
 
     def _other(self) -> None:
-        """Draw what moves once more, for the other motion."""
+        """Draw the ghosts of the second motion."""
         if self.beside is None:
             return
         for item, light in zip(self.items, self.light, strict=True):
@@ -231,48 +285,73 @@ class Drawing:
                 self.viewer[ghost].set_object(Ghost(light, _START))
                 self.viewer[ghost].set_transform(item.placement.homogeneous)
         for joint in range(1, self.world.model.njoints):
-            self.viewer[f"{_BESIDE}/{self.nodes[joint]}"].set_transform(self.beside.local[joint][0].homogeneous)
+            self.viewer[f"{_BESIDE}/{self.nodes[joint]}"].set_transform(
+                self.beside.local[joint][0].homogeneous
+            )
 
     def _movers(self) -> dict[str, Bools]:
-        """Return the joints that move in the world, of the robot and of every object: name → shape (joints,)."""
+        """Return the masks of moving joints, shape (joints,), of the robot and of every object."""
         model, moves = self.world.model, self.motion.moving.copy()
         owners: dict[str, Bools] = {}
         for j in range(1, model.njoints):
             moves[j] |= moves[model.parents[j]]
             if moves[j]:
-                owner = self.nodes[j].split("/")[1] if self.nodes[j].startswith("objects/") else "robot"
+                owner = (
+                    self.nodes[j].split("/")[1] if self.nodes[j].startswith("objects/") else "robot"
+                )
                 owners.setdefault(owner, np.zeros(model.njoints, bool))[j] = True
         return owners
 
     def _surroundings(self) -> None:
-        """Camera, lights, background; meshcat's own grid and axes give way to the room's floor."""
+        """Set up camera, lights and background, and hide meshcat's own grid and axes."""
         (target, position), place = self.viewpoint(), self.viewer
-        # meshcat's camera turns about the origin of its world, so the drawing moves there, not the camera.
+        # meshcat's camera turns about the origin of its world, so the drawing moves there, not the
+        # camera.
         place.set_transform(pin.SE3(np.eye(3), -target).homogeneous)
         x, y, z = position - target
         lens = place["/Cameras/default/rotated/<object>"]
         lens.set_property("fov", FIELD_OF_VIEW)
         lens.set_property("position", [float(x), float(z), float(-y)])
-        for name in ("/Grid", "/Axes", "/Lights/PointLightNegativeX", "/Lights/PointLightPositiveX", "/Lights/FillLight"):
+        for name in (
+            "/Grid",
+            "/Axes",
+            "/Lights/PointLightNegativeX",
+            "/Lights/PointLightPositiveX",
+            "/Lights/FillLight",
+        ):
             place[name].set_property("visible", False)
         place["/Lights/AmbientLight/<object>"].set_property("intensity", 0.62)
-        place["/Lights/Sun"].set_object(Sun(self.room.centre - target, self.room.reach, position - target))
+        place["/Lights/Sun"].set_object(
+            Sun(self.room.centre - target, self.room.reach, position - target)
+        )
         place["/Background"].set_property("top_color", [0.93, 0.95, 0.97])
         place["/Background"].set_property("bottom_color", [0.99, 0.99, 0.99])
 
     def _animation(self) -> Animation:
-        """Return the motion with one key frame per time, in seconds, since the frame rate is 1."""
+        """Make the animation, with key frames in seconds, since the frame rate is 1."""
         movie = Animation(default_framerate=1)
         if self.trajectory is None:
             return movie
         times = (self.motion.times - self.motion.times[0]).tolist()
-        for motion, above in ((self.motion, ""), *([] if self.beside is None else [(self.beside, f"{_BESIDE}/")])):
+        for motion, above in (
+            (self.motion, ""),
+            *([] if self.beside is None else [(self.beside, f"{_BESIDE}/")]),
+        ):
             for j in np.flatnonzero(motion.moving):
                 local = motion.local[j]
-                quaternions = [pin.Quaternion(placement.rotation).coeffs().tolist() for placement in local]
+                quaternions = [
+                    pin.Quaternion(placement.rotation).coeffs().tolist() for placement in local
+                ]
                 tracks = [Track("quaternion", "quaternion", times, quaternions)]
                 if np.ptp([placement.translation for placement in local], axis=0).max() > 1e-9:
-                    tracks.append(Track("position", "vector3", times, [placement.translation.tolist() for placement in local]))
+                    tracks.append(
+                        Track(
+                            "position",
+                            "vector3",
+                            times,
+                            [placement.translation.tolist() for placement in local],
+                        )
+                    )
                 self._clip(movie, above + self.nodes[j], tracks)
         for name, row in (("start", 0), ("end", -1)) if self.beside is None else ():
             for owner, joints in self.movers.items():
@@ -287,9 +366,14 @@ class Drawing:
         return movie
 
     def _alarm(self, item: Item, moments: list[float]) -> Track:
-        """Return a track that colours an item red around `moments` [s]."""
+        """Make a track that colours an item red around `moments` [s]."""
         first, last = self.motion.times[0], self.motion.times[-1]
-        edges = (moment + d for moment in moments for a in (_ALARM_TIME, _ALARM_TIME - 0.05) for d in (-a, a))
+        edges = (
+            moment + d
+            for moment in moments
+            for a in (_ALARM_TIME, _ALARM_TIME - 0.05)
+            for d in (-a, a)
+        )
         times = sorted({first, last, *(t for t in edges if first < t < last)})
         red = [any(abs(t - moment) < _ALARM_TIME - 0.02 for moment in moments) for t in times]
         colours = [[float(c) for c in (_ALARM if alarm else item.colour[:3])] for alarm in red]

@@ -1,4 +1,4 @@
-"""How obstacles are drawn: furniture as it is, walls so that one can look into the room from outside."""
+"""Prepares obstacles for drawing, with walls that are transparent from outside the room."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
-from vkc_pin.files.meshes import load_parts
-from vkc_pin.models.shapes import world_box
-from vkc_pin.scene.scene import Scene
-from vkc_pin.visualization.solids import Solid, box_solid, shade, to_solid
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.visualization.triangles import Solid, box_solid, shade, to_solid
+from vkc_pin.world.files.meshes import load_parts
+from vkc_pin.world.models.shapes import compute_world_box
+from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["Part", "Room", "drawn_parts", "is_wall"]
+__all__ = ["Part", "Room", "is_wall", "load_drawn_parts"]
 
-_THIN, _HIGH = 0.25, 2.0  # [m]: an upright box at most this thick that reaches at least this high is a wall
-_BEYOND = 0.35  # [m]: a wall with more of the arena than this behind it divides a room
+_THIN, _HIGH = (
+    0.25,
+    2.0,
+)  # [m]: an upright box at most this thick that reaches at least this high is a wall
+_BEYOND = 0.35  # a wall with more of the arena behind it is a partition [m]
 _VEIL, _DIVIDER = 0.07, 0.32  # opacities
 _FLOOR_COLOUR = (0.90, 0.89, 0.87)
 _DETAIL = 1e-3  # [m] of meshes
@@ -26,11 +29,11 @@ _DETAIL = 1e-3  # [m] of meshes
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Something to draw that does not move: name, triangles in the world frame, colour, opacity and who sees it.
+    """A static mesh to draw: name, triangles in the world frame, colour and opacity.
 
     Attributes:
         shadow: Whether it casts a shadow.
-        one_sided: Whether it can be seen from its front only.
+        one_sided: Whether it is visible from its front only.
     """
 
     name: str
@@ -46,7 +49,7 @@ class Room:
     """The obstacles of a scene and its floor.
 
     Attributes:
-        centre: Of the arena, at the floor, shape (3,) [m].
+        centre: Centre of the arena on the floor, shape (3,) [m].
         reach: Half of the arena's diagonal [m].
     """
 
@@ -61,28 +64,33 @@ class Room:
             (self._walls if is_wall(shape) else self._furniture).append(shape)
 
     def parts(self) -> list[Part]:
-        """Return what to draw."""
+        """Return the meshes to draw."""
         parts = []
         if self.scene.floor:
             x_min, x_max, y_min, y_max = self.scene.arena
             floor = box_solid(np.array([x_min, y_min, -0.03]), np.array([x_max, y_max, 0.0]))
             parts.append(Part("floor", floor, _FLOOR_COLOUR, shadow=False))
         for shape in self._furniture:
-            drawn = drawn_parts(shape)
+            drawn = load_drawn_parts(shape)
             for k, (solid, colour) in enumerate(drawn):
                 name = f"{shape.name}/{k}" if len(drawn) > 1 else str(shape.name)
                 opacity = colour[3] if len(colour) > 3 else 1.0
-                parts.append(Part(name, solid.moved(shape.placement), colour, opacity, shadow=opacity >= 1.0))
+                parts.append(
+                    Part(name, solid.moved(shape.placement), colour, opacity, shadow=opacity >= 1.0)
+                )
         for shape in self._walls:
             parts += self._wall_parts(shape)
         return parts
 
     def lines(self) -> list[tuple[str, Floats, float]]:
-        """Return line segments, shape (2·k, 3) [m], with name and brightness: the floor's grid and the walls' edges."""
+        """Return name, segments, shape (2·k, 3) [m], and brightness of floor grid and wall edges."""
         drawn = []
         if self.scene.floor:
             x_min, x_max, y_min, y_max = self.scene.arena
-            xs, ys = (np.arange(np.ceil(low / 0.5) * 0.5, high, 0.5) for low, high in ((x_min, x_max), (y_min, y_max)))
+            xs, ys = (
+                np.arange(np.ceil(low / 0.5) * 0.5, high, 0.5)
+                for low, high in ((x_min, x_max), (y_min, y_max))
+            )
             ends = [[(x, y_min), (x, y_max)] for x in xs] + [[(x_min, y), (x_max, y)] for y in ys]
             flat = np.array(ends, float).reshape(-1, 2)
             drawn.append(("grid", np.column_stack([flat, np.full(len(flat), 0.002)]), 0.78))
@@ -92,15 +100,18 @@ class Room:
         return drawn
 
     def obstructions(self) -> list[tuple[Floats, Floats, float]]:
-        """Return boxes that hide what is behind them: lower and upper corner, shape (3,) each [m], and opacity."""
+        """Return the boxes of obstacles: lower and upper corner, shape (3,) each [m], and opacity."""
         opacities = [
             *((wall, 0.6 if self._divides(wall) else 0.0) for wall in self._walls),
             *((one, 1.0) for one in self._furniture),
         ]
-        return [(*world_box(shape.geometry, shape.placement), opacity) for shape, opacity in opacities]
+        return [
+            (*compute_world_box(shape.geometry, shape.placement), opacity)
+            for shape, opacity in opacities
+        ]
 
     def _inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
-        """Return the thin axis of a wall, in its own frame, and the sign of its side towards the middle of the arena."""
+        """Return a wall's thin axis in its own frame, and the sign of its side facing the centre."""
         axis = int(np.argmin(np.asarray(shape.geometry.halfSide)[:2]))
         towards = shape.placement.actInv(self.centre)[axis]
         return axis, 1.0 if towards > 0.0 else -1.0
@@ -118,33 +129,46 @@ class Room:
 
         def part(name: str, opacity: float, sides: tuple[int, ...]) -> Part:
             solid = box_solid(-half, half, sides).moved(shape.placement)
-            return Part(f"walls/{shape.name}/{name}", solid, colour, opacity, shadow=False, one_sided=True)
+            return Part(
+                f"walls/{shape.name}/{name}", solid, colour, opacity, shadow=False, one_sided=True
+            )
 
         if self._divides(shape):
             return [part("sides", _DIVIDER, (0, 1, 2, 3, 5))]
         axis, sign = self._inside(shape)
         inside = 2 * axis + (sign > 0)
-        return [part("inside", 1.0, (inside,)), part("outside", _VEIL, tuple(s for s in range(4) if s != inside))]
+        return [
+            part("inside", 1.0, (inside,)),
+            part("outside", _VEIL, tuple(s for s in range(4) if s != inside)),
+        ]
 
 
-def drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
-    """Return the solids, in the shape's own frame, and colours that a shape is drawn as: from its mesh file, if it has one."""
+def load_drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
+    """Load meshes, in the shape's frame, and colours of a shape, from its mesh file if available."""
     colour = tuple(float(c) for c in shape.meshColor)
     if shape.meshPath and Path(shape.meshPath).is_file():
         parts = load_parts(shape.meshPath, np.asarray(shape.meshScale).ravel(), detail=_DETAIL)
         own = bool(shape.overrideMaterial)
-        return [(shade(part.vertices, part.faces), colour if own else part.colour or colour) for part in parts]
+        return [
+            (shade(part.vertices, part.faces), colour if own else part.colour or colour)
+            for part in parts
+        ]
     return [(to_solid(shape.geometry), colour)]
 
 
 def is_wall(shape: pin.GeometryObject) -> bool:
-    """Return whether a shape that stands in the world is a wall: an upright box, thin and high."""
+    """Return whether an obstacle is a wall: an upright box, thin and high."""
     if not isinstance(shape.geometry, coal.Box):
         return False
     half = np.asarray(shape.geometry.halfSide)
     top = shape.placement.translation[2] + half[2]
     upright = abs(shape.placement.rotation[2, 2]) > 0.999
-    return bool(upright and 2.0 * half[:2].min() <= _THIN and top >= _HIGH and half[:2].max() > 2.0 * half[:2].min())
+    return bool(
+        upright
+        and 2.0 * half[:2].min() <= _THIN
+        and top >= _HIGH
+        and half[:2].max() > 2.0 * half[:2].min()
+    )
 
 
 def _edges(shape: pin.GeometryObject) -> Floats:

@@ -1,6 +1,7 @@
-"""A meshcat server that only this machine can reach; started as a process of its own by `visualization`.
+"""Runs a meshcat server on the loopback interface, as a process of its own.
 
-meshcat's own serves its web page to every interface. This file imports nothing of vkc_pin, so that it starts quickly.
+meshcat's own server listens on every interface. This file imports nothing from vkc_pin, so that it
+starts quickly.
 """
 
 import contextlib
@@ -21,10 +22,11 @@ class LoopbackBridge(ZMQWebSocketBridge):
     """A meshcat server bound to the loopback interface."""
 
     def make_app(self):  # type: ignore[no-untyped-def]
-        """Return the web application, listening on the loopback interface only, to browsers that mean this machine.
+        """Return a web application that listens on loopback and rejects other host names.
 
-        Any page can have its own name lead to this machine, and would then be let in as the viewer's own. So a name that is not
-        this machine's is refused; tornado refuses web sockets of pages from anywhere else than the name that was asked for.
+        Any web page could let its own host name resolve to this machine (DNS rebinding) and would
+        then be accepted as the viewer. Requests with foreign host names are therefore refused.
+        tornado refuses web sockets whose origin is not the requested host.
         """
         app = super().make_app()
         listen, find = app.listen, app.find_handler
@@ -39,20 +41,20 @@ class LoopbackBridge(ZMQWebSocketBridge):
         return app
 
     def forward_to_websockets(self, frames):  # type: ignore[no-untyped-def]
-        """Send a command to every page that is still there: one that was just closed would leave the sender without an answer."""
+        """Send a command to all open pages; closed ones are skipped, so that the sender gets an answer."""
         for page in tuple(self.websocket_pool):
             with contextlib.suppress(tornado.websocket.WebSocketClosedError):
                 page.write_message(frames[2], binary=True)
 
 
 def _end_with_parent() -> None:
-    """End when the process that started this one does: its end of our standard input closes."""
+    """Exit with the parent process, which closes standard input."""
     sys.stdin.buffer.read()
     os._exit(0)
 
 
 def main() -> None:
-    """Serve until standard input closes; say where, in two lines."""
+    """Serve until standard input closes; print the two addresses."""
     bridge = LoopbackBridge(host=LOOPBACK)
     sys.stdout.write(f"zmq_url={bridge.zmq_url}\nweb_url={bridge.web_url}\n")
     sys.stdout.flush()

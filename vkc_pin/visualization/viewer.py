@@ -1,4 +1,4 @@
-"""Shows scenes and plans with meshcat: in a notebook, in the browser, or as one self-contained web page."""
+"""Shows scenes and plans with meshcat, in a notebook, a browser or a self-contained web page."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from vkc_pin.arguments import flag, instance, mapping, whole
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.notebook import in_notebook
-from vkc_pin.scene.poses import as_placement
-from vkc_pin.scene.scene import Scene
-from vkc_pin.validation.report import Judged
+from vkc_pin.utils.arguments import flag, instance, mapping, whole
+from vkc_pin.utils.notebook import in_notebook
+from vkc_pin.validation.report import CheckedMotion
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.poses import as_placement
+from vkc_pin.world.scene.scene import Scene
 
 if TYPE_CHECKING:
     import meshcat
@@ -32,29 +32,33 @@ if TYPE_CHECKING:
 
 __all__ = ["Recorder", "animate", "open_viewer", "render_page", "show", "to_html"]
 
-_server: tuple[subprocess.Popen[bytes], str, str] | None = None  # the process, its address for commands, and for browsers
+_server: tuple[subprocess.Popen[bytes], str, str] | None = (
+    None  # the process, its address for commands, and for browsers
+)
 
 
 def show(
-    plan_or_scene: Judged | Scene,
+    plan_or_scene: CheckedMotion | Scene,
     *,
     open_browser: bool | None = None,
     height: int = 560,
     frames: Mapping[str, pin.SE3] | None = None,
 ) -> Any:
-    """Show a plan's motion, or a scene.
+    """Show the motion of a plan, or a scene.
 
-    In a notebook the result is an inline view, with play, pause and a time slider, that is part of the notebook and
-    survives saving it. Elsewhere a server that only this machine can reach shows it in the browser.
+    In a notebook the result is an inline view with play, pause and a time slider, which is saved
+    with the notebook. Elsewhere a server on the loopback interface shows it in a browser.
 
     Args:
-        plan_or_scene: What to show.
-        open_browser: Whether to open a browser window; None opens one where there is a screen. Not used in a notebook.
-        height: Of the inline view [pixels].
-        frames: Frames to draw, by name, with their placements in the world: x red, y green, z blue. They stand still.
+        plan_or_scene: Plan or scene to show.
+        open_browser: Whether to open a browser window. Default: if there is a screen. Ignored in a
+            notebook.
+        height: Height of the inline view [pixels].
+        frames: Name → placement in the world of static frames to draw (x red, y green, z blue).
 
     Returns:
-        In a notebook an object that displays itself; elsewhere the `meshcat.Visualizer`. Its address is printed.
+        In a notebook an object that displays itself; elsewhere the `meshcat.Visualizer`. Its
+        address is printed.
 
     Raises:
         InputError: Neither a plan nor a scene, or something that cannot be drawn.
@@ -69,11 +73,15 @@ def show(
 
         page, name = html.escape(_page(scene, plan, frames)), html.escape(scene.name)
         style = f"width: 100%; height: {height}px; border: none"
-        return cast(Any, HTML)(f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>')
+        return cast(Any, HTML)(
+            f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>'
+        )
     viewer = open_viewer()
     _draw(viewer, scene, plan, frames=frames)
     sys.stdout.write(f"meshcat shows it at {viewer.url()}\n")
-    screen = sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    screen = sys.platform in ("darwin", "win32") or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
     if screen if open_browser is None else open_browser:
         import webbrowser
 
@@ -81,15 +89,16 @@ def show(
     return viewer
 
 
-def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.Visualizer:
-    """Put a motion into a meshcat viewer, whose controls have play, pause and a time slider in seconds.
+def animate(plan: CheckedMotion, viewer: meshcat.Visualizer | None = None) -> meshcat.Visualizer:
+    """Animate a motion in a meshcat viewer with play, pause and a time slider in seconds.
 
     Args:
-        plan: What to show.
-        viewer: Where; what it shows at its path is replaced. None takes the one of `open_viewer`.
+        plan: Plan to show.
+        viewer: Viewer, whose content at its path is replaced. Default: that of `open_viewer`.
 
     Returns:
-        The viewer. Give its `jupyter_cell()` as a cell's result to see it in a notebook, or visit its `url()`.
+        The viewer. Give its `jupyter_cell()` as a cell's result to see it in a notebook, or visit
+        its `url()`.
 
     Raises:
         InputError: Not a plan, or something that cannot be drawn.
@@ -98,20 +107,27 @@ def animate(plan: Judged, viewer: meshcat.Visualizer | None = None) -> meshcat.V
 
     scene, known = _parts(plan)
     if known is None:
-        raise InputError("nothing moves in it", field="plan", expected="a Plan", got=type(plan).__name__)
+        raise InputError(
+            "a scene has no motion", field="plan", expected="a Plan", got=type(plan).__name__
+        )
     viewer = open_viewer() if viewer is None else instance(viewer, meshcat.Visualizer, "viewer")
     _draw(viewer, scene, known)
     return viewer
 
 
-def to_html(plan_or_scene: Judged | Scene, path: str | Path, *, frames: Mapping[str, pin.SE3] | None = None) -> Path:
-    """Write one self-contained web page with the motion, or the scene; it loads nothing from elsewhere.
+def to_html(
+    plan_or_scene: CheckedMotion | Scene,
+    path: str | Path,
+    *,
+    frames: Mapping[str, pin.SE3] | None = None,
+) -> Path:
+    """Write a self-contained web page with the motion of a plan, or a scene.
 
     The page plays the motion, with a time slider in seconds; `page.html#t=3.5` shows it at 3.5 s.
 
     Args:
         plan_or_scene: What to show.
-        path: The file to write, whole or not at all.
+        path: File to write, atomically.
         frames: Frames to draw; see `show`.
 
     Returns:
@@ -124,9 +140,10 @@ def to_html(plan_or_scene: Judged | Scene, path: str | Path, *, frames: Mapping[
 
 
 def open_viewer() -> meshcat.Visualizer:
-    """Return a viewer on this process's own meshcat server, which is started when first needed and ends with the process.
+    """Return a viewer on the process's own meshcat server, which is started on demand.
 
-    The server listens on the loopback interface only. All viewers of a process are the same window.
+    The server listens on the loopback interface only and ends with the process. All viewers of a
+    process share one window.
 
     Raises:
         VkcError: The server does not start.
@@ -145,28 +162,42 @@ def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
     command = [sys.executable, "-P", "-u", str(Path(__file__).with_name("server.py"))]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=environment,
+        start_new_session=True,
     )
     atexit.register(process.kill)
     assert process.stdout is not None
     addresses = [process.stdout.readline().decode().strip().partition("=")[2] for _ in range(2)]
     if not all(addresses):
         process.kill()
-        raise VkcError("meshcat's server does not start; is a port from 6000 and one from 7000 on free?")
+        raise VkcError(
+            "meshcat's server does not start; is a port from 6000 and one from 7000 on free?"
+        )
     return process, addresses[0], addresses[1]
 
 
-def _parts(plan_or_scene: Any) -> tuple[Scene, Judged | None]:
+def _parts(plan_or_scene: Any) -> tuple[Scene, CheckedMotion | None]:
     if isinstance(plan_or_scene, Scene):
         return plan_or_scene, None
-    if isinstance(plan_or_scene, Judged):
+    if isinstance(plan_or_scene, CheckedMotion):
         return plan_or_scene.scene, plan_or_scene
     got = type(plan_or_scene).__name__
-    raise InputError("this cannot be shown", field="plan_or_scene", expected="a Plan or a Scene", got=got)
+    raise InputError(
+        "this cannot be shown", field="plan_or_scene", expected="a Plan or a Scene", got=got
+    )
 
 
 def _draw(
-    viewer: Any, scene: Scene, plan: Judged | None, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None
+    viewer: Any,
+    scene: Scene,
+    plan: CheckedMotion | None,
+    *,
+    play: bool = True,
+    frames: Mapping[str, pin.SE3] | None = None,
 ) -> None:
     from vkc_pin.visualization.drawing import Drawing
 
@@ -176,7 +207,9 @@ def _draw(
     Drawing(viewer, scene, *motion).draw(play=play, frames=placed)
 
 
-def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | None = None) -> str:
+def _page(
+    scene: Scene, plan: CheckedMotion | None, frames: Mapping[str, pin.SE3] | None = None
+) -> str:
     import meshcat
 
     recorder = Recorder()
@@ -184,40 +217,47 @@ def _page(scene: Scene, plan: Judged | None, frames: Mapping[str, pin.SE3] | Non
     return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_film(scene, plan))
 
 
-def _film(scene: Scene, plan: Judged | None) -> dict[str, Any]:
+def _film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
     if plan is None:
         return {"duration": 0.0, "phases": [], "notes": [], "headline": scene.name}
     times = plan.trajectory.times - plan.trajectory.times[0]
     return {
         "duration": float(times[-1]),
-        "phases": [{"name": phase.name, "last": float(times[phase.last])} for phase in plan.trajectory.phases],
-        "notes": [{"text": f"{v.constraint}: {v.subject}", "time": v.time} for v in plan.validation.violations],
+        "phases": [
+            {"name": phase.name, "last": float(times[phase.last])}
+            for phase in plan.trajectory.phases
+        ],
+        "notes": [
+            {"text": f"{v.constraint}: {v.subject}", "time": v.time}
+            for v in plan.validation.violations
+        ],
         "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
     }
 
 
 class Recorder:
-    """Takes a viewer's commands instead of a server; give it as `window` to `meshcat.Visualizer`.
+    """Records a viewer's commands; pass it as `window` to `meshcat.Visualizer`.
 
     Attributes:
-        commands: The commands so far.
+        commands: Recorded commands.
     """
 
     def __init__(self) -> None:
         self.commands: list[dict[str, Any]] = []
 
     def send(self, command: Any) -> None:
-        """Take one of meshcat's commands."""
+        """Record a meshcat command."""
         self.commands.append(command.lower())
 
 
 def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
-    """Return a web page with a drawing: meshcat's viewer, the drawing's commands, and a bar with play and time.
+    """Render a web page with meshcat's viewer, a drawing's commands and playback controls.
 
     Args:
-        recorder: What to draw.
-        title: Of the page.
-        film: What the bar shows: "duration" [s], "phases" ("name", "last" [s]), "notes" ("text", "time" [s]), "headline".
+        recorder: Commands of the drawing.
+        title: Title of the page.
+        film: Content of the controls: "duration" [s], "phases" ("name", "last" [s]), "notes"
+            ("text", "time" [s]), "headline".
     """
     import meshcat
     import umsgpack  # type: ignore[import-untyped]
@@ -229,7 +269,9 @@ def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
         "TITLE": html.escape(title),
         "FILM": json.dumps(film).replace("<", "\\u003c"),
         "VIEWER": _packed_file(viewer),
-        "COMMANDS": _packed(b"".join(struct.pack("<I", len(command)) + command for command in packed)),
+        "COMMANDS": _packed(
+            b"".join(struct.pack("<I", len(command)) + command for command in packed)
+        ),
     }
     return re.sub(r"%(TITLE|FILM|VIEWER|COMMANDS)%", lambda match: pieces[match[1]], template)
 

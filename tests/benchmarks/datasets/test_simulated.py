@@ -21,7 +21,9 @@ def test_alone_with_a_client_that_costs_nothing() -> None:
 def test_equal_tasks_leave_nothing_in_vain_but_the_last() -> None:
     found = simulated(Costs((2.0,), (2.0,), 0.0, 1.0), 10, 100)
     assert found["efficiency"] == 1.0
-    odd = simulated(Costs((2.0,), (2.0,), 0.0, 1.0), 10, 91)  # one works on the last one, nine on others
+    odd = simulated(
+        Costs((2.0,), (2.0,), 0.0, 1.0), 10, 91
+    )  # one works on the last one, nine on others
     assert odd["efficiency"] == pytest.approx(0.91)
     assert odd["in_vain"] == pytest.approx(0.09)
 
@@ -38,7 +40,10 @@ def test_a_client_that_is_busy_limits_all() -> None:
 
 def test_one_that_straggles_keeps_all_waiting() -> None:
     costs = Costs((1.0,), tuple([1.0] * 99 + [200.0]), 0.0, 1.0)
-    even, straggling = simulated(Costs((1.0,), (1.0,), 0.0, 1.0), 100, 1000), simulated(costs, 100, 1000)
+    even, straggling = (
+        simulated(Costs((1.0,), (1.0,), 0.0, 1.0), 100, 1000),
+        simulated(costs, 100, 1000),
+    )
     assert even["efficiency"] == 1.0
     assert straggling["efficiency"] < 0.3
     assert straggling["in_vain"] > 0.5  # the others go on with numbers that nobody needs
@@ -61,7 +66,13 @@ def test_what_a_journal_says(tmp_path: Path) -> None:
         (4, "a", 2.0, 0.6),
     ):
         record = {"number": key, "success": key != 3, "cpu_time": seconds}
-        more = {"memory_mb": 1.0, "resident_mb": 1.0, "process": process, "seconds": seconds, "client_seconds": client}
+        more = {
+            "memory_mb": 1.0,
+            "resident_mb": 1.0,
+            "process": process,
+            "seconds": seconds,
+            "client_seconds": client,
+        }
         lines.append({"key": str(key), "records": [record], **more})
     (tmp_path / "journal.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     found = measured(Dataset(tmp_path, load_recipe(SMALL)))

@@ -19,13 +19,35 @@ pytest.importorskip("h5py")
 def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe = write(tmp_path)
     out = tmp_path / "out"
-    assert main(["bench", "throughput", "--episodes", "2", "--out", str(out), "--recipe", recipe, "--quiet"]) == 0
+    assert (
+        main(
+            [
+                "bench",
+                "throughput",
+                "--episodes",
+                "2",
+                "--out",
+                str(out),
+                "--recipe",
+                recipe,
+                "--quiet",
+            ]
+        )
+        == 0
+    )
     assert "drive-open" in capsys.readouterr().out
     result = json.loads((out / "results.json").read_text())
     records = result["trials"]
     assert [record["task"] for record in records] == list(TASKS)
     for record in records:
-        assert {"task", "episodes_per_hour", "attempts", "successes", "workers", "memory_mb"} <= set(record)
+        assert {
+            "task",
+            "episodes_per_hour",
+            "attempts",
+            "successes",
+            "workers",
+            "memory_mb",
+        } <= set(record)
         assert record["workers"] == 1
         assert record["attempts"] >= record["successes"] >= 2
         assert record["episodes_per_hour"] > 0.0
@@ -33,8 +55,12 @@ def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         assert record["memory_slope_mb"] is None  # of so few
         assert 0.0 < record["client_ms"] < 1000.0 * record["wall_time"]
         lines = (out / record["task"] / "journal.jsonl").read_text().splitlines()[1:]
-        seconds = [json.loads(line)["seconds"] for line in lines if "session" not in json.loads(line)]
-        assert record["episodes_per_hour"] == pytest.approx(3600.0 * record["successes"] / seconds[-1], rel=1e-2)
+        seconds = [
+            json.loads(line)["seconds"] for line in lines if "session" not in json.loads(line)
+        ]
+        assert record["episodes_per_hour"] == pytest.approx(
+            3600.0 * record["successes"] / seconds[-1], rel=1e-2
+        )
     assert result["curve"] == []  # of one worker
     for task in TASKS:
         many = [one for one in result["simulated"] if one["task"] == task]
@@ -48,12 +74,18 @@ def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 def test_a_curve_of_workers(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     result = run(out=tmp_path / "out", episodes=2, jobs=2, recipe=write(tmp_path), progress=False)
-    assert [(one["task"], one["workers"]) for one in result["curve"]] == [(task, count) for task in TASKS for count in (1, 2)]
+    assert [(one["task"], one["workers"]) for one in result["curve"]] == [
+        (task, count) for task in TASKS for count in (1, 2)
+    ]
     for one, two in zip(result["curve"][::2], result["curve"][1::2], strict=True):
         assert one["times"] == 1.0
-        assert two["times"] == pytest.approx(two["episodes_per_hour"] / one["episodes_per_hour"], abs=1e-3)
+        assert two["times"] == pytest.approx(
+            two["episodes_per_hour"] / one["episodes_per_hour"], abs=1e-3
+        )
         folders = tmp_path / "out/1_workers" / one["task"], tmp_path / "out" / one["task"]
-        shards = [[file.read_bytes() for file in sorted(folder.glob("shards/*/*"))] for folder in folders]
+        shards = [
+            [file.read_bytes() for file in sorted(folder.glob("shards/*/*"))] for folder in folders
+        ]
         assert shards[0] == shards[1]
     assert [one["workers"] for one in result["trials"]] == [2, 2, 2]
     assert "times one" in (tmp_path / "out/table.md").read_text()

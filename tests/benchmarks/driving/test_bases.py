@@ -31,16 +31,35 @@ def test_starts_are_the_same_for_every_base() -> None:
 
 
 def test_bench_bases(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "bases", "--trials", "1", "--tasks", "drawer", "--bases", "omni", "differential", "--quiet"]
+    command = [
+        "bench",
+        "bases",
+        "--trials",
+        "1",
+        "--tasks",
+        "drawer",
+        "--bases",
+        "omni",
+        "differential",
+        "--quiet",
+    ]
     assert main([*command, "--out", str(tmp_path)]) == 0
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     assert table in capsys.readouterr().out
     records = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
-    assert {(r["task"], r["base"], r["success"]) for r in records} == {("drawer", "omni", True), ("drawer", "differential", True)}
+    assert {(r["task"], r["base"], r["success"]) for r in records} == {
+        ("drawer", "omni", True),
+        ("drawer", "differential", True),
+    }
     for record in records:
-        (row,) = [line for line in table.splitlines() if line.startswith(f"| drawer | {record['base']} |")]
+        (row,) = [
+            line for line in table.splitlines() if line.startswith(f"| drawer | {record['base']} |")
+        ]
         assert f"| 1 of 1 | {record['planning_time']:.3f} |" in row
-        assert f"| {record['base_effort']:.2f} | {record['arm_effort']:.2f} | {record['duration']:.2f} |" in row
+        assert (
+            f"| {record['base_effort']:.2f} | {record['arm_effort']:.2f} | {record['duration']:.2f} |"
+            in row
+        )
 
 
 def test_failures_are_listed() -> None:
@@ -54,8 +73,17 @@ def test_failures_are_listed() -> None:
     }
     fields = ("planning_time", "effort", "iterations", "base_effort", "arm_effort", "duration")
     about = {"starts": 5, "seed": 0, "radius": 0.8, "tasks": ["door"], "bases": ["ackermann"]}
-    foot = {**meta(), "trials": 1, "jobs": 1, "wall_time": 1.0, "peak_memory_mb": 100.0, "sources": "abc"}
-    text = bases.report({"meta": {**foot, **about}, "trials": [record | dict.fromkeys(fields, 1.0)]})
+    foot = {
+        **meta(),
+        "trials": 1,
+        "jobs": 1,
+        "wall_time": 1.0,
+        "peak_memory_mb": 100.0,
+        "sources": "abc",
+    }
+    text = bases.report(
+        {"meta": {**foot, **about}, "trials": [record | dict.fromkeys(fields, 1.0)]}
+    )
     assert "- door, ackermann, start 4: rejected; turning base" in text
     assert "| door | ackermann | 0 of 1 |" in text
 

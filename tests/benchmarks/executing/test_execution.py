@@ -14,10 +14,26 @@ from vkc_pin.cli import main
 
 def test_two_tasks_from_one_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    command = ["bench", "execution", "--trials", "1", "--tasks", "drawer", "init_1", "--quiet", "--out", str(out)]
+    command = [
+        "bench",
+        "execution",
+        "--trials",
+        "1",
+        "--tasks",
+        "drawer",
+        "init_1",
+        "--quiet",
+        "--out",
+        str(out),
+    ]
     assert main(command) == 0
     said = capsys.readouterr().out
-    assert {path.name for path in out.iterdir()} == {"results.json", "results.csv", "table.md", "trials.jsonl"}
+    assert {path.name for path in out.iterdir()} == {
+        "results.json",
+        "results.csv",
+        "table.md",
+        "trials.jsonl",
+    }
     result = json.loads((out / "results.json").read_text(encoding="utf-8"))
     drawer, stick = result["trials"]
     assert (drawer["task"], stick["task"]) == ("drawer", "init_1")
@@ -39,7 +55,19 @@ def test_two_tasks_from_one_start(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_by_friction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    command = ["bench", "execution", "--trials", "1", "--tasks", "drawer", "--grasp", "friction", "--quiet", "--out", str(out)]
+    command = [
+        "bench",
+        "execution",
+        "--trials",
+        "1",
+        "--tasks",
+        "drawer",
+        "--grasp",
+        "friction",
+        "--quiet",
+        "--out",
+        str(out),
+    ]
     assert main(command) == 0
     assert "held by friction" in capsys.readouterr().out
     (trial,) = json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
@@ -51,10 +79,20 @@ def test_by_friction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_what_goes_wrong_is_counted() -> None:
     fine = {"task": "drawer", "success": True, "executed": True, "arm_error": 0.01, "problems": []}
-    bad = {"task": "drawer", "success": True, "executed": False, "arm_error": 0.02, "problems": ["cup – floor: 9 mm deep"]}
+    bad = {
+        "task": "drawer",
+        "success": True,
+        "executed": False,
+        "arm_error": 0.02,
+        "problems": ["cup – floor: 9 mm deep"],
+    }
     never = {"task": "drawer", "success": False, "executed": False}
-    recorded = json.loads((Path(__file__).parents[3] / "docs/results/gap.json").read_text(encoding="utf-8"))["meta"]
-    text = report({"meta": {**recorded, "starts": 3, "tasks": ["drawer"]}, "trials": [fine, bad, never]})
+    recorded = json.loads(
+        (Path(__file__).parents[3] / "docs/results/gap.json").read_text(encoding="utf-8")
+    )["meta"]
+    text = report(
+        {"meta": {**recorded, "starts": 3, "tasks": ["drawer"]}, "trials": [fine, bad, never]}
+    )
     assert "| drawer | 2 of 3 | 1 of 2 |" in text
     assert "1.15" in text
     assert "- drawer: cup – floor: 9 mm deep" in text

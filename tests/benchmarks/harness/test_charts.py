@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from helpers.fake_plan import fake_plan
 
-from vkc_pin.benchmarks.harness.charts import criteria_chart, means_chart, motions_chart, success_chart
+from vkc_pin.benchmarks.harness.charts import (
+    criteria_chart,
+    means_chart,
+    motions_chart,
+    success_chart,
+)
 from vkc_pin.benchmarks.harness.tables import TIMES, wilson
 from vkc_pin.benchmarks.scale import scale_chart
 from vkc_pin.planning.plan import Plan
@@ -24,7 +29,9 @@ RECORDS: list[dict[str, Any]] = [
 
 
 def test_bars_and_intervals() -> None:
-    figure = success_chart([*RECORDS, {"scene": "a", "method": "other", "success": True}], None, SCENES, ["one", "two"])
+    figure = success_chart(
+        [*RECORDS, {"scene": "a", "method": "other", "success": True}], None, SCENES, ["one", "two"]
+    )
     (axes,) = figure.axes
     bars = [bar for bar in axes.patches if bar.get_width() < 0.5]
     places = [bar.get_x() + bar.get_width() / 2.0 for bar in bars]
@@ -33,12 +40,19 @@ def test_bars_and_intervals() -> None:
     assert len({bar.get_facecolor() for bar in bars[:2]}) == 1
     assert bars[0].get_facecolor() != bars[2].get_facecolor()
     intervals = [line.get_segments()[0][:, 1] for line in axes.collections]
-    expected = [wilson(*RATES[key]) for key in (("a", "one"), ("b", "one"), ("a", "two"), ("b", "two"))]
+    expected = [
+        wilson(*RATES[key]) for key in (("a", "one"), ("b", "one"), ("a", "two"), ("b", "two"))
+    ]
     np.testing.assert_allclose(intervals, 100.0 * np.array(expected), atol=1e-9)
     assert [text.get_text() for text in axes.texts] == ["100", "25", "75", "0"]
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["easy\n4 trials each", "hard\n4 trials each"]
+    assert [label.get_text() for label in axes.get_xticklabels()] == [
+        "easy\n4 trials each",
+        "hard\n4 trials each",
+    ]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two"]
-    assert all(bar.get_height() == 0.0 for bar in axes.patches if bar not in bars)  # what the legend needs shows nothing
+    assert all(
+        bar.get_height() == 0.0 for bar in axes.patches if bar not in bars
+    )  # what the legend needs shows nothing
 
 
 def test_the_file(tmp_path: Path) -> None:
@@ -62,24 +76,38 @@ def test_the_file(tmp_path: Path) -> None:
 def test_a_method_without_trials_has_no_bar() -> None:
     figure = success_chart(RECORDS[:4], None, SCENES, ["one", "two"])
     assert [text.get_text() for text in figure.axes[0].texts] == ["100"]
-    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["easy\n4 trials each", "hard\nno trials"]
+    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == [
+        "easy\n4 trials each",
+        "hard\nno trials",
+    ]
 
 
-def record(method: str, number: int, success: bool, base: float, time: float | None) -> dict[str, Any]:
+def record(
+    method: str, number: int, success: bool, base: float, time: float | None
+) -> dict[str, Any]:
     efforts = {"base_effort": base, "arm_effort": 10.0 * base, "planning_time": time}
     return {"scene": "a", "method": method, "number": number, "success": success, **efforts}
 
 
 TRIALS = [
-    *(record("one", number, True, base, time) for number, base, time in ((0, 3.0, 1.0), (1, 4.0, 2.0), (2, 9.0, 6.0))),
-    *(record("two", number, good, base, time) for number, good, base, time in ((0, True, 5.0, 3.0), (1, True, 6.0, 4.0))),
+    *(
+        record("one", number, True, base, time)
+        for number, base, time in ((0, 3.0, 1.0), (1, 4.0, 2.0), (2, 9.0, 6.0))
+    ),
+    *(
+        record("two", number, good, base, time)
+        for number, good, base, time in ((0, True, 5.0, 3.0), (1, True, 6.0, 4.0))
+    ),
     record("two", 2, False, 99.0, None),  # an error
 ]
 
 
 def bars_of(axes: Any) -> list[tuple[str, float]]:
     names = [label.get_text() for label in axes.get_xticklabels()]
-    return [(names[round(bar.get_x() + bar.get_width() / 2.0)], bar.get_height()) for bar in axes.patches]
+    return [
+        (names[round(bar.get_x() + bar.get_width() / 2.0)], bar.get_height())
+        for bar in axes.patches
+    ]
 
 
 def test_criteria_against_numbers_by_hand() -> None:
@@ -89,9 +117,15 @@ def test_criteria_against_numbers_by_hand() -> None:
     assert bars_of(base) == [("one", 3.5), ("two", 5.5)]  # only where both succeed
     assert bars_of(arm) == [("one", 35.0), ("two", 55.0)]
     assert bars_of(time) == [("one", 2.0), ("two", 3.5)]  # of all that have one
-    ends = [[line.get_segments()[0][:, 1].tolist() for line in axes.collections] for axes in figure.axes]
+    ends = [
+        [line.get_segments()[0][:, 1].tolist() for line in axes.collections] for axes in figure.axes
+    ]
     assert ends[0] == [pytest.approx([100.0 * end for end in wilson(good, 3)]) for good in (3, 2)]
-    assert ends[1:] == [[[3.25, 3.75], [5.25, 5.75]], [[32.5, 37.5], [52.5, 57.5]], [[1.5, 4.0], [3.25, 3.75]]]
+    assert ends[1:] == [
+        [[3.25, 3.75], [5.25, 5.75]],
+        [[32.5, 37.5], [52.5, 57.5]],
+        [[1.5, 4.0], [3.25, 3.75]],
+    ]
     assert [text.get_text() for text in success.texts + base.texts] == ["100", "67", "3.50", "5.50"]
     about = [axes.get_xlabel().replace("\n", " ") for axes in figure.axes]
     assert "Wilson" in about[0]
@@ -103,7 +137,11 @@ def test_criteria_against_numbers_by_hand() -> None:
 
 
 def test_criteria_without_common_successes() -> None:
-    trials = [*TRIALS[:2], *(r | {"number": r["number"] + 5} for r in TRIALS[3:]), record("three", 0, False, 99.0, 20.0)]
+    trials = [
+        *TRIALS[:2],
+        *(r | {"number": r["number"] + 5} for r in TRIALS[3:]),
+        record("three", 0, False, 99.0, 20.0),
+    ]
     _, base, _, time = criteria_chart(trials, None, ["one", "two", "three"]).axes
     assert bars_of(base) == [("one", 3.5), ("two", 5.5)]
     assert "own successes" in base.get_xlabel()
@@ -121,17 +159,38 @@ def grouped(axes: Any) -> dict[str, list[float]]:
 
 
 def test_means_against_numbers_by_hand() -> None:
-    lonely = [{**record("one", 0, True, 7.0, 5.0), "scene": "b"}, {**record("two", 0, False, 1.0, 7.0), "scene": "b"}]
+    lonely = [
+        {**record("one", 0, True, 7.0, 5.0), "scene": "b"},
+        {**record("two", 0, False, 1.0, 7.0), "scene": "b"},
+    ]
     records, scenes = [*TRIALS, *lonely], {"a": "easy", "b": "hard"}
-    figure = means_chart(records, None, scenes, ["one", "two"], field="base_effort", label="base effort [m]", shared=True)
+    figure = means_chart(
+        records,
+        None,
+        scenes,
+        ["one", "two"],
+        field="base_effort",
+        label="base effort [m]",
+        shared=True,
+    )
     (axes,) = figure.axes
-    assert grouped(axes) == {"easy\n2 trials": [3.5, 5.5], "hard\nown successes": [7.0]}  # 9 and 99 are not shared
+    assert grouped(axes) == {
+        "easy\n2 trials": [3.5, 5.5],
+        "hard\nown successes": [7.0],
+    }  # 9 and 99 are not shared
     ends = [line.get_segments()[0][:, 1].tolist() for line in axes.collections]
     spread = np.sqrt(0.5)  # of 3 and 4, and of 5 and 6; a single value has none
-    assert ends == [pytest.approx([3.5 - spread, 3.5 + spread]), [7.0, 7.0], pytest.approx([5.5 - spread, 5.5 + spread])]
+    assert ends == [
+        pytest.approx([3.5 - spread, 3.5 + spread]),
+        [7.0, 7.0],
+        pytest.approx([5.5 - spread, 5.5 + spread]),
+    ]
     assert [text.get_text() for text in axes.texts] == ["3.5", "7", "5.5"]
     assert axes.get_ylabel() == "base effort [m]"
-    assert axes.get_title() == "Base effort: mean and standard deviation over trials in which all methods succeed"
+    assert (
+        axes.get_title()
+        == "Base effort: mean and standard deviation over trials in which all methods succeed"
+    )
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two"]
     assert axes.get_ylim()[1] > 7.0
 
@@ -141,7 +200,10 @@ def test_means_over_all_trials(tmp_path: Path) -> None:
     how: dict[str, Any] = {"field": "planning_time", "label": "planning time [s]", "shared": False}
     figure = means_chart(TRIALS, path, {"a": "easy", "c": "none"}, ["one", "two"], **how)
     (axes,) = figure.axes
-    assert grouped(axes) == {"easy\n3 trials each": [3.0, 3.5], "none\nno trials": []}  # an error has no time
+    assert grouped(axes) == {
+        "easy\n3 trials each": [3.0, 3.5],
+        "none\nno trials": [],
+    }  # an error has no time
     assert "over all trials" in axes.get_title()
     assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
@@ -182,13 +244,24 @@ def test_motions_are_those_of_the_plans(tmp_path: Path) -> None:
         ):
             when = axes.lines[0].get_xdata()
             assert set(motion.times) <= set(when)
-            np.testing.assert_allclose([line.get_ydata() for line in axes.lines], read(when)[:, columns].T)
+            np.testing.assert_allclose(
+                [line.get_ydata() for line in axes.lines], read(when)[:, columns].T
+            )
     for row in rows:
         assert row[0].get_ylim() == row[1].get_ylim()
-    assert rows[1, 0].get_ylim() == pytest.approx((-2.0 * fastest(slow), 2.0 * fastest(slow)))  # not scaled to the failure
+    assert rows[1, 0].get_ylim() == pytest.approx(
+        (-2.0 * fastest(slow), 2.0 * fastest(slow))
+    )  # not scaled to the failure
     assert {axes.get_xlim() for axes in rows.ravel()} == {(0.0, 12.0)}
-    assert [text.get_text() for text in rows[0, 1].get_legend().get_texts()][:2] == ["shoulder_pan", "shoulder_lift"]
-    assert [text.get_text() for text in rows[2, 1].get_legend().get_texts()] == ["x [m/s]", "y [m/s]", "yaw [rad/s]"]
+    assert [text.get_text() for text in rows[0, 1].get_legend().get_texts()][:2] == [
+        "shoulder_pan",
+        "shoulder_lift",
+    ]
+    assert [text.get_text() for text in rows[2, 1].get_legend().get_texts()] == [
+        "x [m/s]",
+        "y [m/s]",
+        "yaw [rad/s]",
+    ]
     image = imread(path)[..., :3]
     assert float((np.ptp(image, axis=2) > 0.2).mean()) > 0.005  # coloured lines
 
@@ -197,17 +270,29 @@ def test_time_against_the_number_of_obstacles(tmp_path: Path) -> None:
     times = {10: (1.0, 1.2, 1.1), 300: (2.0, 1.6, 1.8), 30: (1.3, 1.4, 1.5)}
     share = dict(zip(TIMES, (0.3, 0.1, 0.2, 0.15, 0.05), strict=True))
     records: list[dict[str, Any]] = [
-        {"obstacles": count, "planning_time": time, **{field: part * time for field, part in share.items()}}
+        {
+            "obstacles": count,
+            "planning_time": time,
+            **{field: part * time for field, part in share.items()},
+        }
         for count, own in times.items()
         for time in own
     ]
-    figure = scale_chart([*records, {"obstacles": 10, "status": "error"}], tmp_path / "scale.png", title="Many")
+    figure = scale_chart(
+        [*records, {"obstacles": 10, "status": "error"}], tmp_path / "scale.png", title="Many"
+    )
     (axes,) = figure.axes
     np.testing.assert_allclose(axes.lines[0].get_xydata(), [[10.0, 1.1], [30.0, 1.4], [300.0, 1.8]])
     tops = [area.get_paths()[0].vertices[:, 1].max() for area in axes.collections[: len(TIMES) + 1]]
     np.testing.assert_allclose(tops, 1.8 * np.array([*np.cumsum(list(share.values())), 1.0]))
-    (bars,) = [part for part in axes.collections if len(part.get_paths()) == 3 and part not in axes.collections[: len(TIMES) + 1]]
-    np.testing.assert_allclose([bar[:, 1] for bar in bars.get_segments()], [[1.05, 1.15], [1.35, 1.45], [1.7, 1.9]])
+    (bars,) = [
+        part
+        for part in axes.collections
+        if len(part.get_paths()) == 3 and part not in axes.collections[: len(TIMES) + 1]
+    ]
+    np.testing.assert_allclose(
+        [bar[:, 1] for bar in bars.get_segments()], [[1.05, 1.15], [1.35, 1.45], [1.7, 1.9]]
+    )
     assert [text.get_text() for text in axes.texts] == ["1.10", "1.40", "1.80"]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["10", "30", "300"]
     names = [text.get_text() for text in figure.legends[0].get_texts()]

@@ -38,8 +38,12 @@ class Counting:
         return square(spec)
 
 
-def run(out: Path, function: Any = square, number: int = 6, jobs: int = 1, **settings: Any) -> dict[str, Any]:
-    return runner.run(trials(number), function, out, settings={**SETTINGS, **settings}, jobs=jobs, progress=False)
+def run(
+    out: Path, function: Any = square, number: int = 6, jobs: int = 1, **settings: Any
+) -> dict[str, Any]:
+    return runner.run(
+        trials(number), function, out, settings={**SETTINGS, **settings}, jobs=jobs, progress=False
+    )
 
 
 def read(out: Path) -> dict[str, Any]:
@@ -85,8 +89,15 @@ def test_csv_has_the_rows_of_json(tmp_path: Path) -> None:
 
 
 def test_several_records_of_a_trial(tmp_path: Path) -> None:
-    result = run(tmp_path, lambda spec: [{"part": part, "number": spec["number"]} for part in "ba"], number=2)
-    assert [(t["key"], t["part"]) for t in result["trials"]] == [("000", "b"), ("000", "a"), ("001", "b"), ("001", "a")]
+    result = run(
+        tmp_path, lambda spec: [{"part": part, "number": spec["number"]} for part in "ba"], number=2
+    )
+    assert [(t["key"], t["part"]) for t in result["trials"]] == [
+        ("000", "b"),
+        ("000", "a"),
+        ("001", "b"),
+        ("001", "a"),
+    ]
 
 
 @pytest.mark.parametrize("until", [0, 1, 5])
@@ -97,10 +108,14 @@ def test_going_on_after_ctrl_c(tmp_path: Path, until: int) -> None:
     assert not (tmp_path / "stopped" / "results.json").exists()
     resumed = run(tmp_path / "stopped", second)
     assert sorted(first.asked + second.asked) == [t["key"] for t in trials()][::-1]
-    assert first.asked == [t["key"] for t in trials()][:until]  # in the order given, not that of the keys
+    assert (
+        first.asked == [t["key"] for t in trials()][:until]
+    )  # in the order given, not that of the keys
     assert [s["trials"] for s in resumed["meta"]["sessions"]] == [until, 6 - until]
     assert resumed["trials"] == run(tmp_path / "whole")["trials"]
-    assert (tmp_path / "stopped" / "results.csv").read_bytes() == (tmp_path / "whole" / "results.csv").read_bytes()
+    assert (tmp_path / "stopped" / "results.csv").read_bytes() == (
+        tmp_path / "whole" / "results.csv"
+    ).read_bytes()
 
 
 def test_a_finished_one_is_not_run_again(tmp_path: Path) -> None:
@@ -122,13 +137,16 @@ def test_a_torn_last_line(tmp_path: Path) -> None:
     data = file.read_bytes()
     lines = data.splitlines(keepends=True)
     assert len(lines) == 2 + 6  # header, session, trials in the order of running
-    # Torn inside the header, the session's line and trials; within a line, and just before the end of it.
+    # Torn inside the header, the session's line and trials; within a line, and just before the end
+    # of it.
     for kept, cut in ((0, 40), (1, 5), (3, 25), (7, len(lines[7]) - 1), (7, 1)):
         file.write_bytes(b"".join(lines[:kept]) + lines[kept][:cut])
         again = Counting()
         assert run(tmp_path, again)["trials"] == whole["trials"]
         assert again.asked == [t["key"] for t in trials()][max(kept - 2, 0) :]
-        assert [json.loads(line) for line in file.read_bytes().splitlines()]  # nothing of the torn line is left
+        assert [
+            json.loads(line) for line in file.read_bytes().splitlines()
+        ]  # nothing of the torn line is left
 
 
 def test_a_damaged_line_is_not_skipped(tmp_path: Path) -> None:
@@ -187,21 +205,36 @@ def test_other_settings_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(InputError) as caught:
         run(tmp_path, seed=4, methods=["x"])
     text = str(caught.value)
-    for part in ("seed 3", "seed 4", "methods None", "methods ['x']", "use another folder", str(tmp_path)):
+    for part in (
+        "seed 3",
+        "seed 4",
+        "methods None",
+        "methods ['x']",
+        "use another folder",
+        str(tmp_path),
+    ):
         assert part in text
     assert caught.value.field == "seed, methods"
     with pytest.raises(InputError, match="specification"):  # the same settings, yet other trials
         runner.run(trials(5), square, tmp_path, settings=SETTINGS, progress=False)
     monkeypatch.setattr(runner, "_sources", lambda: "xyz")
-    with pytest.raises(InputError, match=r"versions\.sources.*expected sources abc, got sources xyz"):
+    with pytest.raises(
+        InputError, match=r"versions\.sources.*expected sources abc, got sources xyz"
+    ):
         run(tmp_path)
     assert (tmp_path / "trials.jsonl").read_bytes() == before
 
 
-def test_other_versions_and_machines_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_versions_and_machines_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run(tmp_path)
     real = record.meta()
-    other = {**real, "versions": {**real["versions"], "pin": "9.9"}, "machine": {**real["machine"], "cores": 999}}
+    other = {
+        **real,
+        "versions": {**real["versions"], "pin": "9.9"},
+        "machine": {**real["machine"], "cores": 999},
+    }
     monkeypatch.setattr(runner, "meta", lambda: json.loads(json.dumps(other)))
     with pytest.raises(InputError, match=r"pin 9\.9, cores 999"):
         run(tmp_path)
@@ -209,7 +242,9 @@ def test_other_versions_and_machines_are_refused(tmp_path: Path, monkeypatch: py
 
 def test_jobs_make_no_difference(tmp_path: Path) -> None:
     assert run(tmp_path / "two", jobs=2)["trials"] == run(tmp_path / "one")["trials"]
-    assert (tmp_path / "two" / "results.csv").read_bytes() == (tmp_path / "one" / "results.csv").read_bytes()
+    assert (tmp_path / "two" / "results.csv").read_bytes() == (
+        tmp_path / "one" / "results.csv"
+    ).read_bytes()
 
 
 def test_other_processes_are_kept_and_have_one_thread(tmp_path: Path) -> None:
@@ -221,7 +256,9 @@ def test_other_processes_are_kept_and_have_one_thread(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_is_a_failure_on_record(tmp_path: Path, jobs: int, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_is_a_failure_on_record(
+    tmp_path: Path, jobs: int, capsys: pytest.CaptureFixture[str]
+) -> None:
     records = run(tmp_path, mistaken, jobs=jobs)["trials"]
     assert records[2] == {
         "key": "002",
@@ -238,14 +275,20 @@ def test_an_error_is_a_failure_on_record(tmp_path: Path, jobs: int, capsys: pyte
     assert "in mistaken" in said  # where it happened
 
 
-def test_the_same_error_again_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_same_error_again_is_told_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run(tmp_path, lambda spec: {}[spec["number"] // 2], number=4)
     said = capsys.readouterr().err
-    assert [f"00{k} failed with an error: KeyError: {k // 2}" in said for k in range(4)] == [True] * 4
+    assert [f"00{k} failed with an error: KeyError: {k // 2}" in said for k in range(4)] == [
+        True
+    ] * 4
     assert said.count("Traceback") == 2
 
 
-def test_a_record_that_is_no_data_is_an_error_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_record_that_is_no_data_is_an_error_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (record,) = run(tmp_path, lambda spec: {"plan": object()}, number=1)["trials"]
     assert record["status"] == "error"
     assert "not JSON serializable" in capsys.readouterr().err
@@ -289,14 +332,25 @@ def test_progress(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert "<00:00" in said  # time left
 
 
-def test_sources_are_those_that_planning_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vkc_pin.files.resources import folder
+def test_sources_are_those_that_planning_depends_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vkc_pin.world.files.resources import folder
 
-    for name in ("__init__.py", "planner.py", "cli/commands.py", "benchmarks/tables.py", "scenes/a.yaml", "scenes/notes.txt"):
+    for name in (
+        "__init__.py",
+        "planner.py",
+        "cli/commands.py",
+        "benchmarks/tables.py",
+        "scenes/a.yaml",
+        "scenes/notes.txt",
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("1\n")
     monkeypatch.setattr(runner, "package_folder", lambda: tmp_path)
-    monkeypatch.setattr(runner, "folder", lambda kind: tmp_path / "scenes" if kind == "scenes" else folder(kind))
+    monkeypatch.setattr(
+        runner, "folder", lambda kind: tmp_path / "scenes" if kind == "scenes" else folder(kind)
+    )
     first = runner._sources()
     for name, counts in (
         ("cli/commands.py", False),
@@ -322,12 +376,16 @@ runner.run(trials(), slow, sys.argv[1], settings=SETTINGS, jobs=int(sys.argv[2])
 
 @pytest.mark.parametrize("jobs", [1, 2])
 @pytest.mark.parametrize("kind", ["SIGINT", "SIGKILL"])
-def test_a_real_stop_leaves_what_was_done_and_no_process(tmp_path: Path, jobs: int, kind: str) -> None:
+def test_a_real_stop_leaves_what_was_done_and_no_process(
+    tmp_path: Path, jobs: int, kind: str
+) -> None:
     path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(tmp_path), str(jobs)],
         start_new_session=True,  # a group of its own, as of a command in a terminal
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it, and hands that on
+        preexec_fn=lambda: signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        ),  # a shell's background job ignores it, and hands that on
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": path},
@@ -341,7 +399,9 @@ def test_a_real_stop_leaves_what_was_done_and_no_process(tmp_path: Path, jobs: i
         os.killpg(process.pid, signal.SIGINT)
     else:
         process.kill()
-    _, said = process.communicate(timeout=30)  # the other processes hold the pipe's end while they live
+    _, said = process.communicate(
+        timeout=30
+    )  # the other processes hold the pipe's end while they live
     if kind == "SIGINT":
         assert "of 6 trials are done" in said
     counting = Counting()

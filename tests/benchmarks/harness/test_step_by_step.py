@@ -19,7 +19,9 @@ def plans() -> list[vkc.Plan]:
 def test_each_begins_where_the_one_before_ends(plans: list[vkc.Plan]) -> None:
     assert [one.success for one in plans] == [True, True, False]
     first, second, _ = plans
-    np.testing.assert_allclose(second.trajectory.positions[0], first.trajectory.positions[-1], atol=1e-9)
+    np.testing.assert_allclose(
+        second.trajectory.positions[0], first.trajectory.positions[-1], atol=1e-9
+    )
     assert [one.seed for one in plans] == [3, 3, 3]
 
 

@@ -13,13 +13,33 @@ from vkc_pin.benchmarks.harness import tables
 SCENES = {"a": "easy", "b": "hard"}
 
 
-def record(scene: str, method: str, number: int, time: float | None, base: float, arm: float, blame: str = "") -> dict[str, Any]:
+def record(
+    scene: str,
+    method: str,
+    number: int,
+    time: float | None,
+    base: float,
+    arm: float,
+    blame: str = "",
+) -> dict[str, Any]:
     """Return a record; `blame` is "status" or "status: constraint subject", nothing for a success."""
     status, _, constraint = (blame or "success").partition(": ")
-    found = {"scene": scene, "method": method, "number": number, "repeat": 0, "success": not blame, "status": status}
+    found = {
+        "scene": scene,
+        "method": method,
+        "number": number,
+        "repeat": 0,
+        "success": not blame,
+        "status": status,
+    }
     found |= {"failed_constraint": (constraint or status) if blame else None}
     if time is not None:
-        found |= {"planning_time": time, "base_effort": base, "base_effort_l1": 2.0 * base, "arm_effort": arm}
+        found |= {
+            "planning_time": time,
+            "base_effort": base,
+            "base_effort_l1": 2.0 * base,
+            "arm_effort": arm,
+        }
     return found
 
 
@@ -40,15 +60,54 @@ RECORDS = [
 def test_methods_against_numbers_by_hand() -> None:
     head, *rows = cells(tables.methods_table(RECORDS, SCENES, ["auto", "slow", "unused"]))
     times = ["time, median [s]", "95th percentile [s]"]
-    assert head == ["scene", "method", "success", *times, "base [m]", "arm [rad]", "timed out", "failures"]
+    assert head == [
+        "scene",
+        "method",
+        "success",
+        *times,
+        "base [m]",
+        "arm [rad]",
+        "timed out",
+        "failures",
+    ]
     assert rows == [
         # 95th percentile of 1, 2, 3: 2 + 0.9 · 1; efforts of successes only
         ["easy", "auto", "3 of 3", "2.00", "2.90", "4.00", "12.00", "0", "none"],
-        ["easy", "slow", "2 of 3", "7.00", "8.80", "5.00", "14.00", "0", "rejected (penetration) 1"],
+        [
+            "easy",
+            "slow",
+            "2 of 3",
+            "7.00",
+            "8.80",
+            "5.00",
+            "14.00",
+            "0",
+            "rejected (penetration) 1",
+        ],
         ["hard", "auto", "1 of 1", "2.50", "2.50", "7.00", "20.00", "0", "none"],
-        ["hard", "slow", "0 of 3", "20.00", "20.00", "–", "–", "2", "error 1"],  # an error has no time
+        [
+            "hard",
+            "slow",
+            "0 of 3",
+            "20.00",
+            "20.00",
+            "–",
+            "–",
+            "2",
+            "error 1",
+        ],  # an error has no time
         ["all", "auto", "4 of 4", "2.25", "2.92", "4.50", "14.50", "0", "none"],
-        ["all", "slow", "2 of 6", "9.00", "20.00", "5.00", "14.00", "2", "error 1, rejected (penetration) 1"],
+        [
+            "all",
+            "slow",
+            "2 of 6",
+            "9.00",
+            "20.00",
+            "5.00",
+            "14.00",
+            "2",
+            "error 1, rejected (penetration) 1",
+        ],
     ]
 
 
@@ -58,8 +117,18 @@ def test_one_scene_has_no_sum() -> None:
 
 
 def test_comparison_against_numbers_by_hand() -> None:
-    head, *rows = cells(tables.comparison_table(RECORDS, SCENES, ("auto", "slow"), ("one", "two")).replace("\\|", "/"))
-    assert head == ["scene", "effort", "one: median (quartiles)", "two: median (quartiles)", "lower with one"]
+    head, *rows = cells(
+        tables.comparison_table(RECORDS, SCENES, ("auto", "slow"), ("one", "two")).replace(
+            "\\|", "/"
+        )
+    )
+    assert head == [
+        "scene",
+        "effort",
+        "one: median (quartiles)",
+        "two: median (quartiles)",
+        "lower with one",
+    ]
     assert rows == [
         # Starts 0 and 2 of scene a: 3 and 5 against 6 and 4; 10 and 17 against 11 and 17.
         ["easy", "base [m]", "4.00 (3.50–4.50)", "5.00 (4.50–5.50)", "1 of 2"],
@@ -77,7 +146,9 @@ def test_comparison_against_numbers_by_hand() -> None:
 def test_common_successes_are_of_one_start_and_repeat() -> None:
     again = {**RECORDS[0], "repeat": 1}
     found = tables.common([again, *RECORDS], ["auto", "slow"])
-    assert [(one["number"], one["repeat"], other["number"], other["repeat"]) for one, other in found] == [
+    assert [
+        (one["number"], one["repeat"], other["number"], other["repeat"]) for one, other in found
+    ] == [
         (0, 0, 0, 0),
         (2, 0, 2, 0),
     ]
@@ -87,17 +158,26 @@ def test_common_successes_are_of_one_start_and_repeat() -> None:
 def test_common_successes_of_three() -> None:
     third = record("a", "third", 2, 1.0, 1.0, 1.0)
     del third["repeat"]  # an experiment without repeats
-    found = tables.common([*RECORDS, third, record("a", "third", 1, 1.0, 1.0, 1.0)], ["third", "slow", "auto"])
-    assert [[(r["method"], r["number"]) for r in row] for row in found] == [[("third", 2), ("slow", 2), ("auto", 2)]]
+    found = tables.common(
+        [*RECORDS, third, record("a", "third", 1, 1.0, 1.0, 1.0)], ["third", "slow", "auto"]
+    )
+    assert [[(r["method"], r["number"]) for r in row] for row in found] == [
+        [("third", 2), ("slow", 2), ("auto", 2)]
+    ]
 
 
 def test_lower() -> None:
-    pairs = [({"x": a}, {"x": b}) for a, b in ((1.0, 2.0), (2.0, 1.0), (3.0, 3.0), (3.0, 3.0 + 1e-8), (3.0, 3.0 + 1e-4))]
+    pairs = [
+        ({"x": a}, {"x": b})
+        for a, b in ((1.0, 2.0), (2.0, 1.0), (3.0, 3.0), (3.0, 3.0 + 1e-8), (3.0, 3.0 + 1e-4))
+    ]
     assert tables.lower(pairs, "x") == 2
 
 
 def test_mean_and_deviation() -> None:
-    assert tables.mean_and_deviation([2.0, 4.0, 9.0]) == pytest.approx((5.0, np.sqrt(13.0)))  # 9 + 1 + 16, by 2
+    assert tables.mean_and_deviation([2.0, 4.0, 9.0]) == pytest.approx(
+        (5.0, np.sqrt(13.0))
+    )  # 9 + 1 + 16, by 2
     one, none = tables.mean_and_deviation([2.0]), tables.mean_and_deviation([])
     assert one[0] == 2.0
     assert np.isnan([one[1], *none]).all()
@@ -106,7 +186,12 @@ def test_mean_and_deviation() -> None:
 @pytest.mark.parametrize(
     ("good", "number", "low", "high"),
     # Published values of the interval: 81 of 263 (Newcombe 1998), 15 of 148, 0 of 20, 1 of 29.
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
 )
 def test_wilson(good: int, number: int, low: float, high: float) -> None:
     assert tables.wilson(good, number) == pytest.approx((low, high), abs=5e-5)
@@ -123,16 +208,35 @@ def test_quartiles() -> None:
 
 
 def test_csv() -> None:
-    records = [{"key": "x", "good": True, "values": [1.5, 2]}, {"key": 'a "b", c\nd', "more": None, "good": False}]
+    records = [
+        {"key": "x", "good": True, "values": [1.5, 2]},
+        {"key": 'a "b", c\nd', "more": None, "good": False},
+    ]
     rows = list(csv.reader(io.StringIO(tables.to_csv(records))))
-    assert rows == [["key", "good", "values", "more"], ["x", "true", "[1.5, 2]", ""], ['a "b", c\nd', "false", "", ""]]
+    assert rows == [
+        ["key", "good", "values", "more"],
+        ["x", "true", "[1.5, 2]", ""],
+        ['a "b", c\nd', "false", "", ""],
+    ]
 
 
 def test_foot() -> None:
-    machine = {"system": "Linux", "machine": "x86_64", "processor": "Abacus 3", "cores": 2, "python": "3.12.1"}
-    sessions = [{"jobs": 2, "trials": 5, "seconds": 60.0}, {"jobs": 1, "trials": 7, "seconds": 30.0}]
+    machine = {
+        "system": "Linux",
+        "machine": "x86_64",
+        "processor": "Abacus 3",
+        "cores": 2,
+        "python": "3.12.1",
+    }
+    sessions = [
+        {"jobs": 2, "trials": 5, "seconds": 60.0},
+        {"jobs": 1, "trials": 7, "seconds": 30.0},
+    ]
     about = {"versions": {"vkc-pin": "1.2", "pin": "4.1"}, "machine": machine}
-    assert tables.foot(about) == "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1."
+    assert (
+        tables.foot(about)
+        == "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1."
+    )
     about["versions"]["sources"] = "abc"
     assert tables.foot({**about, "sessions": sessions, "peak_memory_mb": 320.4}) == (
         "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1 (sources abc). "

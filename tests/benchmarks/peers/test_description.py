@@ -32,7 +32,9 @@ def test_the_same_kinematics_and_pairs(task: str, tmp_path: Path) -> None:
     (part,) = problem.contacts.phases
     assert len(files.margins) == len(part.pairs)
     disabled = ET.parse(files.srdf).findall("disable_collisions")
-    assert not {frozenset((pair.get("link1"), pair.get("link2"))) for pair in disabled} & set(map(frozenset, files.margins))
+    assert not {frozenset((pair.get("link1"), pair.get("link2"))) for pair in disabled} & set(
+        map(frozenset, files.margins)
+    )
 
 
 def test_thicker_shapes_touch_where_margins_are_not_kept(tmp_path: Path) -> None:
@@ -40,7 +42,9 @@ def test_thicker_shapes_touch_where_margins_are_not_kept(tmp_path: Path) -> None
     files = describe(problem, tmp_path, inflated=True)
     model = pin.buildModelFromUrdf(str(files.urdf))
     shapes = pin.buildGeomFromUrdf(model, str(files.urdf), pin.GeometryType.COLLISION)
-    numbers = {shape.name.rpartition("_")[0]: number for number, shape in enumerate(shapes.geometryObjects)}
+    numbers = {
+        shape.name.rpartition("_")[0]: number for number, shape in enumerate(shapes.geometryObjects)
+    }
     for one, other in files.margins:
         shapes.addCollisionPair(pin.CollisionPair(*sorted((numbers[one], numbers[other]))))
     order = [list(model.names)[1:].index(name) for name in files.joints]
@@ -51,7 +55,9 @@ def test_thicker_shapes_touch_where_margins_are_not_kept(tmp_path: Path) -> None
         slack = (contacts.distance - contacts.margin)[contacts.waypoint == row].min(initial=0.1)
         q = np.zeros(model.nq)
         q[order] = configuration
-        hit = pin.computeCollisions(model, model.createData(), shapes, pin.GeometryData(shapes), q, True)
+        hit = pin.computeCollisions(
+            model, model.createData(), shapes, pin.GeometryData(shapes), q, True
+        )
         if abs(slack) > 0.005:
             assert hit == (slack < 0.0), slack
             agreed += 1

@@ -12,14 +12,25 @@ from vkc_pin.benchmarks.peers.projected import plan_by_projection
 from vkc_pin.benchmarks.peers.tasks import given, problem_of
 
 
-@pytest.mark.skipif(find_spec("roboplan") is None, reason='needs roboplan: pip install "vkc-pin[peers]"')
+@pytest.mark.skipif(
+    find_spec("roboplan") is None, reason='needs roboplan: pip install "vkc-pin[peers]"'
+)
 @pytest.mark.parametrize("task", ["reach", "drawer"])
 def test_a_problem(task: str) -> None:
     own = given(task, 18, 0)
     problem = problem_of(own)
-    found = plan_by_projection(own, problem, 0, Clock(60.0), lambda path: judged(own, problem, path, "", name="", seed=0).success)
+    found = plan_by_projection(
+        own,
+        problem,
+        0,
+        Clock(60.0),
+        lambda path: judged(own, problem, path, "", name="", seed=0).success,
+    )
     assert found.path is not None, (found.status, found.about)
     assert np.array_equal(found.path[0], problem.start)
     result = judged(own, problem, found.path, found.status, name="peer", seed=0)
     assert result.success, result.validation
-    assert min(value for value in clearances(problem, result.trajectory).values() if value is not None) > 0.0
+    assert (
+        min(value for value in clearances(problem, result.trajectory).values() if value is not None)
+        > 0.0
+    )

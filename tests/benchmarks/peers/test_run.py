@@ -12,9 +12,24 @@ from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
 
 
-def test_ours_and_the_baselines_at_a_reach(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ours_and_the_baselines_at_a_reach(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
-    command = ["bench", "peers", "--trials", "1", "--tasks", "reach", "--methods", "B1", "B2", "VKC", "--seed", "18"]
+    command = [
+        "bench",
+        "peers",
+        "--trials",
+        "1",
+        "--tasks",
+        "reach",
+        "--methods",
+        "B1",
+        "B2",
+        "VKC",
+        "--seed",
+        "18",
+    ]
     command += ["--quiet", "--out", str(out)]
     assert main(command) == 0
     said = capsys.readouterr().out
@@ -43,11 +58,43 @@ def test_what_is_not_there(tmp_path: Path) -> None:
 
 
 def test_the_table_counts_what_ran_out_of_time() -> None:
-    recorded = json.loads((Path(__file__).parents[3] / "docs/results/gap.json").read_text(encoding="utf-8"))["meta"]
-    about = {**recorded, "starts": 2, "tasks": ["door"], "methods": ["OMPL", "VKC"], "peers": {"ompl": "2"}, "time_limit": 60.0}
-    late = {"task": "door", "method": "OMPL", "success": False, "status": "timed out", "time_final": 9.0, "time_own": 8.0}
-    good = {"task": "door", "method": "OMPL", "success": True, "status": "success", "time_first": 1.0, "time_final": 3.0}
-    good |= {"time_own": 0.5, "base_effort": 1.5, "arm_effort": 2.0, "clearance_at": 0.03, "clearance_between": 0.025}
+    recorded = json.loads(
+        (Path(__file__).parents[3] / "docs/results/gap.json").read_text(encoding="utf-8")
+    )["meta"]
+    about = {
+        **recorded,
+        "starts": 2,
+        "tasks": ["door"],
+        "methods": ["OMPL", "VKC"],
+        "peers": {"ompl": "2"},
+        "time_limit": 60.0,
+    }
+    late = {
+        "task": "door",
+        "method": "OMPL",
+        "success": False,
+        "status": "timed out",
+        "time_final": 9.0,
+        "time_own": 8.0,
+    }
+    good = {
+        "task": "door",
+        "method": "OMPL",
+        "success": True,
+        "status": "success",
+        "time_first": 1.0,
+        "time_final": 3.0,
+    }
+    good |= {
+        "time_own": 0.5,
+        "base_effort": 1.5,
+        "arm_effort": 2.0,
+        "clearance_at": 0.03,
+        "clearance_between": 0.025,
+    }
     text = report({"meta": about, "trials": [late, good]})
-    assert "| door | OMPL | 1 of 2 | 1 | 1.00 | 6.00 | 8.70 | 4.25 | 1.50 | 2.00 | 30.0 | 25.0 |" in text
+    assert (
+        "| door | OMPL | 1 of 2 | 1 | 1.00 | 6.00 | 8.70 | 4.25 | 1.50 | 2.00 | 30.0 | 25.0 |"
+        in text
+    )
     assert "| door | VKC |" not in text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.benchmarks.peers.tasks import TASKS, ends, given, problem_of
-from vkc_pin.seeds.knots import depth
+from vkc_pin.planning.initialization.keyframes import compute_shortfall
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -15,7 +15,7 @@ def test_problems_are_drawn_by_number_and_free(task: str) -> None:
     assert np.array_equal(one.scene.start, same.scene.start)
     assert not np.array_equal(one.scene.start, other.scene.start)
     problem = problem_of(one)
-    assert depth(problem, problem.start[None], 1)[0] == 0.0
+    assert compute_shortfall(problem, problem.start[None], 1)[0] == 0.0
     goals = ends(problem, np.random.default_rng(0), 5)
     assert 1 <= len(goals) <= 5
     residual, _ = problem.transcription.pose_solvers[0].evaluate(goals, problem.targets[0])

@@ -23,12 +23,21 @@ def test_it_says_what_is_not_installed() -> None:
 
 
 @pytest.mark.skipif(
-    find_spec("tesseract_robotics") is None, reason='needs tesseract-robotics-nanobind: pip install "vkc-pin[peers]"'
+    find_spec("tesseract_robotics") is None,
+    reason='needs tesseract-robotics-nanobind: pip install "vkc-pin[peers]"',
 )
 def test_a_request_that_is_wrong_ends_nothing() -> None:
     asked = json.dumps({"urdf": "/nowhere", "srdf": "/nowhere"})
-    done = subprocess.run([sys.executable, str(FILE)], input=f"{asked}\n{asked}\n", capture_output=True, text=True, timeout=120)
-    first, *answers = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    done = subprocess.run(
+        [sys.executable, str(FILE)],
+        input=f"{asked}\n{asked}\n",
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    first, *answers = [
+        json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")
+    ]
     assert first["ready"] is True
     assert len(answers) == 2
     assert all("/nowhere" in answer["error"] for answer in answers)

@@ -6,7 +6,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
-from vkc_pin.solver import loop, trust_region
+from vkc_pin.planning.solver import loop, trust_region
 
 
 def test_an_option() -> None:
@@ -28,17 +28,17 @@ def test_a_constant_changes_for_a_while() -> None:
 
 
 def test_a_constant_changes_where_it_is_imported_too_and_comes_back_after_an_error() -> None:
-    before = trust_region.INSIDE
-    assert before == loop.INSIDE
+    before = trust_region.ACTIVE_FRACTION
+    assert before == loop.ACTIVE_FRACTION
 
     def fail() -> None:
-        with parsed("solver.trust_region:INSIDE=0.123").applied():
-            assert trust_region.INSIDE == loop.INSIDE == 0.123
+        with parsed("solver.trust_region:ACTIVE_FRACTION=0.123").applied():
+            assert trust_region.ACTIVE_FRACTION == loop.ACTIVE_FRACTION == 0.123
             raise KeyError
 
     with pytest.raises(KeyError):
         fail()
-    assert trust_region.INSIDE == loop.INSIDE == before
+    assert trust_region.ACTIVE_FRACTION == loop.ACTIVE_FRACTION == before
 
 
 def test_no_change() -> None:

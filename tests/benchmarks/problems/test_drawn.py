@@ -13,10 +13,10 @@ from vkc_pin.benchmarks.problems import random_problems
 from vkc_pin.benchmarks.problems.drawn import drawn
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.resources import available
 from vkc_pin.planning.plan import Plan
-from vkc_pin.task.goals import random_task
-from vkc_pin.task.steps import step_to_dict
+from vkc_pin.procedural.tasks import random_task
+from vkc_pin.world.files.resources import available
+from vkc_pin.world.task.steps import step_to_dict
 
 
 def test_problems_follow_from_their_numbers() -> None:
@@ -34,7 +34,9 @@ def test_all_scenes_take_turns_with_obstacles_and_all_kinds_of_steps() -> None:
     steps = {type(step).__name__ for own in problems for step in own.steps}
     assert steps == {"Actuate", "Grasp", "Place", "Reach", "Touch", "GoTo"}
     assert {len(own.steps) for own in problems} == {1, 2}
-    more = [sum(name.startswith("random_") for name in own.scene.obstacle_names) for own in problems]
+    more = [
+        sum(name.startswith("random_") for name in own.scene.obstacle_names) for own in problems
+    ]
     assert (min(more), max(more)) == (0, 6)
 
 
@@ -61,8 +63,12 @@ def test_plans_are_kept_and_judged(tmp_path: Path, capsys: pytest.CaptureFixture
     assert not [verdict for verdict in verdicts if verdict.success and verdict.found]
     written(verdicts, out / "plans")
     lines = (out / "plans" / "verdicts.jsonl").read_text(encoding="utf-8").splitlines()
-    assert [json.loads(line)["path"] for line in lines] == [f"{trial['key']}.npz" for trial in trials]
-    assert f"| success | success, and nothing found | {good} |" in (out / "plans" / "agreement.md").read_text(encoding="utf-8")
+    assert [json.loads(line)["path"] for line in lines] == [
+        f"{trial['key']}.npz" for trial in trials
+    ]
+    assert f"| success | success, and nothing found | {good} |" in (
+        out / "plans" / "agreement.md"
+    ).read_text(encoding="utf-8")
 
     record = out / "results.json"
     recorded(verdicts, record)
@@ -86,7 +92,10 @@ def test_plans_are_kept_and_judged(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_one_task_in_each_of_some_rooms(tmp_path: Path) -> None:
     out = tmp_path / "rooms"
-    assert main(["bench", "random", "--of", "rooms", "--problems", "3", "--quiet", "--out", str(out)]) == 0
+    assert (
+        main(["bench", "random", "--of", "rooms", "--problems", "3", "--quiet", "--out", str(out)])
+        == 0
+    )
     trials = json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
     assert [trial["success"] for trial in trials] == [True, True, True]
     for trial in trials:

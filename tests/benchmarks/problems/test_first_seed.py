@@ -20,14 +20,28 @@ def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_first_seed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "first-seed", "--trials", "1", "--tasks", "drawer", "door", "--quiet", "--out", str(tmp_path)]
+    command = [
+        "bench",
+        "first-seed",
+        "--trials",
+        "1",
+        "--tasks",
+        "drawer",
+        "door",
+        "--quiet",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(command) == 0
     said = capsys.readouterr().out
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
     assert [r["task"] for r in trials] == ["door", "drawer"]
     for record in trials:
         assert record["first_seed"] is (record["success"] and record["solves"] == 1)
-        assert f"| {record['task']} | {int(record['success'])} of 1 | {int(record['first_seed'])} of 1 |" in said
+        assert (
+            f"| {record['task']} | {int(record['success'])} of 1 | {int(record['first_seed'])} of 1 |"
+            in said
+        )
     assert f"| all | {sum(r['success'] for r in trials)} of 2 |" in said
 
 

@@ -20,7 +20,20 @@ def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_spread(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "spread", "--problems", "9", "42", "--seeds", "2", "--seed", "4", "--quiet", "--out", str(tmp_path)]
+    command = [
+        "bench",
+        "spread",
+        "--problems",
+        "9",
+        "42",
+        "--seeds",
+        "2",
+        "--seed",
+        "4",
+        "--quiet",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(command) == 0
     said = capsys.readouterr().out
     trials = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["trials"]
@@ -35,7 +48,12 @@ def test_spread(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_the_spread_is_of_successes() -> None:
-    records = [{"success": True, "x": 2.0}, {"success": True, "x": 3.0}, {"success": False, "x": 9.0}, {"success": True}]
+    records = [
+        {"success": True, "x": 2.0},
+        {"success": True, "x": 3.0},
+        {"success": False, "x": 9.0},
+        {"success": True},
+    ]
     assert spread.spread_of(records, "x") == pytest.approx(0.5)
     assert spread.spread_of(records[1:], "x") is None
     assert spread.spread_of([{"success": True, "x": 0.0}, *records], "x") is None

@@ -29,7 +29,11 @@ def test_the_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
 def test_the_objective_of_what_failed_or_is_no_single_problem(drawn: vkc.Plan) -> None:
     assert trials.objective(dataclasses.replace(drawn, status="rejected")) is None
     scene = vkc.load_scene("drawer")
-    apart = vkc.plan(scene, [vkc.Grasp("drawer"), vkc.Actuate("drawer", {"slide": 0.2}), vkc.GoTo(-0.8, 0.5)], joint=False)
+    apart = vkc.plan(
+        scene,
+        [vkc.Grasp("drawer"), vkc.Actuate("drawer", {"slide": 0.2}), vkc.GoTo(-0.8, 0.5)],
+        simultaneous=False,
+    )
     found = trials.objective(apart)
     assert found is None or np.isfinite(found)
 
@@ -46,7 +50,9 @@ def test_first_seed(drawn: vkc.Plan, name: str, solves: int, expected: bool) -> 
 
 def test_a_trial() -> None:
     own = problem(20)
-    record = trials.tried(own.scene, own.steps, seed=3, change=parsed("Options.max_restarts=2"), number=20)
+    record = trials.tried(
+        own.scene, own.steps, seed=3, change=parsed("Options.max_restarts=2"), number=20
+    )
     assert record["success"] is True, record["violations"]
     assert (record["method"], record["seed"], record["number"]) == ("Options.max_restarts=2", 3, 20)
     assert record["solves"] >= 1

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import yaml
 
-from vkc_pin.datasets.formats.card import card
+from vkc_pin.datasets.formats.card import make_card
 
 
 def test_what_a_card_says() -> None:
@@ -14,9 +14,16 @@ def test_what_a_card_says() -> None:
         "versions": {"pin": "4.1"},
         "recipe": "name: home\n",
     }
-    one = {"task": "drive-open", "robot": "panda", "kind": "oven", "room": "room_1", "scene": "s", "duration": 1800.0}
+    one = {
+        "task": "drive-open",
+        "robot": "panda",
+        "kind": "oven",
+        "room": "room_1",
+        "scene": "s",
+        "duration": 1800.0,
+    }
     failed = {"status": "infeasible", "reason": "the wall is in the way"}
-    text = card(about, [one, {**one, "scene": "t"}], [failed, failed])
+    text = make_card(about, [one, {**one, "scene": "t"}], [failed, failed])
     _, head, body = text.split("---\n", 2)
     assert yaml.safe_load(head)["license"] == "cc-by-4.0"
     assert yaml.safe_load(head)["size_categories"] == ["n<1K"]

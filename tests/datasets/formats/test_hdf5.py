@@ -10,9 +10,9 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.episode import attempt, unpacked
-from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, part, write_shard
-from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.episode import run_attempt, unpack
+from vkc_pin.datasets.formats.hdf5 import make_part, read_episodes, read_numbers, write_shard
+from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.datasets.generate import generate
 from vkc_pin.errors import InputError
 
@@ -44,19 +44,25 @@ def test_the_groups_are_those_of_robomimic(made: Dataset) -> None:
                 assert values.dtype in (np.float32, np.uint8), name
             assert group["dones"][:].tolist() == [0] * (count - 1) + [1]
             told, there = group["actions"][:], group["obs"]
-            robot = np.hstack([there["base_pose"][:], there["arm_position"][:], there["gripper"][:]])
+            robot = np.hstack(
+                [there["base_pose"][:], there["arm_position"][:], there["gripper"][:]]
+            )
             assert np.array_equal(told[:-1], robot[1:])  # what it is told is where it is next
 
 
 def test_read_back_to_1e_9(made: Dataset) -> None:
-    for episode in episodes_of(made.shards[0], made.folder / "scenes"):
-        record, data = attempt(made.recipe.document, episode.number, {})
-        fresh = unpacked(data)
+    for episode in read_episodes(made.shards[0], made.folder / "scenes"):
+        record, data = run_attempt(made.recipe.document, episode.number, {})
+        fresh = unpack(data)
         assert record["success"]
         times = np.linspace(fresh.trajectory.times[0], fresh.trajectory.times[-1], 300)
         assert np.abs(episode.trajectory.at(times) - fresh.trajectory.at(times)).max() <= 1e-9
         assert episode.trajectory.phases == fresh.trajectory.phases
-        assert (episode.steps, episode.options, episode.about) == (fresh.steps, fresh.options, fresh.about)
+        assert (episode.steps, episode.options, episode.about) == (
+            fresh.steps,
+            fresh.options,
+            fresh.about,
+        )
         assert episode.document == fresh.document
         assert np.array_equal(episode.scene().start, fresh.scene().start)
 
@@ -64,7 +70,7 @@ def test_read_back_to_1e_9(made: Dataset) -> None:
 def test_samples_are_the_motion(made: Dataset) -> None:
     episode = next(made.episodes())
     robot = episode.scene().robot
-    found = sampled(episode, robot, 25.0)
+    found = sample_episode(episode, robot, 25.0)
     motion = episode.trajectory
     assert found["time"][-1] == motion.times[-1]
     assert np.allclose(np.diff(found["time"])[:-1], 0.04)
@@ -74,12 +80,16 @@ def test_samples_are_the_motion(made: Dataset) -> None:
     rate = (motion.at(middle + step) - motion.at(middle - step)) / (2 * step)
     assert np.allclose(found["arm_velocity"][5], rate[3 : motion.robot_size], atol=1e-5)
     data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(found["states"][7][: motion.robot_size]))
+    pin.framesForwardKinematics(
+        robot.model, data, robot.coordinates.q(found["states"][7][: motion.robot_size])
+    )
     hand = data.oMf[robot.model.getFrameId(robot.tool_frame)]
     there = pin.XYZQUATToSE3(found["hand_pose"][7])
     assert np.allclose(there.homogeneous, hand.homogeneous, atol=1e-9)
     assert (found["holding"] == 1.0).all()  # the grasp is given
-    assert (np.einsum("ij,ij->i", found["hand_pose"][1:, 3:], found["hand_pose"][:-1, 3:]) > 0.0).all()
+    assert (
+        np.einsum("ij,ij->i", found["hand_pose"][1:, 3:], found["hand_pose"][:-1, 3:]) > 0.0
+    ).all()
 
 
 def test_small_enough(made: Dataset) -> None:
@@ -92,12 +102,19 @@ def test_the_same_episodes_give_the_same_bytes(made: Dataset, tmp_path: Path) ->
     files = []
     for episode in made.episodes():
         files.append(tmp_path / f"{episode.number}.hdf5")
-        files[-1].write_bytes(part(episode, episode.scene().robot, made.recipe.fields.rate, made.recipe.digest))
+        files[-1].write_bytes(
+            make_part(episode, episode.scene().robot, made.recipe.fields.rate, made.recipe.digest)
+        )
     again = write_shard(tmp_path / "again.hdf5", [(file, 0) for file in files], tmp_path / "scenes")
-    copied = write_shard(tmp_path / "copied.hdf5", [(made.shards[0], k) for k in range(4)], tmp_path / "scenes")
+    copied = write_shard(
+        tmp_path / "copied.hdf5", [(made.shards[0], k) for k in range(4)], tmp_path / "scenes"
+    )
     assert again.read_bytes() == copied.read_bytes() == made.shards[0].read_bytes()
-    assert numbers_of(again) == made.numbers()
-    scenes = [{file.name: file.read_bytes() for file in (folder / "scenes").iterdir()} for folder in (tmp_path, made.folder)]
+    assert read_numbers(again) == made.numbers()
+    scenes = [
+        {file.name: file.read_bytes() for file in (folder / "scenes").iterdir()}
+        for folder in (tmp_path, made.folder)
+    ]
     assert scenes[0] == scenes[1]
 
 

@@ -11,8 +11,8 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.formats.lerobot import sentence
-from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.formats.lerobot import describe_task
+from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.datasets.generate import generate
 from vkc_pin.errors import InputError
 
@@ -61,30 +61,44 @@ def test_frames_are_the_samples(made: Dataset, root: Path) -> None:
     state = np.array(table["observation.state"].to_pylist())
     first = 0
     for number, episode in enumerate(made.episodes()):
-        found = sampled(episode, episode.scene().robot, said["fps"])
+        found = sample_episode(episode, episode.scene().robot, said["fps"])
         count = len(found["time"])
         own = slice(first, first + count)
         assert set(table["episode_index"].to_pylist()[own]) == {number}
         assert table["frame_index"].to_pylist()[own] == list(range(count))
-        assert np.allclose(np.array(table["timestamp"].to_pylist()[own]) * said["fps"], np.arange(count), atol=1e-4)
+        assert np.allclose(
+            np.array(table["timestamp"].to_pylist()[own]) * said["fps"], np.arange(count), atol=1e-4
+        )
         assert np.allclose(state[own, :3], found["base_pose"], atol=1e-6)
         assert np.allclose(np.array(table["action"].to_pylist())[own], found["actions"], atol=1e-6)
         first += count
     assert first == len(table)
-    assert pq.ParquetFile(root / "data/chunk-000/file-000.parquet").num_row_groups == 4  # one an episode
+    assert (
+        pq.ParquetFile(root / "data/chunk-000/file-000.parquet").num_row_groups == 4
+    )  # one an episode
 
 
 def test_episodes_and_tasks(made: Dataset, root: Path) -> None:
     rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     frames = info(root)["total_frames"]
     assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
-    assert [row["dataset_from_index"] for row in rows] == [0, *(row["dataset_to_index"] for row in rows[:-1])]
+    assert [row["dataset_from_index"] for row in rows] == [
+        0,
+        *(row["dataset_to_index"] for row in rows[:-1]),
+    ]
     assert rows[-1]["dataset_to_index"] == frames
     assert all(row["length"] == row["dataset_to_index"] - row["dataset_from_index"] for row in rows)
-    assert {"data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "stats/action/mean"} <= set(rows[0])
+    assert {
+        "data/chunk_index",
+        "data/file_index",
+        "meta/episodes/chunk_index",
+        "stats/action/mean",
+    } <= set(rows[0])
     tasks = pq.read_table(root / "meta/tasks.parquet").to_pydict()
     texts = dict(zip(tasks["task"], tasks["task_index"], strict=True))
-    assert [row["tasks"] for row in rows] == [[sentence(episode.about)] for episode in made.episodes()]
+    assert [row["tasks"] for row in rows] == [
+        [describe_task(episode.about)] for episode in made.episodes()
+    ]
     assert sorted(texts.values()) == list(range(len(texts)))
 
 
@@ -110,31 +124,44 @@ def test_frames_a_second_are_whole(tmp_path: Path) -> None:
 def test_lerobot_reads_it(made: Dataset, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """LeRobot itself finds every frame, every task and the statistics as they were written."""
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    module = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+    module = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
+    )
     found = module.LeRobotDataset("vkc_pin/small", root=root)
     assert (found.num_episodes, found.fps, found.meta.robot_type) == (4, 10, "husky_ur5e")
     row = 0
     for number, episode in enumerate(made.episodes()):
-        own = sampled(episode, episode.scene().robot, found.fps)
+        own = sample_episode(episode, episode.scene().robot, found.fps)
         state = np.hstack([own[name] for name in ("base_pose", "arm_position", "gripper")])
         for k in range(len(state)):
             frame = found[row]
-            assert (int(frame["episode_index"]), int(frame["frame_index"]), int(frame["index"])) == (number, k, row)
-            assert frame["task"] == sentence(episode.about)
+            assert (
+                int(frame["episode_index"]),
+                int(frame["frame_index"]),
+                int(frame["index"]),
+            ) == (number, k, row)
+            assert frame["task"] == describe_task(episode.about)
             assert np.allclose(frame["observation.state"], state[k], atol=1e-6)
             assert np.allclose(frame["action"], own["actions"][k], atol=1e-6)
             row += 1
     assert row == found.num_frames == len(found)
-    assert np.allclose(found.meta.stats["action"]["mean"], json.loads((root / "meta/stats.json").read_text())["action"]["mean"])
+    assert np.allclose(
+        found.meta.stats["action"]["mean"],
+        json.loads((root / "meta/stats.json").read_text())["action"]["mean"],
+    )
 
 
 def test_lerobot_reads_ahead(root: Path, made: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """Policies take the actions of several moments; some of the last ones are beyond the end and marked as such."""
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    module = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
-    found = module.LeRobotDataset("vkc_pin/small", root=root, episodes=[1], delta_timestamps={"action": [0.0, 0.1, 0.2]})
+    module = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
+    )
+    found = module.LeRobotDataset(
+        "vkc_pin/small", root=root, episodes=[1], delta_timestamps={"action": [0.0, 0.1, 0.2]}
+    )
     episode = list(made.episodes())[1]
-    actions = sampled(episode, episode.scene().robot, 10)["actions"]
+    actions = sample_episode(episode, episode.scene().robot, 10)["actions"]
     assert len(found) == len(actions)
     assert np.allclose(found[0]["action"], actions[:3], atol=1e-6)
     assert np.asarray(found[len(actions) - 1]["action_is_pad"]).tolist() == [False, True, True]
@@ -142,14 +169,27 @@ def test_lerobot_reads_ahead(root: Path, made: Dataset, monkeypatch: pytest.Monk
 
 def test_lerobot_reads_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    module = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+    module = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
+    )
     pytest.importorskip("mujoco")
-    head = {"name": "head", "frame": "base", "position": [0, 0, 1.5], "target": [1.2, 0, 0.6], "width": 32, "height": 24}
-    seen = generate({**SMALL, "simulate": True, "cameras": [head]}, 1, tmp_path / "out", lerobot=True)
+    head = {
+        "name": "head",
+        "frame": "base",
+        "position": [0, 0, 1.5],
+        "target": [1.2, 0, 0.6],
+        "width": 32,
+        "height": 24,
+    }
+    seen = generate(
+        {**SMALL, "simulate": True, "cameras": [head]}, 1, tmp_path / "out", lerobot=True
+    )
     found = module.LeRobotDataset("vkc_pin/seen", root=tmp_path / "out/lerobot/husky_ur5e")
     pictures = next(seen.episodes()).images()
     assert pictures is not None
     assert found.meta.camera_keys == ["observation.images.head"]
     for k in (0, len(found) - 1):
         shown = np.asarray(found[k]["observation.images.head"])  # (3, height, width), from 0 to 1
-        assert np.allclose(shown.transpose(1, 2, 0) * 255.0, pictures.pictures["head_image"][k], atol=1e-3)
+        assert np.allclose(
+            shown.transpose(1, 2, 0) * 255.0, pictures.pictures["head_image"][k], atol=1e-3
+        )

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from helpers.datasets import SMALL
 
-from vkc_pin.datasets.episode import attempts
-from vkc_pin.datasets.formats.hdf5 import episodes_of, numbers_of, write_shard
-from vkc_pin.datasets.formats.parts import parts
+from vkc_pin.datasets.episode import run_attempts
+from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, write_shard
+from vkc_pin.datasets.formats.parts import make_parts
 from vkc_pin.datasets.recipes.recipe import load_recipe
 
 pytest.importorskip("h5py")
@@ -15,19 +15,25 @@ pytest.importorskip("h5py")
 
 def test_attempts_come_as_parts_of_a_shard(tmp_path: Path) -> None:
     document = load_recipe({**SMALL, "tasks": ["given-open"]}).document
-    made, plain = parts((document, [0, 1], {})), attempts((document, [0, 1], {}))
+    made, plain = make_parts((document, [0, 1], {})), run_attempts((document, [0, 1], {}))
     assert [record["success"] for record, _ in made] == [True, True]
     for (record, data), (same, _) in zip(made, plain, strict=True):
         assert {key: record[key] for key in ("number", "way", "scene", "effort")} == {
             key: same[key] for key in ("number", "way", "scene", "effort")
         }
         (tmp_path / f"{record['number']}.hdf5").write_bytes(data)
-    shard = write_shard(tmp_path / "shard.hdf5", [(tmp_path / f"{number}.hdf5", 0) for number in (1, 0)], tmp_path / "scenes")
-    assert numbers_of(shard) == [1, 0]
-    assert all(episode.validate().ok for episode in episodes_of(shard, tmp_path / "scenes"))
+    shard = write_shard(
+        tmp_path / "shard.hdf5",
+        [(tmp_path / f"{number}.hdf5", 0) for number in (1, 0)],
+        tmp_path / "scenes",
+    )
+    assert read_numbers(shard) == [1, 0]
+    assert all(episode.validate().ok for episode in read_episodes(shard, tmp_path / "scenes"))
 
 
 def test_failures_have_nothing(tmp_path: Path) -> None:
-    document = load_recipe({**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}).document
-    ((record, data),) = parts((document, [0], {}))
+    document = load_recipe(
+        {**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}
+    ).document
+    ((record, data),) = make_parts((document, [0], {}))
     assert (record["success"], data) == (False, b"")

@@ -8,10 +8,21 @@ import numpy as np
 import pytest
 import yaml
 
-from vkc_pin.datasets.recipes.recipe import GoalSchema, RecipeSchema, RobotEntry, RoomsSchema, StartSchema, load_recipe
+from vkc_pin.datasets.recipes.recipe import (
+    GoalSchema,
+    RecipeSchema,
+    RobotEntry,
+    RoomsSchema,
+    StartSchema,
+    load_recipe,
+)
 from vkc_pin.errors import InputError, UnknownNameError
 
-SMALL: dict[str, Any] = {"name": "small", "objects": ["random_oven"], "rooms": {"count": 2, "objects": 1}}
+SMALL: dict[str, Any] = {
+    "name": "small",
+    "objects": ["random_oven"],
+    "rooms": {"count": 2, "objects": 1},
+}
 
 
 def write(folder: Path, text: str) -> Path:
@@ -53,7 +64,10 @@ def test_the_digest_is_that_of_what_episodes_depend_on(change: dict[str, Any], s
 
 def test_random_numbers_are_those_of_recipe_and_words() -> None:
     recipe, other = load_recipe(SMALL), load_recipe({**SMALL, "effort": 7})
-    draws = [r.rng(*words).random(4) for r, words in ((recipe, ("a", 1)), (recipe, ("a", 2)), (other, ("a", 1)))]
+    draws = [
+        r.rng(*words).random(4)
+        for r, words in ((recipe, ("a", 1)), (recipe, ("a", 2)), (other, ("a", 1)))
+    ]
     assert np.array_equal(draws[0], load_recipe(dict(SMALL)).rng("a", 1).random(4))
     assert not np.array_equal(draws[0], draws[1])
     assert not np.array_equal(draws[0], draws[2])
@@ -109,7 +123,9 @@ def test_the_documentation_has_every_field(tmp_path: Path) -> None:
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert load_recipe(write(tmp_path, block)).fields.name == "home"
     for schema in (RecipeSchema, RoomsSchema, StartSchema, GoalSchema, RobotEntry):
-        assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], schema.__name__
+        assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], (
+            schema.__name__
+        )
 
 
 def test_no_recipe_of_that_name() -> None:
@@ -118,4 +134,6 @@ def test_no_recipe_of_that_name() -> None:
 
 
 def test_every_field_has_a_default_but_the_name() -> None:
-    assert [name for name, field in RecipeSchema.model_fields.items() if field.is_required()] == ["name"]
+    assert [name for name, field in RecipeSchema.model_fields.items() if field.is_required()] == [
+        "name"
+    ]

@@ -17,7 +17,7 @@ import vkc_pin as vkc
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
-from vkc_pin.datasets.problems import terms_of
+from vkc_pin.datasets.problems import resolve_episode_terms
 from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.datasets.recipes.terms import KeepOutSchema, SpeedSchema, TracedSchema, UprightSchema
 from vkc_pin.errors import InputError, UnknownNameError
@@ -46,20 +46,29 @@ def test_what_each_kind_says() -> None:
     upright, speed, away = recipe(
         {"type": "upright", "frame": "object", "axis": axis.tolist(), "angle": 0.3, "held": True},
         {"type": "speed", "frame": "hand", "most": 0.4},
-        {"type": "keep-out", "frame": "base", "position": [1.0, -0.5, 0.2], "size": [2.0, 0.6, 1.0]},
+        {
+            "type": "keep-out",
+            "frame": "base",
+            "position": [1.0, -0.5, 0.2],
+            "size": [2.0, 0.6, 1.0],
+        },
     ).terms
-    assert [term.name for term in (upright, speed, away)] == ["upright object", "speed hand", "keep-out base"]
+    assert [term.name for term in (upright, speed, away)] == [
+        "upright object",
+        "speed hand",
+        "keep-out base",
+    ]
     assert [term.holding for term in (upright, speed, away)] == ["object", None, None]
     for _ in range(50):
         now, before, dt = pin.SE3.Random(), pin.SE3.Random(), float(rng.uniform(0.01, 0.5))
         now.translation, before.translation = rng.uniform(-2.0, 2.0, (2, 3))
         row = inputs(now, before, dt)
         tilt = math.acos(float((now.rotation @ axis)[2] / np.linalg.norm(axis)))
-        assert (upright.formula.values(row)[0, 0] >= upright.lower) == (tilt <= 0.3)
+        assert (upright.formula.evaluate(row)[0, 0] >= upright.lower) == (tilt <= 0.3)
         expected = np.linalg.norm(now.translation - before.translation) / dt
-        assert speed.formula.values(row)[0, 0] == pytest.approx(expected, rel=1e-6)
+        assert speed.formula.evaluate(row)[0, 0] == pytest.approx(expected, rel=1e-6)
         inside = np.all(np.abs(now.translation - [1.0, -0.5, 0.2]) < [1.0, 0.3, 0.5])
-        assert (away.formula.values(row)[0, 0] < 0.0) == inside
+        assert (away.formula.evaluate(row)[0, 0] < 0.0) == inside
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +80,10 @@ def test_episodes_keep_to_them_and_say_so(made: Dataset) -> None:
     assert [entry.type for entry in made.recipe.fields.terms] == ["speed", "traced"]
     for episode in made.episodes():
         assert [term.name for term in episode.terms] == ["speed base", "low"]
-        assert [term.formula.frames for term in episode.terms] == [("base",), (episode.scene().robot.tool_frame,)]
+        assert [term.formula.frames for term in episode.terms] == [
+            ("base",),
+            (episode.scene().robot.tool_frame,),
+        ]
         assert episode.validate().ok
         times = episode.trajectory.times
         fine = np.linspace(times[0], times[-1], 2000)
@@ -84,7 +96,10 @@ def test_without_them_the_base_is_faster(tmp_path: Path) -> None:
     """Or the test before could not fail."""
     plain = generate(SMALL, 3, tmp_path / "out")
     motions = [episode.trajectory for episode in plain.episodes()]
-    fine = [motion.velocity(np.linspace(motion.times[0], motion.times[-1], 2000))[:, :2] for motion in motions]
+    fine = [
+        motion.velocity(np.linspace(motion.times[0], motion.times[-1], 2000))[:, :2]
+        for motion in motions
+    ]
     assert max(np.linalg.norm(velocities, axis=1).max() for velocities in fine) > 0.31
 
 
@@ -118,7 +133,7 @@ def test_terms_that_are_not_the_recipe_s_are_noticed(copy: Path) -> None:
     number = said(copy, lambda words: words.pop("terms"))
     found = check_dataset(copy)
     assert list(found.refused) == [number]
-    assert "terms are not those of the recipe" in found.refused[number]
+    assert "terms differ from those of the recipe" in found.refused[number]
 
 
 def test_they_are_part_of_what_determines_episodes(made: Dataset) -> None:
@@ -132,9 +147,18 @@ def test_they_are_part_of_what_determines_episodes(made: Dataset) -> None:
 
 
 def test_tasks_have_those_of_their_own(made: Dataset) -> None:
-    own = load_recipe({**SMALL, "tasks": ["given-open", "drive-open"], "terms": [{**SLOW, "tasks": ["drive-open"]}]})
+    own = load_recipe(
+        {
+            **SMALL,
+            "tasks": ["given-open", "drive-open"],
+            "terms": [{**SLOW, "tasks": ["drive-open"]}],
+        }
+    )
     episode = next(made.episodes())
-    found = [terms_of(own, episode.scene(), {**episode.about, "task": task}) for task in ("given-open", "drive-open")]
+    found = [
+        resolve_episode_terms(own, episode.scene(), {**episode.about, "task": task})
+        for task in ("given-open", "drive-open")
+    ]
     assert [len(terms) for terms in found] == [0, 1]
 
 
@@ -149,9 +173,21 @@ def test_tasks_have_those_of_their_own(made: Dataset) -> None:
         ("{type: upright, axis: [0, 0, 0]}", "terms[0].axis", "no direction"),
         ("{type: upright, angle: 4}", "terms[0].angle", "out of range"),
         ("{type: keep-out, position: [0, 0], size: [1, 1, 1]}", "terms[0].position", "3 values"),
-        ("{type: keep-out, position: [0, 0, 0], size: [1, 1, 0]}", "terms[0].size[2]", "out of range"),
-        ("{type: speed, most: 1, tasks: [drive-opn]}", "terms[0].tasks[0]", "did you mean 'drive-open'"),
-        ("{type: traced, traced: {term: Constraint, name: x, expression: import os}}", "terms[0]", "not a saved term"),
+        (
+            "{type: keep-out, position: [0, 0, 0], size: [1, 1, 0]}",
+            "terms[0].size[2]",
+            "out of range",
+        ),
+        (
+            "{type: speed, most: 1, tasks: [drive-opn]}",
+            "terms[0].tasks[0]",
+            "did you mean 'drive-open'",
+        ),
+        (
+            "{type: traced, traced: {term: Constraint, name: x, expression: import os}}",
+            "terms[0]",
+            "not a saved term",
+        ),
         ("{type: python, expression: os.getcwd()}", "terms[0].type", "traced"),
     ],
 )
@@ -183,14 +219,22 @@ def test_two_of_one_name() -> None:
     ("terms", "text"),
     [
         ([low("hnd")], "did you mean 'hand'"),
-        ([vkc.Constraint("x", lambda s: s.coordinate("elbow"), upper=1.0)], "coordinate of husky_ur5e"),
-        ([vkc.Constraint("x", lambda s: s.position("hand")[2], upper=1.0, during="reach")], "phases are not known yet"),
+        (
+            [vkc.Constraint("x", lambda s: s.coordinate("elbow"), upper=1.0)],
+            "coordinate of husky_ur5e",
+        ),
+        (
+            [vkc.Constraint("x", lambda s: s.position("hand")[2], upper=1.0, during="reach")],
+            "phases are not known yet",
+        ),
         ([low(), low()], "two terms share a name"),
         (["low"], "a list of Constraint and Cost"),
         (3, "not a list"),
     ],
 )
-def test_nothing_is_written_for_terms_that_cannot_hold(tmp_path: Path, terms: Any, text: str) -> None:
+def test_nothing_is_written_for_terms_that_cannot_hold(
+    tmp_path: Path, terms: Any, text: str
+) -> None:
     with pytest.raises(InputError) as caught:
         generate(SMALL, 1, tmp_path / "out", terms=terms)
     assert text in str(caught.value)
@@ -206,4 +250,6 @@ def test_frames_of_the_recipe_are_looked_for_first(tmp_path: Path) -> None:
 def test_the_documentation_has_every_field() -> None:
     page = (Path(__file__).parents[3] / "docs/datasets.md").read_text(encoding="utf-8")
     for schema in (UprightSchema, SpeedSchema, KeepOutSchema, TracedSchema):
-        assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], schema.__name__
+        assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], (
+            schema.__name__
+        )

@@ -8,11 +8,13 @@ from helpers.downloads import SDF
 from helpers.homes import HOME_MJCF, PLACES, WALLS, home_urdf
 
 import vkc_pin as vkc
-from vkc_pin.models.shapes import world_box
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.scene import START_CLEARANCE
+from vkc_pin.world.models.shapes import compute_world_box
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import START_CLEARANCE
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*things that can move stand in others")  # cups in their table, as in real homes
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*movable links overlap other shapes"
+)  # cups in their table, as in real homes
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +24,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedHome:
     return vkc.import_home(file, folder / "out")
 
 
-def test_every_shape_of_the_file_is_somewhere(home: vkc.ImportedHome, tmp_path: Path) -> None:
+def test_every_shape_of_the_file_is_imported(home: vkc.ImportedHome, tmp_path: Path) -> None:
     _, shapes = home_urdf(tmp_path)
     assert home.shapes["file"] == shapes
     assert home.shapes["floor"] == 2
@@ -31,14 +33,20 @@ def test_every_shape_of_the_file_is_somewhere(home: vkc.ImportedHome, tmp_path: 
     assert set(WALLS) < set(scene.obstacle_names)
     assert {"table", "sofa"} < set(scene.obstacle_names)
     assert not {"slab", "carpet"} & set(scene.obstacle_names)
-    colliding = sum(len(placed.object.collision.geometryObjects) for placed in scene.objects.values())
+    colliding = sum(
+        len(placed.object.collision.geometryObjects) for placed in scene.objects.values()
+    )
     assert colliding == home.shapes["objects"]  # none of them is a mesh
-    sofa = [shape for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label == "sofa"]
-    assert len(sofa) == 2, "a concave mesh, whose hull would fill what is above the seat"
+    sofa = [
+        shape
+        for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True)
+        if label == "sofa"
+    ]
+    assert len(sofa) == 2, "a concave mesh, whose hull would fill the space above the seat"
     assert len(scene.obstacles) == home.shapes["obstacles"] + 2  # with the floor
 
 
-def test_everything_stands_where_the_file_has_it(home: vkc.ImportedHome) -> None:
+def test_placements_agree_with_the_file(home: vkc.ImportedHome) -> None:
     scene = home.scene
     assert scene.arena == pytest.approx((-4.8, 4.8, -4.1, 6.1))
     for kind in PLACES:
@@ -47,43 +55,63 @@ def test_everything_stands_where_the_file_has_it(home: vkc.ImportedHome) -> None
         document = {
             "robot": "husky_ur5e",
             "start": {"base": [0, 0, 0]},
-            "objects": [{"name": "it", "type": vkc.random_object(kind, seed), "position": [x, y, 0], "yaw": yaw}],
+            "objects": [
+                {
+                    "name": "it",
+                    "type": vkc.random_object(kind, seed),
+                    "position": [x, y, 0],
+                    "yaw": yaw,
+                }
+            ],
         }
         there = vkc.Scene.from_document(document)
         boxes = [
-            np.array([world_box(shape.geometry, shape.placement) for shape in standing_geometry(one)])
+            np.array(
+                [
+                    compute_world_box(shape.geometry, shape.placement)
+                    for shape in make_world_shapes(one)
+                ]
+            )
             for one in (scene.objects[name], there.objects["it"])
         ]
         assert np.allclose(np.sort(boxes[0], axis=0), np.sort(boxes[1], axis=0), atol=1e-5), kind
         own, other = scene.objects[name].object, there.objects["it"].object
         assert np.allclose(own.upper - own.lower, other.upper - other.lower)
     assert scene.objects["cup_0"].placement.translation == pytest.approx([0.25, 0.2, 0.749])
-    assert [name for name, placed in scene.objects.items() if placed.object.free] == ["cup_0", "cup_1", "lump"]
+    assert [name for name, placed in scene.objects.items() if placed.object.free] == [
+        "cup_0",
+        "cup_1",
+        "lump",
+    ]
 
 
-def test_the_start_is_free_in_the_room_with_most(home: vkc.ImportedHome) -> None:
+def test_start_is_free_and_reaches_most_objects(home: vkc.ImportedHome) -> None:
     assert home.scene.start_clearance() >= START_CLEARANCE
-    assert home.scene.start[1] < 2.9  # the bedroom has the lump alone, which no hand takes
+    assert home.scene.start[1] < 2.9  # the bedroom has the lump alone, which no hand can grasp
     assert home.reached == 6
     assert home.scene.sample_start(np.random.default_rng(1)).start_clearance() >= START_CLEARANCE
 
 
-def test_what_no_hand_takes_is_said(home: vkc.ImportedHome) -> None:
+def test_report_names_objects_that_no_hand_can_grasp(home: vkc.ImportedHome) -> None:
     report = home.report()
     for text in (
         "67 shapes",
         "part of it: slab, carpet",
         "lump: carried by no hand",
         "refrigerator_hinge by",
-        "4 with joints, 3 to carry",
+        "4 articulated objects, 3 free objects",
     ):
         assert text in report, text
     assert not home.scene.objects["lump"].object.attachments
     assert "lump" not in {getattr(step, "object", None) for step in vkc.goals(home.scene)}
 
 
-def test_its_things_are_opened_and_its_cups_taken(home: vkc.ImportedHome) -> None:
-    steps = {step.object: step for step in vkc.goals(home.scene) if isinstance(step, vkc.Actuate | vkc.Grasp)}
+def test_imported_objects_can_be_opened_and_grasped(home: vkc.ImportedHome) -> None:
+    steps = {
+        step.object: step
+        for step in vkc.goals(home.scene)
+        if isinstance(step, vkc.Actuate | vkc.Grasp)
+    }
     for name in ("refrigerator_body", "drawers_case", "dishwasher_body", "door_frame", "cup_0"):
         plan = vkc.plan(home.scene, [steps[name]])
         assert plan.success, plan.report()
@@ -92,13 +120,16 @@ def test_its_things_are_opened_and_its_cups_taken(home: vkc.ImportedHome) -> Non
             assert plan.trajectory.column(f"{name}.{joint}")[-1] == pytest.approx(value, abs=1e-3)
 
 
-def test_a_home_of_mujoco(tmp_path: Path) -> None:
+def test_mjcf_home_is_imported(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(HOME_MJCF)
     done = vkc.import_home(tmp_path / "small.xml", tmp_path / "out")
     assert done.shapes == {"file": 9, "obstacles": 5, "objects": 4, "floor": 0}
     assert set(done.scene.obstacle_names) == {"north", "south", "east", "west", "board"}
-    assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {"cupboard": False, "mug": True}
+    assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {
+        "cupboard": False,
+        "mug": True,
+    }
     assert any("'ground'" in note and "plane" in note for note in done.notes)
     assert done.scene.objects["mug"].placement.translation == pytest.approx([0.0, 2.3, 0.7])
     steps = vkc.goals(done.scene)
@@ -108,7 +139,7 @@ def test_a_home_of_mujoco(tmp_path: Path) -> None:
         assert plan.success, plan.report()
 
 
-def test_a_floor_that_is_higher_in_the_file(tmp_path: Path) -> None:
+def test_floor_height_is_respected(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(
         HOME_MJCF.replace("<worldbody>", '<worldbody><body name="storey" pos="0 0 2.8">')
@@ -119,11 +150,14 @@ def test_a_floor_that_is_higher_in_the_file(tmp_path: Path) -> None:
     done = vkc.import_home(tmp_path / "small.xml", tmp_path / "out", floor=2.8)
     assert done.shapes["floor"] == 1
     assert "cupboard" in done.scene.objects
-    low = min(world_box(shape.geometry, shape.placement)[0][2] for shape in standing_geometry(done.scene.objects["cupboard"]))
+    low = min(
+        compute_world_box(shape.geometry, shape.placement)[0][2]
+        for shape in make_world_shapes(done.scene.objects["cupboard"])
+    )
     assert low == pytest.approx(0.0, abs=1e-6)
 
 
-def test_what_is_no_home_and_wrong_arguments(tmp_path: Path) -> None:
+def test_invalid_homes_and_arguments_are_refused(tmp_path: Path) -> None:
     still = tmp_path / "still.urdf"
     still.write_text(
         '<robot name="s"><link name="a"><collision><geometry><box size="1 1 1"/></geometry></collision></link></robot>'
@@ -131,8 +165,8 @@ def test_what_is_no_home_and_wrong_arguments(tmp_path: Path) -> None:
     (tmp_path / "box.sdf").write_text(SDF)
     for file, wrong, word in (
         (tmp_path / "none.urdf", {}, r"none\.urdf"),
-        (still, {}, r"still\.urdf.*nothing in this file can move"),
-        (tmp_path / "box.sdf", {}, "URDF and MJCF alone"),
+        (still, {}, r"still\.urdf.*the home has nothing movable"),
+        (tmp_path / "box.sdf", {}, "URDF and MJCF only"),
         (still, {"floor": float("nan")}, "floor"),
         (still, {"most": 0}, "most"),
         (still, {"robot": "husky_ur5"}, "husky_ur5e"),
@@ -144,14 +178,14 @@ def test_what_is_no_home_and_wrong_arguments(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".import-home-*"))
 
 
-def test_a_folder_is_replaced_only_if_it_was_made_so_and_that_is_wanted(tmp_path: Path) -> None:
+def test_folder_is_replaced_only_with_force(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(HOME_MJCF)
     out = tmp_path / "out"
     out.mkdir()
     (out / "letter.txt").write_text("mine")
     for force in (False, True):
-        with pytest.raises(vkc.InputError, match="something already"):
+        with pytest.raises(vkc.InputError, match="already exists"):
             vkc.import_home(tmp_path / "small.xml", out, force=force)
     assert (out / "letter.txt").read_text() == "mine"
     (out / "letter.txt").unlink()
@@ -211,7 +245,7 @@ def write_halves(file: Path, wardrobe: str, cabinet: str) -> None:
         ("a+b", "a b", ("a_b_2", "a_b")),
     ],
 )
-def test_objects_whose_names_look_alike_stay_what_they_are(
+def test_objects_with_similar_names_stay_distinct(
     wardrobe: str, cabinet: str, files: tuple[str, str], tmp_path: Path
 ) -> None:
     write_halves(tmp_path / "h.urdf", wardrobe, cabinet)
@@ -227,7 +261,10 @@ def test_objects_whose_names_look_alike_stay_what_they_are(
     ):
         item = done.scene.objects[name]
         boxes = np.array(
-            [world_box(shape.geometry, shape.placement) for shape in standing_geometry(item)]
+            [
+                compute_world_box(shape.geometry, shape.placement)
+                for shape in make_world_shapes(item)
+            ]
         )
         assert boxes[:, 0].min(axis=0) == pytest.approx(low, abs=1e-5), name
         assert boxes[:, 1].max(axis=0) == pytest.approx(high, abs=1e-5), name
@@ -241,7 +278,7 @@ def test_objects_whose_names_look_alike_stay_what_they_are(
     assert again.scene.document == done.scene.document
 
 
-def test_a_file_name_cannot_add_fields_to_the_scene(tmp_path: Path) -> None:
+def test_file_name_cannot_add_fields_to_the_scene(tmp_path: Path) -> None:
     file = tmp_path / "x\nfloor: false\n#\x01\udcff.urdf"
     write_halves(file, "wardrobe", "cabinet")
     done = vkc.import_home(file, tmp_path / "out")

@@ -11,21 +11,28 @@ import trimesh
 from vkc_pin.importing.homes.obstacles import write_obstacles
 from vkc_pin.importing.homes.splitting import Home
 from vkc_pin.importing.objects.description import Link, Part
-from vkc_pin.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene
 
 
-def _part(name: str, kind: str, size: tuple[float, ...], at: pin.SE3, **more: object) -> Part:
+def make_part(name: str, kind: str, size: tuple[float, ...], at: pin.SE3, **more: object) -> Part:
     return Part(name=name, placement=at, kind=kind, size=size, **more)  # type: ignore[arg-type]
 
 
-def test_simple_shapes_stay_what_they_are_and_others_become_urdf(tmp_path: Path) -> None:
+def test_primitive_shapes_stay_and_others_become_urdf(tmp_path: Path) -> None:
     turned = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.1), np.array([1.0, 2.0, 0.7]))
     red = (1.0, 0.0, 0.0, 1.0)
-    seen = _part("looks", "box", (2.0, 0.1, 2.0), turned, colour=red)
+    seen = make_part("looks", "box", (2.0, 0.1, 2.0), turned, colour=red)
     wedge = trimesh.convex.convex_hull([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    building = Link("walls", (seen,), (_part("a wall", "box", (2.0, 0.1, 2.0), turned), _part("", "capsule", (0.1, 1.0), turned)))
-    mesh = Link("wedge", (), (_part("", "mesh", (1.0, 1.0, 1.0), turned, triangles=wedge),))
-    ball = Link("a wall", (), (_part("", "sphere", (0.2,), turned),))
+    building = Link(
+        "walls",
+        (seen,),
+        (
+            make_part("a wall", "box", (2.0, 0.1, 2.0), turned),
+            make_part("", "capsule", (0.1, 1.0), turned),
+        ),
+    )
+    mesh = Link("wedge", (), (make_part("", "mesh", (1.0, 1.0, 1.0), turned, triangles=wedge),))
+    ball = Link("a wall", (), (make_part("", "sphere", (0.2,), turned),))
     home = Home((building,), (mesh, ball), (), (), 4, ())
     taken = {"ball", "wedge"}
     entries, notes = write_obstacles(home, tmp_path / "home.urdf", tmp_path, taken, {})
@@ -35,14 +42,25 @@ def test_simple_shapes_stay_what_they_are_and_others_become_urdf(tmp_path: Path)
     assert taken == {"ball", "wedge", "a_wall", "walls_1", "wedge_2", "a_wall_2"}
     assert not notes
     scene = Scene.from_document(
-        {"robot": "husky_ur5e", "start": {"base": [-3, -3, 0]}, "obstacles": entries, "floor": False}, tmp_path
+        {
+            "robot": "husky_ur5e",
+            "start": {"base": [-3, -3, 0]},
+            "obstacles": entries,
+            "floor": False,
+        },
+        tmp_path,
     )
     parts = [*building.collision, *mesh.collision, *ball.collision]
     assert scene.obstacle_labels == tuple(entry["name"] for entry in entries)
     for part, shape in zip(parts, scene.obstacles, strict=True):
         shape.geometry.computeLocalAABB()
-        box, own = shape.geometry.aabb_local, dataclasses.replace(part, placement=shape.placement.inverse() * part.placement)
-        assert np.vstack([box.min_, box.max_]) == pytest.approx(own.mesh().bounds, abs=2e-3)  # balls of triangles are smaller
+        box, own = (
+            shape.geometry.aabb_local,
+            dataclasses.replace(part, placement=shape.placement.inverse() * part.placement),
+        )
+        assert np.vstack([box.min_, box.max_]) == pytest.approx(
+            own.mesh().bounds, abs=2e-3
+        )  # balls of triangles are smaller
         if part.kind != "mesh":
             assert shape.placement.isApprox(part.placement, 1e-5)
 
@@ -58,12 +76,13 @@ def test_simple_shapes_stay_what_they_are_and_others_become_urdf(tmp_path: Path)
         ("con", "x" * 300, ("con_", "x" * 64)),
     ],
 )
-def test_links_whose_names_look_alike_keep_their_own_shapes(
+def test_links_with_similar_names_keep_their_own_shapes(
     first: str, second: str, files: tuple[str, str], tmp_path: Path
 ) -> None:
     def pair(name: str, size: tuple[float, float, float], x: float) -> Link:
         boxes = (
-            _part("", "box", size, pin.SE3(np.eye(3), np.array([x, y, 1.0]))) for y in (0.0, 0.1)
+            make_part("", "box", size, pin.SE3(np.eye(3), np.array([x, y, 1.0])))
+            for y in (0.0, 0.1)
         )
         return Link(name, (), tuple(boxes))
 

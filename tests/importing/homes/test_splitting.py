@@ -8,27 +8,40 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.importing.homes.splitting import split
+from vkc_pin.importing.homes.splitting import split_home
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 
 
 def _box(name: str, size: tuple[float, float, float] = (0.2, 0.2, 0.2), z: float = 0.5) -> Link:
-    part = Part(name=name, placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, z])), kind="box", size=size)
+    part = Part(
+        name=name, placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, z])), kind="box", size=size
+    )
     return Link(name, (), (part,))
 
 
-def _hung(parent: str, child: str, kind: str, limits: tuple[float, float] | None = (0.0, 1.0)) -> Joint:
+def _hung(
+    parent: str, child: str, kind: str, limits: tuple[float, float] | None = (0.0, 1.0)
+) -> Joint:
     up = pin.SE3(np.eye(3), np.array([0.3, 0.0, 0.0]))
     return Joint(
-        name=f"to_{child}", kind=kind, parent=parent, child=child, placement=up, limits=limits if kind != "fixed" else None
+        name=f"to_{child}",
+        kind=kind,
+        parent=parent,
+        child=child,
+        placement=up,
+        limits=limits if kind != "fixed" else None,
     )
 
 
 def _home(links: list[Link], joints: list[Joint]) -> Description:
-    return Description(Path("home.urdf"), {link.name: link for link in links}, {joint.child: joint for joint in joints})
+    return Description(
+        Path("home.urdf"),
+        {link.name: link for link in links},
+        {joint.child: joint for joint in joints},
+    )
 
 
-def test_on_the_building_each_joint_is_a_thing_of_its_own() -> None:
+def test_each_joint_of_the_building_is_an_object() -> None:
     links = [
         Link("world"),
         _box("walls", (8.0, 0.1, 2.5)),
@@ -46,30 +59,41 @@ def test_on_the_building_each_joint_is_a_thing_of_its_own() -> None:
         _hung("world", "cabinet", "fixed"),
         _hung("cabinet", "leaf", "revolute"),
     ]
-    home = split(_home(links, joints))
+    home = split_home(_home(links, joints))
     assert [link.name for link in home.building] == ["walls"]
     assert not home.furniture
-    found = {thing.name: set(thing.description.links) for thing in home.things}
-    assert found == {"left": {"left", "left_base"}, "right": {"right", "right_base", "knob"}, "cabinet": {"cabinet", "leaf"}}
+    found = {thing.name: set(thing.description.links) for thing in home.objects}
+    assert found == {
+        "left": {"left", "left_base"},
+        "right": {"right", "right_base", "knob"},
+        "cabinet": {"cabinet", "leaf"},
+    }
 
 
-def test_joints_that_move_nothing_or_nowhere_are_fixed_where_they_are() -> None:
+def test_immovable_joints_are_fixed() -> None:
     links = [_box("room"), _box("stuck"), Link("dead"), _box("leaf")]
     joints = [
         _hung("room", "stuck", "prismatic", (0.4, 0.4)),
         _hung("room", "dead", "revolute"),
         _hung("room", "leaf", "revolute"),
     ]
-    home = split(_home(links, joints))
-    assert [thing.name for thing in home.things] == ["leaf"]
+    home = split_home(_home(links, joints))
+    assert [thing.name for thing in home.objects] == ["leaf"]
     assert [link.name for link in home.furniture] == ["stuck"]
     assert home.furniture[0].collision[0].placement.translation == pytest.approx([0.7, 0.0, 0.5])
-    assert any("to_stuck" in note and "one value" in note for note in home.notes)
-    assert any("to_dead" in note and "moves nothing" in note for note in home.notes)
+    assert any("to_stuck" in note and "single value" in note for note in home.notes)
+    assert any("to_dead" in note and "moves no shape" in note for note in home.notes)
 
 
-def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
-    links = [Link("world"), _box("case"), _box("drawer"), _box("laptop"), _box("lid"), Link("ghost")]
+def test_free_object_is_rigid_and_separate() -> None:
+    links = [
+        Link("world"),
+        _box("case"),
+        _box("drawer"),
+        _box("laptop"),
+        _box("lid"),
+        Link("ghost"),
+    ]
     joints = [
         _hung("world", "case", "fixed"),
         _hung("case", "drawer", "prismatic", (0.1, 0.5)),
@@ -77,31 +101,50 @@ def test_what_is_carried_is_stiff_and_comes_out_of_what_it_is_in() -> None:
         _hung("laptop", "lid", "revolute"),
         _hung("world", "ghost", "floating", None),
     ]
-    home = split(_home(links, joints))
-    case, laptop = home.things
+    home = split_home(_home(links, joints))
+    case, laptop = home.objects
     assert set(case.description.links) == {"case", "drawer"}
     assert case.position[2] == 0.0  # on the floor, above which it hangs
     assert laptop.free
-    assert laptop.position == pytest.approx((1.15, 0.0, 0.4))  # with the drawer at its lower limit: as the scene has it
+    assert laptop.position == pytest.approx(
+        (1.15, 0.0, 0.4)
+    )  # with the drawer at its lower limit: as the scene has it
     assert [joint.kind for joint in laptop.description.joints.values()] == ["fixed"]
     assert any("'to_lid'" in note for note in home.notes)
 
 
-def test_what_is_carried_is_as_far_open_as_it_must_be() -> None:
+def test_free_object_joints_are_fixed_within_limits() -> None:
     """A lid that cannot be shut is fixed at its lower limit, not where the file's zero is."""
     links = [Link("world"), _box("laptop"), _box("lid")]
-    home = split(_home(links, [_hung("world", "laptop", "floating", None), _hung("laptop", "lid", "prismatic", (0.25, 1.0))]))
-    (laptop,) = home.things
+    home = split_home(
+        _home(
+            links,
+            [
+                _hung("world", "laptop", "floating", None),
+                _hung("laptop", "lid", "prismatic", (0.25, 1.0)),
+            ],
+        )
+    )
+    (laptop,) = home.objects
     (hinge,) = laptop.description.joints.values()
     assert hinge.kind == "fixed"
-    where = laptop.description.placements()
-    base, lid = (where[name].act(laptop.description.links[name].solid[0].placement.translation) for name in ("laptop", "lid"))
+    where = laptop.description.compute_placements()
+    base, lid = (
+        where[name].act(laptop.description.links[name].solid[0].placement.translation)
+        for name in ("laptop", "lid")
+    )
     assert lid - base == pytest.approx([0.3 + 0.25, 0.0, 0.0])
 
 
-def test_what_is_flat_on_the_floor_is_part_of_it() -> None:
-    links = [_box("world", (9.0, 9.0, 0.2), -0.1), _box("carpet", (1.0, 1.0, 0.02), 0.01), _box("step", (1.0, 1.0, 0.05), 0.025)]
-    home = split(_home(links, [_hung("world", "carpet", "fixed"), _hung("world", "step", "fixed")]))
+def test_flat_shapes_are_part_of_the_floor() -> None:
+    links = [
+        _box("world", (9.0, 9.0, 0.2), -0.1),
+        _box("carpet", (1.0, 1.0, 0.02), 0.01),
+        _box("step", (1.0, 1.0, 0.05), 0.025),
+    ]
+    home = split_home(
+        _home(links, [_hung("world", "carpet", "fixed"), _hung("world", "step", "fixed")])
+    )
     assert home.floor == ("world", "carpet")
     assert [link.name for link in home.furniture] == ["step"]
     assert not home.building
@@ -109,7 +152,7 @@ def test_what_is_flat_on_the_floor_is_part_of_it() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_no_shape_is_lost_whatever_the_tree(data: st.DataObject) -> None:
+def test_no_shape_is_lost_for_any_tree(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 12))
     links = [_box("link_0", z=data.draw(st.sampled_from([0.5, -0.1])))]
     joints = []
@@ -117,15 +160,26 @@ def test_no_shape_is_lost_whatever_the_tree(data: st.DataObject) -> None:
         name, parent = f"link_{number}", f"link_{data.draw(st.integers(0, number - 1))}"
         size = data.draw(st.sampled_from([(0.2, 0.2, 0.2), (5.0, 0.1, 2.0)]))
         links.append(data.draw(st.sampled_from([_box(name, size), Link(name)])))
-        kind = data.draw(st.sampled_from(["fixed", "revolute", "prismatic", "continuous", "floating"]))
+        kind = data.draw(
+            st.sampled_from(["fixed", "revolute", "prismatic", "continuous", "floating"])
+        )
         limits = (
-            data.draw(st.sampled_from([None, (0.0, 1.0), (0.2, 0.2), (0.1, 0.4)])) if kind in ("revolute", "prismatic") else None
+            data.draw(st.sampled_from([None, (0.0, 1.0), (0.2, 0.2), (0.1, 0.4)]))
+            if kind in ("revolute", "prismatic")
+            else None
         )
         joints.append(_hung(parent, name, kind, limits))
-    home = split(_home(links, joints))
-    kept = [part.name for link in (*home.building, *home.furniture) for part in link.solid] + list(home.floor)
-    kept += [part.name for thing in home.things for link in thing.description.links.values() for part in link.solid]
+    home = split_home(_home(links, joints))
+    kept = [part.name for link in (*home.building, *home.furniture) for part in link.solid] + list(
+        home.floor
+    )
+    kept += [
+        part.name
+        for thing in home.objects
+        for link in thing.description.links.values()
+        for part in link.solid
+    ]
     assert sorted(kept) == sorted(part.name for link in links for part in link.solid)
     assert home.shapes == len(kept)
-    names = [thing.name for thing in home.things]
+    names = [thing.name for thing in home.objects]
     assert len(set(names)) == len(names)

@@ -27,13 +27,18 @@ def test_volumes_of_parts_are_those_of_their_shapes() -> None:
 def test_placements_follow_the_joints() -> None:
     place, axis = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0])), np.array([0.0, 0.0, 1.0])
     joints = {
-        "c": Joint(name="slide", kind="prismatic", parent="b", child="c", placement=place, axis=axis),
+        "c": Joint(
+            name="slide", kind="prismatic", parent="b", child="c", placement=place, axis=axis
+        ),
         "b": Joint(name="turn", kind="revolute", parent="a", child="b", placement=place, axis=axis),
     }
     found = Description(Path("f"), {name: Link(name) for name in "abc"}, joints)
     assert found.root == "a"
-    assert np.allclose(found.placements({"turn": np.pi / 2, "slide": 0.3})["c"].translation, [1.0, 1.0, 0.3])
-    assert found.below("b") == {"b", "c"}
+    assert np.allclose(
+        found.compute_placements({"turn": np.pi / 2, "slide": 0.3})["c"].translation,
+        [1.0, 1.0, 0.3],
+    )
+    assert found.subtree("b") == {"b", "c"}
 
 
 def test_what_is_seen_is_solid_where_nothing_else_is(tmp_path: Path) -> None:

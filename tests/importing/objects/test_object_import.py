@@ -19,7 +19,9 @@ def cabinet(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedObject:
     return vkc.import_object(partnet(folder / "45427"), folder / "out", height=0.8)
 
 
-def test_a_cabinet_of_partnet_stands_on_the_floor_in_its_height(cabinet: vkc.ImportedObject) -> None:
+def test_a_cabinet_of_partnet_stands_on_the_floor_in_its_height(
+    cabinet: vkc.ImportedObject,
+) -> None:
     assert cabinet.file.name == "object_45427.yaml"
     assert cabinet.size[2] == pytest.approx(0.8)
     item, data = cabinet.object, cabinet.object.model.createData()
@@ -45,12 +47,21 @@ def test_handles_are_found_named_or_not(cabinet: vkc.ImportedObject) -> None:
     assert {drawer.kind, door.kind} == {"bar"}
     assert drawer.thickness == pytest.approx(0.8 * 0.02, rel=0.01)
     assert cabinet.object.attachment(drawer.attachment.name).joint == drawer.attachment.joint
-    assert list(cabinet.object.attachments) == [proposal.attachment.name for proposal in cabinet.proposals.found]
+    assert list(cabinet.object.attachments) == [
+        proposal.attachment.name for proposal in cabinet.proposals.found
+    ]
 
 
-def test_the_report_says_what_was_changed(cabinet: vkc.ImportedObject) -> None:
+def test_report_lists_changes(cabinet: vkc.ImportedObject) -> None:
     report = cabinet.report()
-    for text in ("joint_1' states no limits", "joint_3", "decoration-6", "2 joints", "0.80 m", "husky_ur5e"):
+    for text in (
+        "joint_1' states no limits",
+        "joint_3",
+        "decoration-6",
+        "2 joints",
+        "0.80 m",
+        "husky_ur5e",
+    ):
         assert text in report, text
     assert cabinet.picture.read_bytes().startswith(b"\x89PNG")
 
@@ -69,7 +80,9 @@ def test_a_scene_with_it_can_be_planned(cabinet: vkc.ImportedObject, tmp_path: P
         "objects": [{"name": "it", "type": str(cabinet.file), "position": [0, 0, 0]}],
     }
     (tmp_path / "alone.yaml").write_text(yaml.safe_dump(scene))
-    plan = vkc.plan(vkc.load_scene(tmp_path / "alone.yaml"), [vkc.Actuate("it", {"joint_0": 0.2}, best.name)])
+    plan = vkc.plan(
+        vkc.load_scene(tmp_path / "alone.yaml"), [vkc.Actuate("it", {"joint_0": 0.2}, best.name)]
+    )
     assert plan.success, plan.report()
     assert plan.trajectory.column("it.joint_0")[-1] == pytest.approx(0.2, abs=1e-3)
 
@@ -94,7 +107,7 @@ def test_a_link_alone(tmp_path: Path) -> None:
     assert done.size[2] == pytest.approx(1.0)
 
 
-def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
+def test_invalid_objects_and_arguments_are_refused(tmp_path: Path) -> None:
     (tmp_path / "page.xml").write_text("<html/>")
     with pytest.raises(vkc.InputError, match=r"page\.xml.*<html>"):
         read_description(tmp_path / "page.xml")
@@ -104,8 +117,8 @@ def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
         ({"height": 1.0, "scale": 2.0}, "scale"),
         ({"up": "x"}, "up"),
         ({"link": "link_9"}, "link_2"),
-        ({"folder": tmp_path / "in"}, "something already"),
-        ({"folder": tmp_path / "in", "force": True}, "something already"),
+        ({"folder": tmp_path / "in"}, "already exists"),
+        ({"folder": tmp_path / "in", "force": True}, "already exists"),
         ({"most": 0}, "most"),
     ):
         with pytest.raises(vkc.InputError, match=word):
@@ -113,7 +126,7 @@ def test_what_is_no_object_and_wrong_arguments(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_nothing_is_left_of_what_fails_halfway(tmp_path: Path) -> None:
+def test_failed_import_leaves_no_files(tmp_path: Path) -> None:
     (tmp_path / "box.sdf").write_text(SDF)
     out = tmp_path / "made" / "box"
     handless = dataclasses.replace(vkc.load_robot("husky_ur5e"), touch_links=())

@@ -8,28 +8,36 @@ import pytest
 import trimesh
 from helpers.downloads import partnet
 
+from vkc_pin.importing.objects.clean_up import load_surfaces, merge_fixed_links
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.importing.objects.pieces import Known, with_pieces
-from vkc_pin.importing.objects.tidying import surfaces, tidied
+from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
 HERE = pin.SE3.Identity()
 
 
 def alone(*meshes: trimesh.Trimesh) -> Description:
-    parts = tuple(Part(name="p", placement=HERE, kind="mesh", size=(1, 1, 1), triangles=mesh) for mesh in meshes)
-    joint = Joint(name="j", kind="prismatic", parent="a", child="b", placement=HERE, limits=(0.0, 1.0))
+    parts = tuple(
+        Part(name="p", placement=HERE, kind="mesh", size=(1, 1, 1), triangles=mesh)
+        for mesh in meshes
+    )
+    joint = Joint(
+        name="j", kind="prismatic", parent="a", child="b", placement=HERE, limits=(0.0, 1.0)
+    )
     return Description(Path("f"), {"a": Link("a"), "b": Link("b", parts, parts)}, {"b": joint})
 
 
 def pieces(description: Description) -> tuple[tuple[Part, ...], tuple[str, ...]]:
-    found = with_pieces(description, surfaces(description))
+    found = decompose_links(description, load_surfaces(description))
     return found.links["b"].collision, found.notes
 
 
 def test_a_bracket_leaves_room_for_fingers() -> None:
     pytest.importorskip("coacd")
-    outline = np.array([[0, -15], [7, -15], [7, 15], [0, 15], [0, 13], [5, 13], [5, -13], [0, -13]]) / 100.0
+    outline = (
+        np.array([[0, -15], [7, -15], [7, 15], [0, 15], [0, 13], [5, 13], [5, -13], [0, -13]])
+        / 100.0
+    )
     above = np.array([[0, 1, 6], [0, 6, 7], [1, 2, 5], [1, 5, 6], [2, 3, 4], [2, 4, 5]])
     around = [[k, (k + 1) % 8, side] for k in range(8) for side in ((k + 1) % 8 + 8, -1)]
     sides = [[k, j, top] if top > 0 else [k, j + 8, k + 8] for k, j, top in around]
@@ -45,9 +53,11 @@ def test_a_bracket_leaves_room_for_fingers() -> None:
 
 
 def test_flat_shapes_get_thick_and_are_named(tmp_path: Path) -> None:
-    found = tidied(read_object_urdf(partnet(tmp_path)))
-    done = with_pieces(found, surfaces(found))
-    decoration = next(part for part in done.links["link_0"].collision if part.name == "decoration-6")
+    found = merge_fixed_links(read_object_urdf(partnet(tmp_path)))
+    done = decompose_links(found, load_surfaces(found))
+    decoration = next(
+        part for part in done.links["link_0"].collision if part.name == "decoration-6"
+    )
     assert decoration.mesh().volume > 0.0
     assert any("decoration-6" in note and "link_0" in note for note in done.notes)
 
@@ -61,23 +71,34 @@ def test_what_lies_inside_of_another_piece_goes() -> None:
 
 def test_boxes_stay_boxes_and_what_is_seen_collides_where_nothing_else_does() -> None:
     box = Part(name="", placement=HERE, kind="box", size=(0.1, 0.1, 0.1))
-    found = with_pieces(Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.mesh()})
+    found = decompose_links(
+        Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.mesh()}
+    )
     assert found.links["a"].collision == (box,)
-    assert any("collides as what it looks like" in note for note in found.notes)
+    assert any("visual geometry is used" in note for note in found.notes)
 
 
 def test_a_file_that_is_there_twice_is_cut_once_and_is_where_it_stands(tmp_path: Path) -> None:
     trimesh.creation.annulus(0.3, 0.5, 0.2).export(tmp_path / "ring.stl")
-    places = [pin.SE3(pin.rpy.rpyToMatrix(0.2, 0.3, k), np.array([float(k), 0.0, 0.5])) for k in range(2)]
-    parts = tuple(Part(name="", placement=at, kind="mesh", size=(1.0, 1.0, 1.0), file=tmp_path / "ring.stl") for at in places)
-    known: Known = {}
+    places = [
+        pin.SE3(pin.rpy.rpyToMatrix(0.2, 0.3, k), np.array([float(k), 0.0, 0.5])) for k in range(2)
+    ]
+    parts = tuple(
+        Part(name="", placement=at, kind="mesh", size=(1.0, 1.0, 1.0), file=tmp_path / "ring.stl")
+        for at in places
+    )
+    known: PieceCache = {}
     found = []
     for part in parts:
         description = Description(tmp_path / "t.urdf", {"ring": Link("ring", (), (part,))}, {})
-        found.append(with_pieces(description, surfaces(description), known).links["ring"].collision)
+        found.append(
+            decompose_links(description, load_surfaces(description), known).links["ring"].collision
+        )
     assert len(known) == 1
     (cut,) = known.values()
     assert len(found[0]) == len(found[1]) == len(cut) > 1
     for at, pieces in zip(places, found, strict=True):
         for part, piece in zip(pieces, cut, strict=True):
-            assert np.allclose(part.mesh().vertices, piece.copy().apply_transform(at.homogeneous).vertices)
+            assert np.allclose(
+                part.mesh().vertices, piece.copy().apply_transform(at.homogeneous).vertices
+            )

@@ -21,7 +21,7 @@ def test_frames_that_refer_to_each_other(tmp_path: Path) -> None:
     hinge = found.joints["door"]
     assert (found.root, hinge.kind, hinge.limits) == ("case", "revolute", (-1.5, 0.0))
     assert np.allclose(hinge.axis, [0.0, 0.0, -1.0])
-    shut, open_ = (found.placements({"hinge": value})["door"] for value in (0.0, -0.7))
+    shut, open_ = (found.compute_placements({"hinge": value})["door"] for value in (0.0, -0.7))
     leaf = found.links["door"].collision[0].placement
     assert np.allclose((shut * leaf).translation, [-0.25, 0.0, 0.0])  # in the frame of the case
     assert np.allclose(shut.translation, [-0.25, -0.3, 0.0])  # on the hinge
@@ -33,7 +33,7 @@ def test_a_joint_to_the_world_makes_that_the_root(tmp_path: Path) -> None:
     (tmp_path / "t.sdf").write_text(SDF.replace("</model>", fixed))
     found = read_object_sdf(tmp_path / "t.sdf")
     assert found.root == "world"
-    assert np.allclose(found.placements()["case"].translation, [1.0, 0.0, 0.4])
+    assert np.allclose(found.compute_placements()["case"].translation, [1.0, 0.0, 0.4])
     (tmp_path / "t.sdf").write_text(SDF.replace("<parent>case</parent>", "<parent>world</parent>"))
     with pytest.raises(InputError, match="case, world"):
         read_object_sdf(tmp_path / "t.sdf")
@@ -51,7 +51,9 @@ def test_a_joint_to_the_world_makes_that_the_root(tmp_path: Path) -> None:
         ('<link name="case">', '<link name="door"/><link name="case">', InputError),
     ],
 )
-def test_what_is_wrong_is_said_with_the_file(tmp_path: Path, old: str, new: str, error: type[InputError]) -> None:
+def test_what_is_wrong_is_said_with_the_file(
+    tmp_path: Path, old: str, new: str, error: type[InputError]
+) -> None:
     assert old in SDF
     with pytest.raises(error, match=r"t\.sdf"):
         read(tmp_path, SDF.replace(old, new))
@@ -71,7 +73,10 @@ def test_what_links_weigh(tmp_path: Path) -> None:
     moments = "<inertia><ixx>0.1</ixx><iyy>0.2</iyy><izz>0.25</izz></inertia>"
     stated = f"<inertial><pose>0 0 0.1 0 0 0</pose><mass>2</mass>{moments}</inertial>"
     place = SDF.index(">", SDF.index("<link")) + 1
-    for inertial, mass, half in ((stated, 2.0, False), ("<inertial><mass>2</mass></inertial>", 0.0, True)):
+    for inertial, mass, half in (
+        (stated, 2.0, False),
+        ("<inertial><mass>2</mass></inertial>", 0.0, True),
+    ):
         (tmp_path / "t.sdf").write_text(SDF[:place] + inertial + SDF[place:])
         found = read_object_sdf(tmp_path / "t.sdf")
         weights = [link.inertia for link in found.links.values()]

@@ -36,7 +36,10 @@ def test_limits_the_wrong_way_round_and_unknown_joints_are_noted(tmp_path: Path)
     assert found.joints["b"].limits == (-0.5, 1.0)
     assert np.allclose(found.joints["b"].axis, [1.0, 0.0, 0.0])
     assert found.joints["c"].kind == "fixed"
-    assert [word in " ".join(found.notes) for word in ("wrong way round", "floating", "mimics")] == [True] * 3
+    assert [
+        word in " ".join(found.notes)
+        for word in ("lower limit above its upper limit", "floating", "mimics")
+    ] == [True] * 3
     free = read_object_urdf(tmp_path / "t.urdf", free=True)
     assert free.joints["c"].kind == "floating"
     assert "floating" not in " ".join(free.notes)
@@ -50,12 +53,14 @@ def test_errors_name_file_and_element(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match=r"t\.urdf"):
         read_object_urdf(file)
     geometry = '<geometry><mesh filename="gone.obj"/></geometry>'
-    file.write_text(f'<robot name="t"><link name="a"><collision>{geometry}</collision></link></robot>')
+    file.write_text(
+        f'<robot name="t"><link name="a"><collision>{geometry}</collision></link></robot>'
+    )
     with pytest.raises(InputError, match=r"gone\.obj"):
         read_object_urdf(file)
 
 
-def test_what_joints_resist_with(tmp_path: Path) -> None:
+def test_joint_resistance_is_read(tmp_path: Path) -> None:
     text = """<robot name="t"><link name="a"/><link name="b"/><link name="c"/>
     <joint name="j" type="continuous"><parent link="a"/><child link="b"/><dynamics damping="0.4" friction="0.2"/></joint>
     <joint name="k" type="continuous"><parent link="b"/><child link="c"/><dynamics damping="-1"/></joint></robot>"""
@@ -64,7 +69,7 @@ def test_what_joints_resist_with(tmp_path: Path) -> None:
     assert [(joint.damping, joint.friction) for joint in found.values()] == [(0.4, 0.2), (0.0, 0.0)]
 
 
-def test_what_links_weigh(tmp_path: Path) -> None:
+def test_inertia_is_read(tmp_path: Path) -> None:
     placed = '<origin xyz="0.1 0.2 0.3" rpy="0 0 1.5707963267948966"/>'
     whole = f'<inertial>{placed}<mass value="2"/><inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0.01"/></inertial>'
     text = f"""<robot name="t"><link name="a">{whole}</link><link name="b"/>
@@ -72,14 +77,23 @@ def test_what_links_weigh(tmp_path: Path) -> None:
     <link name="d"><inertial><mass value="-1"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
     <link name="e"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="3"/></inertial></link>
     <link name="f"><inertial><mass value="heavy"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
-    """ + "".join(f'<joint name="{c}" type="fixed"><parent link="a"/><child link="{c}"/></joint>' for c in "bcdef")
+    """ + "".join(
+        f'<joint name="{c}" type="fixed"><parent link="a"/><child link="{c}"/></joint>'
+        for c in "bcdef"
+    )
     (tmp_path / "t.urdf").write_text(text + "</robot>")
     found = read_object_urdf(tmp_path / "t.urdf")
     stated = found.links["a"].inertia
     assert (stated.mass, list(stated.lever)) == (2.0, [0.1, 0.2, 0.3])
-    assert np.allclose(stated.inertia, [[0.2, -0.01, 0.0], [-0.01, 0.1, 0.0], [0.0, 0.0, 0.25]])  # along the link's axes
+    assert np.allclose(
+        stated.inertia, [[0.2, -0.01, 0.0], [-0.01, 0.1, 0.0], [0.0, 0.0, 0.25]]
+    )  # along the link's axes
     assert [found.links[name].inertia.mass for name in "bcdef"] == [0.0] * 5
-    said = [next(note for note in found.notes if f"'{name}'" in note) for name in "cdef"]
-    for note, words in zip(said, ("without <inertia>", "a mass below zero", "moments of inertia", "heavy"), strict=True):
+    link_notes = [next(note for note in found.notes if f"'{name}'" in note) for name in "cdef"]
+    for note, words in zip(
+        link_notes,
+        ("without <inertia>", "a negative mass", "moments of inertia", "heavy"),
+        strict=True,
+    ):
         assert words in note
         assert "counts as none" in note

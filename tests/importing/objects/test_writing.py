@@ -9,14 +9,21 @@ import trimesh
 import yaml
 
 import vkc_pin as vkc
-from vkc_pin.files.urdf import read_urdf
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.writing import write_description, write_urdf
+from vkc_pin.world.files.urdf import read_urdf
 
 
 def test_a_capsule_is_a_cylinder_and_two_balls(tmp_path: Path) -> None:
-    part = Part(name="bar", placement=pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0])), kind="capsule", size=(0.02, 0.3))
-    write_urdf(Description(tmp_path / "x", {"a": Link("a", (part,), (part,))}, {}), tmp_path / "thing.urdf")
+    part = Part(
+        name="bar",
+        placement=pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0])),
+        kind="capsule",
+        size=(0.02, 0.3),
+    )
+    write_urdf(
+        Description(tmp_path / "x", {"a": Link("a", (part,), (part,))}, {}), tmp_path / "thing.urdf"
+    )
     write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=())
     shapes = vkc.load_object(tmp_path / "thing.yaml").collision.geometryObjects
     assert [type(shape.geometry).__name__ for shape in shapes] == ["Cylinder", "Sphere", "Sphere"]
@@ -29,7 +36,14 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     parts = (
         Part(name="handle & bar", placement=place, kind="cylinder", size=(0.01, 0.3), colour=red),
         Part(name="", placement=place, kind="box", size=(0.1, 0.2, 0.3)),
-        Part(name="", placement=place, kind="mesh", size=(0.5, 0.5, 0.5), triangles=trimesh.creation.icosphere(), colour=red),
+        Part(
+            name="",
+            placement=place,
+            kind="mesh",
+            size=(0.5, 0.5, 0.5),
+            triangles=trimesh.creation.icosphere(),
+            colour=red,
+        ),
     )
     axis = np.array([0.6, 0.0, 0.8])
     joint = Joint(
@@ -49,7 +63,10 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     write_urdf(Description(tmp_path / "x", links, {"b": joint}), tmp_path / "thing.urdf")
     write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=["One.", "Two."])
     assert (tmp_path / "thing.yaml").read_text().startswith("# One.\n# Two.\nurdf: thing.urdf\n")
-    assert yaml.safe_load((tmp_path / "thing.yaml").read_text()) == {"urdf": "thing.urdf", "attachments": []}
+    assert yaml.safe_load((tmp_path / "thing.yaml").read_text()) == {
+        "urdf": "thing.urdf",
+        "attachments": [],
+    }
     item = vkc.load_object(tmp_path / "thing.yaml")
     assert (item.lower[0], item.upper[0], item.velocity[0]) == (-0.2, 1.1, 0.7)
     assert (item.resistance["hinge"].damping, item.resistance["hinge"].friction) == (0.5, 0.25)
@@ -62,7 +79,11 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert (bar.geometry.radius, bar.geometry.halfLength) == (0.01, 0.15)
     assert 'name="handle &amp; bar"' in (tmp_path / "thing.urdf").read_text()
     ball = item.collision.geometryObjects[3]
-    assert np.allclose(ball.placement.act(np.asarray(ball.geometry.points()).mean(axis=0)), place.translation, atol=1e-3)
+    assert np.allclose(
+        ball.placement.act(np.asarray(ball.geometry.points()).mean(axis=0)),
+        place.translation,
+        atol=1e-3,
+    )
     assert np.allclose(item.visual.geometryObjects[1].meshColor, red)
 
 
@@ -88,7 +109,7 @@ def test_links_whose_names_look_alike_keep_their_own_meshes(
     links = {"case": Link("case"), **{name: Link(name, own, own) for name, own in parts.items()}}
     joints = {
         name: Joint(
-            name=f"{name}_joint",
+            name=f"{name}_format_joint",
             kind="prismatic",
             parent="case",
             child=name,

@@ -7,27 +7,40 @@ from helpers.arm_urdf import write_arms
 from helpers.telescopes import write_telescope
 
 import vkc_pin as vkc
-from vkc_pin.files import resources
-from vkc_pin.files.urdf import UrdfFile, read_urdf
-from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
-from vkc_pin.models.robot_model import full_model
+from vkc_pin.importing.robots.arms import (
+    Arm,
+    build_body_tree,
+    choose_arm,
+    find_arms,
+    find_own_base,
+    find_telescopes,
+    guess_base_kind,
+)
+from vkc_pin.world.files import resources
+from vkc_pin.world.files.urdf import UrdfFile, read_urdf
+from vkc_pin.world.models.robot_model import build_full_model
 
 
 def arms_of(file: UrdfFile) -> list[Arm]:
-    return find_arms(file, bodies(file), {}, {shape.link for shape in file.shapes("collision")})
+    return find_arms(
+        file, build_body_tree(file), {}, {shape.link for shape in file.shapes("collision")}
+    )
 
 
 def test_both_arms_are_found_by_their_hands(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, sides=("left_", "right_")))
     arms = arms_of(file)
     assert sorted(arm.name for arm in arms) == ["left", "right"]
-    left = choose(arms, "Left", file, {})
+    left = choose_arm(arms, "Left", file, {})
     assert left.joints == tuple(f"left_arm_{k}_joint" for k in range(1, 6))
-    assert [finger.name for finger in left.fingers] == ["left_finger_a_joint", "left_finger_b_joint"]
+    assert [finger.name for finger in left.fingers] == [
+        "left_finger_a_joint",
+        "left_finger_b_joint",
+    ]
     assert left.palm.links == ["left_arm_5", "left_hand"]
     assert left.sure == "sure"
     with pytest.raises(vkc.UnknownNameError) as caught:
-        choose(arms, "midle", file, {})
+        choose_arm(arms, "midle", file, {})
     assert set(caught.value.choices) == {"left", "right"}
 
 
@@ -37,12 +50,12 @@ def test_groups_of_an_srdf_name_arms(tmp_path: Path) -> None:
         "port": [f"left_arm_{k}_joint" for k in range(1, 6)],
         "all": [joint for arm in arms_of(file) for joint in arm.joints],
     }
-    named = find_arms(file, bodies(file), groups, {"body"})
+    named = find_arms(file, build_body_tree(file), groups, {"body"})
     assert [arm.name for arm in named if arm.joints[0].startswith("left")] == ["port"]
     groups |= {"port_and_more": ["lift", *groups["port"]], "hand": ["left_finger_a_joint"]}
-    assert choose(named, "port_and_more", file, groups).name == "port"
+    assert choose_arm(named, "port_and_more", file, groups).name == "port"
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'port_and_more'") as caught:
-        choose(named, "port_and_mor", file, groups)
+        choose_arm(named, "port_and_mor", file, groups)
     assert {"port", "all", "port_and_more"} <= set(caught.value.choices)
     assert "hand" not in caught.value.choices, "no arm"
 
@@ -50,10 +63,10 @@ def test_groups_of_an_srdf_name_arms(tmp_path: Path) -> None:
 def test_a_base_of_its_own_is_no_part_of_the_arm(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, own_base=True))
     solid = {shape.link for shape in file.shapes("collision")}
-    assert own_base(bodies(file), solid) == ("drive_x", "drive_y", "drive_yaw")
+    assert find_own_base(build_body_tree(file), solid) == ("drive_x", "drive_y", "drive_yaw")
     assert arms_of(file)[0].joints[0] == "arm_1_joint"
     plain = read_urdf(write_arms(tmp_path))
-    assert own_base(bodies(plain), solid) == ()
+    assert find_own_base(build_body_tree(plain), solid) == ()
 
 
 def robots(pattern: str) -> Path:
@@ -80,19 +93,20 @@ def test_arms_of_robots_that_others_described(pattern: str, joints: int, fingers
 
 
 @pytest.mark.parametrize(
-    "pattern", ["**/solo12.urdf", "**/go1.urdf", "**/anymal_b*/**/anymal.urdf", "**/allegro_right_hand.urdf"]
+    "pattern",
+    ["**/solo12.urdf", "**/go1.urdf", "**/anymal_b*/**/anymal.urdf", "**/allegro_right_hand.urdf"],
 )
 def test_legs_and_hands_alone_are_no_arms(pattern: str) -> None:
     file = read_urdf(robots(pattern))
     assert arms_of(file) == []
     with pytest.raises(vkc.InputError, match="no arm was found"):
-        choose([], None, file, {})
+        choose_arm([], None, file, {})
 
 
 def test_wheels_say_how_the_base_moves(tmp_path: Path) -> None:
-    assert base_kind(read_urdf(robots("**/tiago.urdf")).root)[0] == "differential"
-    assert base_kind(read_urdf(robots("**/pr2.urdf")).root)[0] == "omni"
-    assert base_kind(read_urdf(write_arms(tmp_path)).root)[0] == "omni"
+    assert guess_base_kind(read_urdf(robots("**/tiago.urdf")).root)[0] == "differential"
+    assert guess_base_kind(read_urdf(robots("**/pr2.urdf")).root)[0] == "omni"
+    assert guess_base_kind(read_urdf(write_arms(tmp_path)).root)[0] == "omni"
 
 
 @pytest.mark.parametrize(
@@ -100,11 +114,18 @@ def test_wheels_say_how_the_base_moves(tmp_path: Path) -> None:
     [
         ({}, [("out_1", "out_2", "out_3", "out_4")]),
         ({'name="out_3" type="prismatic"': 'name="out_3" type="revolute"'}, [("out_1", "out_2")]),
-        ({'<child link="segment_3"/><axis xyz="1 0 0"/>': '<child link="segment_3"/><axis xyz="-1 0 0"/>'}, [("out_1", "out_2")]),
+        (
+            {
+                '<child link="segment_3"/><axis xyz="1 0 0"/>': '<child link="segment_3"/><axis xyz="-1 0 0"/>'
+            },
+            [("out_1", "out_2")],
+        ),
         ({'upper="0.15"': 'upper="0.16"'}, [("out_2", "out_3", "out_4")]),
     ],
 )
-def test_segments_of_a_telescope(tmp_path: Path, changed: dict[str, str], groups: list[tuple[str, ...]]) -> None:
+def test_segments_of_a_telescope(
+    tmp_path: Path, changed: dict[str, str], groups: list[tuple[str, ...]]
+) -> None:
     """They slide alike, one on the other, and equally far; the lift before them slides elsewhere."""
     file = write_telescope(tmp_path).parent / "robot.urdf"
     text = file.read_text()
@@ -112,4 +133,4 @@ def test_segments_of_a_telescope(tmp_path: Path, changed: dict[str, str], groups
         text = text.replace(old, new, 1)
     urdf = read_urdf(file, text=text)
     names = ("lift", "out_1", "out_2", "out_3", "out_4", "yaw_joint", "pitch_joint", "roll_joint")
-    assert telescopes(full_model(urdf), names) == groups
+    assert find_telescopes(build_full_model(urdf), names) == groups

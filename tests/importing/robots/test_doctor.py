@@ -10,24 +10,32 @@ import vkc_pin as vkc
 from vkc_pin.importing.robots.doctor import Diagnosis
 
 
-def said(diagnosis: Diagnosis, level: str, topic: str) -> list[str]:
-    return [finding.text for finding in diagnosis.findings if (finding.level, finding.topic) == (level, topic)]
+def find_texts(diagnosis: Diagnosis, level: str, topic: str) -> list[str]:
+    return [
+        finding.text
+        for finding in diagnosis.findings
+        if (finding.level, finding.topic) == (level, topic)
+    ]
 
 
 def test_the_robot_that_comes_along_is_healthy() -> None:
     found = vkc.doctor("husky_ur5e", samples=40)
     assert found.healthy
-    assert said(found, "note", "home")[0].startswith("free")
+    assert find_texts(found, "note", "home")[0].startswith("free")
 
 
 def test_home_in_collision_and_below_the_floor(tmp_path: Path) -> None:
     file = write_arms(tmp_path / "robot")
     home = {"arm_2_joint": 1.9, "arm_3_joint": 1.9}
-    (tmp_path / "robot" / "robot.yaml").write_text(json.dumps({"urdf": file.name, "home": home}), encoding="utf-8")
+    (tmp_path / "robot" / "robot.yaml").write_text(
+        json.dumps({"urdf": file.name, "home": home}), encoding="utf-8"
+    )
     found = vkc.doctor(tmp_path / "robot", samples=20)
     assert not found.healthy
-    assert "below the floor" in " ".join(said(found, "fault", "home"))
-    assert "links that overlap at home are not kept apart" in " ".join(said(found, "warning", "loading"))
+    assert "below the floor" in " ".join(find_texts(found, "fault", "home"))
+    assert "links that overlap at home are not kept apart" in " ".join(
+        find_texts(found, "warning", "loading")
+    )
     assert str(found).startswith("robot: ")
     assert "fault" in str(found).splitlines()[1]
 
@@ -36,25 +44,35 @@ def test_pairs_that_nothing_brings_apart(tmp_path: Path) -> None:
     """The first link turns about the vertical, 30 mm above the body."""
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
     found = vkc.doctor(robot, samples=60, margin=0.035)
-    assert any("body and arm_1 were never more than 30.0 mm" in text for text in said(found, "fault", "pairs"))
+    assert any(
+        "body and arm_1 were never more than 30.0 mm" in text
+        for text in find_texts(found, "fault", "pairs")
+    )
     fewer = vkc.doctor(robot, samples=60, margin=1e-3)
-    assert len(said(fewer, "fault", "pairs")) < len(said(found, "fault", "pairs"))
+    assert len(find_texts(fewer, "fault", "pairs")) < len(find_texts(found, "fault", "pairs"))
 
 
-def test_numbers_that_no_file_names(tmp_path: Path) -> None:
+def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8").replace('effort="10" velocity="1.5"', 'effort="0" velocity="0"', 3)
+    text = path.read_text(encoding="utf-8").replace(
+        'effort="10" velocity="1.5"', 'effort="0" velocity="0"', 3
+    )
     path.write_text(text, encoding="utf-8")
     found = vkc.doctor(path, samples=5)
-    assert "arm_1_joint, arm_2_joint, arm_3_joint (taken: 3.14, 3.14, 3.14)" in said(found, "warning", "limits")[0]
-    assert "arm_1_joint" in said(found, "note", "effort")[0]
-    assert "arm_4_joint" not in said(found, "note", "effort")[0]
-    assert "body" in said(found, "note", "mass")[0]
+    assert (
+        "arm_1_joint, arm_2_joint, arm_3_joint (assumed: 3.14, 3.14, 3.14)"
+        in find_texts(found, "warning", "limits")[0]
+    )
+    assert "arm_1_joint" in find_texts(found, "note", "effort")[0]
+    assert "arm_4_joint" not in find_texts(found, "note", "effort")[0]
+    assert "body" in find_texts(found, "note", "mass")[0]
 
 
-def test_hands_that_look_the_wrong_way(tmp_path: Path) -> None:
+def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    assert said(vkc.doctor(path, samples=5), "warning", "hand") == ["no link may touch what is grasped"]
+    assert find_texts(vkc.doctor(path, samples=5), "warning", "hand") == [
+        "no link may touch what is grasped"
+    ]
     text = path.read_text(encoding="utf-8").replace(
         "</robot>",
         '<link name="back"/><joint name="back_joint" type="fixed"><origin xyz="0 0 -0.1"/><parent link="hand"/>'
@@ -63,37 +81,53 @@ def test_hands_that_look_the_wrong_way(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     settings = "urdf: robot.urdf\ntool_frame: back\ntouch_links: [hand, finger_a, finger_b]\n"
     (tmp_path / "robot.yaml").write_text(settings, encoding="utf-8")
-    assert "in front of its tool frame back" in said(vkc.doctor(tmp_path, samples=5), "fault", "hand")[0]
+    assert (
+        "in front of its tool frame back"
+        in find_texts(vkc.doctor(tmp_path, samples=5), "fault", "hand")[0]
+    )
 
 
-def test_what_robot_yaml_says_is_known(tmp_path: Path) -> None:
+def test_values_of_robot_yaml_are_respected(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8").replace('effort="10" velocity="1.5"', 'effort="0" velocity="0"', 2)
+    text = path.read_text(encoding="utf-8").replace(
+        'effort="10" velocity="1.5"', 'effort="0" velocity="0"', 2
+    )
     path.write_text(text, encoding="utf-8")
     named = {"urdf": path.name, "joints": {"arm_1_joint": {"velocity": 2.0, "effort": 30.0}}}
     (tmp_path / "robot.yaml").write_text(json.dumps(named), encoding="utf-8")
     found = vkc.doctor(tmp_path, samples=5)
-    assert "no speed in the file: arm_2_joint (taken: 3.14)" in said(found, "warning", "limits")
-    assert "no effort: arm_2_joint (their torques are not limited)" in said(found, "note", "effort")
+    assert "no velocity limit in the file: arm_2_joint (assumed: 3.14)" in find_texts(
+        found, "warning", "limits"
+    )
+    assert "no effort limit: arm_2_joint (their torques are not limited)" in find_texts(
+        found, "note", "effort"
+    )
 
 
-def test_a_hand_without_room(tmp_path: Path) -> None:
-    """Fingers that are shut, 0 apart, take hold of nothing; open they do."""
+def test_closed_hand_is_reported(tmp_path: Path) -> None:
+    """A hand whose fingers are closed cannot grasp; an open one can."""
     path = write_arms(tmp_path)
-    for where, told in ((0.0, 1), (0.03, 0)):
+    for where, count in ((0.0, 1), (0.03, 0)):
         named = {"urdf": path.name, "tool_frame": "hand", "touch_links": ["finger_a", "finger_b"]}
         tool = path.read_text(encoding="utf-8")
         if "tool" not in tool:
             joint = '<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="hand"/><child link="tool"/>'
             joint += '<origin xyz="0 0 0.125" rpy="0 0 1.5707963267948966"/></joint></robot>'
             path.write_text(tool.replace("</robot>", joint), encoding="utf-8")
-        named |= {"tool_frame": "tool", "locked_joints": {"finger_a_joint": where, "finger_b_joint": where}}
+        named |= {
+            "tool_frame": "tool",
+            "locked_joints": {"finger_a_joint": where, "finger_b_joint": where},
+        }
         (tmp_path / "robot.yaml").write_text(json.dumps(named), encoding="utf-8")
-        lines = [text for text in said(vkc.doctor(tmp_path, samples=5), "warning", "hand") if "no room" in text]
-        assert len(lines) == told
+        lines = [
+            text
+            for text in find_texts(vkc.doctor(tmp_path, samples=5), "warning", "hand")
+            if "no room" in text
+        ]
+        assert len(lines) == count
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_invalid_argument_is_named() -> None:
     for wrong in ({"samples": 0}, {"margin": -1.0}):
         with pytest.raises(vkc.InputError) as refused:
             vkc.doctor("husky_ur5e", **wrong)  # type: ignore[arg-type]

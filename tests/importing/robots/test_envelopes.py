@@ -7,7 +7,7 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.envelopes import envelopes, leave_out
+from vkc_pin.importing.robots.envelopes import find_envelopes, remove_collision_shapes
 
 
 def caged(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> Path:
@@ -17,7 +17,9 @@ def caged(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> P
     shape = f"<geometry><box size='{size}'/></geometry>"
     cage = f"<link name='cage'><collision>{shape}</collision>{f'<visual>{shape}</visual>' if visual else ''}</link>"
     joint = "<joint name='caging' type='fixed'><parent link='hand'/><child link='cage'/><origin xyz='0 0 0.1'/></joint>"
-    text = file.read_text(encoding="utf-8").replace('<link name="hand">', f'<link name="hand">{seen}')
+    text = file.read_text(encoding="utf-8").replace(
+        '<link name="hand">', f'<link name="hand">{seen}'
+    )
     file.write_text(text.replace("</robot>", f"{cage}{joint}</robot>"), encoding="utf-8")
     return file
 
@@ -25,15 +27,17 @@ def caged(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> P
 def test_a_box_around_the_hand(tmp_path: Path) -> None:
     """Of hand and fingers it has everything; of the arm's last link, which it turns with, a part."""
     robot = vkc.load_robot(caged(tmp_path), pairs="all", tool_frame="hand")
-    found = envelopes(robot)
+    found = find_envelopes(robot)
     assert list(found) == ["cage"]
     assert 0.75 <= found["cage"] < 1.0
 
 
-@pytest.mark.parametrize("given", [{"size": "0.02 0.02 0.02"}, {"visual": True}], ids=["small", "seen"])
+@pytest.mark.parametrize(
+    "given", [{"size": "0.02 0.02 0.02"}, {"visual": True}], ids=["small", "seen"]
+)
 def test_shapes_that_belong_to_the_hand(tmp_path: Path, given: dict[str, object]) -> None:
     robot = vkc.load_robot(caged(tmp_path, **given), pairs="all", tool_frame="hand")  # type: ignore[arg-type]
-    assert envelopes(robot) == {}
+    assert find_envelopes(robot) == {}
 
 
 def test_a_robot_of_which_nothing_is_seen_has_none(tmp_path: Path) -> None:
@@ -43,12 +47,12 @@ def test_a_robot_of_which_nothing_is_seen_has_none(tmp_path: Path) -> None:
         for visual in link.findall("visual"):
             link.remove(visual)
     file.write_bytes(ElementTree.tostring(root))
-    assert envelopes(vkc.load_robot(file, pairs="all", tool_frame="hand")) == {}
+    assert find_envelopes(vkc.load_robot(file, pairs="all", tool_frame="hand")) == {}
 
 
 def test_only_what_collides_is_left_out(tmp_path: Path) -> None:
     root = ElementTree.fromstring(caged(tmp_path, visual=True).read_text(encoding="utf-8"))
-    leave_out(root, ["cage"])
+    remove_collision_shapes(root, ["cage"])
     cage = next(link for link in root.iter("link") if link.get("name") == "cage")
     assert [child.tag for child in cage] == ["visual"]
     assert len(root.findall("link/collision")) == 9
@@ -60,7 +64,7 @@ def test_importing_leaves_it_out_and_the_doctor_finds_it(tmp_path: Path) -> None
     assert "cage" not in imported.robot.links
     assert "cage" not in imported.robot.touch_links
     assert {"hand", "finger_a", "finger_b"} <= set(imported.robot.touch_links)
-    assert "cage is a shape around the hand" in str(imported)
+    assert "cage encloses" in str(imported)
     found = vkc.doctor(vkc.load_robot(file, tool_frame="hand"), samples=5)
-    assert "cage is a shape around the hand" in str(found)
+    assert "cage encloses" in str(found)
     assert "cage" not in str(vkc.doctor(imported.robot, samples=5))

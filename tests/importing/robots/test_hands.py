@@ -6,22 +6,26 @@ import numpy as np
 import pytest
 from helpers.arm_urdf import write_arms
 
-from vkc_pin.files.urdf import read_urdf
-from vkc_pin.importing.robots.arms import Arm, bodies, find_arms
-from vkc_pin.importing.robots.hands import look_at
-from vkc_pin.models.robot_model import full_model
+from vkc_pin.importing.robots.arms import Arm, build_body_tree, find_arms
+from vkc_pin.importing.robots.hands import analyze_hand
+from vkc_pin.world.files.urdf import read_urdf
+from vkc_pin.world.models.robot_model import build_full_model
 
 
 def found(path: Path) -> tuple[Arm, object]:
     file = read_urdf(path)
-    arm = find_arms(file, bodies(file), {}, {shape.link for shape in file.shapes("collision")})[0]
-    return arm, look_at(file, full_model(file), arm)
+    arm = find_arms(
+        file, build_body_tree(file), {}, {shape.link for shape in file.shapes("collision")}
+    )[0]
+    return arm, analyze_hand(file, build_full_model(file), arm)
 
 
 def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
     _, hand = found(write_arms(tmp_path))
     assert hand.link == "arm_5"
-    np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9)  # approach: where fingers point
+    np.testing.assert_allclose(
+        hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9
+    )  # approach: where fingers point
     np.testing.assert_allclose(np.abs(hand.tool.rotation[:, 0]), [0, 1, 0], atol=1e-9)  # closing
     assert np.linalg.det(hand.tool.rotation) == pytest.approx(1.0)
     np.testing.assert_allclose(hand.tool.translation[:2], 0.0, atol=2e-3)
@@ -38,7 +42,10 @@ def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
 def test_one_jaw_opens_from_the_hand(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8")
-    still = text.replace('<joint name="finger_b_joint" type="prismatic">', '<joint name="finger_b_joint" type="fixed">')
+    still = text.replace(
+        '<joint name="finger_b_joint" type="prismatic">',
+        '<joint name="finger_b_joint" type="fixed">',
+    )
     path.write_text(still, encoding="utf-8")
     arm, hand = found(path)
     assert [finger.name for finger in arm.fingers] == ["finger_a_joint"]
@@ -56,4 +63,6 @@ def test_a_flange_points_along_its_last_axis(tmp_path: Path) -> None:
     assert hand.open == {}
     assert hand.settings() == {}
     np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=0.2)
-    assert hand.tool.translation[2] == pytest.approx(0.2 + 0.14, abs=0.01)  # in front of all that is there
+    assert hand.tool.translation[2] == pytest.approx(
+        0.2 + 0.14, abs=0.01
+    )  # in front of all that is there

@@ -9,10 +9,10 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.files.kinematic_tree import check_tree
-from vkc_pin.files.meshes import load_mesh
-from vkc_pin.importing.robots.mjcf import convert
-from vkc_pin.models.robot_model import configuration
+from vkc_pin.importing.robots.mjcf import convert_mjcf
+from vkc_pin.world.files.kinematic_tree import check_tree
+from vkc_pin.world.files.meshes import load_mesh
+from vkc_pin.world.models.robot_model import make_configuration
 
 ARM = """
 <mujoco model="arm"><compiler angle="degree"/>
@@ -50,7 +50,7 @@ def file(tmp_path: Path) -> Path:
 
 def test_links_are_where_mujoco_has_the_bodies(file: Path, tmp_path: Path) -> None:
     """Several joints of a body, anchors away from its origin, references: at random positions."""
-    root = convert(file, tmp_path / "meshes").root
+    root = convert_mjcf(file, tmp_path / "meshes").root
     for limit in root.iter("limit"):  # Pinocchio insists on them
         limit.attrib.update(effort="1", velocity="1")
     model = pin.buildModelFromXML(ElementTree.tostring(root, encoding="unicode"))
@@ -61,7 +61,7 @@ def test_links_are_where_mujoco_has_the_bodies(file: Path, tmp_path: Path) -> No
         mujoco.mj_kinematics(theirs, state)
         moved = state.qpos - theirs.qpos0
         positions = {theirs.joint(j).name: moved[theirs.jnt_qposadr[j]] for j in range(theirs.njnt)}
-        pin.framesForwardKinematics(model, data, configuration(model, positions))
+        pin.framesForwardKinematics(model, data, make_configuration(model, positions))
         for name in ("foot", "upper", "fore", "tip"):
             place = data.oMf[model.getFrameId(name, pin.FrameType.BODY)]
             np.testing.assert_allclose(place.translation, state.body(name).xpos, atol=1e-7)
@@ -69,7 +69,7 @@ def test_links_are_where_mujoco_has_the_bodies(file: Path, tmp_path: Path) -> No
 
 
 def test_limits_shapes_couplings_and_states_are_kept(file: Path, tmp_path: Path) -> None:
-    made = convert(file, tmp_path / "meshes")
+    made = convert_mjcf(file, tmp_path / "meshes")
     joints = {joint.get("name"): joint for joint in made.root.findall("joint")}
 
     def limit(name: str, key: str) -> float:
@@ -89,7 +89,9 @@ def test_limits_shapes_couplings_and_states_are_kept(file: Path, tmp_path: Path)
     assert len(fore.findall("visual")) == 1
     masses = sum(float(element.get("value", "0")) for element in made.root.iter("mass"))
     theirs = mujoco.MjModel.from_xml_path(str(file))
-    assert masses == pytest.approx(theirs.body_mass[theirs.body_rootid == theirs.body("foot").id].sum(), rel=1e-6)
+    assert masses == pytest.approx(
+        theirs.body_mass[theirs.body_rootid == theirs.body("foot").id].sum(), rel=1e-6
+    )
     assert any("table" in note for note in made.notes)
 
 
@@ -98,20 +100,26 @@ def test_what_mujoco_does_not_take_is_named(tmp_path: Path) -> None:
         (
             "wrong.xml",
             "<mujoco><worldbody><body><joint type='hinge' axis='0 0 0'/></body></worldbody></mujoco>",
-            "MuJoCo does not",
+            "MuJoCo cannot",
         ),
-        ("still.xml", "<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>", "nothing moves here"),
+        (
+            "still.xml",
+            "<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>",
+            "the file has no joints",
+        ),
     ):
         path = tmp_path / name
         path.write_text(text, encoding="utf-8")
         with pytest.raises(vkc.InputError, match=said) as caught:
-            convert(path, tmp_path)
+            convert_mjcf(path, tmp_path)
         assert caught.value.file == path
 
 
 def coupled(*equalities: str) -> str:
     """Return an MJCF of three sliding joints one on the other, with couplings."""
-    joints = "".join(f'<body><joint name="j{k}" type="slide" range="0 1"/><geom size="0.01"/>' for k in range(3))
+    joints = "".join(
+        f'<body><joint name="j{k}" type="slide" range="0 1"/><geom size="0.01"/>' for k in range(3)
+    )
     return f"<mujoco><worldbody>{joints}{'</body>' * 3}</worldbody><equality>{''.join(equalities)}</equality></mujoco>"
 
 
@@ -123,18 +131,34 @@ def same(one: str, other: str, more: str = "") -> str:
     ("equalities", "follows", "noted"),
     [
         ((same("j1", "j0"), same("j2", "j1")), {"j1": "j0", "j2": "j1"}, ""),
-        ((same("j0", "j1"), same("j0", "j2")), {"j0": "j1", "j2": "j0"}, ""),  # of j0 both: the other way round
-        ((same("j0", "j1"), same("j1", "j0")), {"j0": "j1"}, "j1 follows j0; another coupling of it is left out"),
-        ((same("j1", "j0", 'polycoef="0 1 0.5 0 0"'),), {"j1": "j0"}, "j1 follows j0 along a curve"),
+        (
+            (same("j0", "j1"), same("j0", "j2")),
+            {"j0": "j1", "j2": "j0"},
+            "",
+        ),  # of j0 both: the other way round
+        (
+            (same("j0", "j1"), same("j1", "j0")),
+            {"j0": "j1"},
+            "j1 follows j0; another coupling of it is left out",
+        ),
+        (
+            (same("j1", "j0", 'polycoef="0 1 0.5 0 0"'),),
+            {"j1": "j0"},
+            "j1 follows j0 by a nonlinear function",
+        ),
         ((same("j1", "j0", 'active="false"'),), {}, ""),
     ],
 )
-def test_couplings_become_a_tree(tmp_path: Path, equalities: tuple[str, ...], follows: dict[str, str], noted: str) -> None:
+def test_couplings_become_a_tree(
+    tmp_path: Path, equalities: tuple[str, ...], follows: dict[str, str], noted: str
+) -> None:
     path = tmp_path / "arm.xml"
     path.write_text(coupled(*equalities))
-    made = convert(path, tmp_path / "meshes")
+    made = convert_mjcf(path, tmp_path / "meshes")
     said = {joint.get("name"): joint.find("mimic") for joint in made.root.findall("joint")}
-    assert {name: mimic.get("joint") for name, mimic in said.items() if mimic is not None} == follows
+    assert {
+        name: mimic.get("joint") for name, mimic in said.items() if mimic is not None
+    } == follows
     assert any(noted in note for note in made.notes) == bool(noted)
 
 
@@ -142,7 +166,10 @@ def test_a_coupling_the_other_way_round_has_its_inverse(tmp_path: Path) -> None:
     """j0 = 0.1 + 2·j2 is j2 = -0.05 + 0.5·j0."""
     path = tmp_path / "arm.xml"
     path.write_text(coupled(same("j0", "j1"), same("j0", "j2", 'polycoef="0.1 2 0 0 0"')))
-    joints = {joint.get("name"): joint for joint in convert(path, tmp_path / "meshes").root.findall("joint")}
+    joints = {
+        joint.get("name"): joint
+        for joint in convert_mjcf(path, tmp_path / "meshes").root.findall("joint")
+    }
     mimic = joints["j2"].find("mimic")
     assert mimic is not None
     assert mimic.attrib == {"joint": "j0", "multiplier": "0.5", "offset": "-0.05"}
@@ -165,7 +192,7 @@ def test_names_that_look_alike_become_different_links_and_joints(tmp_path: Path)
         '<mujoco><worldbody><body name="base"><geom size="0.2"/>'
         f"{bodies}</body></worldbody></mujoco>"
     )
-    root = convert(path, tmp_path / "meshes").root
+    root = convert_mjcf(path, tmp_path / "meshes").root
     check_tree(path, root)
     radii = {
         link.get("name"): [
@@ -215,7 +242,7 @@ def test_meshes_whose_names_look_alike_keep_their_own_files(tmp_path: Path) -> N
         f"<mujoco><asset>{meshes}</asset><worldbody><body><joint range='-1 1'/>{geoms}"
         "</body></worldbody></mujoco>"
     )
-    root = convert(path, tmp_path / "meshes").root
+    root = convert_mjcf(path, tmp_path / "meshes").root
     files = [
         Path(mesh.get("filename", "")) for mesh in root.findall("link/collision/geometry/mesh")
     ]

@@ -12,8 +12,8 @@ from helpers.arm_urdf import HEIGHT, write_arms
 from helpers.telescopes import FOLLOWERS, write_telescope
 
 import vkc_pin as vkc
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.importing.robots.homes import HOME_ROOM, Clearances
+from vkc_pin.importing.robots.rest_configuration import HOME_ROOM, Clearances
+from vkc_pin.world.files.writing import write_atomically
 
 SAMPLES = 150
 
@@ -23,8 +23,13 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedRobot:
     """Two arms on a base of their own, 0.35 m up, the base an open bin; imported without anything written by hand."""
     folder = tmp_path_factory.mktemp("imported")
     walls = [trimesh.creation.box((0.5, 0.4, 0.05)).apply_translation((0, 0, -0.325))]
-    walls += [trimesh.creation.box((0.02, 0.4, 0.4)).apply_translation((x, 0, -0.099)) for x in (-0.24, 0.24)]
-    write_atomically(folder / "given" / "bin.stl", trimesh.util.concatenate(walls).export(file_type="stl"))
+    walls += [
+        trimesh.creation.box((0.02, 0.4, 0.4)).apply_translation((x, 0, -0.099))
+        for x in (-0.24, 0.24)
+    ]
+    write_atomically(
+        folder / "given" / "bin.stl", trimesh.util.concatenate(walls).export(file_type="stl")
+    )
     file = write_arms(folder / "given", sides=("left_", "right_"), own_base=True, mesh="bin.stl")
     return vkc.import_robot(file, folder / "mine", arm="right", samples=SAMPLES)
 
@@ -36,14 +41,24 @@ def test_the_folder_is_whole(imported: vkc.ImportedRobot) -> None:
     assert again.name == "mine"
     assert again.coordinates.names[3:] == tuple(f"right_arm_{k}_joint" for k in range(1, 6))
     assert again.tool_frame == "tool"
-    assert set(again.touch_links) == {"right_arm_5", "right_hand", "right_finger_a", "right_finger_b"}
+    assert set(again.touch_links) == {
+        "right_arm_5",
+        "right_hand",
+        "right_finger_a",
+        "right_finger_b",
+    }
     np.testing.assert_array_equal(again.home, imported.robot.home)
 
 
 def test_what_was_guessed_is_told(imported: vkc.ImportedRobot) -> None:
     assert imported.arms == ("right", "left")
     said = str(imported)
-    for part in ("drive_x, drive_y, drive_yaw are locked", "arm: right, 5 joints", "open from 0 to 80 mm", "bin.stl in 3 pieces"):
+    for part in (
+        "drive_x, drive_y, drive_yaw are locked",
+        "arm: right, 5 joints",
+        "open from 0 to 80 mm",
+        "bin.stl in 3 pieces",
+    ):
         assert part in said, said
     assert imported.diagnosis.healthy
 
@@ -58,14 +73,19 @@ def test_the_base_is_hollow_and_stands_on_the_floor(imported: vkc.ImportedRobot)
     look.place(imported.robot.home)
     assert look.floor(moved=False)[0][1] == pytest.approx(0.0, abs=1e-5)
     robot = imported.robot.model
-    assert robot.frames[robot.getFrameId("body")].placement.translation[2] == pytest.approx(HEIGHT, abs=1e-5)
+    assert robot.frames[robot.getFrameId("body")].placement.translation[2] == pytest.approx(
+        HEIGHT, abs=1e-5
+    )
 
 
 def test_the_gripper_opens_and_other_hands_stand_still(imported: vkc.ImportedRobot) -> None:
-    gripper, said = imported.robot.gripper, yaml.safe_load((imported.folder / "robot.yaml").read_text(encoding="utf-8"))
+    gripper, said = (
+        imported.robot.gripper,
+        yaml.safe_load((imported.folder / "robot.yaml").read_text(encoding="utf-8")),
+    )
     assert gripper is not None
     assert gripper.names == ("right_finger_a_joint", "right_finger_b_joint")
-    assert (gripper.narrowest, gripper.widest) == (0.0, pytest.approx(0.08, abs=2e-4))
+    assert (gripper.min_opening, gripper.max_opening) == (0.0, pytest.approx(0.08, abs=2e-4))
     assert not set(said["locked_joints"]) & set(said["gripper"])
 
 
@@ -74,13 +94,16 @@ def test_a_gripper_that_does_not_open_as_guessed_is_locked_and_told(tmp_path: Pa
     file = write_arms(tmp_path / "given")
     bar = '<link name="bar"><collision><geometry><box size="0.02 0.02 0.09"/></geometry></collision></link>'
     joint = '<joint name="bar_joint" type="fixed"><parent link="hand"/><child link="bar"/><origin xyz="0 0 0.1"/></joint>'
-    file.write_text(file.read_text(encoding="utf-8").replace("</robot>", bar + joint + "</robot>"), encoding="utf-8")
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("</robot>", bar + joint + "</robot>"),
+        encoding="utf-8",
+    )
     made = vkc.import_robot(file, tmp_path / "mine", samples=SAMPLES)
     said = (made.folder / "robot.yaml").read_text(encoding="utf-8")
     assert made.robot.gripper is None
     assert "gripper" not in said
     assert "finger_a_joint: 0.04" in said
-    assert "the fingers stand still: the gripper does not open" in str(made)
+    assert "the fingers are locked: the gripper does not open" in str(made)
 
 
 def test_home_has_room(imported: vkc.ImportedRobot) -> None:
@@ -92,16 +115,24 @@ def test_home_has_room(imported: vkc.ImportedRobot) -> None:
 
 def test_reachable_poses_are_planned(imported: vkc.ImportedRobot, tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
-    scene.write_text(f"robot: {imported.folder / 'robot.yaml'}\nstart: {{base: [0, 0, 0]}}\n", encoding="utf-8")
+    scene.write_text(
+        f"robot: {imported.folder / 'robot.yaml'}\nstart: {{base: [0, 0, 0]}}\n", encoding="utf-8"
+    )
     loaded = vkc.load_scene(scene)
     robot, rng = loaded.robot, np.random.default_rng(4)
-    look, data, frame = Clearances(robot), robot.model.createData(), robot.model.getFrameId(robot.tool_frame)
+    look, data, frame = (
+        Clearances(robot),
+        robot.model.createData(),
+        robot.model.getFrameId(robot.tool_frame),
+    )
     goals = []
     while len(goals) < 2:
         arm = rng.uniform(robot.lower[3:], robot.upper[3:])
         look.place(arm)
         if look.least() > HOME_ROOM:
-            pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(np.concatenate([[1.0, 0.5, 2.0], arm])))
+            pin.framesForwardKinematics(
+                robot.model, data, robot.coordinates.q(np.concatenate([[1.0, 0.5, 2.0], arm]))
+            )
             goals.append(data.oMf[frame].copy())
     for goal in goals:
         plan = vkc.plan(loaded, [vkc.Reach(goal)])
@@ -121,14 +152,20 @@ def test_home_keeps_apart_what_overlaps_at_zero(tmp_path: Path) -> None:
     plain = vkc.load_robot(file, pairs="all")
     look = Clearances(plain)
     look.place(np.zeros(5))
-    assert ("arm_4", "body") in {tuple(sorted(pair[:2])) for pair in look.links(0.0)}, "the test's own premise"
+    assert ("arm_4", "body") in {tuple(sorted(pair[:2])) for pair in look.links(0.0)}, (
+        "the test's own premise"
+    )
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # "links that overlap at home are not kept apart", and names of folders that are gone
+        warnings.simplefilter(
+            "error"
+        )  # "links that overlap at home are not checked", and names of folders that are gone
         imported = vkc.import_robot(file, tmp_path / "mine", samples=SAMPLES)
     look = Clearances(imported.robot)
     look.place(imported.robot.home)
     assert look.least() >= HOME_ROOM
-    kept_apart = {tuple(sorted((imported.robot.link_of(a), imported.robot.link_of(b)))) for a, b in look.pairs}
+    kept_apart = {
+        tuple(sorted((imported.robot.link_of(a), imported.robot.link_of(b)))) for a, b in look.pairs
+    }
     assert ("arm_4", "body") in kept_apart
 
 
@@ -142,13 +179,15 @@ def test_warnings_name_files_that_are_there_to_stay(tmp_path: Path) -> None:
     assert named == {str(imported.folder.resolve() / "mine.urdf")}
 
 
-def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(tmp_path: Path) -> None:
+def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(
+    tmp_path: Path,
+) -> None:
     file = write_arms(tmp_path / "given")
     target = tmp_path / "mine"
     target.mkdir()
     (target / "notes.txt").write_text("dear", encoding="utf-8")
     for force in (False, True):
-        with pytest.raises(vkc.InputError, match="something already"):
+        with pytest.raises(vkc.InputError, match="already exists"):
             vkc.import_robot(file, target, force=force)
     assert [path.name for path in target.iterdir()] == ["notes.txt"]
     (target / "notes.txt").unlink()
@@ -160,7 +199,10 @@ def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(tm
         vkc.import_robot(file, target, samples=SAMPLES, force=True)
     (target / "notes.txt").rename(tmp_path / "notes.txt")
     (target / "mine.urdf").write_text("changed by hand", encoding="utf-8")
-    with pytest.raises(vkc.UnknownNameError, match=r"given/robot\.urdf: tool_frame: .*did you mean 'right_hand'|'hand'"):
+    with pytest.raises(
+        vkc.UnknownNameError,
+        match=r"given/robot\.urdf: tool_frame: .*did you mean 'right_hand'|'hand'",
+    ):
         vkc.import_robot(file, target, tool_frame="hnd", force=True)
     with pytest.raises(vkc.UnknownNameError):
         vkc.import_robot(file, target, arm="third", force=True)
@@ -177,7 +219,7 @@ def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(tm
     ("text", "said"),
     [
         ("<sdf/>", r"expected <robot> \(URDF or xacro\) or <mujoco> \(MJCF\), got <sdf>"),
-        ("<robot name='x'><link name='a'/></robot>", "this robot has no shapes"),
+        ("<robot name='x'><link name='a'/></robot>", "the robot has no shapes"),
         ("not xml", "not valid XML"),
     ],
 )
@@ -192,12 +234,21 @@ def test_what_is_no_robot_is_named(tmp_path: Path, text: str, said: str) -> None
 def test_a_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
     """Where the file does not say so, with what to do if it is none; where it does, nothing is proposed."""
     for mimics, told in (("", True), ("first", False), ("chain", False)):
-        file = write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics).parent / "robot.urdf"
+        file = (
+            write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics).parent
+            / "robot.urdf"
+        )
         made = vkc.import_robot(file, tmp_path / f"mine{mimics}", samples=SAMPLES)
-        assert made.robot.coordinates.names[3:] == ("lift", "out_1", "yaw_joint", "pitch_joint", "roll_joint")
+        assert made.robot.coordinates.names[3:] == (
+            "lift",
+            "out_1",
+            "yaw_joint",
+            "pitch_joint",
+            "roll_joint",
+        )
         said = yaml.safe_load((made.folder / "robot.yaml").read_text())
         assert said.get("couplings", {}) == (FOLLOWERS if told else {})
-        assert ("out_2, out_3, out_4 slide along with out_1, as a telescope" in str(made)) == told
+        assert ("out_2, out_3, out_4 follow out_1 as a telescope" in str(made)) == told
         assert set(said["home"]) == {*made.robot.coordinates.names[3:]}
 
 

@@ -6,8 +6,8 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.files import resources
 from vkc_pin.importing.robots.sources import Source, read_source
+from vkc_pin.world.files import resources
 
 
 def read(file: Path, scratch: Path) -> Source:
@@ -17,11 +17,13 @@ def read(file: Path, scratch: Path) -> Source:
 def test_what_a_urdf_does_not_have_is_left_out_and_what_is_missing_is_told(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8").replace(' effort="10"', "", 1)
-    path.write_text(text.replace("</robot>", "<gazebo/><transmission name='t'/></robot>"), encoding="utf-8")
+    path.write_text(
+        text.replace("</robot>", "<gazebo/><transmission name='t'/></robot>"), encoding="utf-8"
+    )
     source = read(path, tmp_path)
     assert source.kind == "URDF"
-    assert "left out what a URDF does not have: <gazebo>, <transmission>" in source.notes
-    assert any("name no effort or no velocity: arm_1_joint" in note for note in source.notes)
+    assert "left out elements that a URDF does not have: <gazebo>, <transmission>" in source.notes
+    assert any("state no effort or velocity limit: arm_1_joint" in note for note in source.notes)
     assert source.file.root.find("gazebo") is None
 
 
@@ -39,6 +41,6 @@ def test_an_srdf_of_another_robot_is_named(tmp_path: Path) -> None:
     other = "<robot name='x'><disable_collisions link1='elsewhere' link2='body'/></robot>"
     (tmp_path / "robot.srdf").write_text(other, encoding="utf-8")
     source = read(path, tmp_path)
-    assert any("is of another robot" in note for note in source.notes)
+    assert any("links of another robot" in note for note in source.notes)
     with pytest.raises(vkc.UnknownNameError):
         read_source(path, tmp_path, packages={}, arguments={}, srdf=tmp_path / "robot.srdf")

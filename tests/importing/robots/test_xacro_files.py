@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.files.xml import parse_xml
-from vkc_pin.importing.robots.xacro_files import expand
+from vkc_pin.importing.robots.xacro_files import expand_xacro
+from vkc_pin.world.files.xml import parse_xml
 
 TEXT = """<?xml version="1.0"?>
 <robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -42,25 +42,25 @@ def size(text: str, file: Path) -> str | None:
 
 
 def test_packages_are_found_around_the_file(file: Path) -> None:
-    assert size(expand(file, {}, {}), file) == "0.6 0.1 0.1"
-    assert size(expand(file, {}, {"length": "0.5"}), file) == "1.0 0.1 0.1"
+    assert size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
+    assert size(expand_xacro(file, {}, {"length": "0.5"}), file) == "1.0 0.1 0.1"
 
 
 def test_a_package_that_is_given_goes_first(file: Path, tmp_path: Path) -> None:
     other = tmp_path / "elsewhere"
     other.mkdir()
     (other / "links.xacro").write_text(PART.replace("2*length", "4*length"), encoding="utf-8")
-    assert size(expand(file, {"my_parts": other}, {}), file).startswith("1.2")  # type: ignore[union-attr]
+    assert size(expand_xacro(file, {"my_parts": other}, {}), file).startswith("1.2")  # type: ignore[union-attr]
 
 
 def test_what_is_wrong_is_said(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text(TEXT.replace("my_parts", "my_prats"), encoding="utf-8")
     with pytest.raises(vkc.InputError, match="my_prats") as caught:
-        expand(file, {}, {})
+        expand_xacro(file, {}, {})
     assert caught.value.file == file
     file.write_text(TEXT.replace("$(arg length)", "${1/0}"), encoding="utf-8")
-    with pytest.raises(vkc.InputError, match="xacro does not understand this"):
-        expand(file, {}, {})
+    with pytest.raises(vkc.InputError, match="xacro cannot process the file"):
+        expand_xacro(file, {}, {})
     monkeypatch.setitem(sys.modules, "xacro", None)
     with pytest.raises(vkc.InputError, match=r"vkc-pin\[import\]"):
-        expand(file, {}, {})
+        expand_xacro(file, {}, {})

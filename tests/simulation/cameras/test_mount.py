@@ -6,21 +6,24 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.models.robot_file import load_robot
 from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
+from vkc_pin.world.models.robot_file import load_robot
 
 points = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 
 
 @given(points, points, points)
-def test_the_target_is_in_the_middle_and_up_is_up(
+def test_target_is_centred_and_up_points_up(
     position: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...]
 ) -> None:
     ahead = np.subtract(target, position)
-    assume(np.linalg.norm(np.cross(ahead, up)) > 1e-2 * max(1.0, np.linalg.norm(ahead) * np.linalg.norm(up)))
+    assume(
+        np.linalg.norm(np.cross(ahead, up))
+        > 1e-2 * max(1.0, np.linalg.norm(ahead) * np.linalg.norm(up))
+    )
     place = Camera("eye", BASE, position, target, up=up).placement  # type: ignore[arg-type]
-    seen = place.inverse().act(np.array(target))
-    np.testing.assert_allclose(seen, [0.0, 0.0, -np.linalg.norm(ahead)], atol=1e-9)
+    in_camera = place.inverse().act(np.array(target))
+    np.testing.assert_allclose(in_camera, [0.0, 0.0, -np.linalg.norm(ahead)], atol=1e-9)
     above = place.rotation.T @ np.array(up)
     assert above[1] > 0.0
     assert above[0] == pytest.approx(0.0, abs=1e-9)
@@ -28,16 +31,16 @@ def test_the_target_is_in_the_middle_and_up_is_up(
 
 
 @pytest.mark.parametrize("target", [(0.0, 0.0, 1.0), (0.0, 0.0, 0.3)])
-def test_a_camera_needs_a_direction(target: tuple[float, float, float]) -> None:
-    with pytest.raises(vkc.InputError, match="no direction"):
+def test_camera_with_undefined_orientation_is_refused(target: tuple[float, float, float]) -> None:
+    with pytest.raises(vkc.InputError, match="orientation of camera 'eye' is undefined"):
         Camera("eye", BASE, (0.0, 0.0, 1.0), target)
 
 
-def test_frames_are_those_of_the_robot() -> None:
+def test_frames_resolve_to_robot_frames() -> None:
     robot = load_robot("husky_ur5e")
     at = {"position": (0.0, 0.0, 1.0), "target": (1.0, 0.0, 0.0)}
-    assert Camera("eye", HAND, **at).on(robot) == robot.tool_frame
-    assert Camera("eye", BASE, **at).on(robot) == robot.model.names[1]
-    assert Camera("eye", "wrist_3_link", **at).on(robot) == "wrist_3_link"
+    assert Camera("eye", HAND, **at).find_frame(robot) == robot.tool_frame
+    assert Camera("eye", BASE, **at).find_frame(robot) == robot.model.names[1]
+    assert Camera("eye", "wrist_3_link", **at).find_frame(robot) == "wrist_3_link"
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'wrist_3_link'"):
-        Camera("eye", "wrist_3_lnk", **at).on(robot)
+        Camera("eye", "wrist_3_lnk", **at).find_frame(robot)

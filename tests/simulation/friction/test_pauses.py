@@ -1,4 +1,4 @@
-"""Pauses stand still, and leave the rest of a motion as it is."""
+"""Pauses keep the robot at rest and leave the remaining motion unchanged."""
 
 from __future__ import annotations
 
@@ -8,19 +8,22 @@ from helpers.executions import drawer_plan
 from helpers.fake_plan import fake_plan
 
 import vkc_pin as vkc
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.simulation.friction.pauses import paused
+from vkc_pin.simulation.friction.pauses import insert_pauses
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 @pytest.mark.parametrize("make", [drawer_plan, fake_plan])
-def test_a_motion_waits_where_it_is_told_to(make: object) -> None:
+def test_pause_is_inserted_at_waypoint(make: object) -> None:
     motion: Trajectory = make().trajectory  # type: ignore[operator]
     at = motion.phases[1].first
     time = float(motion.times[at])
-    longer = paused(motion, [at, at], 0.5)
+    longer = insert_pauses(motion, [at, at], 0.5)
     assert len(longer.times) == len(motion.times) + 1
     assert longer.times[-1] == pytest.approx(motion.times[-1] + 0.5)
-    before, after = np.linspace(0.0, time - 1e-6, 50), np.linspace(time + 1e-6, motion.times[-1], 50)
+    before, after = (
+        np.linspace(0.0, time - 1e-6, 50),
+        np.linspace(time + 1e-6, motion.times[-1], 50),
+    )
     for read in ("at", "velocity", "acceleration"):
         one, other = getattr(longer, read), getattr(motion, read)
         np.testing.assert_allclose(one(before), other(before), atol=1e-9)
@@ -28,20 +31,23 @@ def test_a_motion_waits_where_it_is_told_to(make: object) -> None:
     inside = time + np.linspace(1e-6, 0.5 - 1e-6, 20)
     np.testing.assert_allclose(longer.at(inside), np.tile(motion.at(time), (20, 1)), atol=1e-12)
     assert np.abs(longer.velocity(inside)).max() < 1e-9
-    # The pause is of the phase that begins there.
-    assert [(p.first, p.last) for p in longer.phases][:2] == [(0, at), (at, motion.phases[1].last + 1)]
+    # The pause belongs to the phase that begins there.
+    assert [(p.first, p.last) for p in longer.phases][:2] == [
+        (0, at),
+        (at, motion.phases[1].last + 1),
+    ]
     assert [p.holds for p in longer.phases] == [p.holds for p in motion.phases]
 
 
-def test_several_pauses() -> None:
+def test_several_pauses_are_inserted() -> None:
     motion = fake_plan().trajectory
-    longer = paused(motion, [3, 6], 0.25)
+    longer = insert_pauses(motion, [3, 6], 0.25)
     assert longer.times[-1] == pytest.approx(motion.times[-1] + 0.5)
     assert [(p.first, p.last) for p in longer.phases] == [(0, 7), (7, len(motion.times) + 1)]
-    assert paused(motion, [], 0.25) is motion
+    assert insert_pauses(motion, [], 0.25) is motion
 
 
-def test_a_curve_that_does_not_rest_there_is_refused() -> None:
+def test_pause_of_a_moving_curve_is_refused() -> None:
     motion = drawer_plan().trajectory
     with pytest.raises(vkc.InputError, match="while the robot moves"):
-        paused(motion, [motion.phases[0].last // 2], 0.5)
+        insert_pauses(motion, [motion.phases[0].last // 2], 0.5)

@@ -1,9 +1,11 @@
 """Many workers, simulated from what tasks took with few: what the one client costs, stragglers, and work in vain.
 
-A simulation of discrete events of how `running.engine` feeds processes. Every worker has a task in hand and one waiting. What it
-returns waits for the client, which takes results one after the other: it writes them down, fills shards, and sends the worker
-another task. A dataset is the first numbers that become episodes, so that it ends when the last of these is there; whatever
-was begun beyond them is in vain. What tasks take is drawn from what they took, the first of a worker from first ones.
+A simulation of discrete events of how `utils.parallel.engine` feeds processes. Every worker has a
+task in hand and one waiting. What it returns waits for the client, which takes results one after
+the other: it writes them down, fills shards, and sends the worker another task. A dataset is the
+first numbers that become episodes, so that it ends when the last of these is there; whatever was
+begun beyond them is in vain. What tasks take is drawn from what they took, the first of a worker
+from first ones.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.running.journal import Kept
+from vkc_pin.utils.parallel.journal import Kept
 
 __all__ = ["WORKERS", "Costs", "measured", "simulated"]
 
@@ -54,7 +56,9 @@ def measured(dataset: Dataset) -> Costs:
     size = fields.rooms.episodes * fields.variants
     tasks: dict[tuple[int, str], list[float]] = {}
     for key, (record,) in kept.lines.items():
-        tasks.setdefault((int(key) // size, kept.processes.get(key, "")), []).append(float(record.get("cpu_time", 0.0)))
+        tasks.setdefault((int(key) // size, kept.processes.get(key, "")), []).append(
+            float(record.get("cpu_time", 0.0))
+        )
     first: list[float] = []
     later: list[float] = []
     known = set[str]()
@@ -75,9 +79,10 @@ def simulated(costs: Costs, workers: int, tasks: int | None = None) -> dict[str,
         tasks: How many make the dataset; None: a hundred for each worker.
 
     Returns:
-        `workers`, `tasks`; `episodes_per_hour`; `efficiency`: the share of the workers' time, from the first task's sending to
-        the end, in which they work on what becomes part of the dataset; `client`: the share of the time in which the client is
-        busy; `in_vain`: the share of the workers' time in which they work on what is not needed.
+        `workers`, `tasks`; `episodes_per_hour`; `efficiency`: the share of the workers' time, from
+        the first task's sending to the end, in which they work on what becomes part of the dataset;
+        `client`: the share of the time in which the client is busy; `in_vain`: the share of the
+        workers' time in which they work on what is not needed.
     """
     wanted = _EACH * workers if tasks is None else tasks
     rng = np.random.default_rng(_SEED)
@@ -85,7 +90,9 @@ def simulated(costs: Costs, workers: int, tasks: int | None = None) -> dict[str,
     half = costs.client / 2.0  # to send a task; the other half to take its result
     free = 0.0  # when the client has done what it has to do so far
     ready = [0.0] * workers  # when a worker has done what it has been sent so far
-    ended: list[tuple[float, int, int]] = []  # results on their way to the client: when, which task, which worker's
+    ended: list[
+        tuple[float, int, int]
+    ] = []  # results on their way to the client: when, which task, which worker's
     spans: list[tuple[float, float]] = []  # of each task
 
     def send(worker: int) -> None:
@@ -109,7 +116,10 @@ def simulated(costs: Costs, workers: int, tasks: int | None = None) -> dict[str,
             break
         send(worker)
     all_time = workers * free
-    needed, others = (sum(max(0.0, min(end, free) - begin) for begin, end in part) for part in (spans[:wanted], spans[wanted:]))
+    needed, others = (
+        sum(max(0.0, min(end, free) - begin) for begin, end in part)
+        for part in (spans[:wanted], spans[wanted:])
+    )
     return {
         "workers": workers,
         "tasks": wanted,

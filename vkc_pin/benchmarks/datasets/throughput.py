@@ -1,6 +1,7 @@
 """How many validated episodes an hour a machine makes of each task, of which share of attempts, and with how much memory.
 
-With several workers, one alone makes the same episodes as well, for the cost curve; and many are simulated from what tasks took.
+With several workers, one alone makes the same episodes as well, for the cost curve; and many are
+simulated from what tasks took.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipes.recipe import TASKS, load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import write_atomically
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, styled
-from vkc_pin.running.journal import Kept
+from vkc_pin.utils.parallel.journal import Kept
+from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
+from vkc_pin.world.files.writing import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,18 +54,20 @@ def run(
         jobs: Number of processes.
         recipe: Name or path of a recipe; its own tasks make no difference.
         scheduler: Address of a Dask scheduler; see `generate`.
-        curve: Whether one worker, and two if `jobs` are more, make the same episodes as well, in folders of their own.
+        curve: Whether one worker, and two if `jobs` are more, make the same episodes as well, in
+            folders of their own.
         progress: Whether to show a progress bar.
 
     Returns:
         {"meta": ..., "trials": [...], "curve": [...], "simulated": [...]}.
 
-        In "trials", one record a task with `task`, `episodes_per_hour`, `attempts`, `successes`, `workers`, `memory_mb`,
-        `memory_slope_mb` (growth of a process in a thousand attempts), `client_ms` (processor time an attempt of the process that
-        feeds the others, writes down what comes and fills shards), `episodes_per_core_hour` and the medians of what attempts
-        take. In "curve", one a task and number of workers, with `times`: how many times as fast as one worker of this run. In
-        "simulated", one a task and number of workers, see `simulated`, with `saturated_at`: the number of workers at which the
-        client would be busy all the time.
+        In "trials", one record a task with `task`, `episodes_per_hour`, `attempts`, `successes`,
+        `workers`, `memory_mb`, `memory_slope_mb` (growth of a process in a thousand attempts),
+        `client_ms` (processor time an attempt of the process that feeds the others, writes down
+        what comes and fills shards), `episodes_per_core_hour` and the medians of what attempts
+        take. In "curve", one a task and number of workers, with `times`: how many times as fast as
+        one worker of this run. In "simulated", one a task and number of workers, see `simulated`,
+        with `saturated_at`: the number of workers at which the client would be busy all the time.
 
     Raises:
         InputError: No episodes, or the recipe or `out` is wrong.
@@ -74,7 +77,9 @@ def run(
         raise InputError("out of range", field="episodes", expected="at least 1", got=episodes)
     made, folder = load_recipe(recipe), Path(out)
     check_folder(folder, [f"{task}/journal.jsonl" for task in TASKS])
-    counts = sorted({*(count for count in (1, 2) if curve and scheduler is None and count < jobs), jobs})
+    counts = sorted(
+        {*(count for count in (1, 2) if curve and scheduler is None and count < jobs), jobs}
+    )
     records: list[dict[str, Any]] = []
     curves: list[dict[str, Any]] = []
     many: list[dict[str, Any]] = []
@@ -83,8 +88,12 @@ def run(
         for count in counts:
             where = folder / task if count == jobs else folder / f"{count}_workers" / task
             began = time.perf_counter()
-            dataset = generate(own, episodes, where, jobs=count, scheduler=scheduler, progress=progress)
-            found = record(task, dataset, None if scheduler is not None else count, time.perf_counter() - began)
+            dataset = generate(
+                own, episodes, where, jobs=count, scheduler=scheduler, progress=progress
+            )
+            found = record(
+                task, dataset, None if scheduler is not None else count, time.perf_counter() - began
+            )
             rates[count] = found["episodes_per_hour"]
             if count == jobs:
                 records.append(found)
@@ -99,11 +108,18 @@ def run(
                 }
                 for count, rate in rates.items()
             ]
-    about = meta(benchmark="throughput", recipe=made.digest, episodes=episodes, jobs=jobs, sessions=[])
-    about |= {"peak_memory_mb": max(record["memory_mb"] for record in records), "scheduled": jobs > 1 or scheduler is not None}
+    about = meta(
+        benchmark="throughput", recipe=made.digest, episodes=episodes, jobs=jobs, sessions=[]
+    )
+    about |= {
+        "peak_memory_mb": max(record["memory_mb"] for record in records),
+        "scheduled": jobs > 1 or scheduler is not None,
+    }
     result = {"meta": about, "trials": records, "curve": curves, "simulated": many}
     write_atomically(folder / "results.csv", to_csv(records).encode())
-    write_atomically(folder / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+    write_atomically(
+        folder / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()
+    )
     workers_chart(result, folder / "workers.png")
     write_atomically(folder / "table.md", report(result).encode())
     return result
@@ -128,7 +144,10 @@ def record(task: str, dataset: Dataset, jobs: int | None, wall: float) -> dict[s
     attempts = [record for (record,) in kept.lines.values()]
     good = sum(bool(one["success"]) for one in attempts)
     worked = sum(float(one.get("cpu_time", 0.0)) for one in attempts)
-    timed = {name: _median(attempts, name) for name in ("setup_time", "planning_time", "build_time", "seconds")}
+    timed = {
+        name: _median(attempts, name)
+        for name in ("setup_time", "planning_time", "build_time", "seconds")
+    }
     return {
         "task": task,
         "episodes_per_hour": round(3600.0 * good / kept.seconds, 1) if kept.seconds else 0.0,
@@ -140,7 +159,10 @@ def record(task: str, dataset: Dataset, jobs: int | None, wall: float) -> dict[s
         "memory_mb": round(kept.memory, 1),
         "memory_slope_mb": _slope(kept.memories.values()),
         "client_ms": round(
-            1000.0 * sum(session.get("client_seconds", 0.0) for session in kept.sessions) / max(1, len(attempts)), 2
+            1000.0
+            * sum(session.get("client_seconds", 0.0) for session in kept.sessions)
+            / max(1, len(attempts)),
+            2,
         ),
         "wall_time": round(wall, 2),
         **{f"{name}_median": value for name, value in timed.items()},
@@ -160,8 +182,8 @@ def _slope(memories: Iterable[Sequence[float]]) -> float | None:
     """Return by how much the memory of a process grows in a thousand attempts [MB], by least squares; None for few attempts.
 
     Args:
-        memories: Of each process, after each of its attempts [MB]. The first half, in which caches fill, does not count; of
-            several processes the one that grows most is told.
+        memories: Of each process, after each of its attempts [MB]. The first half, in which caches
+            fill, does not count; of several processes the one that grows most is told.
     """
     late = [np.asarray(one[len(one) // 2 :], float) for one in memories]
     slopes = [np.polyfit(np.arange(len(one)), one, 1)[0] for one in late if len(one) >= _LEAST]
@@ -217,14 +239,25 @@ def _curve(curve: Sequence[Record]) -> list[str]:
     """Return the table of what one and more workers made in one run, headed by a sentence; nothing for no curve."""
     if not curve:
         return []
-    rows = [[one["task"], str(one["workers"]), f"{one['episodes_per_hour']:.0f}", decimal(one["times"])] for one in curve]
+    rows = [
+        [one["task"], str(one["workers"]), f"{one['episodes_per_hour']:.0f}", decimal(one["times"])]
+        for one in curve
+    ]
     text = "The same episodes by fewer workers, in this run too. One works in the client's own process, without Dask."
     return [text, markdown(["task", "workers", "episodes an hour", "times one"], rows)]
 
 
 def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
     """Return the table of what many workers would come to, headed by what that is simulated from."""
-    head = ["task", "workers", "episodes an hour, simulated", "efficiency", "client busy", "in vain", "client saturated at"]
+    head = [
+        "task",
+        "workers",
+        "episodes an hour, simulated",
+        "efficiency",
+        "client busy",
+        "in vain",
+        "client saturated at",
+    ]
     rows = [
         [
             *(one["task"], str(one["workers"]), f"{one['episodes_per_hour']:.0f}"),
@@ -252,12 +285,18 @@ def workers_chart(result: Mapping[str, Any], path: str | Path | None) -> Figure:
     Returns:
         The figure.
     """
-    with styled():
+    with use_style():
         figure = new_figure(6.4, 3.6)
         axes = figure.subplots()
         for task, colour in zip(TASKS, COLOURS, strict=False):
             own = [one for one in result["simulated"] if one["task"] == task]
-            axes.plot([one["workers"] for one in own], [one["efficiency"] for one in own], "o-", color=colour, label=task)
+            axes.plot(
+                [one["workers"] for one in own],
+                [one["efficiency"] for one in own],
+                "o-",
+                color=colour,
+                label=task,
+            )
             seen = [one for one in result["curve"] if one["task"] == task]
             shares = [one["times"] / one["workers"] for one in seen]
             axes.plot([one["workers"] for one in seen], shares, "x", color=colour, markersize=9.0)

@@ -14,8 +14,8 @@ from vkc_pin.benchmarks.harness.tables import foot, markdown
 from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate
 
 __all__ = ["BASES", "TASKS", "TURNING_RADIUS", "report", "run", "started"]
 
@@ -65,7 +65,8 @@ def run(
         tasks: Some of `TASKS`; None: all.
         bases: Some of `BASES`; None: all.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -80,14 +81,36 @@ def run(
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     tasks = list(runner.chosen("task", TASKS if tasks is None else tasks, TASKS))
     bases = list(runner.chosen("base", BASES if bases is None else bases, BASES))
-    settings = {"benchmark": "bases", "seed": seed, "starts": trials, "tasks": tasks, "bases": bases, "radius": TURNING_RADIUS}
+    settings = {
+        "benchmark": "bases",
+        "seed": seed,
+        "starts": trials,
+        "tasks": tasks,
+        "bases": bases,
+        "radius": TURNING_RADIUS,
+    }
     specs = [
-        {"key": f"{task}-{base}-{number:04d}", "task": task, "base": base, "number": number, "seed": seed}
+        {
+            "key": f"{task}-{base}-{number:04d}",
+            "task": task,
+            "base": base,
+            "number": number,
+            "seed": seed,
+        }
         for task in tasks
         for base in bases
         for number in range(trials)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        _record,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:
@@ -99,7 +122,15 @@ def report(result: Mapping[str, Any]) -> str:
         for r in records
         if not r["success"]
     ]
-    heads = ["task", "base", "success", "time, median [s]", "95th percentile [s]", "units of effort", "Ipopt iterations"]
+    heads = [
+        "task",
+        "base",
+        "success",
+        "time, median [s]",
+        "95th percentile [s]",
+        "units of effort",
+        "Ipopt iterations",
+    ]
     parts = [
         "# Bases that drive",
         f"{about['starts']} random starts, seed {about['seed']}; bases that are steered turn on {about['radius']:g} m or more. "
@@ -116,8 +147,18 @@ def _row(task: str, base: str, records: Sequence[Record]) -> list[str]:
     good = [row for row in rows if row["success"]]
     time, late = distribution(rows, "planning_time")
     counts = [f"{distribution(rows, field)[0]:.0f}" for field in ("effort", "iterations")]
-    lengths = [f"{distribution(good, field)[0]:.2f}" for field in ("base_effort", "arm_effort", "duration")]
-    return [task, base, f"{len(good)} of {len(rows)}", f"{time:.3f}", f"{late:.3f}", *counts, *lengths]
+    lengths = [
+        f"{distribution(good, field)[0]:.2f}" for field in ("base_effort", "arm_effort", "duration")
+    ]
+    return [
+        task,
+        base,
+        f"{len(good)} of {len(rows)}",
+        f"{time:.3f}",
+        f"{late:.3f}",
+        *counts,
+        *lengths,
+    ]
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:

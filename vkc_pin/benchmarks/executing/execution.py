@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arguments import known
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, trial, values
@@ -21,8 +20,9 @@ from vkc_pin.benchmarks.problems.problem_set import started
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
 from vkc_pin.simulation.execution import GRASPS, simulate
-from vkc_pin.simulation.physics import Physics, engine
+from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.result import SimulationResult
+from vkc_pin.utils.arguments import known
 
 __all__ = ["TASKS", "report", "run"]
 
@@ -70,7 +70,8 @@ def run(
         trials: Number of random starts per task, at least 1.
         seed: Of the starts and of planning.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         tasks: Some of `TASKS`.
         grasp: What holds, see `simulate`.
         progress: Whether to show a progress bar.
@@ -80,29 +81,57 @@ def run(
 
     Raises:
         UnknownNameError: There is no such task or grasp.
-        InputError: No trials or tasks, MuJoCo is not installed, or `out` has trials of other settings.
+        InputError: No trials or tasks, MuJoCo is not installed, or `out` has trials of other
+            settings.
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
-    engine()
+    import_mujoco()
     if trials < 1:
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     names = runner.chosen("task", tasks, TASKS)
-    settings = {"benchmark": "execution", "seed": seed, "starts": trials, "tasks": names, "mujoco": version("mujoco"), **LIMITS}
+    settings = {
+        "benchmark": "execution",
+        "seed": seed,
+        "starts": trials,
+        "tasks": names,
+        "mujoco": version("mujoco"),
+        **LIMITS,
+    }
     settings |= {"physics": vars(Physics()), "grasp": known(grasp, GRASPS, "grasp")}
     specs = [
-        {"key": f"{list(TASKS).index(name):02d}/{number:04d}", "task": name, "number": number, "seed": seed, "grasp": grasp}
+        {
+            "key": f"{list(TASKS).index(name):02d}/{number:04d}",
+            "task": name,
+            "number": number,
+            "seed": seed,
+            "grasp": grasp,
+        }
         for name in names
         for number in range(trials)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        _record,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown, with versions and machine at the foot."""
     about, records = result["meta"], result["trials"]
-    rows = [_row(name, [record for record in records if record.get("task") == name]) for name in about["tasks"]]
+    rows = [
+        _row(name, [record for record in records if record.get("task") == name])
+        for name in about["tasks"]
+    ]
     rows += [_row("all", records)] if len(rows) > 1 else []
-    problems = Counter(f"{r.get('task')}: {text}" for r in records for text in r.get("problems", ()))
+    problems = Counter(
+        f"{r.get('task')}: {text}" for r in records for text in r.get("problems", ())
+    )
     parts = [
         "# Plans in physics" + (", held by friction" if about.get("grasp") == "friction" else ""),
         f"{about['starts']} random starts per task, seed {about['seed']}, {allowed(about)} each. Plans are counted by the "
@@ -111,7 +140,11 @@ def report(result: Mapping[str, Any]) -> str:
         "Errors of arm and base, misses of goals, forces, torques and slips are the largest of any moment of any trial.",
         markdown(_HEAD, rows),
         "## What went wrong",
-        "\n".join(f"- {text}" + (f" ({count} times)" if count > 1 else "") for text, count in problems.items()) or "Nothing.",
+        "\n".join(
+            f"- {text}" + (f" ({count} times)" if count > 1 else "")
+            for text, count in problems.items()
+        )
+        or "Nothing.",
     ]
     return "\n\n".join([*parts, foot(about)]) + "\n"
 
@@ -151,7 +184,10 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
 
 def _figures(result: SimulationResult) -> dict[str, Any]:
     """Return what is kept of an execution."""
-    missed = {unit: max((m.amount for m in result.misses if m.unit == unit), default=None) for unit in ("m", "rad")}
+    missed = {
+        unit: max((m.amount for m in result.misses if m.unit == unit), default=None)
+        for unit in ("m", "rad")
+    }
     return {
         "executed": result.ok,
         "problems": result.problems(),

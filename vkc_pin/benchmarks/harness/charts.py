@@ -12,7 +12,13 @@ from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.benchmarks.harness.record import values as numbers
 from vkc_pin.benchmarks.harness.tables import common, mean_and_deviation, quartiles, wilson
 from vkc_pin.planning.plan import Plan
-from vkc_pin.plotting.style import COLOURS, new_figure, save_figure, shade_phases, styled
+from vkc_pin.visualization.plots.style import (
+    COLOURS,
+    new_figure,
+    save_figure,
+    shade_phases,
+    use_style,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,12 +28,19 @@ __all__ = ["criteria_chart", "means_chart", "motions_chart", "success_chart"]
 
 _WIDTH = 0.8  # of a group of bars; the distance between groups is 1
 _SAMPLES = 400  # moments of a motion that are drawn
-_ROOM = 2.0  # a scale that is not made for all motions reaches so many times farther than the others
+_ROOM = (
+    2.0  # a scale that is not made for all motions reaches so many times farther than the others
+)
 _BASE = ("x [m/s]", "y [m/s]", "yaw [rad/s]")
 
 
 def success_chart(
-    records: Sequence[Record], path: str | Path | None, scenes: Mapping[str, str], methods: Sequence[str], *, title: str = ""
+    records: Sequence[Record],
+    path: str | Path | None,
+    scenes: Mapping[str, str],
+    methods: Sequence[str],
+    *,
+    title: str = "",
 ) -> Figure:
     """Draw success rates as bars, grouped by scene, with Wilson's intervals of 95 % confidence.
 
@@ -75,8 +88,8 @@ def means_chart(
         methods: One bar of each group, in this order.
         field: The field.
         label: Its name and unit.
-        shared: Over the trials in which all methods succeed, or over each method's own successes where there are none;
-            otherwise over all trials.
+        shared: Over the trials in which all methods succeed, or over each method's own successes
+            where there are none; otherwise over all trials.
 
     Returns:
         The figure.
@@ -109,11 +122,14 @@ def means_chart(
     return save_figure(figure, path)
 
 
-def criteria_chart(records: Sequence[Record], path: str | Path | None, methods: Sequence[str], *, title: str = "") -> Figure:
+def criteria_chart(
+    records: Sequence[Record], path: str | Path | None, methods: Sequence[str], *, title: str = ""
+) -> Figure:
     """Draw a task's success rate, base effort, arm effort and planning time as bars, side by side.
 
-    Rates have Wilson's intervals of 95 % confidence. The other bars are medians with quartiles: times over all trials, efforts
-    over the trials in which all methods succeed, or over each method's own successes if there are no such trials.
+    Rates have Wilson's intervals of 95 % confidence. The other bars are medians with quartiles:
+    times over all trials, efforts over the trials in which all methods succeed, or over each
+    method's own successes if there are no such trials.
 
     Args:
         records: Records of one task as `record.trial` makes them.
@@ -125,7 +141,11 @@ def criteria_chart(records: Sequence[Record], path: str | Path | None, methods: 
         The figure.
     """
     both = common(records, methods)
-    where = f"the\n{len(both)} trial{'s' * (len(both) != 1)} where all succeed" if both else "own successes;\nnowhere all succeed"
+    where = (
+        f"the\n{len(both)} trial{'s' * (len(both) != 1)} where all succeed"
+        if both
+        else "own successes;\nnowhere all succeed"
+    )
     shared = f"median and quartiles over {where}"
     panels = (
         ("success", "success [%]", "all trials,\n95 % confidence (Wilson)", ".0f"),
@@ -133,17 +153,32 @@ def criteria_chart(records: Sequence[Record], path: str | Path | None, methods: 
         ("arm_effort", "arm effort [rad]", shared, ".2f"),
         ("planning_time", "planning time [s]", "median and quartiles\nover all trials", ".2f"),
     )
-    with styled():
+    with use_style():
         figure = new_figure(11.0, 3.4)
-        for axes, (field, name, about, form) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        for axes, (field, name, about, form) in zip(
+            figure.subplots(1, len(panels)), panels, strict=True
+        ):
             for k, method in enumerate(methods):
                 own = [record for record in records if record["method"] == method]
                 if field in ("base_effort", "arm_effort"):
-                    own = [row[k] for row in both] or [record for record in own if record["success"]]
+                    own = [row[k] for row in both] or [
+                        record for record in own if record["success"]
+                    ]
                 values = numbers(own, field)
                 if values:
-                    interval = _rate([value > 0.0 for value in values]) if field == "success" else quartiles(values)
-                    _bar(axes, k, interval, COLOURS[k % len(COLOURS)], f"{interval[1]:{form}}", width=0.7)
+                    interval = (
+                        _rate([value > 0.0 for value in values])
+                        if field == "success"
+                        else quartiles(values)
+                    )
+                    _bar(
+                        axes,
+                        k,
+                        interval,
+                        COLOURS[k % len(COLOURS)],
+                        f"{interval[1]:{form}}",
+                        width=0.7,
+                    )
             _name_bars(axes, methods, 0.6)
             axes.set_ylim(0.0, 110.0 if field == "success" else 1.12 * axes.get_ylim()[1])
             axes.set_title(name, fontsize=9.5)
@@ -165,16 +200,26 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
     Returns:
         The figure.
     """
-    with styled():
+    with use_style():
         figure = new_figure(1.2 + 4.0 * len(plans), 7.0)
         columns: Any = figure.subplots(3, len(plans), sharex=True, sharey="row", squeeze=False).T
         for (position, velocity, base), (name, plan) in zip(columns, plans.items(), strict=True):
             motion = plan.trajectory
-            fine = np.unique(np.concatenate([np.linspace(motion.times[0], motion.times[-1], _SAMPLES), motion.times]))
+            fine = np.unique(
+                np.concatenate(
+                    [np.linspace(motion.times[0], motion.times[-1], _SAMPLES), motion.times]
+                )
+            )
             places, rates = motion(fine), motion.velocity(fine)
-            steps: Any = {"linewidth": 1.2, "drawstyle": "steps-post" if motion.curve is None else "default"}
+            steps: Any = {
+                "linewidth": 1.2,
+                "drawstyle": "steps-post" if motion.curve is None else "default",
+            }
             for k, joint in enumerate(range(3, motion.robot_size)):
-                colour, label = COLOURS[k % len(COLOURS)], motion.names[joint].removesuffix("_joint")
+                colour, label = (
+                    COLOURS[k % len(COLOURS)],
+                    motion.names[joint].removesuffix("_joint"),
+                )
                 position.plot(fine, places[:, joint], color=colour, label=label)
                 velocity.plot(fine, rates[:, joint], color=colour, **steps)
             for k, label in enumerate(_BASE):
@@ -183,14 +228,26 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
                 shade_phases(axes, motion)
                 axes.margins(x=0.0)
             outcome = "" if plan.success else f", FAILED: {plan.status}"
-            position.set_title(f"{name}{outcome} ({motion.times[-1] - motion.times[0]:.1f} s)", fontsize=9.5)
+            position.set_title(
+                f"{name}{outcome} ({motion.times[-1] - motion.times[0]:.1f} s)", fontsize=9.5
+            )
             base.set_xlabel("time [s]")
         good = [plan.trajectory for plan in plans.values() if plan.success]
-        for row, part in ((1, lambda motion: slice(3, motion.robot_size)), (2, lambda motion: slice(0, 3))):
+        for row, part in (
+            (1, lambda motion: slice(3, motion.robot_size)),
+            (2, lambda motion: slice(0, 3)),
+        ):
             if good and len(good) < len(plans):
-                largest = max(float(np.abs(motion.velocity(motion.times)[:, part(motion)]).max()) for motion in good)
+                largest = max(
+                    float(np.abs(motion.velocity(motion.times)[:, part(motion)]).max())
+                    for motion in good
+                )
                 columns[0][row].set_ylim(-_ROOM * largest, _ROOM * largest)
-        for axes, label in zip(columns[0], ("arm positions [rad]", "arm velocities [rad/s]", "base velocity"), strict=True):
+        for axes, label in zip(
+            columns[0],
+            ("arm positions [rad]", "arm velocities [rad/s]", "base velocity"),
+            strict=True,
+        ):
             axes.set_ylabel(label)
         for axes in columns[-1][[0, 2]]:
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
@@ -208,7 +265,7 @@ def _grouped(
     title: str,
 ) -> Figure:
     """Draw bars grouped by scene, one for each method: `bar` returns lower end, height and upper end, or None for no bar."""
-    with styled():
+    with use_style():
         figure = new_figure(max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1)), 3.8)
         axes = figure.subplots()
         width = _WIDTH / len(methods)
@@ -233,13 +290,23 @@ def _rate(good: Sequence[bool]) -> tuple[float, float, float]:
     return 100.0 * low, 100.0 * sum(good) / len(good), 100.0 * high
 
 
-def _bar(axes: Axes, place: float, interval: tuple[float, float, float], colour: str, text: str, *, width: float) -> None:
+def _bar(
+    axes: Axes,
+    place: float,
+    interval: tuple[float, float, float],
+    colour: str,
+    text: str,
+    *,
+    width: float,
+) -> None:
     """Draw a bar with an error bar: an interval is its lower end, the bar's height, and its upper end."""
     low, height, high = interval
     axes.bar(place, height, width, color=colour)
     error = np.clip([[height - low], [high - height]], 0.0, None)
     axes.errorbar(place, height, error, color="0.25", linewidth=0.9, capsize=2.5)
-    axes.annotate(text, (place, high), (0, 2), textcoords="offset points", ha="center", fontsize=7.5)
+    axes.annotate(
+        text, (place, high), (0, 2), textcoords="offset points", ha="center", fontsize=7.5
+    )
 
 
 def _name_bars(axes: Axes, names: Sequence[str], margin: float) -> None:
@@ -253,6 +320,10 @@ def _name_bars(axes: Axes, names: Sequence[str], margin: float) -> None:
 
 def _number(records: Sequence[Record], scene: str, methods: Sequence[str]) -> str:
     """Return how many trials each method has in a scene."""
-    shown = [record["method"] for record in records if record["scene"] == scene and record["method"] in methods]
+    shown = [
+        record["method"]
+        for record in records
+        if record["scene"] == scene and record["method"] in methods
+    ]
     numbers = sorted({shown.count(method) for method in shown})
     return f"{' or '.join(map(str, numbers))} trials each" if numbers else "no trials"

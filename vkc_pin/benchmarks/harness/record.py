@@ -9,13 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.files.resources import package_folder
-from vkc_pin.motion.trajectory import Trajectory
 from vkc_pin.planning.plan import Plan
-from vkc_pin.running.machine import machine, peak_memory, versions
-from vkc_pin.scene.scene import Scene
+from vkc_pin.utils.parallel.machine import machine, peak_memory, versions
+from vkc_pin.world.files.resources import package_folder
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Record", "Solve", "commit", "distribution", "meta", "peak_memory", "peaks", "trial", "values", "versions"]
+__all__ = [
+    "Record",
+    "Solve",
+    "commit",
+    "distribution",
+    "meta",
+    "peak_memory",
+    "peaks",
+    "trial",
+    "values",
+    "versions",
+]
 
 Record = Mapping[str, Any]
 """What is kept of a trial, by field; see `trial`."""
@@ -33,7 +44,12 @@ def commit() -> str | None:
     """Return which commit the package's sources are of, `-dirty` if they are changed; None where git does not know."""
     command = ["git", "-C", str(package_folder()), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip() or None
+        return (
+            subprocess.run(
+                command, capture_output=True, text=True, timeout=10, check=True
+            ).stdout.strip()
+            or None
+        )
     except (OSError, subprocess.SubprocessError):
         return None
 
@@ -42,7 +58,9 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
     """Return the record of one plan; success is validation's word."""
     m = plan.metrics
     first = plan.validation.violations[0] if plan.validation.violations else None
-    failed = None if plan.success else (f"{first.constraint} {first.subject}" if first else plan.status)
+    failed = (
+        None if plan.success else (f"{first.constraint} {first.subject}" if first else plan.status)
+    )
     return {
         "scene": plan.scene.name,
         "method": method,
@@ -50,8 +68,13 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "seed": seed,
         "success": plan.success,
         "status": plan.status,
-        **{field: m[field] for field in ("planning_time", "base_effort", "base_effort_l1", "arm_effort")},
-        "clearance": m["clearance"] if np.isfinite(m["clearance"]) else None,  # JSON knows no infinity
+        **{
+            field: m[field]
+            for field in ("planning_time", "base_effort", "base_effort_l1", "arm_effort")
+        },
+        "clearance": m["clearance"]
+        if np.isfinite(m["clearance"])
+        else None,  # JSON knows no infinity
         "closure_error": m["closure_error"],
         "iterations": int(m["iterations"]),
         "rounds": int(m["rounds"]),
@@ -70,7 +93,11 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
 def peaks(trajectory: Trajectory) -> dict[str, float]:
     """Return the largest velocity [rad/s] and acceleration [rad/s²] of an arm joint: peak_velocity, peak_acceleration."""
     arm, curve = slice(3, trajectory.robot_size), trajectory.curve
-    rates = (trajectory.velocities(), trajectory.accelerations()) if curve is None else curve.speeds()
+    rates = (
+        (trajectory.velocities(), trajectory.accelerations())
+        if curve is None
+        else curve.compute_max_rates()
+    )
     largest = [float(np.abs(rate[:, arm]).max(initial=0.0)) for rate in rates]
     return dict(zip(("peak_velocity", "peak_acceleration"), largest, strict=True))
 
@@ -83,4 +110,8 @@ def values(trials: Iterable[Record], field: str) -> list[float]:
 def distribution(trials: Iterable[Record], field: str) -> tuple[float, float]:
     """Return median and 95th percentile of a field; NaN for no values."""
     found = values(trials, field)
-    return (float(np.median(found)), float(np.percentile(found, 95))) if found else (float("nan"), float("nan"))
+    return (
+        (float(np.median(found)), float(np.percentile(found, 95)))
+        if found
+        else (float("nan"), float("nan"))
+    )

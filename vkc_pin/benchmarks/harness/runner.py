@@ -19,10 +19,10 @@ from tqdm import tqdm
 from vkc_pin.benchmarks.harness.record import meta, peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.resources import folder, package_folder
-from vkc_pin.files.writing import check_links, check_writable, write_atomically
-from vkc_pin.running.engine import Died, needs_dask, results
-from vkc_pin.running.journal import Journal
+from vkc_pin.utils.parallel.engine import Died, needs_dask, results
+from vkc_pin.utils.parallel.journal import Journal
+from vkc_pin.world.files.resources import folder, package_folder
+from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
 
 __all__ = ["Function", "check_folder", "chosen", "run"]
 
@@ -48,25 +48,29 @@ def run(
 ) -> dict[str, Any]:
     """Run `function` on every trial, but for those that `out` has already.
 
-    Every finished trial is a line of `out`/trials.jsonl at once, so a stop, of whatever kind, loses only those that were
-    running; the same call goes on from there. At the end `out` has results.json and results.csv with the records in the
-    order of their keys: neither `jobs` nor stops make a difference to them, but for measured times.
+    Every finished trial is a line of `out`/trials.jsonl at once, so a stop, of whatever kind, loses
+    only those that were running; the same call goes on from there. At the end `out` has
+    results.json and results.csv with the records in the order of their keys: neither `jobs` nor
+    stops make a difference to them, but for measured times.
 
     Args:
-        trials: Plain data, each with a text `key` of its own. They are begun in this order, and a process keeps what it has
-            built: put those that share a symbolic program together.
-        function: What runs a trial. It must be importable by other processes if `jobs` > 1. If it raises an exception, that
-            is printed, and the trial is recorded as a failure of status "error". A record of status "interrupted" counts as
-            Ctrl-C.
+        trials: Plain data, each with a text `key` of its own. They are begun in this order, and a
+            process keeps what it has built: put those that share a symbolic program together.
+        function: What runs a trial. It must be importable by other processes if `jobs` > 1. If it
+            raises an exception, that is printed, and the trial is recorded as a failure of status
+            "error". A record of status "interrupted" counts as Ctrl-C.
         out: The folder, made if need be.
-        settings: Everything that the results depend on, as plain data; goes into the results' "meta".
+        settings: Everything that the results depend on, as plain data; goes into the results'
+            "meta".
         report: What makes of a result the text of `out`/table.md.
         jobs: Number of processes, each with one thread of BLAS; 1 runs all trials in this process.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead; see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead; see
+            `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": commit, versions, machine, settings, sessions, peak_memory_mb, "trials": records}, as in results.json.
+        {"meta": commit, versions, machine, settings, sessions, peak_memory_mb, "trials": records},
+        as in results.json.
 
     Raises:
         InputError: `out` has trials of other settings, versions or machines, has other files but no
@@ -89,28 +93,45 @@ def run(
         raise InputError("this is no folder", file=out, field="out") from None
     check_writable(out / _JOURNAL)
     about = meta()
-    made = about.pop("commit")  # what the sources are says more than it about whether trials go together
+    made = about.pop(
+        "commit"
+    )  # what the sources are says more than it about whether trials go together
     about["versions"]["sources"] = _sources()
     described = json.dumps([todo[key] for key in sorted(todo)], sort_keys=True).encode()
-    header = {"settings": dict(settings), **about, "specification": hashlib.sha256(described).hexdigest()[:12]}
+    header = {
+        "settings": dict(settings),
+        **about,
+        "specification": hashlib.sha256(described).hexdigest()[:12],
+    }
     with (out / _JOURNAL).open("a+b") as stream:
         journal = Journal(out / _JOURNAL, stream, header)
         left = [trial for key, trial in todo.items() if key not in journal.lines]
         if left:
             done = len(todo) - len(left)
-            bar = tqdm(total=len(todo), initial=done, unit="trial", smoothing=0.05, disable=not progress)
+            bar = tqdm(
+                total=len(todo), initial=done, unit="trial", smoothing=0.05, disable=not progress
+            )
             try:
                 _run(left, function, journal, jobs, scheduler, bar)
             except KeyboardInterrupt:
-                raise KeyboardInterrupt(f"{len(journal.lines)} of {len(todo)} trials are done and kept in {out}") from None
+                raise KeyboardInterrupt(
+                    f"{len(journal.lines)} of {len(todo)} trials are done and kept in {out}"
+                ) from None
         records = [record for key in sorted(todo) for record in journal.lines[key]]
         measured = {"sessions": journal.sessions, "peak_memory_mb": round(journal.memory, 1)}
     result = {
-        "meta": {"commit": _commits(records) or made, **about, **json.loads(json.dumps(dict(settings))), **measured},
+        "meta": {
+            "commit": _commits(records) or made,
+            **about,
+            **json.loads(json.dumps(dict(settings))),
+            **measured,
+        },
         "trials": records,
     }
     write_atomically(out / "results.csv", to_csv(records).encode())
-    write_atomically(out / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+    write_atomically(
+        out / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()
+    )
     if report is not None:
         write_atomically(out / "table.md", report(result).encode())
     return result
@@ -156,7 +177,12 @@ def chosen(kind: str, names: Iterable[str], choices: Iterable[str]) -> tuple[str
 
 
 def _run(
-    trials: Sequence[dict[str, Any]], function: Function, journal: Journal, jobs: int, scheduler: str | None, bar: Any
+    trials: Sequence[dict[str, Any]],
+    function: Function,
+    journal: Journal,
+    jobs: int,
+    scheduler: str | None,
+    bar: Any,
 ) -> None:
     """Run `trials`, write each down as it comes, and print what went wrong."""
     began, told = time.perf_counter(), set[str]()
@@ -172,8 +198,12 @@ def _run(
             bar.update()
             if "traceback" in line:
                 (message,) = line["records"][0]["violations"]
-                detail = "" if message in told else f"\n{line['traceback']}"  # many trials may fail in the same way
-                tqdm.write(f"{line['key']} failed with an error: {message}{detail}", file=sys.stderr)
+                detail = (
+                    "" if message in told else f"\n{line['traceback']}"
+                )  # many trials may fail in the same way
+                tqdm.write(
+                    f"{line['key']} failed with an error: {message}{detail}", file=sys.stderr
+                )
                 told.add(message)
 
 
@@ -187,20 +217,33 @@ def _attempt(function: Function, trial: dict[str, Any]) -> dict[str, Any]:
         records = json.loads(text, parse_constant=lambda _: None)  # numbers that JSON does not know
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
-        failure = {"success": False, "status": "error", "failed_constraint": "error", "violations": [message]}
+        failure = {
+            "success": False,
+            "status": "error",
+            "failed_constraint": "error",
+            "violations": [message],
+        }
         records, more = [{**trial, **failure}], {"traceback": traceback.format_exc()}
     return {"key": key, "memory_mb": round(peak_memory(), 1), "records": records, **more}
 
 
 def _given_up(key: str, died: Died) -> dict[str, Any]:
     """Return the line of a trial that no process survived."""
-    failure = {"key": key, "success": False, "status": "error", "failed_constraint": "error", "violations": [died.reason]}
+    failure = {
+        "key": key,
+        "success": False,
+        "status": "error",
+        "failed_constraint": "error",
+        "violations": [died.reason],
+    }
     return {"key": key, "memory_mb": 0.0, "records": [failure], "traceback": died.reason}
 
 
 def _commits(records: Iterable[Mapping[str, Any]]) -> str:
     """Return the commits that trials are of: one, or several where a run went on after a change that had no part in it."""
-    return ", ".join(dict.fromkeys(str(record["commit"]) for record in records if record.get("commit")))
+    return ", ".join(
+        dict.fromkeys(str(record["commit"]) for record in records if record.get("commit"))
+    )
 
 
 def _plain(value: Any) -> Any:
@@ -213,7 +256,11 @@ def _plain(value: Any) -> Any:
 def _sources() -> str:
     """Return a digest of all that planning depends on here: the package's sources, scenes and robots."""
     package, digest = package_folder(), hashlib.sha256()
-    named = {path.relative_to(package).as_posix(): path for suffix in ("py", "cpp") for path in package.rglob(f"*.{suffix}")}
+    named = {
+        path.relative_to(package).as_posix(): path
+        for suffix in ("py", "cpp")
+        for path in package.rglob(f"*.{suffix}")
+    }
     named = {name: path for name, path in named.items() if not name.startswith(_NO_PART)}
     for kind in ("scenes", "robots"):
         files = (path for path in folder(kind).rglob("*") if path.suffix in _DESCRIPTIONS)

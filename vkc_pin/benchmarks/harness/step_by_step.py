@@ -10,8 +10,8 @@ from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.scene.scene import Scene
-from vkc_pin.task.steps import Step
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Step
 
 __all__ = ["combined", "step_by_step"]
 
@@ -27,10 +27,22 @@ def step_by_step(scene: Scene, steps: Sequence[Step], *, options: Options, seed:
     return plans
 
 
-def combined(plans: Sequence[Plan], of: int, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
+def combined(
+    plans: Sequence[Plan], of: int, *, method: str, seed: int, **more: Any
+) -> dict[str, Any]:
     """Return the record of `of` steps of which these are the plans: what the last one says, and all that they come to."""
-    records = [trial(one, method=method, seed=seed, duration=one.trajectory.metrics()["duration"]) for one in plans]
-    sums = ("planning_time", "base_effort", "base_effort_l1", "arm_effort", "duration", "build_time")
+    records = [
+        trial(one, method=method, seed=seed, duration=one.trajectory.metrics()["duration"])
+        for one in plans
+    ]
+    sums = (
+        "planning_time",
+        "base_effort",
+        "base_effort_l1",
+        "arm_effort",
+        "duration",
+        "build_time",
+    )
     counts = ("iterations", "rounds", "effort", "waypoints")
     times = [key for key in records[0] if key.startswith("time_")]
     clearances = [record["clearance"] for record in records if record["clearance"] is not None]
@@ -44,7 +56,8 @@ def combined(plans: Sequence[Plan], of: int, *, method: str, seed: int, **more: 
         "clearance": min(clearances, default=None),
         "closure_error": max(record["closure_error"] for record in records),
         "initialization": "; ".join(dict.fromkeys(record["initialization"] for record in records)),
-        "failed_constraint": failed and f"{failed} at steps[{len(plans) - 1}], {plans[-1].steps[0]}",
+        "failed_constraint": failed
+        and f"{failed} at steps[{len(plans) - 1}], {plans[-1].steps[0]}",
         "steps_done": good,
         **more,
     }

@@ -31,7 +31,11 @@ __all__ = [
     "wilson",
 ]
 
-EFFORTS = {"base_effort": "base [m]", "base_effort_l1": "base |dx|+|dy| [m]", "arm_effort": "arm [rad]"}
+EFFORTS = {
+    "base_effort": "base [m]",
+    "base_effort_l1": "base |dx|+|dy| [m]",
+    "arm_effort": "arm [rad]",
+}
 """What motions are compared by: field → name."""
 TIMES = {
     "time_initialization": "seeds",
@@ -51,15 +55,25 @@ def to_csv(records: Sequence[Record]) -> str:
     columns = list(dict.fromkeys(field for record in records for field in record))
     writer.writerow(columns)
     for values in ([record.get(column) for column in columns] for record in records):
-        texts = [json.dumps(value, ensure_ascii=False) if value is not None else "" for value in values]
-        writer.writerow([value if isinstance(value, str) else text for value, text in zip(values, texts, strict=True)])
+        texts = [
+            json.dumps(value, ensure_ascii=False) if value is not None else "" for value in values
+        ]
+        writer.writerow(
+            [
+                value if isinstance(value, str) else text
+                for value, text in zip(values, texts, strict=True)
+            ]
+        )
     return stream.getvalue()
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: int = 1) -> str:
     """Return a table in Markdown; the first `text` columns are aligned left, the others right."""
     rule = ["---" if column < text else "---:" for column in range(len(head))]
-    return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |" for row in (head, rule, *rows))
+    return "\n".join(
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |"
+        for row in (head, rule, *rows)
+    )
 
 
 def wilson(good: int, number: int) -> tuple[float, float]:
@@ -74,7 +88,9 @@ def wilson(good: int, number: int) -> tuple[float, float]:
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
     """Return first quartile, median and third quartile; NaN for no values."""
-    first, median, third = np.percentile(values, (25, 50, 75)) if len(values) else (np.nan, np.nan, np.nan)
+    first, median, third = (
+        np.percentile(values, (25, 50, 75)) if len(values) else (np.nan, np.nan, np.nan)
+    )
     return float(first), float(median), float(third)
 
 
@@ -96,7 +112,13 @@ def failures(records: Iterable[Record]) -> str:
         if not record["success"]:
             status, blame = str(record["status"]), str(record.get("failed_constraint") or "")
             kinds[status if blame in ("", status) else f"{status} ({blame.split()[0]})"] += 1
-    return ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items(), key=lambda item: (-item[1], item[0]))) or "none"
+    return (
+        ", ".join(
+            f"{kind} {count}"
+            for kind, count in sorted(kinds.items(), key=lambda item: (-item[1], item[0]))
+        )
+        or "none"
+    )
 
 
 def timed_out(records: Iterable[Record]) -> list[str]:
@@ -106,15 +128,19 @@ def timed_out(records: Iterable[Record]) -> list[str]:
     return [str(len(records) - len(others)), failures(others)]
 
 
-def methods_table(records: Sequence[Record], scenes: Mapping[str, str], methods: Sequence[str]) -> str:
+def methods_table(
+    records: Sequence[Record], scenes: Mapping[str, str], methods: Sequence[str]
+) -> str:
     """Return successes, planning times, efforts and failures per scene and method, and over all scenes if there are several.
 
-    Planning times are those of all trials, but for errors, which have none; efforts are those of successes.
+    Planning times are those of all trials, but for errors, which have none; efforts are those of
+    successes.
 
     Args:
         records: Records as `record.trial` makes them.
         scenes: Scene → name to show.
-        methods: The methods in the order of the rows; those without trials in a scene are left out there.
+        methods: The methods in the order of the rows; those without trials in a scene are left out
+            there.
     """
     rows = []
     for name, chosen in _groups(records, scenes):
@@ -124,9 +150,13 @@ def methods_table(records: Sequence[Record], scenes: Mapping[str, str], methods:
                 continue
             good = [record for record in own if record["success"]]
             time, late = distribution(own, "planning_time")
-            efforts = (decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort"))
+            efforts = (
+                decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort")
+            )
             times = (decimal(time), decimal(late))
-            rows.append([name, method, f"{len(good)} of {len(own)}", *times, *efforts, *timed_out(own)])
+            rows.append(
+                [name, method, f"{len(good)} of {len(own)}", *times, *efforts, *timed_out(own)]
+            )
     head = [
         "scene",
         "method",
@@ -146,8 +176,12 @@ def common(records: Iterable[Record], methods: Sequence[str]) -> list[tuple[Reco
     found: dict[str, dict[tuple[Any, ...], Record]] = {method: {} for method in methods}
     for record in records:
         if record["success"] and record["method"] in found:
-            found[record["method"]][(record["scene"], record["number"], record.get("repeat", 0))] = record
-    places = [place for place in found[methods[0]] if all(place in found[method] for method in methods)]
+            found[record["method"]][
+                (record["scene"], record["number"], record.get("repeat", 0))
+            ] = record
+    places = [
+        place for place in found[methods[0]] if all(place in found[method] for method in methods)
+    ]
     return [tuple(found[method][place] for method in methods) for place in places]
 
 
@@ -157,7 +191,10 @@ def lower(pairs: Sequence[tuple[Record, ...]], field: str) -> int:
 
 
 def comparison_table(
-    records: Sequence[Record], scenes: Mapping[str, str], methods: tuple[str, str], names: tuple[str, str]
+    records: Sequence[Record],
+    scenes: Mapping[str, str],
+    methods: tuple[str, str],
+    names: tuple[str, str],
 ) -> str:
     """Return the efforts of two methods where both succeed, per scene, and over all scenes if there are several.
 
@@ -172,8 +209,15 @@ def comparison_table(
         both = common(chosen, methods)
         for field, shown in EFFORTS.items():
             one, other = ([float(pair[k][field]) for pair in both] for k in (0, 1))
-            rows.append([name, shown, _spread(one), _spread(other), f"{lower(both, field)} of {len(both)}"])
-    head = ["scene", "effort", *(f"{name}: median (quartiles)" for name in names), f"lower with {names[0]}"]
+            rows.append(
+                [name, shown, _spread(one), _spread(other), f"{lower(both, field)} of {len(both)}"]
+            )
+    head = [
+        "scene",
+        "effort",
+        *(f"{name}: median (quartiles)" for name in names),
+        f"lower with {names[0]}",
+    ]
     return markdown(head, rows, text=2)
 
 
@@ -185,18 +229,22 @@ def foot(about: Mapping[str, Any]) -> str:
     text = f"{machine['cores']} cores of {machine['processor'] or machine['machine']}, {machine['system']}, "
     text = f"Measured on {text}Python {machine['python']}, {listed}{f' (sources {sources})' if sources else ''}."
     if sessions := about.get("sessions"):
-        jobs = " or ".join(str(number) for number in sorted({session["jobs"] for session in sessions}))
+        jobs = " or ".join(
+            str(number) for number in sorted({session["jobs"] for session in sessions})
+        )
         minutes = sum(session["seconds"] for session in sessions) / 60.0
         number = sum(session["trials"] for session in sessions)
-        text += (
-            f" {number} trials, {jobs} at a time, took {minutes:.1f} min and up to {about['peak_memory_mb']:.0f} MB a process."
-        )
+        memory = f"{about['peak_memory_mb']:.0f} MB"
+        text += f" {number} trials, {jobs} at a time, took {minutes:.1f} min and up to {memory} a process."
     return text
 
 
 def _groups(records: Sequence[Record], scenes: Mapping[str, str]) -> list[tuple[str, list[Record]]]:
     """Return name and records of every scene, and of all of them if there are several."""
-    groups = [(name, [record for record in records if record["scene"] == scene]) for scene, name in scenes.items()]
+    groups = [
+        (name, [record for record in records if record["scene"] == scene])
+        for scene, name in scenes.items()
+    ]
     return [*groups, ("all", list(records))] if len(groups) > 1 else groups
 
 

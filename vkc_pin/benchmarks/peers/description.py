@@ -1,7 +1,8 @@
 """The virtual kinematic chain and all that stands around it as one URDF, with an SRDF of the pairs that are not looked at.
 
-What is held is a branch of the hand, inverted, as in the chain itself; what stands in the world is fixed to the root. Each shape
-is a link of its own, `shape_<number>`, so that pairs of shapes can be left out, and keep margins of their own.
+What is held is a branch of the hand, inverted, as in the chain itself; what stands in the world is
+fixed to the root. Each shape is a link of its own, `shape_<number>`, so that pairs of shapes can be
+left out, and keep margins of their own.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
 from vkc_pin.benchmarks.peers.sampled import ranges
 from vkc_pin.errors import InputError
-from vkc_pin.files.hulls import compute_hull
-from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.hulls import compute_hull
 
 __all__ = ["FRAME", "GROUP", "Description", "describe"]
 
@@ -54,8 +55,8 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
     Args:
         problem: Of one phase.
         folder: Where to; it exists.
-        inflated: Whether the second shape of each pair is thicker by the clearance that the pair is to keep, for planners that
-            know of none: one link for each shape and clearance.
+        inflated: Whether the second shape of each pair is thicker by the clearance that the pair is
+            to keep, for planners that know of none: one link for each shape and clearance.
 
     Raises:
         InputError: The chain has a joint that a URDF cannot have.
@@ -67,8 +68,14 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
     lower, upper = ranges(problem)
     model, at = chain.model, 0
     for j in range(1, model.njoints):
-        parent, kind = ("world" if model.parents[j] == 0 else f"body_{model.parents[j]}"), model.joints[j]
-        placement, short = model.jointPlacements[j], str(kind.shortname()).removeprefix("JointModel")
+        parent, kind = (
+            ("world" if model.parents[j] == 0 else f"body_{model.parents[j]}"),
+            model.joints[j],
+        )
+        placement, short = (
+            model.jointPlacements[j],
+            str(kind.shortname()).removeprefix("JointModel"),
+        )
         if short == "Planar":
             moves = [("prismatic", _AXES["X"]), ("prismatic", _AXES["Y"]), ("revolute", _AXES["Z"])]
         elif short[-1] in _AXES and short[0] in "RP":
@@ -82,21 +89,34 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
             ET.SubElement(root, "link", name=child)
             joint = _joint(root, names[at], form, parent, child, placement)
             ET.SubElement(joint, "axis", xyz=_numbers(axis))
-            limits = {"lower": lower[at], "upper": upper[at], "velocity": chain.velocity[at], "effort": _EFFORT}
-            ET.SubElement(joint, "limit", {name: repr(float(value)) for name, value in limits.items()})
+            limits = {
+                "lower": lower[at],
+                "upper": upper[at],
+                "velocity": chain.velocity[at],
+                "effort": _EFFORT,
+            }
+            ET.SubElement(
+                joint, "limit", {name: repr(float(value)) for name, value in limits.items()}
+            )
             parent, placement, at = child, pin.SE3.Identity(), at + 1
     if at != len(names):
         raise InputError("joints move together", field=", ".join(names))
     goal = problem.pose_goals[0].row
     ET.SubElement(root, "link", name=FRAME)
     _joint(root, f"to_{FRAME}", "fixed", f"body_{goal.joint}", FRAME, goal.local)
-    margins = {tuple(pair): margin for pair, margin in zip(part.pairs.tolist(), part.margins.tolist(), strict=True)}
+    margins = {
+        tuple(pair): margin
+        for pair, margin in zip(part.pairs.tolist(), part.margins.tolist(), strict=True)
+    }
     links = {f"shape_{number}": (number, 0.0) for number in range(len(part.shapes))}
     kept = {frozenset((f"shape_{i}", f"shape_{j}")): margin for (i, j), margin in margins.items()}
     if inflated:  # the second of each pair, once for every clearance
         own = {(j, max(0.0, margin)) for (_, j), margin in margins.items()}
         links |= {_thick(j, margin): (j, margin) for j, margin in own}
-        kept = {frozenset((f"shape_{i}", _thick(j, max(0.0, margin)))): 0.0 for (i, j), margin in margins.items()}
+        kept = {
+            frozenset((f"shape_{i}", _thick(j, max(0.0, margin)))): 0.0
+            for (i, j), margin in margins.items()
+        }
         used = {name for pair in kept for name in pair}
         links = {name: about for name, about in links.items() if name in used}
     for name, (number, thicker) in links.items():
@@ -108,14 +128,20 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
     group = ET.SubElement(semantics, "group", name=GROUP)
     for name in names:
         ET.SubElement(group, "joint", name=name)
-    ET.SubElement(semantics, "contact_managers_plugin_config", filename=_PLUGINS)  # which tesseract cannot do without
+    ET.SubElement(
+        semantics, "contact_managers_plugin_config", filename=_PLUGINS
+    )  # which tesseract cannot do without
     for one, other in combinations(links, 2):
-        if frozenset((one, other)) not in kept and (part.joint[links[one][0]] or part.joint[links[other][0]]):
+        if frozenset((one, other)) not in kept and (
+            part.joint[links[one][0]] or part.joint[links[other][0]]
+        ):
             ET.SubElement(semantics, "disable_collisions", link1=one, link2=other, reason="Never")
     files = folder / "chain.urdf", folder / "chain.srdf"
     for file, tree in zip(files, (root, semantics), strict=True):
         ET.ElementTree(tree).write(file)
-    return Description(*files, names, {(one, other): kept[pair] for pair in kept for one, other in [sorted(pair)]})
+    return Description(
+        *files, names, {(one, other): kept[pair] for pair in kept for one, other in [sorted(pair)]}
+    )
 
 
 def _thick(number: int, thicker: float) -> str:
@@ -130,7 +156,9 @@ def _axis(model: Any, joint: int) -> Floats:
     return np.asarray(columns[3:] if np.linalg.norm(columns[3:]) > 0.5 else columns[:3])
 
 
-def _joint(root: ET.Element, name: str, form: str, parent: str, child: str, placement: pin.SE3) -> ET.Element:
+def _joint(
+    root: ET.Element, name: str, form: str, parent: str, child: str, placement: pin.SE3
+) -> ET.Element:
     joint = ET.SubElement(root, "joint", name=name, type=form)
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
@@ -149,7 +177,9 @@ def _collision(link: ET.Element, shape: Any, thicker: float, file: Path) -> None
         ET.SubElement(geometry, "box", size=_numbers(2.0 * np.asarray(shape.halfSide)))
     elif isinstance(shape, coal.Cylinder) and not thicker:
         sizes = {"radius": shape.radius, "length": 2.0 * shape.halfLength}
-        ET.SubElement(geometry, "cylinder", {name: repr(float(size)) for name, size in sizes.items()})
+        ET.SubElement(
+            geometry, "cylinder", {name: repr(float(size)) for name, size in sizes.items()}
+        )
     else:
         import trimesh
 
@@ -158,15 +188,23 @@ def _collision(link: ET.Element, shape: Any, thicker: float, file: Path) -> None
         elif isinstance(shape, coal.Box):
             points = trimesh.creation.box(2.0 * np.asarray(shape.halfSide)).vertices
         elif isinstance(shape, coal.Cylinder):
-            points = trimesh.creation.cylinder(shape.radius, 2.0 * shape.halfLength, sections=32).vertices
+            points = trimesh.creation.cylinder(
+                shape.radius, 2.0 * shape.halfLength, sections=32
+            ).vertices
         else:
             ball = shape.radius * _AROUND * trimesh.creation.icosphere(subdivisions=1).vertices
-            points = np.concatenate([ball + np.array([0.0, 0.0, end]) for end in (-shape.halfLength, shape.halfLength)])
+            points = np.concatenate(
+                [ball + np.array([0.0, 0.0, end]) for end in (-shape.halfLength, shape.halfLength)]
+            )
         if thicker:
             around = thicker * _AROUND * trimesh.creation.icosphere(subdivisions=1).vertices
             points = (points[:, None] + around).reshape(-1, 3)
         compute_hull(points).export(file)
-        ET.SubElement(geometry, "mesh", {"filename": f"file://{file.resolve()}", "tesseract:make_convex": "true"})
+        ET.SubElement(
+            geometry,
+            "mesh",
+            {"filename": f"file://{file.resolve()}", "tesseract:make_convex": "true"},
+        )
         checking = ET.SubElement(link, "collision_checking")
         ET.SubElement(checking, "convex", name=link.attrib["name"])
 

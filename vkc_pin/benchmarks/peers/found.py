@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
 from vkc_pin.benchmarks.peers.tasks import Given
-from vkc_pin.motion.spans import PhaseSpan
-from vkc_pin.motion.trajectory import Trajectory
-from vkc_pin.planning.outcome import outcome, spent, still
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.retiming.repair import accepted
+from vkc_pin.planning.results import build_plan, make_stationary_trajectory
+from vkc_pin.planning.retime_validated import retime_validated
+from vkc_pin.planning.statistics import PlanningStatistics
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["Clock", "Found", "Peer", "clearances", "judged"]
 
@@ -31,9 +32,11 @@ class Found:
     """What a planner came to.
 
     Attributes:
-        path: Its waypoints from the start on, straight lines between them, shape (K, n); None: it has none.
+        path: Its waypoints from the start on, straight lines between them, shape (K, n); None: it
+            has none.
         own: CPU time of its solver alone [s].
-        first: CPU time from the call to its first motion, everything included [s]; None: it has none.
+        first: CPU time from the call to its first motion, everything included [s]; None: it has
+            none.
         status: "found", or why not: "timed out", or its own word.
         about: What else is kept.
     """
@@ -76,7 +79,15 @@ Peer = Callable[[Given, TrajectoryProblem, int, Clock, Callable[[Floats], bool]]
 """What plans: takes a problem, the same as a program, a random seed, the clock, and what tells whether a path is accepted."""
 
 
-def judged(own: Given, problem: TrajectoryProblem, path: Floats | None, status: str, *, name: str, seed: int) -> Plan:
+def judged(
+    own: Given,
+    problem: TrajectoryProblem,
+    path: Floats | None,
+    status: str,
+    *,
+    name: str,
+    seed: int,
+) -> Plan:
     """Return a path as a plan: timed as those of this package are, and checked by the independent validation.
 
     Args:
@@ -92,17 +103,27 @@ def judged(own: Given, problem: TrajectoryProblem, path: Floats | None, status: 
         return validate(own.scene, own.steps, motion, problem.options)
 
     if path is None:
-        trajectory = still(own.scene, problem.options)
+        trajectory = make_stationary_trajectory(own.scene, problem.options)
         report = check(trajectory)
     else:
         (phase,) = problem.task.phases
         span = PhaseSpan(phase.name, 0, len(path) - 1, phase.held, phase.opening)
         times = np.linspace(0.0, problem.options.dt * (len(path) - 1), len(path))
-        waypoints = Trajectory(problem.chain.names, times, path, (span,), problem.chain.robot.coordinates.size)
-        trajectory, report = accepted(own.scene, waypoints, check)
+        waypoints = Trajectory(
+            problem.chain.names, times, path, (span,), problem.chain.robot.coordinates.size
+        )
+        trajectory, report = retime_validated(own.scene, waypoints, check)
     said = "success" if report.ok else "rejected" if path is not None else status
-    return outcome(
-        own.scene, own.steps, problem.options, trajectory, report, said, took=spent(), random_seed=seed, initialization=name
+    return build_plan(
+        own.scene,
+        own.steps,
+        problem.options,
+        trajectory,
+        report,
+        said,
+        statistics=PlanningStatistics(),
+        random_seed=seed,
+        initialization=name,
     )
 
 
@@ -117,6 +138,6 @@ def clearances(problem: TrajectoryProblem, trajectory: Trajectory) -> Mapping[st
     for name, times in (("at", trajectory.times), ("between", (begins + share * lasts).ravel())):
         z = trajectory.at(times)
         contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=_NEAR, nearest=1)
-        least = contacts.clearance()
+        least = contacts.compute_clearance()
         found[f"clearance_{name}"] = float(least) if np.isfinite(least) else None
     return found

@@ -1,8 +1,9 @@
 """trajopt (tesseract's): sequential convex optimisation on the same chain, with collisions of casts between waypoints.
 
-The chain goes to it as a URDF whose hand carries, inverted, what is held. That the latter's base stays where it stands is a
-constraint on its pose at every waypoint, as in the paper; the pose to reach is one at the last. It starts from straight lines
-to configurations at the goal, the nearest first, until a motion is accepted.
+The chain goes to it as a URDF whose hand carries, inverted, what is held. That the latter's base
+stays where it stands is a constraint on its pose at every waypoint, as in the paper; the pose to
+reach is one at the last. It starts from straight lines to configurations at the goal, the nearest
+first, until a motion is accepted.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
 from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
 from vkc_pin.benchmarks.peers.found import Clock, Found
 from vkc_pin.benchmarks.peers.sampled import ranges
 from vkc_pin.benchmarks.peers.tasks import Given, ends
 from vkc_pin.errors import InputError
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.seeds.knots import smooth
+from vkc_pin.planning.initialization.keyframes import sample_smoothstep
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
 
 __all__ = ["plan_by_trajopt"]
 
@@ -43,7 +44,13 @@ _PARAMETERS = {
 }
 
 
-def plan_by_trajopt(own: Given, problem: TrajectoryProblem, seed: int, clock: Clock, accept: Callable[[Floats], bool]) -> Found:
+def plan_by_trajopt(
+    own: Given,
+    problem: TrajectoryProblem,
+    seed: int,
+    clock: Clock,
+    accept: Callable[[Floats], bool],
+) -> Found:
     """Plan with trajopt; see `found.Peer`."""
     worker = _worker()
     goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
@@ -52,7 +59,11 @@ def plan_by_trajopt(own: Given, problem: TrajectoryProblem, seed: int, clock: Cl
     segments, found = problem.segments, Found(status="not converged")
     lower, upper = ranges(problem)
     goal = problem.pose_goals[0].row
-    asked = {n.replace(".", "_"): float(problem.lower[-1, k]) for k, n in enumerate(problem.chain.names) if _goal(problem, k)}
+    asked = {
+        n.replace(".", "_"): float(problem.lower[-1, k])
+        for k, n in enumerate(problem.chain.names)
+        if _goal(problem, k)
+    }
     with tempfile.TemporaryDirectory() as folder:
         files = describe(problem, Path(folder), inflated=True)
         for row in goals:
@@ -65,7 +76,10 @@ def plan_by_trajopt(own: Given, problem: TrajectoryProblem, seed: int, clock: Cl
                 "group": GROUP,
                 "frame": FRAME,
                 "joints": files.joints,
-                "seed": (problem.start + np.append(0.0, smooth(segments))[:, None] * (row - problem.start)).tolist(),
+                "seed": (
+                    problem.start
+                    + np.append(0.0, sample_smoothstep(segments))[:, None] * (row - problem.start)
+                ).tolist(),
                 "lower": lower.tolist(),
                 "upper": upper.tolist(),
                 "weights": np.sqrt(problem.effort.metric).tolist(),
@@ -87,7 +101,10 @@ def plan_by_trajopt(own: Given, problem: TrajectoryProblem, seed: int, clock: Cl
             found.about.setdefault("said", []).append(answer["status"])
             path = np.array(answer["z"])
             path[0] = problem.start
-            found.path, found.status = path, "found" if answer["status"] == "NLP_CONVERGED" else "not converged"
+            found.path, found.status = (
+                path,
+                "found" if answer["status"] == "NLP_CONVERGED" else "not converged",
+            )
             if accept(path):
                 found.first = clock.spent
                 break
@@ -107,18 +124,24 @@ def _goal(problem: TrajectoryProblem, column: int) -> bool:
 def _worker() -> Callable[[dict[str, Any]], dict[str, Any]]:
     """Return what sends a request to the other process, begun once, and waits for its answer."""
     command = [sys.executable, str(Path(__file__).with_name("trajopt_worker.py"))]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
 
     def heard() -> dict[str, Any]:
         assert process.stdout is not None
         while line := process.stdout.readline():
             if line.startswith("{"):
                 return dict(json.loads(line))
-        raise InputError("the process of trajopt has ended", field="method", got=f"exit code {process.wait()}")
+        raise InputError(
+            "the process of trajopt has ended", field="method", got=f"exit code {process.wait()}"
+        )
 
     first = heard()
     if "error" in first:
-        raise InputError("trajopt cannot be run", expected='pip install "vkc-pin[peers]"', got=first["error"])
+        raise InputError(
+            "trajopt cannot be run", expected='pip install "vkc-pin[peers]"', got=first["error"]
+        )
 
     def asked(ask: dict[str, Any]) -> dict[str, Any]:
         assert process.stdin is not None

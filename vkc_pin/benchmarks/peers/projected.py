@@ -1,7 +1,8 @@
 """roboplan: RRT-Connect, with its projection where something is held, and its shortcuts where nothing is.
 
-It reads the chain as a URDF, and projects onto poses by itself. It knows of no clearance, so of each pair one shape is thicker by
-what the pair is to keep. Goals are configurations, from this package; the next one is tried until a motion is accepted.
+It reads the chain as a URDF, and projects onto poses by itself. It knows of no clearance, so of
+each pair one shape is thicker by what the pair is to keep. Goals are configurations, from this
+package; the next one is tried until a motion is accepted.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
 from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
 from vkc_pin.benchmarks.peers.found import Clock, Found
 from vkc_pin.benchmarks.peers.sampled import dense
 from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
-from vkc_pin.needed import optional_package
-from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["plan_by_projection"]
 
@@ -30,7 +31,11 @@ _SHARE = 0.2  # of the time that is left, at most, for one configuration at the 
 
 
 def plan_by_projection(
-    own: Given, problem: TrajectoryProblem, seed: int, clock: Clock, accept: Callable[[Floats], bool]
+    own: Given,
+    problem: TrajectoryProblem,
+    seed: int,
+    clock: Clock,
+    accept: Callable[[Floats], bool],
 ) -> Found:
     """Plan with roboplan; see `found.Peer`."""
     core = optional_package("roboplan.core", "peers", what="bench peers")
@@ -87,7 +92,9 @@ def plan_by_projection(
         found.first = clock.spent if found.first is None else found.first
         if not held:
             began = time.process_time()
-            shortcuts = core.PathShortcuttingOptions(group_name=GROUP, max_step_size=_STEP, max_iters=1000, seed=seed)
+            shortcuts = core.PathShortcuttingOptions(
+                group_name=GROUP, max_step_size=_STEP, max_iters=1000, seed=seed
+            )
             path = core.PathShortcutter(scene, shortcuts).shortcut(path)
             found.own += time.process_time() - began
         rows = np.array(path.positions)[:, order]

@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.arrays import Floats
 from vkc_pin.baselines.separate import BASELINES, plan_separately
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial, values
@@ -20,9 +19,10 @@ from vkc_pin.benchmarks.peers.projected import plan_by_projection
 from vkc_pin.benchmarks.peers.sampled import plan_by_sampling
 from vkc_pin.benchmarks.peers.tasks import TASKS, Given, given, problem_of
 from vkc_pin.errors import InputError
-from vkc_pin.needed import optional_package
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["METHODS", "PEERS", "TIME_LIMIT", "report", "run"]
 
@@ -70,7 +70,8 @@ def run(
         trials: Number of problems per task, at least 1.
         seed: Of the problems and of planning.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         tasks: Some of `TASKS`.
         methods: Some of `METHODS`.
         time_limit: By the clock, for a trial [s].
@@ -87,17 +88,38 @@ def run(
     if trials < 1:
         raise InputError("out of range", field="trials", expected="at least 1", got=trials)
     names, chosen = runner.chosen("task", tasks, TASKS), runner.chosen("method", methods, METHODS)
-    settings = {"benchmark": "peers", "seed": seed, "starts": trials, "tasks": names, "methods": chosen}
+    settings = {
+        "benchmark": "peers",
+        "seed": seed,
+        "starts": trials,
+        "tasks": names,
+        "methods": chosen,
+    }
     settings |= {"time_limit": time_limit, "peers": _installed(chosen)}
     specs = [
-        {"key": f"{task}/{number:04d}/{method}", "task": task, "number": number, "method": method, "seed": seed}
+        {
+            "key": f"{task}/{number:04d}/{method}",
+            "task": task,
+            "number": number,
+            "method": method,
+            "seed": seed,
+        }
         | {"time_limit": time_limit}
         for task in names
         for number in range(trials)
         for method in chosen
     ]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
-    return runner.run(specs, function, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        function,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:
@@ -125,10 +147,23 @@ def _row(task: str, method: str, records: Sequence[Record]) -> list[str]:
     good = [record for record in records if record["success"]]
     late = sum(record["status"] in ("timed out", "time limit") for record in records)
     final, percentile = distribution(records, "time_final")
-    times = [distribution(records, "time_first")[0], final, percentile, distribution(records, "time_own")[0]]
+    times = [
+        distribution(records, "time_first")[0],
+        final,
+        percentile,
+        distribution(records, "time_own")[0],
+    ]
     efforts = [distribution(good, field)[0] for field in ("base_effort", "arm_effort")]
-    least = [min(values(good, f"clearance_{where}"), default=float("nan")) * 1e3 for where in ("at", "between")]
-    shown = [f"{len(good)} of {len(records)}", str(late), *map(decimal, times), *map(decimal, efforts)]
+    least = [
+        min(values(good, f"clearance_{where}"), default=float("nan")) * 1e3
+        for where in ("at", "between")
+    ]
+    shown = [
+        f"{len(good)} of {len(records)}",
+        str(late),
+        *map(decimal, times),
+        *map(decimal, efforts),
+    ]
     return [task, method, *shown, *(f"{value:.1f}" if value == value else "–" for value in least)]
 
 
@@ -158,14 +193,22 @@ def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
     else:
         plan_of = _by_us(own, method, number, spec["time_limit"])
         took = plan_of.metrics  # by the clock: their share of the CPU time counts
-        share = (took["time_casadi"] + took["time_ipopt"]) / (took["planning_time"] + took["build_time"])
+        share = (took["time_casadi"] + took["time_ipopt"]) / (
+            took["planning_time"] + took["build_time"]
+        )
         found.own, found.first = share * clock.spent, clock.spent if plan_of.success else None
     spent, wall = clock.spent, clock.wall
     if plan_of.status != "interrupted":
         Path(folder).mkdir(parents=True, exist_ok=True)
         plan_of.save(Path(folder) / f"{spec['key'].replace('/', '_')}.npz")
     more: dict[str, Any] = {"task": task, "number": number, "duration": plan_of.metrics["duration"]}
-    more |= {"time_own": found.own, "time_first": found.first, "time_final": spent, "wall": wall, "about": found.about}
+    more |= {
+        "time_own": found.own,
+        "time_first": found.first,
+        "time_final": spent,
+        "wall": wall,
+        "about": found.about,
+    }
     more |= clearances(problem_of(own), plan_of.trajectory) if plan_of.success else {}
     return trial(plan_of, method=method, seed=seed, **more)
 

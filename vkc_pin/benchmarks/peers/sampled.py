@@ -1,11 +1,13 @@
 """OMPL: RRT-Connect, on the manifold on which a hand stays on its handle where something is held, then its simplifier.
 
-The manifold is an atlas of charts. `ProjectedStateSpace`, the other choice, found nothing here: what it samples is mostly not on
-the manifold, where ways to it break off, and OMPL 2.0.1 then stays where it was.
+The manifold is an atlas of charts. `ProjectedStateSpace`, the other choice, found nothing here:
+what it samples is mostly not on the manifold, where ways to it break off, and OMPL 2.0.1 then stays
+where it was.
 
-OMPL knows neither robots nor collisions: kinematics, distances and configurations at the goal are this package's. Coordinates
-are scaled by the chain's metric, so that a turn and a metre count as in the other searches. Where nothing is held, motions are
-checked in batches, as calls from C++ to Python cost more than what they do.
+OMPL knows neither robots nor collisions: kinematics, distances and configurations at the goal are
+this package's. Coordinates are scaled by the chain's metric, so that a turn and a metre count as in
+the other searches. Where nothing is held, motions are checked in batches, as calls from C++ to
+Python cost more than what they do.
 """
 
 from __future__ import annotations
@@ -17,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
 from vkc_pin.benchmarks.peers.found import Clock, Found
 from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
-from vkc_pin.needed import optional_package
-from vkc_pin.program.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["dense", "plan_by_sampling", "ranges"]
 
@@ -42,9 +44,18 @@ def ranges(problem: TrajectoryProblem) -> tuple[Floats, Floats]:
     )
 
 
-def plan_by_sampling(own: Given, problem: TrajectoryProblem, seed: int, clock: Clock, accept: Callable[[Floats], bool]) -> Found:
+def plan_by_sampling(
+    own: Given,
+    problem: TrajectoryProblem,
+    seed: int,
+    clock: Clock,
+    accept: Callable[[Floats], bool],
+) -> Found:
     """Plan with OMPL; see `found.Peer`."""
-    ob, og, ou = (optional_package(f"ompl.{part}", "peers", what="bench peers") for part in ("base", "geometric", "util"))
+    ob, og, ou = (
+        optional_package(f"ompl.{part}", "peers", what="bench peers")
+        for part in ("base", "geometric", "util")
+    )
     ou.setLogLevel(ou.LogLevel.LOG_NONE)
     ou.RNG.setSeed(seed + 1)
     goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
@@ -61,7 +72,9 @@ def plan_by_sampling(own: Given, problem: TrajectoryProblem, seed: int, clock: C
     space.setBounds(bounds)
 
     def blocked(z: Floats) -> int:
-        return problem.contacts.first_blocked(z, middle, reach=problem.options.largest_margin, allowed=0.0)
+        return problem.contacts.first_blocked(
+            z, middle, reach=problem.options.largest_margin, allowed=0.0
+        )
 
     def values(state: Any) -> Floats:
         return np.array([state[k] for k in range(size)]) / scale

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.arrays import Bools, Floats
 from vkc_pin.benchmarks.problems.poses import pose_among, pose_over, random_start
-from vkc_pin.cache import Cache
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.program.merit import TOLERANCE
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.rooms.random_room import random_layout
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.seeds.knots import depth, scatter
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.steps import Actuate, Grasp, Reach, Step
+from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_goal_configurations
+from vkc_pin.planning.nlp.merit import TOLERANCE
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.procedural.rooms.random_room import sample_layout
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.steps import Actuate, Grasp, Reach, Step
 
 __all__ = ["TASKS", "Given", "beginning", "ends", "given", "problem_of"]
 
@@ -53,8 +53,9 @@ class Given:
 def given(task: str, seed: int, number: int) -> Given:
     """Return a problem, which follows from numbers alone: no planner was asked whether it can solve it.
 
-    Nothing is closer than its margin at the start. A thing is held by a configuration drawn at random of those that hold it,
-    and from which some configuration that holds it at the goal is known, so that the end, if not the way, is possible.
+    Nothing is closer than its margin at the start. A thing is held by a configuration drawn at
+    random of those that hold it, and from which some configuration that holds it at the goal is
+    known, so that the end, if not the way, is possible.
 
     Args:
         task: One of `TASKS`.
@@ -66,10 +67,14 @@ def given(task: str, seed: int, number: int) -> Given:
     """
     rng = np.random.default_rng([seed, list(TASKS).index(task), number])
     if task == "reach":
-        layout = random_layout(_ROOMS + 1000 * seed + number, clutter=number % 10 / 10.0)
-        scene = layout.scene()
+        layout = sample_layout(_ROOMS + 1000 * seed + number, clutter=number % 10 / 10.0)
+        scene = layout.make_scene()
         over = number % 2 == 0
-        pose = pose_over(layout, scene, layout.part("table_1"), rng) if over else pose_among(layout, scene, rng)
+        pose = (
+            pose_over(layout, scene, layout.find_part("table_1"), rng)
+            if over
+            else pose_among(layout, scene, rng)
+        )
         return Given(random_start(scene, rng) if scene.start_region else scene, (Reach(pose),))
     joint, goal, state = _HELD[task]
     steps = (Actuate(task, {joint: goal}),)
@@ -79,23 +84,35 @@ def given(task: str, seed: int, number: int) -> Given:
         for row in _free(problem, rng)[:10]:
             robot = row[: problem.chain.robot.coordinates.size]
             attachment = scene.objects[task].object.attachment().name
-            own = Given(scene.with_start(base=robot[:3], arm=robot[3:]).with_held({task: attachment}), steps)
+            own = Given(
+                scene.with_start(base=robot[:3], arm=robot[3:]).with_held({task: attachment}), steps
+            )
             held = problem_of(own)
-            if depth(held, held.start[None], 1)[0] <= 0.0 and len(_free(held, rng)):
+            if compute_shortfall(held, held.start[None], 1)[0] <= 0.0 and len(_free(held, rng)):
                 return own
-    raise InputError("nothing holds it", field=task, expected="a free configuration", got=f"{_DRAWS} draws without one")
+    raise InputError(
+        "nothing holds it",
+        field=task,
+        expected="a free configuration",
+        got=f"{_DRAWS} draws without one",
+    )
 
 
-def problem_of(own: Given, options: Options | None = None, cache: Cache | None = None) -> TrajectoryProblem:
+def problem_of(
+    own: Given, options: Options | None = None, cache: Cache | None = None
+) -> TrajectoryProblem:
     """Return a problem's chain, limits, margins and goals: what all planners are given, whatever they make of it."""
     options = Options() if options is None else options
-    return TrajectoryProblem(own.scene, compile_task(own.scene, own.steps, options), options, cache=cache)
+    return TrajectoryProblem(
+        own.scene, compile_task(own.scene, own.steps, options), options, cache=cache
+    )
 
 
 def ends(problem: TrajectoryProblem, rng: np.random.Generator, most: int) -> Floats:
     """Return configurations at the goal that keep their margins, the nearest to the start first, shape (K, n), K ≤ `most`.
 
-    For planners that go from configuration to configuration and have no inverse kinematics of their own.
+    For planners that go from configuration to configuration and have no inverse kinematics of their
+    own.
     """
     found = _free(problem, rng)
     if not len(found):
@@ -117,14 +134,18 @@ def beginning(problem: TrajectoryProblem) -> Floats:
 def _exact(problem: TrajectoryProblem, z: Floats, row: int) -> tuple[Floats, Bools]:
     """Return configurations next to some, shape (B, n), with an exact pose, within the bounds of a row, and which are."""
     (solver, *_), (target, *_) = problem.transcription.pose_solvers, problem.targets
-    limits = {"lower": problem.lower[row], "upper": problem.upper[row], "weights": problem.chain.metric}
+    limits = {
+        "lower": problem.lower[row],
+        "upper": problem.upper[row],
+        "weights": problem.chain.metric,
+    }
     return solver.solve(z, target, **limits, iterations=6, tolerance=_EXACT)
 
 
 def _free(problem: TrajectoryProblem, rng: np.random.Generator) -> Floats:
     """Return random configurations at the last waypoint, where it should be and free, in the order they were drawn."""
-    drawn = scatter(problem, problem.segments, rng)
+    drawn = sample_goal_configurations(problem, problem.segments, rng)
     assert drawn is not None  # all of these tasks have a pose at the end
     z, error = drawn
     z = z[error < TOLERANCE]
-    return np.asarray(z[depth(problem, z, problem.segments) <= 0.0])
+    return np.asarray(z[compute_shortfall(problem, z, problem.segments) <= 0.0])

@@ -1,7 +1,7 @@
 """A process of its own that runs trajopt: reads one request a line, answers with one line, both JSON.
 
-The wheel brings a C++ library of its own, newer than some systems', which must be loaded before any other is; so nothing of this
-package is imported here. Run as a file.
+The wheel brings a C++ library of its own, newer than some systems', which must be loaded before any
+other is; so nothing of this package is imported here. Run as a file.
 """
 
 from __future__ import annotations
@@ -46,9 +46,20 @@ class _Solver:
     """Keeps the environment of the last request's files."""
 
     def __init__(self) -> None:
-        from tesseract_robotics import tesseract_collision, tesseract_common, tesseract_environment, trajopt_ifopt, trajopt_sqp
+        from tesseract_robotics import (
+            tesseract_collision,
+            tesseract_common,
+            tesseract_environment,
+            trajopt_ifopt,
+            trajopt_sqp,
+        )
 
-        self.ti, self.sqp, self.common, self.collision = trajopt_ifopt, trajopt_sqp, tesseract_common, tesseract_collision
+        self.ti, self.sqp, self.common, self.collision = (
+            trajopt_ifopt,
+            trajopt_sqp,
+            tesseract_common,
+            tesseract_collision,
+        )
         self.environment_module = tesseract_environment
         self.files: tuple[str, str] = ("", "")
         self.environment: Any = None
@@ -83,11 +94,19 @@ class _Solver:
             nlp.addConstraintSet(one)
 
         constrain(ti.JointPosConstraint(seed[0], at[0], np.full(len(names), 5.0), "start"))
-        same, target = self.common.Isometry3d.Identity(), self.common.Isometry3d(np.asfortranarray(ask["target"]))
+        same, target = (
+            self.common.Isometry3d.Identity(),
+            self.common.Isometry3d(np.asfortranarray(ask["target"])),
+        )
         for k in ask["at"]:
-            constrain(ti.CartPosConstraint(at[k], group, ask["frame"], "world", same, target, f"pose_{k}"))
+            constrain(
+                ti.CartPosConstraint(at[k], group, ask["frame"], "world", same, target, f"pose_{k}")
+            )
         if ask["goal"]:
-            goal, asked = seed[-1].copy(), np.full(len(names), 1e-5)  # 0 is refused; this lets others be anywhere
+            goal, asked = (
+                seed[-1].copy(),
+                np.full(len(names), 1e-5),
+            )  # 0 is refused; this lets others be anywhere
             for name, value in ask["goal"].items():
                 goal[names.index(name)], asked[names.index(name)] = value, 5.0
             constrain(ti.JointPosConstraint(goal, at[-1], asked, "goal"))
@@ -106,7 +125,9 @@ class _Solver:
         config.collision_check_config = check
         for k in range(1, steps):
             evaluator = ti.LVSContinuousCollisionEvaluator(group, self.environment, config)
-            one = ti.ContinuousCollisionConstraint(evaluator, at[k - 1], at[k], k == 1, False, ask["contacts"], False, f"hit_{k}")
+            one = ti.ContinuousCollisionConstraint(
+                evaluator, at[k - 1], at[k], k == 1, False, ask["contacts"], False, f"hit_{k}"
+            )
             kept += [evaluator, one]
             problem.addConstraintSet(one)
         problem.setup()
@@ -116,7 +137,9 @@ class _Solver:
         began = time.process_time()
         solver.solve(problem)
         own = time.process_time() - began
-        z = np.asarray(solver.getResults().best_var_vals)[: steps * len(names)].reshape(steps, len(names))
+        z = np.asarray(solver.getResults().best_var_vals)[: steps * len(names)].reshape(
+            steps, len(names)
+        )
         back = np.empty_like(z)
         back[:, order] = z
         return {"z": back.tolist(), "status": solver.getStatus().name, "own": own}

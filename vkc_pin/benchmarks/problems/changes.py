@@ -27,7 +27,8 @@ class Change:
     """One setting with another value.
 
     Attributes:
-        module: The module of a constant, `solver.loop` for one; "Options" for a field of `Options`; "" for no change at all.
+        module: The module of a constant, `planning.solver.loop` for one; "Options" for a field of
+            `Options`; "" for no change at all.
         name: Of the constant or the field.
         value: What it is to be.
     """
@@ -44,14 +45,19 @@ class Change:
     @property
     def options(self) -> Options:
         """The options to plan with."""
-        return dataclasses.replace(Options(), **{self.name: self.value}) if self.module == "Options" else Options()
+        return (
+            dataclasses.replace(Options(), **{self.name: self.value})
+            if self.module == "Options"
+            else Options()
+        )
 
     @contextlib.contextmanager
     def applied(self) -> Iterator[None]:
         """Let a constant have its new value meanwhile, in its module and in those that import it by name.
 
-        What a module made of it when it was loaded, a table or a default of an argument, stays as it was. Plan with a `Planner`
-        of its own: what another has kept was built with the old value.
+        What a module made of it when it was loaded, a table or a default of an argument, stays as
+        it was. Plan with a `Planner` of its own: what another has kept was built with the old
+        value.
         """
         places = _places(self.module, self.name) if self.module not in ("", "Options") else []
         before = [(module, name, getattr(module, name)) for module, name in places]
@@ -72,7 +78,8 @@ def parsed(text: str) -> Change:
 
     Raises:
         UnknownNameError: There is no such field, module or constant.
-        InputError: It is no such text, or the value is of another kind than the one that it replaces.
+        InputError: It is no such text, or the value is of another kind than the one that it
+            replaces.
     """
     place, equals, value = text.partition("=")
     try:
@@ -90,15 +97,31 @@ def parsed(text: str) -> Change:
         return change
     module, _, name = (part.strip() for part in place.partition(":"))
     if not name or module.partition(".")[0] not in _WINGS:
-        raise InputError("not a change", field="change", expected=f"{_FORM}; modules of {', '.join(_WINGS)}", got=repr(text))
+        raise InputError(
+            "not a change",
+            field="change",
+            expected=f"{_FORM}; modules of {', '.join(_WINGS)}",
+            got=repr(text),
+        )
     found = _module(module)
-    constants = [key for key, there in vars(found).items() if key.strip("_").isupper() and not isinstance(there, ModuleType)]
+    constants = [
+        key
+        for key, there in vars(found).items()
+        if key.strip("_").isupper() and not isinstance(there, ModuleType)
+    ]
     if name not in constants:
         raise UnknownNameError(f"constant of {module}", name, constants, field="change")
     old = getattr(found, name)
-    number = isinstance(old, int | float) and isinstance(new, int | float) and not isinstance(old, bool)
+    number = (
+        isinstance(old, int | float) and isinstance(new, int | float) and not isinstance(old, bool)
+    )
     if not number and not isinstance(new, type(old)):
-        raise InputError("of another kind", field=str(Change(module, name, new)), expected=repr(old), got=repr(new))
+        raise InputError(
+            "of another kind",
+            field=str(Change(module, name, new)),
+            expected=repr(old),
+            got=repr(new),
+        )
     return Change(module, name, new)
 
 
@@ -106,15 +129,23 @@ def _module(name: str) -> ModuleType:
     try:
         return importlib.import_module(f"vkc_pin.{name}")
     except ModuleNotFoundError:
-        raise InputError("there is no such module", field="change", expected="solver.loop for one", got=name) from None
+        raise InputError(
+            "there is no such module", field="change", expected="solver.loop for one", got=name
+        ) from None
 
 
 def _places(module: str, name: str) -> list[tuple[ModuleType, str]]:
     """Return the modules in which a constant is bound, each with the name that it has there."""
-    importlib.import_module("vkc_pin.planning.planner")  # and with it all that may import the constant
+    importlib.import_module(
+        "vkc_pin.planning.planner"
+    )  # and with it all that may import the constant
     home = _module(module)
     found = [(home, name)]
-    for other in [one for key, one in sorted(sys.modules.items()) if key.startswith("vkc_pin.") and one is not home]:
+    for other in [
+        one
+        for key, one in sorted(sys.modules.items())
+        if key.startswith("vkc_pin.") and one is not home
+    ]:
         try:
             tree = ast.parse(inspect.getsource(other))
         except (OSError, TypeError):

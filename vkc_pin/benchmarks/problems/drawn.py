@@ -1,6 +1,7 @@
 """Problems drawn at random: rooms, or scenes that come along with more obstacles; starts; one or two steps, sensible or not.
 
-Some of them cannot be done, and nobody asks which: what a plan says of itself is to be right either way.
+Some of them cannot be done, and nobody asks which: what a plan says of itself is to be right either
+way.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
 from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.errors import InputError
-from vkc_pin.files.resources import available
-from vkc_pin.models.shapes import world_box
 from vkc_pin.options import Options
-from vkc_pin.scene.obstacles import FLOOR
-from vkc_pin.scene.placed import standing_geometry
-from vkc_pin.scene.rooms.fixtures import OPENED
-from vkc_pin.scene.rooms.random_room import random_room
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch
+from vkc_pin.procedural.rooms.fixtures import OPENABLE
+from vkc_pin.procedural.rooms.random_room import random_room
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.resources import available
+from vkc_pin.world.models.shapes import compute_world_box
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch
 
 __all__ = ["drawn"]
 
@@ -48,22 +49,28 @@ def drawn(seed: int, number: int) -> Problem:
     names = sorted(available("scenes", "*.yaml"))
     for _ in range(_TRIES):
         try:
-            scene = _room(rng) if number % 2 == 0 else _crowded(names[number // 2 % len(names)], rng)
+            scene = (
+                _room(rng) if number % 2 == 0 else _crowded(names[number // 2 % len(names)], rng)
+            )
         except InputError:  # no place for something
             continue
         steps = _steps(scene, rng)
         kind = "room" if number % 2 == 0 else "scene"
         about = ", ".join(type(step).__name__ for step in steps)
         return Problem(number, f"{scene.name}: {about}", kind, scene, steps)
-    raise InputError("nothing found a place", field="problem", expected=f"one of {_TRIES} scenes", got=number)
+    raise InputError(
+        "nothing found a place", field="problem", expected=f"one of {_TRIES} scenes", got=number
+    )
 
 
 def _room(rng: np.random.Generator) -> Scene:
     """Return a room with one or two things to open and something to carry."""
     count = int(rng.integers(1, 3))
-    objects = tuple(str(kind) for kind in rng.choice(list(OPENED), count, replace=False))
+    objects = tuple(str(kind) for kind in rng.choice(list(OPENABLE), count, replace=False))
     carried = tuple(str(kind) for kind in rng.choice(["cup", "ball"], int(rng.integers(1, 3))))
-    clutter = round(float(rng.uniform(0.0, 0.6)), 2)  # much more, and few rooms have a place for everything
+    clutter = round(
+        float(rng.uniform(0.0, 0.6)), 2
+    )  # much more, and few rooms have a place for everything
     return random_room(int(rng.integers(2**31)), clutter=clutter, objects=objects, carried=carried)
 
 
@@ -86,12 +93,19 @@ def _obstacle(scene: Scene, number: int, rng: np.random.Generator) -> dict[str, 
         return {**where, "type": "sphere", "radius": size[0] / 2}
     if kind == 1:
         return {**where, "type": "cylinder", "radius": size[0] / 2, "length": size[2]}
-    return {**where, "type": "box", "size": size, "yaw": round(float(rng.uniform(-np.pi, np.pi)), 3)}
+    return {
+        **where,
+        "type": "box",
+        "size": size,
+        "yaw": round(float(rng.uniform(-np.pi, np.pi)), 3),
+    }
 
 
 def _spot(scene: Scene, rng: np.random.Generator) -> Floats:
     x_low, x_high, y_low, y_high = scene.arena
-    return np.array([round(float(value), 3) for value in rng.uniform((x_low, y_low), (x_high, y_high))])
+    return np.array(
+        [round(float(value), 3) for value in rng.uniform((x_low, y_low), (x_high, y_high))]
+    )
 
 
 def _steps(scene: Scene, rng: np.random.Generator) -> tuple[Step, ...]:
@@ -112,19 +126,26 @@ def _step(scene: Scene, rng: np.random.Generator) -> Step:
         kinds += 4 * [lambda: _actuate(scene, str(rng.choice(fixed)), rng)]
     if free:
         kinds += 3 * [lambda: _place(scene, str(rng.choice(free)), rng)]
-        kinds += [lambda: Grasp(str(rng.choice(free))), lambda: _touch(scene, str(rng.choice(free)), rng)]
+        kinds += [
+            lambda: Grasp(str(rng.choice(free))),
+            lambda: _touch(scene, str(rng.choice(free)), rng),
+        ]
     return kinds[int(rng.integers(len(kinds)))]()
 
 
 def _reach(scene: Scene, rng: np.random.Generator) -> Step:
     x, y = _spot(scene, rng)
-    roll, pitch, yaw = rng.uniform((np.pi / 2, -np.pi / 4, -np.pi), (np.pi, np.pi / 4, np.pi))  # level, or downwards
+    roll, pitch, yaw = rng.uniform(
+        (np.pi / 2, -np.pi / 4, -np.pi), (np.pi, np.pi / 4, np.pi)
+    )  # level, or downwards
     return Reach((x, y, float(rng.uniform(0.2, 1.4)), roll, pitch, yaw))
 
 
 def _go(scene: Scene, rng: np.random.Generator) -> Step:
     x, y = _spot(scene, rng)
-    return GoTo(float(x), float(y), float(rng.uniform(-np.pi, np.pi)) if rng.random() < 0.5 else None)
+    return GoTo(
+        float(x), float(y), float(rng.uniform(-np.pi, np.pi)) if rng.random() < 0.5 else None
+    )
 
 
 def _actuate(scene: Scene, name: str, rng: np.random.Generator) -> Step:
@@ -142,16 +163,27 @@ def _actuate(scene: Scene, name: str, rng: np.random.Generator) -> Step:
 def _place(scene: Scene, name: str, rng: np.random.Generator) -> Step:
     """Put an object on the floor, or on top of an obstacle."""
     placed = scene.objects[name]
-    below = min(world_box(shape.geometry, shape.placement)[0][2] for shape in standing_geometry(placed))
+    below = min(
+        compute_world_box(shape.geometry, shape.placement)[0][2]
+        for shape in make_world_shapes(placed)
+    )
     shapes = zip(scene.obstacles, scene.obstacle_labels, strict=True)
-    boxes = [world_box(shape.geometry, shape.placement) for shape, label in shapes if label != FLOOR]
-    tops = [(low, high) for low, high in boxes if 0.3 < high[2] < 1.3 and min(high[:2] - low[:2]) > 0.2]
+    boxes = [
+        compute_world_box(shape.geometry, shape.placement)
+        for shape, label in shapes
+        if label != FLOOR
+    ]
+    tops = [
+        (low, high) for low, high in boxes if 0.3 < high[2] < 1.3 and min(high[:2] - low[:2]) > 0.2
+    ]
     if tops and rng.random() < 0.8:
         low, high = tops[int(rng.integers(len(tops)))]
         x, y, height = *rng.uniform(low[:2], high[:2]), high[2]
     else:
         x, y, height = *_spot(scene, rng), 0.0
-    return Place(name, (float(x), float(y), float(height + placed.placement.translation[2] - below + _AIR)))
+    return Place(
+        name, (float(x), float(y), float(height + placed.placement.translation[2] - below + _AIR))
+    )
 
 
 def _touch(scene: Scene, name: str, rng: np.random.Generator) -> Step:

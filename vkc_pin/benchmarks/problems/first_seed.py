@@ -35,7 +35,8 @@ def run(
         trials: Number of random starts per task, at least 1.
         seed: Of the starts and of planning.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         tasks: Some of `TASKS`.
         progress: Whether to show a progress bar.
 
@@ -52,11 +53,25 @@ def run(
     names = runner.chosen("task", tasks, TASKS)
     settings = {"benchmark": "first-seed", "seed": seed, "starts": trials, "tasks": names, **LIMITS}
     specs = [
-        {"key": f"{list(TASKS).index(name):02d}/{number:04d}", "task": name, "number": number, "seed": seed}
+        {
+            "key": f"{list(TASKS).index(name):02d}/{number:04d}",
+            "task": name,
+            "number": number,
+            "seed": seed,
+        }
         for name in names
         for number in range(trials)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        _record,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:
@@ -64,12 +79,31 @@ def report(result: Mapping[str, Any]) -> str:
     about, records, rows = result["meta"], result["trials"], []
     for task in (*about["tasks"], "all"):
         own = [record for record in records if task in (record.get("task"), "all")]
-        good, first = (sum(bool(record.get(field)) for record in own) for field in ("success", "first_seed"))
+        good, first = (
+            sum(bool(record.get(field)) for record in own) for field in ("success", "first_seed")
+        )
         low, high = wilson(first, len(own))
         interval = f"{100.0 * low:.0f}–{100.0 * high:.0f}"
         times = map(decimal, distribution(own, "planning_time"))
-        rows.append([task, f"{good} of {len(own)}", f"{first} of {len(own)}", interval, *times, failures(own)])
-    head = ["task", "success", "with the first seed", "of all [%]", "time, median [s]", "95th percentile [s]", "failures"]
+        rows.append(
+            [
+                task,
+                f"{good} of {len(own)}",
+                f"{first} of {len(own)}",
+                interval,
+                *times,
+                failures(own),
+            ]
+        )
+    head = [
+        "task",
+        "success",
+        "with the first seed",
+        "of all [%]",
+        "time, median [s]",
+        "95th percentile [s]",
+        "failures",
+    ]
     parts = [
         "# Success with the first seed",
         f"{about['starts']} random starts per task, seed {about['seed']}. Success is the word of the independent validation. The "
@@ -83,4 +117,6 @@ def report(result: Mapping[str, Any]) -> str:
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     own = problem_of_task(spec["task"], spec["seed"], spec["number"])
-    return tried(own.scene, own.steps, seed=spec["seed"], number=own.number, task=own.kind, problem=own.name)
+    return tried(
+        own.scene, own.steps, seed=spec["seed"], number=own.number, task=own.kind, problem=own.name
+    )

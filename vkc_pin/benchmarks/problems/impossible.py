@@ -15,11 +15,11 @@ from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
 from vkc_pin.benchmarks.problems.ablation import every_trial
 from vkc_pin.errors import InputError
+from vkc_pin.planning.diagnosis.proofs import PROVEN
 from vkc_pin.planning.planner import plan
-from vkc_pin.planning.reasons.proofs import PROVEN
-from vkc_pin.scene.rooms.random_room import random_layout
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
+from vkc_pin.procedural.rooms.random_room import sample_layout
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
 
 __all__ = ["KINDS", "impossible", "report", "run"]
 
@@ -30,7 +30,13 @@ _Problem = tuple[Scene, tuple[Step, ...]]
 
 
 def run(
-    *, out: str | Path, problems: int = 50, seed: int = 0, jobs: int = 1, scheduler: str | None = None, progress: bool = True
+    *,
+    out: str | Path,
+    problems: int = 50,
+    seed: int = 0,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    progress: bool = True,
 ) -> dict[str, Any]:
     """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
 
@@ -39,12 +45,14 @@ def run(
         problems: How many, at least 1; kinds take turns.
         seed: Of the problems and of planning.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`. A trial has also `kind`, `notes`, `wall_time` of the whole call without
-        what is built once [s], `explained` (a note names a cause, or a constraint that no motion could meet) and `proven`.
+        {"meta": ..., "trials": [...]}; see `runner.run`. A trial has also `kind`, `notes`,
+        `wall_time` of the whole call without what is built once [s], `explained` (a note names a
+        cause, or a constraint that no motion could meet) and `proven`.
 
     Raises:
         InputError: No problems, or `out` has trials of other settings.
@@ -54,7 +62,16 @@ def run(
         raise InputError("out of range", field="problems", expected="at least 1", got=problems)
     settings = {"benchmark": "impossible", "seed": seed, "problems": problems, **LIMITS}
     specs = [{"key": f"{number:05d}", "number": number, "seed": seed} for number in range(problems)]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        _record,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:
@@ -62,14 +79,32 @@ def report(result: Mapping[str, Any]) -> str:
     about, records, rows = result["meta"], result["trials"], []
     for kind in (*KINDS, "all"):
         own = [record for record in records if kind in (record.get("kind"), "all")]
-        counts = [str(sum(bool(record.get(field)) for record in own)) for field in ("success", "explained", "proven")]
+        counts = [
+            str(sum(bool(record.get(field)) for record in own))
+            for field in ("success", "explained", "proven")
+        ]
         rows.append([kind, str(len(own)), *counts, *map(decimal, distribution(own, "wall_time"))])
-    said = [(f"{r['kind']}, problem {r['number']}", r["notes"] or r["violations"][:1]) for r in records if "notes" in r]
+    said = [
+        (f"{r['kind']}, problem {r['number']}", r["notes"] or r["violations"][:1])
+        for r in records
+        if "notes" in r
+    ]
     parts = [
         "# Impossible problems",
         f"{about['problems']} problems that cannot be done, seed {about['seed']}, {allowed(about)} each. "
         "Explained: the report names a cause. Proven: it does so for certain.",
-        markdown(["kind", "problems", "success", "explained", "proven", "time, median [s]", "95th percentile [s]"], rows),
+        markdown(
+            [
+                "kind",
+                "problems",
+                "success",
+                "explained",
+                "proven",
+                "time, median [s]",
+                "95th percentile [s]",
+            ],
+            rows,
+        ),
         "## What the reports say",
         "\n".join(f"- {name}: {'; '.join(why)}" for name, why in said),
         "## Every trial",
@@ -97,15 +132,30 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     found = plan(scene, steps, seed=seed, **LIMITS)
     took = time.perf_counter() - began - found.metrics["build_time"]
     notes = found.validation.notes
-    reasons = [violation for violation in found.validation.violations if violation.constraint == "goal"]
+    reasons = [
+        violation for violation in found.validation.violations if violation.constraint == "goal"
+    ]
     explained = bool(notes) or (found.status == "infeasible" and bool(reasons))
     proven = any(PROVEN in note for note in notes) or (found.status == "infeasible" and not notes)
-    more = {"number": number, "problem": f"{kind} {number}", "kind": kind, "wall_time": took, "notes": list(notes)}
+    more = {
+        "number": number,
+        "problem": f"{kind} {number}",
+        "kind": kind,
+        "wall_time": took,
+        "notes": list(notes),
+    }
     return trial(found, method="VKC", seed=seed, explained=explained, proven=proven, **more)
 
 
-def _box(name: str, size: tuple[float, float, float], at: tuple[float, float], *, bottom: float = 0.0) -> dict[str, Any]:
-    return {"name": name, "type": "box", "size": list(size), "position": [*at, bottom + size[2] / 2]}
+def _box(
+    name: str, size: tuple[float, float, float], at: tuple[float, float], *, bottom: float = 0.0
+) -> dict[str, Any]:
+    return {
+        "name": name,
+        "type": "box",
+        "size": list(size),
+        "position": [*at, bottom + size[2] / 2],
+    }
 
 
 def _hall(*obstacles: dict[str, Any]) -> Scene:
@@ -122,29 +172,48 @@ def _hall(*obstacles: dict[str, Any]) -> Scene:
 
 
 def _with(scene: Scene, *obstacles: dict[str, Any]) -> Scene:
-    return Scene.from_document({**scene.document, "obstacles": [*scene.document["obstacles"], *obstacles]}, scene.folder)
+    return Scene.from_document(
+        {**scene.document, "obstacles": [*scene.document["obstacles"], *obstacles]}, scene.folder
+    )
 
 
 def _beyond(rng: np.random.Generator) -> Step:
     """Return a step to be done where x is between 3 and 5 m: the base goes there, or the tool."""
     x, y, yaw = (float(value) for value in rng.uniform((3.5, -2.0, -np.pi), (5.0, 2.0, np.pi)))
-    return GoTo(x, y) if rng.random() < 0.5 else Reach((x, y, float(rng.uniform(0.5, 1.1)), np.pi / 2, 0.0, yaw))
+    return (
+        GoTo(x, y)
+        if rng.random() < 0.5
+        else Reach((x, y, float(rng.uniform(0.5, 1.1)), np.pi / 2, 0.0, yaw))
+    )
 
 
 def _wall(rng: np.random.Generator) -> _Problem:
-    return _hall(_box("fence", (0.1, 2 * _HALL, 2.0), (float(rng.uniform(1.0, 1.6)), 0.0))), (_beyond(rng),)
+    return _hall(_box("fence", (0.1, 2 * _HALL, 2.0), (float(rng.uniform(1.0, 1.6)), 0.0))), (
+        _beyond(rng),
+    )
 
 
 def _ring(x: float, y: float, half: float, height: float) -> list[dict[str, Any]]:
-    sides = {"fence_north": (0, 1), "fence_south": (0, -1), "fence_east": (1, 0), "fence_west": (-1, 0)}
+    sides = {
+        "fence_north": (0, 1),
+        "fence_south": (0, -1),
+        "fence_east": (1, 0),
+        "fence_west": (-1, 0),
+    }
     return [
-        _box(name, (0.1 if u else 2 * half, 0.1 if v else 2 * half, height), (x + half * u, y + half * v))
+        _box(
+            name,
+            (0.1 if u else 2 * half, 0.1 if v else 2 * half, height),
+            (x + half * u, y + half * v),
+        )
         for name, (u, v) in sides.items()
     ]
 
 
 def _fenced_in(rng: np.random.Generator) -> _Problem:
-    return _hall(*_ring(0.0, 0.0, float(rng.uniform(0.9, 1.6)), float(rng.uniform(0.3, 1.5)))), (_beyond(rng),)
+    return _hall(*_ring(0.0, 0.0, float(rng.uniform(0.9, 1.6)), float(rng.uniform(0.3, 1.5)))), (
+        _beyond(rng),
+    )
 
 
 def _fenced_out(rng: np.random.Generator) -> _Problem:
@@ -156,7 +225,10 @@ def _fenced_out(rng: np.random.Generator) -> _Problem:
 def _narrow(rng: np.random.Generator) -> _Problem:
     gap, y, x = _WIDTH - 0.05, float(rng.uniform(-2.0, 2.0)), float(rng.uniform(1.2, 1.8))
     ends = {"wall_left": (y + gap / 2, _HALL), "wall_right": (-_HALL, y - gap / 2)}
-    walls = [_box(name, (0.2, high - low, 2.0), (x, (low + high) / 2)) for name, (low, high) in ends.items()]
+    walls = [
+        _box(name, (0.2, high - low, 2.0), (x, (low + high) / 2))
+        for name, (low, high) in ends.items()
+    ]
     return _hall(*walls), (_beyond(rng),)
 
 
@@ -168,24 +240,33 @@ def _bend(rng: np.random.Generator) -> _Problem:
     walls += [_box("wall_east", (0.1, 3.0 + width, 1.0), (x + 2.05 + width, 1.5))]
     walls += [_box("wall_west", (0.1, 3.0, 1.0), (x + 1.95, width / 2 + 1.5))]
     ends = {"wall_left": (width / 2, _HALL), "wall_right": (-_HALL, -width / 2)}
-    walls += [_box(name, (0.1, high - low, 1.0), (x, (low + high) / 2)) for name, (low, high) in ends.items()]
+    walls += [
+        _box(name, (0.1, high - low, 1.0), (x, (low + high) / 2))
+        for name, (low, high) in ends.items()
+    ]
     return _hall(*walls), (GoTo(x + 2.4, float(rng.uniform(4.3, 4.8))),)
 
 
 def _low_beam(rng: np.random.Generator) -> _Problem:
     """Return a wall under which the base fits, but not the lowest link of the arm."""
-    return _hall(_box("beam", (0.2, 2 * _HALL + 1.0, 1.5), (float(rng.uniform(1.2, 1.6)), 0.0), bottom=0.42)), (_beyond(rng),)
+    return _hall(
+        _box("beam", (0.2, 2 * _HALL + 1.0, 1.5), (float(rng.uniform(1.2, 1.6)), 0.0), bottom=0.42)
+    ), (_beyond(rng),)
 
 
 def _taken(rng: np.random.Generator) -> _Problem:
     x, y = (float(value) for value in rng.uniform((1.5, -2.0), (4.0, 2.0)))
-    return _hall(_box("crate", (0.6, 0.6, 0.5), (x, y))), (GoTo(x + float(rng.uniform(-0.2, 0.2)), y),)
+    return _hall(_box("crate", (0.6, 0.6, 0.5), (x, y))), (
+        GoTo(x + float(rng.uniform(-0.2, 0.2)), y),
+    )
 
 
 def _turned(rng: np.random.Generator) -> _Problem:
     """Return a place where the base fits, but not at the heading asked for."""
     x, y = (float(value) for value in rng.uniform((2.0, -2.0), (4.0, 2.0)))
-    walls = [_box(f"wall_{k}", (2.0, 0.1, 1.0), (x, y + side * 0.45)) for k, side in enumerate((-1, 1))]
+    walls = [
+        _box(f"wall_{k}", (2.0, 0.1, 1.0), (x, y + side * 0.45)) for k, side in enumerate((-1, 1))
+    ]
     return _hall(*walls), (GoTo(x, y, np.pi / 2),)
 
 
@@ -201,7 +282,9 @@ def _high(rng: np.random.Generator) -> _Problem:
 
 
 def _outside(rng: np.random.Generator) -> _Problem:
-    return _hall(), (Reach((_HALL + float(rng.uniform(1.6, 3.0)), 0.0, 0.8, np.pi / 2, 0.0, np.pi / 2)),)
+    return _hall(), (
+        Reach((_HALL + float(rng.uniform(1.6, 3.0)), 0.0, 0.8, np.pi / 2, 0.0, np.pi / 2)),
+    )
 
 
 def _boxed(rng: np.random.Generator) -> _Problem:
@@ -217,32 +300,47 @@ def _beyond_limits(rng: np.random.Generator) -> _Problem:
 
 
 def _shut(rng: np.random.Generator) -> _Problem:
-    return load_scene("door"), (GoTo(*(float(value) for value in rng.uniform((3.6, -1.0), (4.4, 1.0)))),)
+    return load_scene("door"), (
+        GoTo(*(float(value) for value in rng.uniform((3.6, -1.0), (4.4, 1.0)))),
+    )
 
 
 def _cup(rng: np.random.Generator) -> tuple[Scene, Any]:
-    layout = random_layout(int(rng.integers(1000)), clutter=0.0, objects=(), tables=2, carried=("cup",))
-    return layout.scene(), layout.part("table_2")
+    layout = sample_layout(
+        int(rng.integers(1000)), clutter=0.0, objects=(), tables=2, carried=("cup",)
+    )
+    return layout.make_scene(), layout.find_part("table_2")
 
 
 def _covered(rng: np.random.Generator) -> _Problem:
     """Return a cup under a lid."""
     scene, _ = _cup(rng)
     x, y, z = scene.objects["cup"].placement.translation.tolist()
-    return _with(scene, _box("lid", (0.5, 0.5, 0.05), (x, y), bottom=z + 0.11), *_sides(x, y, z)), (Grasp("cup"),)
+    return _with(scene, _box("lid", (0.5, 0.5, 0.05), (x, y), bottom=z + 0.11), *_sides(x, y, z)), (
+        Grasp("cup"),
+    )
 
 
 def _sides(x: float, y: float, z: float) -> list[dict[str, Any]]:
     around = ((0.22, 0.0), (-0.22, 0.0), (0.0, 0.22), (0.0, -0.22))
     sizes = ((0.05, 0.5), (0.05, 0.5), (0.5, 0.05), (0.5, 0.05))
-    return [_box(f"side_{k}", (*sizes[k], 0.1), (x + u, y + v), bottom=z + 0.005) for k, (u, v) in enumerate(around)]
+    return [
+        _box(f"side_{k}", (*sizes[k], 0.1), (x + u, y + v), bottom=z + 0.005)
+        for k, (u, v) in enumerate(around)
+    ]
 
 
 def _occupied(rng: np.random.Generator) -> _Problem:
     """Return a cup that is to be put where something stands."""
     scene, table = _cup(rng)
-    x, y = table.frame.point(float(rng.uniform(-0.15, 0.0)), 0.0)
-    vase = {"name": "vase", "type": "cylinder", "radius": 0.12, "length": 0.3, "position": [x, y, table.size[2] + 0.15]}
+    x, y = table.frame.transform_point(float(rng.uniform(-0.15, 0.0)), 0.0)
+    vase = {
+        "name": "vase",
+        "type": "cylinder",
+        "radius": 0.12,
+        "length": 0.3,
+        "position": [x, y, table.size[2] + 0.15],
+    }
     return _with(scene, vase), (Place("cup", (x, y, table.size[2] + 0.001)),)
 
 

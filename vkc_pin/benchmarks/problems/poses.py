@@ -10,12 +10,12 @@ import itertools
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.models.shapes import shape_distance, world_box
-from vkc_pin.scene.rooms.parts import Part
-from vkc_pin.scene.rooms.random_room import Layout
-from vkc_pin.scene.scene import Scene
+from vkc_pin.procedural.rooms.parts import Part
+from vkc_pin.procedural.rooms.random_room import Layout
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box
+from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["pose_among", "pose_over", "random_start"]
 
@@ -38,17 +38,32 @@ def pose_over(layout: Layout, scene: Scene, table: Part, rng: np.random.Generato
         InputError: No configuration was found.
     """
     depth, width, height = table.size
-    into = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, table.frame.yaw), np.array([table.frame.x, table.frame.y, 0.0]))
+    into = pin.SE3(
+        pin.rpy.rpyToMatrix(0.0, 0.0, table.frame.yaw),
+        np.array([table.frame.x, table.frame.y, 0.0]),
+    )
     own = into.inverse()
     for _ in range(_TRIES):
         ahead, side = rng.uniform((0.4, -0.6), (1.0, 0.6))
-        base = (*table.frame.point(-depth / 2.0 - ahead, side), rng.uniform(-np.pi, np.pi))
+        base = (
+            *table.frame.transform_point(-depth / 2.0 - ahead, side),
+            rng.uniform(-np.pi, np.pi),
+        )
         at, z = _drawn(scene, base, rng)
         x, y, up = own.act(at.translation)
-        over = -depth / 2.0 < x < min(-depth / 2.0 + 0.5, depth / 2.0) and abs(y) < width / 2.0 and 0.05 < up - height < 0.45
+        over = (
+            -depth / 2.0 < x < min(-depth / 2.0 + 0.5, depth / 2.0)
+            and abs(y) < width / 2.0
+            and 0.05 < up - height < 0.45
+        )
         if over and _free(scene, z):
             return at
-    raise InputError("no configuration reaches over the table", field="pose", expected=f"one of {_TRIES}", got=table.name)
+    raise InputError(
+        "no configuration reaches over the table",
+        field="pose",
+        expected=f"one of {_TRIES}",
+        got=table.name,
+    )
 
 
 def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE3:
@@ -69,13 +84,18 @@ def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE
     for _ in range(_TRIES):
         x, y, yaw = rng.uniform([*-half, -np.pi], [*half, np.pi])
         apart = np.hypot(x - layout.start[0], y - layout.start[1]) >= FAR
-        if not apart or not layout.floor.free(standing, layout.radius, [[x, y]])[0]:
+        if not apart or not layout.floor.find_free(standing, layout.radius, [[x, y]])[0]:
             continue
         at, z = _drawn(scene, (x, y, yaw), rng)
         free = 0.2 < at.translation[2] < 1.4 and _free(scene, z, NEAR)
-        if free and layout.floor.connected(standing, layout.radius, [layout.start[:2], (x, y)]):
+        if free and layout.floor.is_connected(standing, layout.radius, [layout.start[:2], (x, y)]):
             return at
-    raise InputError("no configuration is near anything", field="pose", expected=f"one of {_TRIES}", got=scene.name)
+    raise InputError(
+        "no configuration is near anything",
+        field="pose",
+        expected=f"one of {_TRIES}",
+        got=scene.name,
+    )
 
 
 def random_start(scene: Scene, rng: np.random.Generator) -> Scene:
@@ -89,16 +109,28 @@ def random_start(scene: Scene, rng: np.random.Generator) -> Scene:
         InputError: There is no start region, or no configuration was found.
     """
     if scene.start_region is None:
-        raise InputError("the scene has no start region", file=scene.file, field="start_region", expected="x and y intervals")
-    for x, y, yaw in itertools.islice(scene.start_region.draws(rng), _TRIES):
+        raise InputError(
+            "the scene has no start region",
+            file=scene.file,
+            field="start_region",
+            expected="x and y intervals",
+        )
+    for x, y, yaw in itertools.islice(scene.start_region.sample_poses(rng), _TRIES):
         _, z = _drawn(scene, (x, y, yaw), rng)
         if _free(scene, z):
             return scene.with_start(base=z[:3], arm=z[3:])
     problem = f"no free configuration of the robot in {_TRIES} tries"
-    raise InputError(problem, file=scene.file, field="start_region", expected=f"a clearance of {CLEAR} m somewhere")
+    raise InputError(
+        problem,
+        file=scene.file,
+        field="start_region",
+        expected=f"a clearance of {CLEAR} m somewhere",
+    )
 
 
-def _drawn(scene: Scene, base: tuple[float, float, float], rng: np.random.Generator) -> tuple[pin.SE3, Floats]:
+def _drawn(
+    scene: Scene, base: tuple[float, float, float], rng: np.random.Generator
+) -> tuple[pin.SE3, Floats]:
     """Return the tool's placement with the arm anywhere, and the configuration, shape (n,)."""
     robot = scene.robot
     lower, upper = np.maximum(robot.lower, -np.pi)[3:], np.minimum(robot.upper, np.pi)[3:]
@@ -115,11 +147,14 @@ def _free(scene: Scene, z: Floats, near: float = np.inf) -> bool:
     pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(z))
     geometry = robot.collision.geometryObjects
     for shape, where in zip(geometry, shapes.oMg, strict=True):
-        if shape.parentJoint > 1 and world_box(shape.geometry, where)[0][2] < CLEAR:
+        if shape.parentJoint > 1 and compute_world_box(shape.geometry, where)[0][2] < CLEAR:
             return False
     for pair in robot.collision.collisionPairs:
         one, two = (geometry[k].geometry for k in (pair.first, pair.second))
-        if shape_distance(one, shapes.oMg[pair.first], two, shapes.oMg[pair.second]) < CLEAR:
+        if (
+            compute_shape_distance(one, shapes.oMg[pair.first], two, shapes.oMg[pair.second])
+            < CLEAR
+        ):
             return False
     try:
         there = scene.with_start(base=z[:3], arm=z[3:])

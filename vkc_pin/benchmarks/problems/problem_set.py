@@ -1,6 +1,7 @@
 """Sixty problems by number: forty in random rooms, twenty from fixed starts of the scenes that come along.
 
-Which problems these are follows from numbers alone. No planner was asked whether it can solve one, and none is left out for that.
+Which problems these are follows from numbers alone. No planner was asked whether it can solve one,
+and none is left out for that.
 """
 
 from __future__ import annotations
@@ -16,11 +17,20 @@ from vkc_pin.benchmarks import baselines, door, household, initialization
 from vkc_pin.benchmarks.comparison import Assignment, placed
 from vkc_pin.benchmarks.problems.poses import pose_among, pose_over
 from vkc_pin.errors import InputError
-from vkc_pin.scene.rooms.random_room import random_layout
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.task.steps import Actuate, Grasp, Place, Reach, Step, Touch
+from vkc_pin.procedural.rooms.random_room import sample_layout
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Reach, Step, Touch
 
-__all__ = ["KINDS", "NUMBER", "TASKS", "Problem", "kind_of", "problem", "problem_of_task", "started"]
+__all__ = [
+    "KINDS",
+    "NUMBER",
+    "TASKS",
+    "Problem",
+    "kind_of",
+    "problem",
+    "problem_of_task",
+    "started",
+]
 
 KINDS = ("reach", "door", "pull", "carry", "scene")
 """Kinds of problems: ten of each of the first four, in random rooms, then twenty in scenes that come along."""
@@ -42,7 +52,11 @@ TASKS: Mapping[str, Assignment] = {
     "door": Assignment("door", (Actuate("door", door.GOAL),), "open a door"),
     "drawer": Assignment("drawer", (Actuate("drawer", {"slide": 0.3}),), "pull a drawer"),
     **{
-        scene: Assignment(scene, (Grasp("stick"), Touch("stick.tip", initialization.TARGET)), "touch a cube with a stick")
+        scene: Assignment(
+            scene,
+            (Grasp("stick"), Touch("stick.tip", initialization.TARGET)),
+            "touch a cube with a stick",
+        )
         for scene in initialization.SCENES
     },
     **{task.scene: task for task in baselines.TASKS.values()},
@@ -77,7 +91,12 @@ def kind_of(number: int) -> str:
         InputError: There is no such problem.
     """
     if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < NUMBER:
-        raise InputError("there is no such problem", field="problem", expected=f"0 to {NUMBER - 1}", got=repr(number))
+        raise InputError(
+            "there is no such problem",
+            field="problem",
+            expected=f"0 to {NUMBER - 1}",
+            got=repr(number),
+        )
     return KINDS[min(number // _EACH, len(KINDS) - 1)]
 
 
@@ -94,7 +113,9 @@ def problem(number: int) -> Problem:
     if kind == "scene":
         name, start = _FIXED[number - (len(KINDS) - 1) * _EACH]
         return dataclasses.replace(problem_of_task(name, _STARTS, start), number=number, kind=kind)
-    scene, step, about = {"reach": _reach, "door": _door, "pull": _pull, "carry": _carry}[kind](number)
+    scene, step, about = {"reach": _reach, "door": _door, "pull": _pull, "carry": _carry}[kind](
+        number
+    )
     return Problem(number, f"{scene.name} {about}", kind, scene, (step,))
 
 
@@ -117,7 +138,9 @@ def started(task: str, seed: int, number: int) -> Scene:
     return scattered.sample_start(rng)
 
 
-_FIXED = [(name, start) for name in TASKS for start in range(1 if name.startswith("household") else 2)]
+_FIXED = [
+    (name, start) for name in TASKS for start in range(1 if name.startswith("household") else 2)
+]
 
 
 def _clutter(number: int) -> float:
@@ -126,32 +149,40 @@ def _clutter(number: int) -> float:
 
 
 def _reach(number: int) -> tuple[Scene, Step, str]:
-    layout = random_layout(number, clutter=_clutter(number))
-    scene, rng = layout.scene(), np.random.default_rng([2, number])
+    layout = sample_layout(number, clutter=_clutter(number))
+    scene, rng = layout.make_scene(), np.random.default_rng([2, number])
     over = number % 2 == 0
-    pose: pin.SE3 = pose_over(layout, scene, layout.part("table_1"), rng) if over else pose_among(layout, scene, rng)
+    pose: pin.SE3 = (
+        pose_over(layout, scene, layout.find_part("table_1"), rng)
+        if over
+        else pose_among(layout, scene, rng)
+    )
     return scene, Reach(pose), f"reach {'over a table' if over else 'among furniture'}"
 
 
 def _door(number: int) -> tuple[Scene, Step, str]:
     name, attachment = _DOORS[number % len(_DOORS)]
-    scene = random_layout(number, clutter=_clutter(number), objects=(name,)).scene()
+    scene = sample_layout(number, clutter=_clutter(number), objects=(name,)).make_scene()
     angle = round(float(np.random.default_rng([2, number]).uniform(*_SWUNG)), 2)
     return scene, Actuate(name, {"hinge": angle}, attachment), f"push {name} by {angle:g} rad"
 
 
 def _pull(number: int) -> tuple[Scene, Step, str]:
     name, joint, interval = _PULLED[number % len(_PULLED)]
-    scene = random_layout(number, clutter=_clutter(number), objects=(name,)).scene()
+    scene = sample_layout(number, clutter=_clutter(number), objects=(name,)).make_scene()
     value = round(float(np.random.default_rng([2, number]).uniform(*interval)), 2)
-    return scene, Actuate(name, {joint: value}), f"pull {name} by {value:g} {'m' if joint == 'slide' else 'rad'}"
+    return (
+        scene,
+        Actuate(name, {joint: value}),
+        f"pull {name} by {value:g} {'m' if joint == 'slide' else 'rad'}",
+    )
 
 
 def _carry(number: int) -> tuple[Scene, Step, str]:
-    layout = random_layout(number, clutter=_clutter(number), tables=2, carried=("cup",))
-    rng, table = np.random.default_rng([2, number]), layout.part("table_2")
+    layout = sample_layout(number, clutter=_clutter(number), tables=2, carried=("cup",))
+    rng, table = np.random.default_rng([2, number]), layout.find_part("table_2")
     depth, width, _ = table.size
     x = -depth / 2.0 + float(rng.uniform(_EDGE, 0.3))
     y = float(rng.uniform(_EDGE - width / 2.0, width / 2.0 - _EDGE))
-    place = (*table.frame.point(x, y), round(table.size[2] + 0.001, 3))
-    return layout.scene(), Place("cup", place), "carry the cup to table_2"
+    place = (*table.frame.transform_point(x, y), round(table.size[2] + 0.001, 3))
+    return layout.make_scene(), Place("cup", place), "carry the cup to table_2"

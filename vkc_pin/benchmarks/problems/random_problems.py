@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.arguments import known
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
@@ -20,13 +19,17 @@ from vkc_pin.benchmarks.problems.drawn import drawn
 from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
-from vkc_pin.task.goals import random_task
-from vkc_pin.task.steps import Actuate, Grasp
+from vkc_pin.procedural.tasks import random_task
+from vkc_pin.utils.arguments import known
+from vkc_pin.world.task.steps import Actuate, Grasp
 
 __all__ = ["report", "run"]
 
 _ROOMS = 100_000  # of one seed
-_LIMITS = {**LIMITS, "effort": LIMITS["effort"] // 10}  # many of them cannot be done; those that can take up to 60 000
+_LIMITS = {
+    **LIMITS,
+    "effort": LIMITS["effort"] // 10,
+}  # many of them cannot be done; those that can take up to 60 000
 OF = ("anything", "rooms")
 
 
@@ -46,9 +49,11 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         problems: How many, at least 1.
         seed: Of the problems and of planning.
-        of: "anything" for steps at random, possible or not; "rooms" for `random_task`: something to open in a random room.
+        of: "anything" for steps at random, possible or not; "rooms" for `random_task`: something to
+            open in a random room.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -61,10 +66,27 @@ def run(
     if problems < 1:
         raise InputError("out of range", field="problems", expected="at least 1", got=problems)
     known(of, OF, "set of problems", "of")
-    settings = {"benchmark": "random" if of == OF[0] else of, "seed": seed, "problems": problems, **_LIMITS}
-    specs = [{"key": f"{number:05d}", "number": number, "seed": seed, "of": of} for number in range(problems)]
+    settings = {
+        "benchmark": "random" if of == OF[0] else of,
+        "seed": seed,
+        "problems": problems,
+        **_LIMITS,
+    }
+    specs = [
+        {"key": f"{number:05d}", "number": number, "seed": seed, "of": of}
+        for number in range(problems)
+    ]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
-    return runner.run(specs, function, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        function,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def report(result: Mapping[str, Any]) -> str:
@@ -84,7 +106,10 @@ def report(result: Mapping[str, Any]) -> str:
         title,
         f"{about['problems']} problems, seed {about['seed']}, {allowed(about)} each. {possible}"
         "Success is the word of the independent validation.",
-        markdown(["kind", "problems", "success", *statuses, "time, median [s]", "95th percentile [s]"], rows),
+        markdown(
+            ["kind", "problems", "success", *statuses, "time, median [s]", "95th percentile [s]"],
+            rows,
+        ),
         "## Every trial",
         every_trial(records),
     ]

@@ -41,7 +41,8 @@ def run(
         out: The folder; if it has trials of the same settings already, they are not run again.
         seed: The first seed of planning; the others follow it.
         jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see `engine.results`.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
         seeds: How many seeds, at least 2.
         problems: Numbers of problems; None: all.
         progress: Whether to show a progress bar.
@@ -54,7 +55,9 @@ def run(
         KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
     """
     if isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 2:
-        raise InputError("out of range", field="seeds", expected="a whole number of at least 2", got=repr(seeds))
+        raise InputError(
+            "out of range", field="seeds", expected="a whole number of at least 2", got=repr(seeds)
+        )
     numbers = chosen(problems)
     settings = {"benchmark": "spread", "seed": seed, "seeds": seeds, "problems": numbers, **LIMITS}
     specs = [
@@ -62,7 +65,16 @@ def run(
         for number in numbers
         for own in range(seed, seed + seeds)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, jobs=jobs, scheduler=scheduler, progress=progress)
+    return runner.run(
+        specs,
+        _record,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
 
 
 def spread_of(records: Sequence[Record], field: str) -> float | None:
@@ -82,21 +94,45 @@ def report(result: Mapping[str, Any]) -> str:
         first, median, third = quartiles(found)
         late = float(np.percentile(found, 95)) if found else float("nan")
         same = sum(spread <= WITHIN for spread in found)
-        texts = [f"{100.0 * value:.1f}" for value in (first, median, third, late, max(found, default=float("nan")))]
+        texts = [
+            f"{100.0 * value:.1f}"
+            for value in (first, median, third, late, max(found, default=float("nan")))
+        ]
         summary.append([name, f"{same} of {len(found)}", *texts])
     rows = []
     for number, own in groups.items():
         spreads = [spread_of(own, field) for field in FIELDS]
         good = f"{sum(bool(r['success']) for r in own)} of {len(own)}"
         names = next((r["problem"] for r in own if "problem" in r), "")
-        seeds = "; ".join(dict.fromkeys(r["initialization"] for r in own if r.get("initialization")))
-        rows.append([str(number), names, good, *("–" if s is None else f"{100.0 * s:.1f}" for s in spreads), seeds])
+        seeds = "; ".join(
+            dict.fromkeys(r["initialization"] for r in own if r.get("initialization"))
+        )
+        rows.append(
+            [
+                str(number),
+                names,
+                good,
+                *("–" if s is None else f"{100.0 * s:.1f}" for s in spreads),
+                seeds,
+            ]
+        )
     percent = [f"{name} [%]" for name in FIELDS.values()]
     parts = [
         "# Spread over random seeds",
         f"{len(groups)} problems, each planned with {about['seeds']} seeds from {about['seed']} on. Spread is the largest value "
         f"over the least, minus 1, of successes. The summary is over the {len(whole)} problems that succeed with every seed.",
-        markdown(["of", f"within {100 * WITHIN:.0f} %", "1st quartile [%]", "median", "3rd quartile", "95th", "most"], summary),
+        markdown(
+            [
+                "of",
+                f"within {100 * WITHIN:.0f} %",
+                "1st quartile [%]",
+                "median",
+                "3rd quartile",
+                "95th",
+                "most",
+            ],
+            summary,
+        ),
         "## Every problem",
         markdown(["number", "problem", "success", *percent, "seed trajectories"], rows, text=2),
         "## Every trial",

@@ -11,18 +11,20 @@ import numpy as np
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import Planner, borrowed, plan
-from vkc_pin.program.problem import TrajectoryProblem
-from vkc_pin.scene.scene import Scene, load_scene
-from vkc_pin.solver.solution import Iteration
-from vkc_pin.task.compiler import compile_task
-from vkc_pin.task.steps import Reach, Step
+from vkc_pin.planning.planner import Planner, acquire_cache, plan
+from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.steps import Reach, Step
 
 __all__ = ["first_seed", "objective", "tried"]
 
 
-def tried(scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = UNCHANGED, **more: Any) -> dict[str, Any]:
+def tried(
+    scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = UNCHANGED, **more: Any
+) -> dict[str, Any]:
     """Plan and return the record: `record.trial`, and `solves`, `first_seed`, `objective`, `cpu_time` and `wall_time` of it all.
 
     Args:
@@ -39,9 +41,19 @@ def tried(scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = 
         solves.extend([row.round] if row.round == 1 else [])
 
     planner = _planner(change)
-    with change.applied():  # before the clock starts: looking for where a constant is imported takes a while
+    with (
+        change.applied()
+    ):  # before the clock starts: looking for where a constant is imported takes a while
         wall, cpu = time.perf_counter(), time.process_time()
-        found = plan(scene, steps, options=change.options, seed=seed, callback=count, planner=planner, **LIMITS)
+        found = plan(
+            scene,
+            steps,
+            options=change.options,
+            seed=seed,
+            callback=count,
+            planner=planner,
+            **LIMITS,
+        )
         took = {"wall_time": time.perf_counter() - wall, "cpu_time": time.process_time() - cpu}
     own: dict[str, Any] = {
         **took,
@@ -66,8 +78,8 @@ def first_seed(found: Plan, solves: int) -> bool:
 def objective(found: Plan, planner: Planner | None = None) -> float | None:
     """Return what the way costs, in the options' weights, of a plan that is a success and one problem; None for others.
 
-    It is that of robot and objects. Freedoms of grasps are left out: while nothing is held they mean nothing, and the motion has
-    other values for them there than the program.
+    It is that of robot and objects. Freedoms of grasps are left out: while nothing is held they
+    mean nothing, and the motion has other values for them there than the program.
 
     Args:
         found: The plan; without own costs.
@@ -79,11 +91,14 @@ def objective(found: Plan, planner: Planner | None = None) -> float | None:
     spans = found.trajectory.phases
     if [span.name for span in spans][: len(task.phases)] != [phase.name for phase in task.phases]:
         return None  # motions of single steps, one after the other
-    with borrowed(planner) as cache:
+    with acquire_cache(planner) as cache:
         problem = TrajectoryProblem(found.scene, task, found.options, (), cache=cache)
         # Pauses for the gripper, at the beginning of a phase, are no waypoints of the program.
         rows = np.concatenate(
-            [np.arange(span.last - phase.segments, span.last) + 1 for span, phase in zip(spans, task.phases, strict=False)]
+            [
+                np.arange(span.last - phase.segments, span.last) + 1
+                for span, phase in zip(spans, task.phases, strict=False)
+            ]
         )
         if problem.chain.names != found.trajectory.names:
             return None

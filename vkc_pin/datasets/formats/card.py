@@ -8,12 +8,16 @@ from typing import Any
 
 import yaml
 
-__all__ = ["card"]
+__all__ = ["make_card"]
 
 _ROWS = 12  # of reasons
 
 
-def card(about: Mapping[str, Any], records: Sequence[Mapping[str, Any]], failures: Sequence[Mapping[str, Any]]) -> str:
+def make_card(
+    about: Mapping[str, Any],
+    records: Sequence[Mapping[str, Any]],
+    failures: Sequence[Mapping[str, Any]],
+) -> str:
     """Return the card as Markdown, headed by the fields that dataset hubs read.
 
     Args:
@@ -32,7 +36,9 @@ def card(about: Mapping[str, Any], records: Sequence[Mapping[str, Any]], failure
     seconds = sum(float(record["duration"]) for record in records)
     attempts = len(records) + len(failures)
     share = f"{100.0 * len(records) / attempts:.1f} %" if attempts else "–"
-    reasons = Counter(f"{record['status']}: {str(record.get('reason', ''))[:120]}" for record in failures)
+    reasons = Counter(
+        f"{record['status']}: {str(record.get('reason', ''))[:120]}" for record in failures
+    )
     parts = [
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---",
         f"# {about['name']}",
@@ -44,9 +50,11 @@ def card(about: Mapping[str, Any], records: Sequence[Mapping[str, Any]], failure
         f"The recipe below, of digest `{about['digest']}`, and a number determine an episode. {attempts} numbers were tried, "
         f"{share} of which became episodes; `failures.csv` has the others with their reasons.",
         f"```yaml\n{about['recipe']}```",
-        "| what | version |\n| --- | --- |\n" + "\n".join(f"| {name} | {value} |" for name, value in about["versions"].items()),
+        "| what | version |\n| --- | --- |\n"
+        + "\n".join(f"| {name} | {value} |" for name, value in about["versions"].items()),
         "## What went wrong",
-        "\n".join(f"- {text} ({count})" for text, count in reasons.most_common(_ROWS)) or "Nothing.",
+        "\n".join(f"- {text} ({count})" for text, count in reasons.most_common(_ROWS))
+        or "Nothing.",
         "## Files",
         "- `shards/<robot>/shard-<k>.hdf5`: groups as robomimic's, sampled at "
         f"{about['rate']:g} Hz, with the exact motion under `motion`\n"
@@ -67,6 +75,15 @@ def _counted(records: Sequence[Mapping[str, Any]]) -> str:
     """Return a table of how many episodes there are of which task, robot and kind of object."""
     rows = ["| | episodes |", "| --- | --- |"]
     for field in ("task", "robot", "kind"):
-        rows += [f"| {field} {name} | {count} |" for name, count in sorted(Counter(r[field] for r in records).items())]
+        rows += [
+            f"| {field} {name} | {count} |"
+            for name, count in sorted(Counter(r[field] for r in records).items())
+        ]
     rooms = len({record["room"] for record in records})
-    return "\n".join([*rows, f"| rooms | {rooms} |", f"| scenes | {len({record['scene'] for record in records})} |"])
+    return "\n".join(
+        [
+            *rows,
+            f"| rooms | {rooms} |",
+            f"| scenes | {len({record['scene'] for record in records})} |",
+        ]
+    )

@@ -1,8 +1,9 @@
 """Shards: many episodes in one HDF5 file, in groups as robomimic has them, with the exact motion beside the samples.
 
-The groups are those of robomimic's documentation (`data/demo_<k>` with `actions`, `states`, `obs`, `rewards`, `dones`; the
-attributes `total`, `env_args` and `num_samples`; `mask`). What is sampled is single precision; the motion itself, which is what
-can be validated again, is double precision under `motion`.
+The groups are those of robomimic's documentation (`data/demo_<k>` with `actions`, `states`, `obs`,
+`rewards`, `dones`; the attributes `total`, `env_args` and `num_samples`; `mask`). What is sampled
+is single precision; the motion itself, which is what can be validated again, is double precision
+under `motion`.
 """
 
 from __future__ import annotations
@@ -17,22 +18,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats, Ints
-from vkc_pin.datasets.episode import Episode, made_of, scene_name
-from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.episode import Episode, compute_scene_name, make_episode
+from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.errors import InputError
-from vkc_pin.files.documents import parse_json, read_text
-from vkc_pin.files.writing import check_name, write_atomically
-from vkc_pin.models.robot import Robot
-from vkc_pin.needed import optional_package
 from vkc_pin.simulation.cameras.images import Images
-from vkc_pin.task.steps import step_to_dict
-from vkc_pin.task.terms import term_to_dict
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.world.files.documents import parse_json, read_text
+from vkc_pin.world.files.writing import check_name, write_atomically
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.task.steps import step_to_dict
+from vkc_pin.world.task.terms import term_to_dict
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["episodes_of", "needed", "numbers_of", "part", "write_shard"]
+__all__ = ["make_part", "read_episodes", "read_numbers", "require_h5py", "write_shard"]
 
 _OBSERVED = (
     *("base_pose", "base_velocity", "arm_position", "arm_velocity"),
@@ -42,7 +43,7 @@ _ENVIRONMENT = "vkc_pin"
 _HELD_OUT = 10  # every so many an episode is in mask/valid, the others are in mask/train
 
 
-def needed() -> Any:
+def require_h5py() -> Any:
     """Return h5py.
 
     Raises:
@@ -54,15 +55,15 @@ def needed() -> Any:
 def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> Path:
     """Write episodes of one robot to a file, whole or not at all; the same episodes give the same bytes. Return the path.
 
-    They are copied as they are, which takes a fraction of a millisecond each; making a part takes twenty times as long, and is
-    done where the episode is made.
+    They are copied as they are, which takes a fraction of a millisecond each; making a part takes
+    twenty times as long, and is done where the episode is made.
 
     Args:
         path: The file.
-        parts: For each episode, in order, a file of `part`, or a shard, and its place in there.
+        parts: For each episode, in order, a file of `make_part`, or a shard, and its place in there.
         scenes: The folder of the dataset's scenes, to which those of the parts are added.
     """
-    h5py = needed()
+    h5py = require_h5py()
     buffer = io.BytesIO()
     masks: dict[str, list[str]] = {"train": [], "valid": []}
     total = 0
@@ -78,14 +79,16 @@ def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> 
                 scene = check_name(data[name].attrs["scene"], f"demo_{place}: scene", file=source)
                 _keep_scene(found, scenes / f"{scene}.json")
             total += int(data[name].attrs["num_samples"])
-            masks["valid" if data[name].attrs["number"] % _HELD_OUT == _HELD_OUT - 1 else "train"].append(name)
+            masks[
+                "valid" if data[name].attrs["number"] % _HELD_OUT == _HELD_OUT - 1 else "train"
+            ].append(name)
         data.attrs["total"] = total
         for mask, names in masks.items():
             file.create_dataset(f"mask/{mask}", data=np.array(names, dtype="S"))
     return write_atomically(path, buffer.getvalue())
 
 
-def part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes:
+def make_part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes:
     """Return an episode as a file of its own, with its scene, of which `write_shard` makes part of a shard.
 
     Args:
@@ -94,14 +97,21 @@ def part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes:
         rate: Samples a second.
         recipe: The digest of what it was made of.
     """
-    h5py = needed()
+    h5py = require_h5py()
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="latest") as file:
         data = file.create_group("data")
         _write(data.create_group("demo_0"), episode, robot, rate)
         data.attrs["options"] = json.dumps(asdict(episode.options), sort_keys=True)
-        settings = {"robot": robot.name, "rate": rate, "recipe": recipe, "scenes": "../../scenes/<scene>.json"}
-        data.attrs["env_args"] = json.dumps({"env_name": _ENVIRONMENT, "env_type": -1, "env_kwargs": settings})
+        settings = {
+            "robot": robot.name,
+            "rate": rate,
+            "recipe": recipe,
+            "scenes": "../../scenes/<scene>.json",
+        }
+        data.attrs["env_args"] = json.dumps(
+            {"env_name": _ENVIRONMENT, "env_type": -1, "env_kwargs": settings}
+        )
         scene = json.dumps(episode.document, sort_keys=True, separators=(",", ":")) + "\n"
         file.create_dataset("scene", data=np.frombuffer(scene.encode(), np.uint8))
     return buffer.getvalue()
@@ -115,14 +125,16 @@ def _keep_scene(found: h5py.File, path: Path) -> None:
 
 def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> None:
     """Write one episode."""
-    found, motion = sampled(episode, robot, rate), episode.trajectory.to_dict()
+    found, motion = sample_episode(episode, robot, rate), episode.trajectory.to_dict()
     count = len(found["time"])
     for name in _OBSERVED:
         _array(group, f"obs/{name}", found[name], np.float32)
     _array(group, "actions", found["actions"], np.float32)
     _array(group, "states", found["states"], np.float32)
     images = episode.images()
-    for name, pixels in {} if images is None else images.pictures.items():  # a chunk each: loaders read single moments
+    for name, pixels in (
+        {} if images is None else images.pictures.items()
+    ):  # a chunk each: loaders read single moments
         squeezed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
         group.create_dataset(f"obs/{name}", data=pixels, chunks=(1, *pixels.shape[1:]), **squeezed)
     done = np.zeros(count, np.uint8)
@@ -144,7 +156,7 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> No
         report[name] = _finite(report[name])
     group.attrs["num_samples"] = count
     group.attrs["number"] = episode.number
-    group.attrs["scene"] = scene_name(episode.document)
+    group.attrs["scene"] = compute_scene_name(episode.document)
     group.attrs["task"] = str(episode.about["task"])
     said: dict[str, Any] = {
         "about": dict(episode.about),
@@ -172,7 +184,11 @@ def _among(curve: Mapping[str, Floats], waypoints: Mapping[str, Floats]) -> Ints
 
 def _array(group: h5py.Group, name: str, values: Any, kind: Any) -> None:
     values = np.asarray(values, kind)
-    squeezed = {"compression": "gzip", "compression_opts": 6, "shuffle": True} if values.nbytes > 512 else {}
+    squeezed = (
+        {"compression": "gzip", "compression_opts": 6, "shuffle": True}
+        if values.nbytes > 512
+        else {}
+    )
     group.create_dataset(name, data=values, chunks=values.shape if squeezed else None, **squeezed)
 
 
@@ -182,7 +198,7 @@ def _finite(values: Any) -> Any:
     return float(values) if np.isfinite(values) else None
 
 
-def numbers_of(path: Path) -> list[int]:
+def read_numbers(path: Path) -> list[int]:
     """Return the numbers of a shard's episodes, in order.
 
     Raises:
@@ -192,7 +208,7 @@ def numbers_of(path: Path) -> list[int]:
         return [int(file["data"][f"demo_{k}"].attrs["number"]) for k in range(len(file["data"]))]
 
 
-def episodes_of(path: Path, scenes: Path) -> Iterator[Episode]:
+def read_episodes(path: Path, scenes: Path) -> Iterator[Episode]:
     """Yield the episodes of a shard, in order.
 
     Args:
@@ -219,11 +235,19 @@ def episodes_of(path: Path, scenes: Path) -> Iterator[Episode]:
             except (LookupError, TypeError, OSError, ValueError) as error:
                 if isinstance(error, InputError):
                     raise
-                raise InputError("not a shard of episodes", file=path, field=f"demo_{k}", got=str(error)) from error
-            episode = made_of(
-                {**said, "options": options, "number": number, "scene": documents[name]}, arrays, scenes.parent / "robots"
+                raise InputError(
+                    "not a shard of episodes", file=path, field=f"demo_{k}", got=str(error)
+                ) from error
+            episode = make_episode(
+                {**said, "options": options, "number": number, "scene": documents[name]},
+                arrays,
+                scenes.parent / "robots",
             )
-            yield replace(episode, load_images=functools.partial(_images, path, k)) if "images" in said else episode
+            yield (
+                replace(episode, load_images=functools.partial(_images, path, k))
+                if "images" in said
+                else episode
+            )
 
 
 def _images(path: Path, k: int) -> Images:
@@ -236,22 +260,33 @@ def _images(path: Path, k: int) -> Images:
         try:
             group = file["data"][f"demo_{k}"]
             said = parse_json(str(group.attrs["episode"]), path)
-            return Images({name: group["obs"][name][:] for name in said["images"]}, tuple(said["segments"]))
+            return Images(
+                {name: group["obs"][name][:] for name in said["images"]}, tuple(said["segments"])
+            )
         except (LookupError, TypeError, OSError) as error:
-            raise InputError("images are missing or damaged", file=path, field=f"demo_{k}", got=str(error)) from error
+            raise InputError(
+                "images are missing or damaged", file=path, field=f"demo_{k}", got=str(error)
+            ) from error
 
 
 def _document(scenes: Path, name: str) -> Any:
     file = scenes / f"{name}.json"
     document = parse_json(read_text(file, "scene"), file)
-    if scene_name(document) != name:
-        raise InputError("this scene is not what its name says", file=file, expected=name, got=scene_name(document))
+    if compute_scene_name(document) != name:
+        raise InputError(
+            "this scene is not what its name says",
+            file=file,
+            expected=name,
+            got=compute_scene_name(document),
+        )
     return document
 
 
 def _opened(path: Path) -> Any:
-    h5py = needed()
+    h5py = require_h5py()
     try:
         return h5py.File(path, "r")
     except OSError as error:
-        raise InputError("not an HDF5 file", file=path, expected="a shard of a dataset", got=str(error)) from error
+        raise InputError(
+            "not an HDF5 file", file=path, expected="a shard of a dataset", got=str(error)
+        ) from error

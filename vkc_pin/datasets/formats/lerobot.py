@@ -1,8 +1,9 @@
 """LeRobot's dataset layout 3.0: many episodes in one parquet file, with tables of episodes and tasks, and statistics.
 
-What each file holds is documented with LeRobot ("LeRobotDataset v3.0", huggingface/lerobot, src/lerobot/datasets). Features
-have one shape in all of a dataset, so that every robot gets a dataset of its own. Images are PNG files
-inside of the parquet files, features of the type "image"; there are no videos.
+What each file holds is documented with LeRobot ("LeRobotDataset v3.0", huggingface/lerobot,
+src/lerobot/datasets). Features have one shape in all of a dataset, so that every robot gets a
+dataset of its own. Images are PNG files inside of the parquet files, features of the type "image";
+there are no videos.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.arrays import Floats
 from vkc_pin.datasets.episode import Episode
-from vkc_pin.datasets.formats.samples import sampled
+from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.errors import InputError
-from vkc_pin.files.writing import folder_at_once
-from vkc_pin.models.robot import Robot
-from vkc_pin.needed import optional_package
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.world.models.robot import Robot
 
-__all__ = ["VERSION", "needed", "sentence", "write_lerobot"]
+__all__ = ["VERSION", "describe_task", "require_pyarrow", "write_lerobot"]
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -33,34 +34,50 @@ _SIZE = 100  # [MB] of a file; files are cut before they get there
 _ROWS = 200_000  # frames of a file
 _IMAGES = 90_000_000  # bytes of images in a file, after which the next one is begun
 _SEEN = "_image"  # end of the names of what becomes an image
-_KINDS = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
+_KINDS = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
 _STATE = ("base_pose", "arm_position", "gripper")
 
 
-def needed(rate: float) -> Any:
+def require_pyarrow(rate: float) -> Any:
     """Return pyarrow, if frames can be written at a rate [Hz].
 
     Raises:
         InputError: It is not installed, or the rate is no whole number.
     """
     if rate != int(rate):
-        raise InputError("LeRobot has whole numbers of frames a second", field="rate", expected="a whole number", got=rate)
+        raise InputError(
+            "LeRobot has whole numbers of frames a second",
+            field="rate",
+            expected="a whole number",
+            got=rate,
+        )
     optional_package("pyarrow.parquet", "data", what="LeRobot's layout", field="lerobot")
     return optional_package("pyarrow", "data", what="LeRobot's layout", field="lerobot")
 
 
-def sentence(about: Mapping[str, Any]) -> str:
+def describe_task(about: Mapping[str, Any]) -> str:
     """Return what an episode does, in words, as policies that take language are told it."""
     thing = str(about["kind"]).replace("_", " ")
-    return f"Bring the {thing} from one table to another." if about["task"] == "fetch-place" else f"Open the {thing}."
+    return (
+        f"Bring the {thing} from one table to another."
+        if about["task"] == "fetch-place"
+        else f"Open the {thing}."
+    )
 
 
 def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: float) -> Path:
     """Write episodes of one robot as a dataset, whole or not at all, in place of one that is there; return its folder.
 
-    `observation.state` is base pose, arm and gripper, `observation.velocity` their rates but for the gripper's,
-    `observation.environment_state` where the hand is and whether it holds something, `action` the state of the next moment,
-    `observation.images.<camera>` what a camera saw; LeRobot has no depths and no segmentation.
+    `observation.state` is base pose, arm and gripper, `observation.velocity` their rates but for
+    the gripper's, `observation.environment_state` where the hand is and whether it holds something,
+    `action` the state of the next moment, `observation.images.<camera>` what a camera saw; LeRobot
+    has no depths and no segmentation.
 
     Args:
         path: The folder.
@@ -68,7 +85,7 @@ def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: f
         robot: Theirs.
         rate: Frames a second, a whole number.
     """
-    arrow = needed(rate)
+    arrow = require_pyarrow(rate)
     with folder_at_once(path, force=True) as folder:
         writer = _Writer(arrow, folder, robot, rate)
         for episode in episodes:
@@ -85,9 +102,17 @@ class _Writer:
         names = list(robot.coordinates.names)
         hand = ["hand_x", "hand_y", "hand_z", "hand_qx", "hand_qy", "hand_qz", "hand_qw", "holding"]
         self.features: dict[str, dict[str, Any]] = {
-            "observation.state": {"dtype": "float32", "shape": [len(names) + 1], "names": [*names, "gripper"]},
+            "observation.state": {
+                "dtype": "float32",
+                "shape": [len(names) + 1],
+                "names": [*names, "gripper"],
+            },
             "observation.velocity": {"dtype": "float32", "shape": [len(names)], "names": names},
-            "observation.environment_state": {"dtype": "float32", "shape": [len(hand)], "names": hand},
+            "observation.environment_state": {
+                "dtype": "float32",
+                "shape": [len(hand)],
+                "names": hand,
+            },
             "action": {"dtype": "float32", "shape": [len(names) + 1], "names": [*names, "gripper"]},
             **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _KINDS.items()},
         }
@@ -100,13 +125,17 @@ class _Writer:
 
     def add(self, episode: Episode) -> None:
         """Add an episode."""
-        found = sampled(episode, self.robot, self.rate)
+        found = sample_episode(episode, self.robot, self.rate)
         count, number = len(found["time"]), len(self.rows)
-        task = self.tasks.setdefault(sentence(episode.about), len(self.tasks))
+        task = self.tasks.setdefault(describe_task(episode.about), len(self.tasks))
         columns: dict[str, Any] = {
             "observation.state": np.hstack([found[name] for name in _STATE]).astype(np.float32),
-            "observation.velocity": np.hstack([found["base_velocity"], found["arm_velocity"]]).astype(np.float32),
-            "observation.environment_state": np.hstack([found["hand_pose"], found["holding"]]).astype(np.float32),
+            "observation.velocity": np.hstack(
+                [found["base_velocity"], found["arm_velocity"]]
+            ).astype(np.float32),
+            "observation.environment_state": np.hstack(
+                [found["hand_pose"], found["holding"]]
+            ).astype(np.float32),
             "action": found["actions"].astype(np.float32),
             "timestamp": (np.arange(count) / self.rate).astype(np.float32),
             "frame_index": np.arange(count),
@@ -124,9 +153,13 @@ class _Writer:
                     "names": ["height", "width", "channels"],
                 }
             stats[name] = _statistics(pixels.reshape(-1, 3) / 255.0)
-            stats[name] = {key: value.reshape(3, 1, 1) for key, value in stats[name].items() if key != "count"}
+            stats[name] = {
+                key: value.reshape(3, 1, 1) for key, value in stats[name].items() if key != "count"
+            }
             stats[name]["count"] = np.array([count])
-            columns[name] = [{"bytes": _png(one), "path": f"frame-{k:06d}.png"} for k, one in enumerate(pixels)]
+            columns[name] = [
+                {"bytes": _png(one), "path": f"frame-{k:06d}.png"} for k, one in enumerate(pixels)
+            ]
             size += sum(len(one["bytes"]) for one in columns[name])
         if self._held and (self._held + count > _ROWS or self._bytes + size > _IMAGES):
             self._flush()
@@ -134,7 +167,7 @@ class _Writer:
         self.rows.append(
             {
                 "episode_index": number,
-                "tasks": [sentence(episode.about)],
+                "tasks": [describe_task(episode.about)],
                 "length": count,
                 "data/chunk_index": self.files // _CHUNK,
                 "data/file_index": self.files % _CHUNK,
@@ -142,7 +175,11 @@ class _Writer:
                 "dataset_to_index": self.frames + count,
                 "meta/episodes/chunk_index": 0,
                 "meta/episodes/file_index": 0,
-                **{f"stats/{name}/{key}": value.tolist() for name, own in stats.items() for key, value in own.items()},
+                **{
+                    f"stats/{name}/{key}": value.tolist()
+                    for name, own in stats.items()
+                    for key, value in own.items()
+                },
             }
         )
         self._waiting.append(columns)
@@ -153,15 +190,21 @@ class _Writer:
     def _flush(self) -> None:
         """Write the frames that wait to a file, a row group an episode."""
         arrow = self.arrow
-        path = self.folder / _DATA.format(chunk_index=self.files // _CHUNK, file_index=self.files % _CHUNK)
+        path = self.folder / _DATA.format(
+            chunk_index=self.files // _CHUNK, file_index=self.files % _CHUNK
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         fields: list[Any] = []
         for name, feature in self.features.items():
             if feature["dtype"] == "image":
-                fields.append((name, arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])))
+                fields.append(
+                    (name, arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())]))
+                )
                 continue
             kind = arrow.float32() if feature["dtype"] == "float32" else arrow.int64()
-            fields.append((name, kind if feature["shape"] == [1] else arrow.list_(kind, feature["shape"][0])))
+            fields.append(
+                (name, kind if feature["shape"] == [1] else arrow.list_(kind, feature["shape"][0]))
+            )
         schema = arrow.schema(fields)
         with arrow.parquet.ParquetWriter(path, schema, compression="snappy") as writer:
             for columns in self._waiting:
@@ -172,7 +215,11 @@ class _Writer:
                         arrays.append(arrow.array(values, kind))
                         continue
                     flat = arrow.array(values.reshape(-1))
-                    arrays.append(flat if values.ndim == 1 else arrow.FixedSizeListArray.from_arrays(flat, type=kind))
+                    arrays.append(
+                        flat
+                        if values.ndim == 1
+                        else arrow.FixedSizeListArray.from_arrays(flat, type=kind)
+                    )
                 writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
         self._waiting, self._held, self._bytes, self.files = [], 0, 0, self.files + 1
 
@@ -184,8 +231,12 @@ class _Writer:
         path = self.folder / _EPISODES.format(chunk_index=0, file_index=0)
         path.parent.mkdir(parents=True, exist_ok=True)
         arrow.parquet.write_table(arrow.Table.from_pylist(self.rows), path, compression="snappy")
-        # As pandas writes a table whose index are the tasks' texts: readers ask for the number of a text.
-        columns = {"task_index": arrow.array(list(self.tasks.values()), arrow.int64()), "task": arrow.array(list(self.tasks))}
+        # As pandas writes a table whose index are the tasks' texts: readers ask for the number of a
+        # text.
+        columns = {
+            "task_index": arrow.array(list(self.tasks.values()), arrow.int64()),
+            "task": arrow.array(list(self.tasks)),
+        }
         about = {
             "index_columns": ["task"],
             "column_indexes": [],
@@ -197,7 +248,13 @@ class _Writer:
                     "numpy_type": "int64",
                     "metadata": None,
                 },
-                {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
+                {
+                    "name": "task",
+                    "field_name": "task",
+                    "pandas_type": "unicode",
+                    "numpy_type": "object",
+                    "metadata": None,
+                },
             ],
             "pandas_version": "2.0.0",
         }
@@ -254,7 +311,9 @@ def _statistics(values: Any) -> dict[str, Floats]:
 
 def _together(parts: list[dict[str, Floats]]) -> dict[str, list[float]]:
     """Return the statistics of all rows of those of some parts of them."""
-    counts = np.array([part["count"][0] for part in parts], float).reshape(-1, *[1] * parts[0]["mean"].ndim)
+    counts = np.array([part["count"][0] for part in parts], float).reshape(
+        -1, *[1] * parts[0]["mean"].ndim
+    )
     means, deviations = (np.array([part[name] for part in parts]) for name in ("mean", "std"))
     total = counts.sum()  # images of a camera are all equally large: frames weigh as pixels do
     mean = (means * counts).sum(axis=0) / total

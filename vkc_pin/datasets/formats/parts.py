@@ -8,24 +8,29 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.datasets.episode import Episode, Made, attempts, unpacked
-from vkc_pin.datasets.formats.hdf5 import part
+from vkc_pin.datasets.episode import Episode, Made, run_attempts, unpack
+from vkc_pin.datasets.formats.hdf5 import make_part
 from vkc_pin.datasets.recipes.recipe import load_recipe
-from vkc_pin.models.robot import Robot
+from vkc_pin.world.models.robot import Robot
 
-__all__ = ["parts"]
+__all__ = ["make_parts"]
 
 
-def parts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> list[Made]:
-    """Make episodes as `attempts` does, each as the bytes of `part`; the time that this takes is the attempt's."""
+def make_parts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> list[Made]:
+    """Make episodes as `run_attempts` does, each as the bytes of `make_part`; the time that this takes is the attempt's."""
     said, _, robots = task
     recipe, found = load_recipe(said), []
-    for record, data in attempts(task):
+    for record, data in run_attempts(task):
         if data:
             began, worked = time.perf_counter(), time.process_time()
-            episode = unpacked(data, _folder(robots))
-            data = part(episode, _robot(recipe.digest, episode), recipe.fields.rate, recipe.digest)
-            for name, spent in (("seconds", time.perf_counter() - began), ("cpu_time", time.process_time() - worked)):
+            episode = unpack(data, _folder(robots))
+            data = make_part(
+                episode, _robot(recipe.digest, episode), recipe.fields.rate, recipe.digest
+            )
+            for name, spent in (
+                ("seconds", time.perf_counter() - began),
+                ("cpu_time", time.process_time() - worked),
+            ):
                 record[name] = round(record[name] + spent, 4)
         found.append((record, data))
     return found

@@ -13,19 +13,29 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from vkc_pin.arguments import mapping
 from vkc_pin.datasets.recipes.terms import TermSchema, check_entries
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.documents import Document, check, read_yaml
-from vkc_pin.files.fields import Name, NotNegative, Number, Positive, Schema, Vector3, count, require, text_for
-from vkc_pin.files.resources import available, located
-from vkc_pin.models.robot_file import find_robot
 from vkc_pin.options import Options
-from vkc_pin.scene.rooms.fixtures import known_objects
-from vkc_pin.scene.rooms.parts import CARRIED
-from vkc_pin.scene.rooms.settings import RoomSettings
+from vkc_pin.procedural.rooms.fixtures import list_openable_types
+from vkc_pin.procedural.rooms.parts import CARRIED
+from vkc_pin.procedural.rooms.settings import RoomSettings
 from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
-from vkc_pin.task.terms import Term, as_data
+from vkc_pin.utils.arguments import mapping
+from vkc_pin.world.files.documents import Document, check, read_yaml
+from vkc_pin.world.files.fields import (
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Schema,
+    Vector3,
+    count,
+    require,
+    text_for,
+)
+from vkc_pin.world.files.resources import available, located
+from vkc_pin.world.models.robot_file import find_robot
+from vkc_pin.world.task.terms import Term, trace_terms_without_scene
 
 __all__ = [
     "CAMERAS",
@@ -37,16 +47,20 @@ __all__ = [
     "RobotEntry",
     "RoomsSchema",
     "StartSchema",
+    "get_robot_name",
     "load_recipe",
-    "robot_name",
 ]
 
 TASKS = ("given-open", "drive-open", "fetch-place")
 """What an episode can be: something is opened by a hand that has hold of it, or by a robot that first drives there; something is
 taken from one table to another."""
 
-_increasing = require(lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]")
-_share = require(lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range", "shares above 0 and up to 1")
+_increasing = require(
+    lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]"
+)
+_share = require(
+    lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range", "shares above 0 and up to 1"
+)
 Interval = Annotated[tuple[Number, Number], count(2), _increasing]
 Share = Annotated[Interval, _share]
 Whole = Annotated[int, Field(strict=True, ge=1)]
@@ -104,8 +118,21 @@ class CameraSchema(Schema):
 
 
 CAMERAS = (
-    {"name": "head", "frame": BASE, "position": [0.0, 0.0, 1.5], "target": [1.2, 0.0, 0.6], "fov": 90.0},
-    {"name": "wrist", "frame": HAND, "position": [0, -0.12, -0.12], "target": [0, 0, 0.1], "up": [0, -1, 0], "fov": 75.0},
+    {
+        "name": "head",
+        "frame": BASE,
+        "position": [0.0, 0.0, 1.5],
+        "target": [1.2, 0.0, 0.6],
+        "fov": 90.0,
+    },
+    {
+        "name": "wrist",
+        "frame": HAND,
+        "position": [0, -0.12, -0.12],
+        "target": [0, 0, 0.1],
+        "up": [0, -1, 0],
+        "fov": 75.0,
+    },
 )
 """The cameras of recipes that are asked for images and name none: one above the base, one beside the fingers."""
 
@@ -119,7 +146,10 @@ class RecipeSchema(Schema):
     name: Name
     license: str = "CC-BY-4.0"
     robots: Robots = (RobotEntry(name="husky_ur5e"),)
-    tasks: Annotated[tuple[Literal[TASKS], ...], require(lambda v: v, "there is nothing", "at least one")] = TASKS  # type: ignore[valid-type]
+    tasks: Annotated[
+        tuple[Literal[TASKS], ...],  # type: ignore[valid-type]
+        require(lambda v: v, "there is nothing", "at least one"),
+    ] = TASKS
     objects: Names = (
         "random_cabinet",
         "random_drawers",
@@ -164,7 +194,9 @@ class Recipe:
     @property
     def digest(self) -> str:
         """A name for what it says: the same for recipes that make the same episodes."""
-        said = {key: value for key, value in self.document.items() if key not in ("name", "license")}
+        said = {
+            key: value for key, value in self.document.items() if key not in ("name", "license")
+        }
         for name in ("cameras", "terms"):
             if not said[name]:
                 del said[name]  # datasets without them are gone on with whatever the version
@@ -178,9 +210,9 @@ class Recipe:
     @functools.cached_property
     def terms(self) -> tuple[Term, ...]:
         """Its own constraints and costs, in order: what every motion keeps to, about frames by words; see `terms`."""
-        return as_data([entry.term() for entry in self.fields.terms])
+        return trace_terms_without_scene([entry.term() for entry in self.fields.terms])
 
-    def terms_of(self, task: str) -> tuple[Term, ...]:
+    def select_terms(self, task: str) -> tuple[Term, ...]:
         """Return those of its terms that a task has to keep to."""
         entries = zip(self.terms, self.fields.terms, strict=True)
         return tuple(term for term, entry in entries if not entry.tasks or task in entry.tasks)
@@ -188,14 +220,17 @@ class Recipe:
     def rng(self, *words: object) -> np.random.Generator:
         """Return random numbers that depend on the recipe and on some words, such as the number of an episode, alone."""
         text = "/".join([self.digest, *map(str, words)])
-        return np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little"))
+        return np.random.default_rng(
+            int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little")
+        )
 
 
 def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any) -> Recipe:
     """Return a recipe.
 
     Args:
-        recipe: The name of one that comes with the package, the path of a YAML file, or what such a file says.
+        recipe: The name of one that comes with the package, the path of a YAML file, or what such a
+            file says.
         changes: Fields that are to be otherwise; None leaves them.
 
     Raises:
@@ -215,7 +250,9 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
     folder = document.file.parent if document.file else Path()
     found = {
         "robots": _robots(document, fields.robots, folder),
-        "objects": tuple(_object(document, k, name, folder) for k, name in enumerate(fields.objects)),
+        "objects": tuple(
+            _object(document, k, name, folder) for k, name in enumerate(fields.objects)
+        ),
         "scenes": tuple(_scene(document, k, name, folder) for k, name in enumerate(fields.scenes)),
     }
     for k, kind in enumerate(fields.carried):
@@ -223,18 +260,30 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
             raise document.unknown(("carried", k), "object that is carried", kind, CARRIED)
     if fields.scenes and "fetch-place" in fields.tasks:
         expected = "random rooms, whose tables are known, or only given-open and drive-open"
-        raise document.error(("tasks",), "nothing says where to put things in scene files", expected=expected, got="fetch-place")
+        raise document.error(
+            ("tasks",),
+            "nothing says where to put things in scene files",
+            expected=expected,
+            got="fetch-place",
+        )
     for k, camera in enumerate(fields.cameras):
         with document.at(("cameras", k)):
             Camera(**camera.model_dump())
         if camera.name in [other.name for other in fields.cameras[:k]]:
-            raise document.error(("cameras", k, "name"), "two cameras of one name", expected="another name", got=camera.name)
+            raise document.error(
+                ("cameras", k, "name"),
+                "two cameras of one name",
+                expected="another name",
+                got=camera.name,
+            )
     check_entries(document, fields.terms, TASKS)
     if fields.cameras and not fields.simulate:
         expected = "`simulate: true` as well, or --simulate: images are of what happens in physics"
         raise document.error(("cameras",), "nothing is simulated", expected=expected, got="cameras")
     with document.at(("rooms",)):
-        RoomSettings(clutter=fields.rooms.clutter[0], width=fields.rooms.width, front=fields.rooms.front)
+        RoomSettings(
+            clutter=fields.rooms.clutter[0], width=fields.rooms.width, front=fields.rooms.front
+        )
         RoomSettings(clutter=fields.rooms.clutter[1])
     return Recipe(fields.model_copy(update=found), _options(document, fields.options))
 
@@ -247,36 +296,55 @@ def _options(document: Document, given: Mapping[str, Any]) -> Options:
         return Options(**given)
     except InputError as error:
         name = (error.field or "").removeprefix("Options.")
-        raise document.error(("options", name), error.problem, expected=error.expected, got=error.got) from error
+        raise document.error(
+            ("options", name), error.problem, expected=error.expected, got=error.got
+        ) from error
 
 
-def robot_name(name: str) -> str:
+def get_robot_name(name: str) -> str:
     """Return what a robot is called in a dataset: its name, or that of its file or folder."""
     path = Path(name)
-    return (path.parent.name if path.name == "robot.yaml" else path.stem) if len(path.parts) > 1 else name
+    return (
+        (path.parent.name if path.name == "robot.yaml" else path.stem)
+        if len(path.parts) > 1
+        else name
+    )
 
 
 def _is_path(name: str) -> bool:
     return name.endswith((".yaml", ".yml", ".urdf")) or "/" in name
 
 
-def _robots(document: Document, entries: Sequence[RobotEntry], folder: Path) -> tuple[RobotEntry, ...]:
+def _robots(
+    document: Document, entries: Sequence[RobotEntry], folder: Path
+) -> tuple[RobotEntry, ...]:
     found: dict[str, str] = {}
     robots = []
     for k, entry in enumerate(entries):
         with document.at(("robots", k)):
-            path = find_robot(str((folder / entry.name).resolve()) if _is_path(entry.name) else entry.name)
-        robots.append(entry.model_copy(update={"name": str(path)}) if _is_path(entry.name) else entry)
+            path = find_robot(
+                str((folder / entry.name).resolve()) if _is_path(entry.name) else entry.name
+            )
+        robots.append(
+            entry.model_copy(update={"name": str(path)}) if _is_path(entry.name) else entry
+        )
         name = robots[-1].name
-        if found.setdefault(robot_name(name), name) != name:
-            raise document.error(("robots", k), "two robots of one name", expected="folders of different names", got=name)
+        if found.setdefault(get_robot_name(name), name) != name:
+            raise document.error(
+                ("robots", k),
+                "two robots of one name",
+                expected="folders of different names",
+                got=name,
+            )
     return tuple(robots)
 
 
 def _object(document: Document, place: int, name: str, folder: Path) -> str:
     if not _is_path(name):
-        if name not in known_objects():
-            raise document.unknown(("objects", place), "object that opens", name, known_objects())
+        if name not in list_openable_types():
+            raise document.unknown(
+                ("objects", place), "object that opens", name, list_openable_types()
+            )
         return name
     return _file(document, ("objects", place), folder / name)
 
@@ -286,7 +354,12 @@ def _scene(document: Document, place: int, name: str, folder: Path) -> str:
         known = available("scenes", "*.yaml")
         if name not in known:
             raise UnknownNameError(
-                "scene", name, known, file=document.file, line=document.line(("scenes", place)), field="scenes"
+                "scene",
+                name,
+                known,
+                file=document.file,
+                line=document.line(("scenes", place)),
+                field="scenes",
             )
         return name
     return _file(document, ("scenes", place), folder / name)

@@ -8,13 +8,21 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from vkc_pin.arguments import known
-from vkc_pin.files.documents import Document
-from vkc_pin.files.fields import Positive, Schema, Vector3, count, require
-from vkc_pin.models.robot import Robot
-from vkc_pin.scene.scene import Scene
-from vkc_pin.simulation.cameras.mount import BASE, HAND, frame_of
-from vkc_pin.task.terms import Constraint, State, Term, as_data, renamed, term_from_dict, term_to_dict
+from vkc_pin.simulation.cameras.mount import BASE, HAND, resolve_frame
+from vkc_pin.utils.arguments import known
+from vkc_pin.world.files.documents import Document
+from vkc_pin.world.files.fields import Positive, Schema, Vector3, count, require
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.terms import (
+    Constraint,
+    State,
+    Term,
+    rename_term,
+    term_from_dict,
+    term_to_dict,
+    trace_terms_without_scene,
+)
 
 __all__ = [
     "OBJECT",
@@ -23,16 +31,19 @@ __all__ = [
     "TermSchema",
     "TracedSchema",
     "UprightSchema",
-    "as_entries",
     "check_entries",
     "check_robot",
-    "meant",
+    "make_entries",
+    "resolve_terms",
 ]
 
 OBJECT = "object"
 """The link that an episode takes hold of, as a frame, and the object that it belongs to, in `holding`."""
 
-Axis = Annotated[Vector3, require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length")]
+Axis = Annotated[
+    Vector3,
+    require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length"),
+]
 Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
 
 
@@ -125,20 +136,24 @@ class TracedSchema(_Entry):
         return term_from_dict(self.traced)
 
 
-TermSchema = Annotated[UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema, Field(discriminator="type")]
+TermSchema = Annotated[
+    UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema, Field(discriminator="type")
+]
 Entry = UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema
 
 
-def as_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
+def make_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
     """Return terms as entries of a recipe: plain data.
 
     Raises:
         InputError: They are no terms, or name phases, which are called after what is drawn.
     """
-    for term in (found := as_data(terms)):
+    for term in (found := trace_terms_without_scene(terms)):
         if term.during is not None:
-            expected = f"holding={OBJECT!r}, or nothing: phases are called after objects that are drawn"
-            raise term.error("phases are not known yet", "during", expected, list(term.during))
+            expected = (
+                f"holding={OBJECT!r}, or nothing: phases are called after objects that are drawn"
+            )
+            raise term.make_error("phases are not known yet", "during", expected, list(term.during))
     return [{"type": "traced", "traced": term_to_dict(term)} for term in found]
 
 
@@ -155,9 +170,11 @@ def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[
             if task not in tasks:
                 raise document.unknown(("terms", k, "tasks", j), "task", task, tasks)
         with document.at(("terms", k)):
-            (term,) = as_data([entry.term()])
+            (term,) = trace_terms_without_scene([entry.term()])
         if term.name in names:
-            raise document.error(("terms", k), "two terms of one name", expected="another `name`", got=term.name)
+            raise document.error(
+                ("terms", k), "two terms of one name", expected="another `name`", got=term.name
+            )
         names.append(term.name)
 
 
@@ -167,7 +184,9 @@ def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
     Raises:
         UnknownNameError: It lacks one.
     """
-    frames = sorted({BASE, HAND, OBJECT, *(str(frame.name) for frame in robot.model.frames)} - {"universe"})
+    frames = sorted(
+        {BASE, HAND, OBJECT, *(str(frame.name) for frame in robot.model.frames)} - {"universe"}
+    )
     for term in terms:
         where = f"terms[{term.name!r}]"
         for frame in (name for name in term.formula.frames if "." not in name):
@@ -176,7 +195,9 @@ def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
             known(coordinate, robot.coordinates.names, f"coordinate of {robot.name}", where)
 
 
-def meant(terms: Sequence[Term], scene: Scene, name: str, attachment: str) -> tuple[Term, ...]:
+def resolve_terms(
+    terms: Sequence[Term], scene: Scene, name: str, attachment: str
+) -> tuple[Term, ...]:
     """Return terms about what is there.
 
     Args:
@@ -186,5 +207,7 @@ def meant(terms: Sequence[Term], scene: Scene, name: str, attachment: str) -> tu
         attachment: Where the hand takes hold of it.
     """
     link = scene.objects[name].object.attachments[attachment].link
-    frames = {word: frame_of(scene.robot, word) for word in (BASE, HAND)} | {OBJECT: f"{name}.{link}"}
-    return tuple(renamed(term, frames, {OBJECT: name}) for term in terms)
+    frames = {word: resolve_frame(scene.robot, word) for word in (BASE, HAND)} | {
+        OBJECT: f"{name}.{link}"
+    }
+    return tuple(rename_term(term, frames, {OBJECT: name}) for term in terms)

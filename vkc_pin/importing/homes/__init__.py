@@ -1,1 +1,1 @@
-"""Homes that can be planned in, made from one large file of another program."""
+"""Imports homes from one large file of another program."""

@@ -1,4 +1,4 @@
-"""Cuts the tree of a home into what stands fixed, what can be opened, and what can be carried."""
+"""Divides the tree of a home into fixed parts, articulated objects and free objects."""
 
 from __future__ import annotations
 
@@ -9,27 +9,33 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.importing.objects.clean_up import (
+    compute_bounds,
+    extract_subtree,
+    find_closed_positions,
+    load_surfaces,
+    move_root,
+)
 from vkc_pin.importing.objects.description import Description, Joint, Link
-from vkc_pin.importing.objects.tidying import bounds, closed, only, rooted, surfaces
 
-__all__ = ["FLOOR_RISE", "Home", "Thing", "split"]
+__all__ = ["FLOOR_RISE", "Home", "HomeObject", "split_home"]
 
 FLOOR_RISE = 0.02
-"""What rises no higher above the floor is part of it [m]: slabs, carpets and thresholds, which wheels roll over."""
-_BUILDING = 3.5  # [m]: what is longer is no piece of furniture but part of the building
+"""Height up to which shapes are part of the floor [m]: slabs, carpets and thresholds."""
+_BUILDING = 3.5  # [m] length above which a link is part of the building, not furniture
 _MOVING = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
-    """Something that moves: furniture with its joints, or a thing to carry.
+class HomeObject:
+    """A movable object of a home: furniture with joints, or a free object.
 
     Attributes:
-        name: What it is called in the scene, as the link that it hangs on.
-        description: Its links and joints. The axes of its root are the world's. The origin is below its middle, on the floor,
-            or at the lowest point of what is carried.
-        position: Of that origin in the world [m].
-        free: Whether it can be carried away.
+        name: Name in the scene, that of its root link in the file.
+        description: Links and joints. The root's axes are the world's. The origin is below the
+            centre, on the floor, or at the lowest point of a free object.
+        position: Origin in the world [m].
+        free: Whether it can be carried.
     """
 
     name: str
@@ -40,127 +46,183 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class Home:
-    """A home that was taken apart.
+    """A home, divided into its parts.
 
     Attributes:
-        building: Links that are longer than furniture, or the root, with their shapes in the world.
-        furniture: Other links that stand fixed, with their shapes in the world.
+        building: Links longer than furniture, or the root, with shapes in the world frame.
+        furniture: Other fixed links, with shapes in the world frame.
         floor: Names of the shapes that are part of the floor.
-        things: What moves.
-        shapes: How many colliding shapes the file has.
-        notes: What was changed or left out.
+        objects: Movable objects.
+        shapes: Number of collision shapes in the file.
+        notes: Changes and omissions.
     """
 
     building: tuple[Link, ...]
     furniture: tuple[Link, ...]
     floor: tuple[str, ...]
-    things: tuple[Thing, ...]
+    objects: tuple[HomeObject, ...]
     shapes: int
     notes: tuple[str, ...]
 
 
-def split(description: Description) -> Home:
-    """Return what a home consists of.
+def split_home(description: Description) -> Home:
+    """Divide a home into its parts.
 
-    A link that stands fixed and has joints on it becomes one thing with all that moves on it. On links of the building, each
-    joint starts a thing of its own, which has no shape that stands still: a door swings past walls as past anything else.
+    A fixed link with joints becomes one object with everything that moves on it. On links of the
+    building, each joint starts an object of its own, without fixed shapes: doors may swing past
+    walls.
 
     Args:
-        description: The home, with the floor at z = 0; names are those of scenes.
+        description: The home, with the floor at z = 0 and names that scenes accept.
     """
-    description = _unstuck(description)
+    description = _fix_immovable_joints(description)
     joints, notes = description.joints, list(description.notes)
-    places, values = description.placements(), closed(description)
-    now = description.placements(values)
+    places, values = description.compute_placements(), find_closed_positions(description)
+    current_placements = description.compute_placements(values)
     free = [child for child, joint in joints.items() if joint.kind == "floating"]
     fixed = {description.root}
-    while grown := {child for child, joint in joints.items() if joint.kind == "fixed" and joint.parent in fixed} - fixed:
-        fixed |= grown
-    building, furniture, floor, things = list[Link](), list[Link](), list[str](), list[Thing]()
+    while (
+        added := {
+            child
+            for child, joint in joints.items()
+            if joint.kind == "fixed" and joint.parent in fixed
+        }
+        - fixed
+    ):
+        fixed |= added
+    building, furniture, floor, objects = (
+        list[Link](),
+        list[Link](),
+        list[str](),
+        list[HomeObject](),
+    )
     for name in (name for name in description.links if name in fixed):
-        link = description.links[name].placed(places[name])
-        moved = [child for child, joint in joints.items() if joint.parent == name and joint.kind in _MOVING]
-        large = name == description.root or _length(link) > _BUILDING
-        if moved and not large:
-            kept = {name}.union(*(_carried(description, child) for child in moved))
-            things.append(_thing(name, _part(description, name, kept), places[name]))
+        link = description.links[name].transform(places[name])
+        children = [
+            child
+            for child, joint in joints.items()
+            if joint.parent == name and joint.kind in _MOVING
+        ]
+        large = name == description.root or _measure_length(link) > _BUILDING
+        if children and not large:
+            links_of_object = {name}.union(
+                *(_collect_attached_links(description, child) for child in children)
+            )
+            objects.append(
+                _place_object(
+                    name, _extract_links(description, name, links_of_object), places[name]
+                )
+            )
             continue
-        for child in moved:
-            hung = _on_nothing(description, child)
-            things.append(_thing(child, hung, places[name]))
+        for child in children:
+            part = _add_empty_base(description, child)
+            objects.append(_place_object(child, part, places[name]))
         low = [part for part in link.solid if part.mesh().bounds[1, 2] <= FLOOR_RISE]
         floor += [part.name or name for part in low]
         solid = tuple(part for part in link.solid if not any(part is other for other in low))
         if solid:
-            looks = link.visual if not low else ()
-            (building if large else furniture).append(Link(name, looks, solid))
+            visual = link.visual if not low else ()
+            (building if large else furniture).append(Link(name, visual, solid))
     for name in free:
-        kept = _carried(description, name)
-        if not any(description.links[link].solid for link in kept):
-            notes.append(f"link '{name}' moves freely and has no shape: left out")
+        links_of_object = _collect_attached_links(description, name)
+        if not any(description.links[link].solid for link in links_of_object):
+            notes.append(f"link '{name}' is free and has no shape: left out")
             continue
-        part = _part(description, name, kept)
-        stiff = dict(part.joints)
+        part = _extract_links(description, name, links_of_object)
+        fixed_joints = dict(part.joints)
         for child, joint in part.joints.items():
             if joint.kind in _MOVING:
-                placement = joint.placement * joint.motion(values.get(joint.name, 0.0))
-                stiff[child] = dataclasses.replace(joint, kind="fixed", placement=placement, limits=None)
-                notes.append(f"joint '{joint.name}' belongs to '{name}', which is carried as it is: fixed")
-        things.append(_thing(name, dataclasses.replace(part, joints=stiff), now[name], free=True))
+                placement = joint.placement * joint.compute_motion(values.get(joint.name, 0.0))
+                fixed_joints[child] = dataclasses.replace(
+                    joint, kind="fixed", placement=placement, limits=None
+                )
+                notes.append(f"joint '{joint.name}' belongs to the free object '{name}': fixed")
+        objects.append(
+            _place_object(
+                name,
+                dataclasses.replace(part, joints=fixed_joints),
+                current_placements[name],
+                free=True,
+            )
+        )
     shapes = sum(len(link.solid) for link in description.links.values())
-    return Home(tuple(building), tuple(furniture), tuple(floor), tuple(things), shapes, tuple(notes))
+    return Home(
+        tuple(building), tuple(furniture), tuple(floor), tuple(objects), shapes, tuple(notes)
+    )
 
 
-def _unstuck(description: Description) -> Description:
-    """Return the home with joints fixed that have one value only, or move nothing that has a shape."""
+def _fix_immovable_joints(description: Description) -> Description:
+    """Return the home with those joints fixed that have one value or move no shape."""
     joints, notes = dict(description.joints), list(description.notes)
     for child, joint in description.joints.items():
         if joint.kind not in _MOVING:
             continue
-        stuck = joint.limits is not None and joint.limits[0] == joint.limits[1]
-        if stuck or not any(description.links[link].solid for link in description.below(child)):
-            notes.append(f"joint '{joint.name}' {'has one value only' if stuck else 'moves nothing that has a shape'}: fixed")
-            placement = joint.placement * joint.motion(joint.limits[0] if stuck and joint.limits else 0.0)
-            joints[child] = dataclasses.replace(joint, kind="fixed", placement=placement, limits=None)
+        is_single_valued = joint.limits is not None and joint.limits[0] == joint.limits[1]
+        if is_single_valued or not any(
+            description.links[link].solid for link in description.subtree(child)
+        ):
+            reason = "has a single value" if is_single_valued else "moves no shape"
+            notes.append(f"joint '{joint.name}' {reason}: fixed")
+            placement = joint.placement * joint.compute_motion(
+                joint.limits[0] if is_single_valued and joint.limits else 0.0
+            )
+            joints[child] = dataclasses.replace(
+                joint, kind="fixed", placement=placement, limits=None
+            )
     return dataclasses.replace(description, joints=joints, notes=tuple(notes))
 
 
-def _carried(description: Description, link: str) -> set[str]:
-    """Return a link and what hangs on it, without what moves freely."""
-    found = description.below(link)
+def _collect_attached_links(description: Description, link: str) -> set[str]:
+    """Return a link and those attached to it, without free objects."""
+    found = description.subtree(link)
     for child, joint in description.joints.items():
         if child != link and child in found and joint.kind == "floating":
-            found -= description.below(child)
+            found -= description.subtree(child)
     return found
 
 
-def _part(description: Description, root: str, kept: Collection[str]) -> Description:
-    """Return some links and the joints between them as a description, whose notes begin anew."""
-    part = only(description, root)
-    links = {name: link for name, link in part.links.items() if name in kept}
-    return Description(description.file, links, {child: joint for child, joint in part.joints.items() if child in kept})
+def _extract_links(
+    description: Description, root: str, links_of_object: Collection[str]
+) -> Description:
+    """Return some links and the joints between them as a description without notes."""
+    part = extract_subtree(description, root)
+    links = {name: link for name, link in part.links.items() if name in links_of_object}
+    return Description(
+        description.file,
+        links,
+        {child: joint for child, joint in part.joints.items() if child in links_of_object},
+    )
 
 
-def _on_nothing(description: Description, child: str) -> Description:
-    """Return what a joint moves, with that joint, on a link without shapes."""
-    part, base = _part(description, child, _carried(description, child)), f"{child}_base"
+def _add_empty_base(description: Description, child: str) -> Description:
+    """Return the subtree of a joint, including the joint, on a base link without shapes."""
+    part, base = (
+        _extract_links(description, child, _collect_attached_links(description, child)),
+        f"{child}_base",
+    )
     while base in description.links:
         base += "_"
     joint: Joint = dataclasses.replace(description.joints[child], parent=base)
-    return Description(description.file, {base: Link(base), **part.links}, {child: joint, **part.joints})
+    return Description(
+        description.file, {base: Link(base), **part.links}, {child: joint, **part.joints}
+    )
 
 
-def _thing(name: str, description: Description, place: pin.SE3, *, free: bool = False) -> Thing:
-    """Return a thing whose root is at a place in the world."""
-    inside = rooted(description, place)
-    low, high = bounds(inside, surfaces(inside), closed(inside))
+def _place_object(
+    name: str, description: Description, place: pin.SE3, *, free: bool = False
+) -> HomeObject:
+    """Return an object whose root is at `place` in the world."""
+    inside = move_root(description, place)
+    low, high = compute_bounds(inside, load_surfaces(inside), find_closed_positions(inside))
     x, y = ((low + high) / 2.0).round(6)[:2].tolist()
     z = float(low[2].round(6)) if free else 0.0
-    return Thing(name, rooted(inside, pin.SE3(np.eye(3), -np.array([x, y, z]))), (x, y, z), free)
+    return HomeObject(
+        name, move_root(inside, pin.SE3(np.eye(3), -np.array([x, y, z]))), (x, y, z), free
+    )
 
 
-def _length(link: Link) -> float:
-    """Return how long a link is on the floor [m]; 0 without shapes."""
+def _measure_length(link: Link) -> float:
+    """Return the horizontal length of a link [m]; 0 without shapes."""
     if not link.solid:
         return 0.0
     boxes = np.array([part.mesh().bounds for part in link.solid])

@@ -1,1 +1,1 @@
-"""Objects that can be opened, made from files of other programs: URDF, MJCF, SDF."""
+"""Imports articulated objects from URDF, MJCF and SDF files."""

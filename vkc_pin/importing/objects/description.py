@@ -1,4 +1,4 @@
-"""What a file says about an object, whatever its format: links with shapes, and the joints between them."""
+"""Defines the description of an object, independent of its file format."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.files.meshes import load_mesh
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.meshes import load_mesh
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["WEIGHTLESS", "Colour", "Description", "Joint", "Link", "Part", "inertia"]
+__all__ = ["WEIGHTLESS", "Colour", "Description", "Joint", "Link", "Part", "make_inertia"]
 
 Colour = tuple[float, float, float, float]
-WEIGHTLESS = "no mass is stated: torques of the arm leave weight and inertia out, physics assumes a density"  # said once
-_SIDES = 48  # of a cylinder as triangles
+WEIGHTLESS = (
+    "no mass is stated: arm torques ignore weight and inertia, and simulation assumes a density"
+)
+_SIDES = 48  # facets of a cylinder mesh
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -29,13 +31,13 @@ class Part:
     """A shape of a link.
 
     Attributes:
-        name: What the file calls it; need not be unique.
-        placement: In the frame of its link.
+        name: Name in the file; need not be unique.
+        placement: Placement in the frame of its link.
         kind: "box", "sphere", "cylinder", "capsule" or "mesh".
-        size: As in `vkc_pin.files.urdf.UrdfShape`, [m]; scale of a mesh.
-        file: The mesh's file, or None if it is given as triangles.
-        triangles: The mesh, before it is scaled.
-        colour: Red, green, blue, opacity, or None.
+        size: Dimensions as in `vkc_pin.world.files.urdf.UrdfShape` [m]; for meshes, the scale.
+        file: Mesh file, or None if the mesh is given as triangles.
+        triangles: Mesh before scaling.
+        colour: Red, green, blue and opacity, or None.
     """
 
     name: str
@@ -47,10 +49,10 @@ class Part:
     colour: Colour | None = None
 
     def mesh(self) -> trimesh.Trimesh:
-        """Return its surface in the frame of its link, [m].
+        """Return the surface in the frame of its link [m].
 
         Raises:
-            InputError: Its file cannot be read, or is empty.
+            InputError: The mesh file cannot be read or is empty.
         """
         import trimesh
 
@@ -63,7 +65,9 @@ class Part:
         elif self.kind == "sphere":
             mesh = trimesh.creation.icosphere(subdivisions=3, radius=self.size[0])
         elif self.kind == "capsule":
-            mesh = trimesh.creation.capsule(height=self.size[1], radius=self.size[0], count=[_SIDES, _SIDES])
+            mesh = trimesh.creation.capsule(
+                height=self.size[1], radius=self.size[0], count=[_SIDES, _SIDES]
+            )
         else:
             mesh = trimesh.creation.cylinder(self.size[0], height=self.size[1], sections=_SIDES)
         return mesh.apply_transform(self.placement.homogeneous)
@@ -71,7 +75,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A link: what it looks like, what collides, and what it weighs (nothing if no mass is stated), each in the link's frame."""
+    """A link with its visual and collision shapes and its inertia, in the link's frame."""
 
     name: str
     visual: tuple[Part, ...] = ()
@@ -80,31 +84,32 @@ class Link:
 
     @property
     def solid(self) -> tuple[Part, ...]:
-        """What collides; what it looks like where the file says nothing about that."""
+        """Collision shapes, or visual shapes if the file has no collision shapes."""
         return self.collision or self.visual
 
-    def placed(self, placement: pin.SE3) -> Link:
-        """Return the link as seen from a frame in which its own is at `placement`."""
+    def transform(self, placement: pin.SE3) -> Link:
+        """Return the link in a frame in which its own frame is at `placement`."""
         visual, collision = (
-            tuple(replace(part, placement=placement * part.placement) for part in kind) for kind in (self.visual, self.collision)
+            tuple(replace(part, placement=placement * part.placement) for part in kind)
+            for kind in (self.visual, self.collision)
         )
         return Link(self.name, visual, collision, placement.act(self.inertia))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Joint:
-    """A joint; at zero, the child's frame is at `placement` in the parent's.
+    """A joint, at whose zero position the child's frame is at `placement` in the parent's.
 
     Attributes:
-        name: Its name.
+        name: Joint name.
         kind: "fixed", "revolute", "continuous" or "prismatic"; in homes also "floating".
-        parent, child: Names of links.
-        placement: Of the child's frame in the parent's.
+        parent, child: Names of the links.
+        placement: Placement of the child's frame in the parent's.
         axis: Unit axis in the child's frame, shape (3,).
-        limits: Lower and upper, [rad] or [m]; None if the file states none.
-        velocity: Its limit, [rad/s] or [m/s]; None if the file states none.
-        damping: [N·m·s/rad] or [N·s/m]; 0 if the file states none.
-        friction: Coulomb's, [N·m] or [N]; 0 if the file states none.
+        limits: Lower and upper limit, [rad] or [m]; None if the file states none.
+        velocity: Velocity limit, [rad/s] or [m/s]; None if the file states none.
+        damping: Damping, [N·m·s/rad] or [N·s/m]; 0 if the file states none.
+        friction: Coulomb friction, [N·m] or [N]; 0 if the file states none.
     """
 
     name: str
@@ -118,8 +123,8 @@ class Joint:
     damping: float = 0.0
     friction: float = 0.0
 
-    def motion(self, value: float) -> pin.SE3:
-        """Return the child's frame at a value, [rad] or [m], in its frame at zero."""
+    def compute_motion(self, value: float) -> pin.SE3:
+        """Return the child's frame at a position, [rad] or [m], in its frame at zero."""
         if self.kind == "prismatic":
             return pin.SE3(np.eye(3), self.axis * value)
         return pin.SE3(pin.exp3(self.axis * value), np.zeros(3))
@@ -127,13 +132,13 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """What a file says, as one tree of links.
+    """Description of an object as a tree of links.
 
     Attributes:
         file: The file.
-        links: By name.
-        joints: By the name of their child.
-        notes: What was changed or left out.
+        links: Links by name.
+        joints: Joints by the name of their child link.
+        notes: Changes and omissions.
     """
 
     file: Path
@@ -143,40 +148,49 @@ class Description:
 
     @property
     def root(self) -> str:
-        """The link that hangs on no joint."""
+        """The link without a parent joint."""
         return next(name for name in self.links if name not in self.joints)
 
-    def placements(self, values: Mapping[str, float] | None = None) -> dict[str, pin.SE3]:
-        """Return the frames of the links in the root's frame, at values of joints by their names [rad] or [m]; others at zero."""
-        found = {self.root: pin.SE3.Identity()}
-        while len(found) < len(self.links):
+    def compute_placements(self, values: Mapping[str, float] | None = None) -> dict[str, pin.SE3]:
+        """Return the frames of all links in the root's frame.
+
+        Args:
+            values: Joint positions by name, [rad] or [m]; others are at zero.
+        """
+        placements = {self.root: pin.SE3.Identity()}
+        while len(placements) < len(self.links):
             for child, joint in self.joints.items():
-                if child not in found and joint.parent in found:
+                if child not in placements and joint.parent in placements:
                     value = (values or {}).get(joint.name, 0.0)
-                    found[child] = found[joint.parent] * joint.placement * joint.motion(value)
-        return found
+                    placements[child] = (
+                        placements[joint.parent] * joint.placement * joint.compute_motion(value)
+                    )
+        return placements
 
     @property
-    def weightless(self) -> bool:
+    def is_massless(self) -> bool:
         """Whether no link has a mass."""
         return not any(link.inertia.mass > 0.0 for link in self.links.values())
 
-    def below(self, link: str) -> set[str]:
-        """Return a link and all that hang on it."""
-        found, before = {link}, 0
-        while len(found) > before:
-            before = len(found)
-            found |= {child for child, joint in self.joints.items() if joint.parent in found}
-        return found
+    def subtree(self, link: str) -> set[str]:
+        """Return a link and all its descendants."""
+        placements, before = {link}, 0
+        while len(placements) > before:
+            before = len(placements)
+            placements |= {
+                child for child, joint in self.joints.items() if joint.parent in placements
+            }
+        return placements
 
 
-def inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.Inertia:
-    """Return what a link weighs, from what URDF and SDF state.
+def make_inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.Inertia:
+    """Return a link's inertia from the values that URDF and SDF state.
 
     Args:
-        mass: [kg].
-        moments: About the centre of mass [kg·m²], in the order of `vkc_pin.files.kinematic_tree.MOMENTS`.
-        placement: Of the centre of mass, and of the axes of the moments, in the link's frame.
+        mass: Mass [kg].
+        moments: Moments of inertia about the centre of mass [kg·m²], in the order of
+            `vkc_pin.world.files.kinematic_tree.MOMENTS`.
+        placement: Frame of the moments at the centre of mass, in the link's frame.
 
     Raises:
         InputError: The mass or a principal moment is negative.
@@ -185,6 +199,6 @@ def inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.In
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     least = float(np.linalg.eigvalsh(tensor)[0])
     if mass < 0.0 or least < -1e-9 * max(abs(xx), abs(yy), abs(zz)):
-        problem = "a mass below zero" if mass < 0.0 else "moments of inertia that no body has"
+        problem = "a negative mass" if mass < 0.0 else "impossible moments of inertia"
         raise InputError(problem, expected="0 or more", got=mass if mass < 0.0 else least)
     return placement.act(pin.Inertia(mass, np.zeros(3), tensor))

@@ -1,4 +1,4 @@
-"""Reads the MJCF of an object with MuJoCo, which knows best what its defaults, includes and meshes mean."""
+"""Reads an object from an MJCF file with MuJoCo's compiler."""
 
 from __future__ import annotations
 
@@ -10,33 +10,37 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.needed import optional_package
+from vkc_pin.utils.optional_imports import optional_package
 
 __all__ = ["read_object_mjcf"]
 
-_FREE = 0  # the type of a joint that leaves a body free
-_HIDDEN = 3  # MuJoCo's viewer hides groups from here on: by custom, what collides and is not to be seen
+_FREE = 0  # type of a free joint
+_HIDDEN = 3  # first group that MuJoCo's viewer hides; by convention, collision geometry
 
 
 def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
-    """Return what an MJCF file says about an object, or a home; what stands in the world is one link, `world`.
+    """Read the description of an object or a home from an MJCF file.
+
+    Everything fixed in the world becomes one link, `world`.
 
     Args:
         file: The file.
-        free: Whether to keep bodies that move freely, on floating joints; else they are left out.
+        free: Whether to keep free bodies, on floating joints; otherwise they are left out.
 
     Raises:
-        InputError: MuJoCo is not installed, or cannot read the file.
+        InputError: MuJoCo is not installed or cannot read the file.
     """
     mujoco = optional_package("mujoco", "import", what="reading MJCF", file=file)
     try:
         model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:
-        raise InputError(f"MuJoCo cannot read this: {error}", file=file, expected="an MJCF file") from error
+        raise InputError(
+            f"MuJoCo cannot read the file: {error}", file=file, expected="an MJCF file"
+        ) from error
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
-    return _Reader(mujoco, model, data, file).description(free=free)
+    return _Reader(mujoco, model, data, file).read(free=free)
 
 
 class _Reader:
@@ -47,52 +51,67 @@ class _Reader:
         self.taken = set(filter(None, names))
         self.bodies = [name or self._add_name(f"body_{k}") for k, name in enumerate(names)]
 
-    def description(self, *, free: bool) -> Description:
+    def read(self, *, free: bool) -> Description:
         model = self.model
         frames, links, joints = dict[str, pin.SE3](), dict[str, Link](), dict[str, Joint]()
         left_out: set[int] = set()
         for body in range(model.nbody):
             name, parent = self.bodies[body], int(model.body_parentid[body])
             above = self.bodies[parent]
-            moving = range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + int(model.body_jntnum[body]))
+            moving = range(
+                int(model.body_jntadr[body]),
+                int(model.body_jntadr[body]) + int(model.body_jntnum[body]),
+            )
             if parent in left_out and body:
                 left_out.add(body)
                 continue
-            here = _placement(self.data.xpos[body], self.data.xmat[body])
-            floats = any(int(model.jnt_type[j]) == _FREE for j in moving)
-            if floats and not free:
-                self.notes.append(f"body '{name}' moves freely, it is an object of its own: left out")
+            placement = _placement(self.data.xpos[body], self.data.xmat[body])
+            is_free = any(int(model.jnt_type[j]) == _FREE for j in moving)
+            if is_free and not free:
+                self.notes.append(f"body '{name}' is free, hence a separate object: left out")
                 left_out.add(body)
                 continue
-            if floats:  # has no other joints
+            if is_free:  # a free body has no other joints
                 moving = range(0)
             last = above
-            for count, j in enumerate(moving):  # several joints of one body: links without shapes between them
+            # Several joints of one body are connected by links without shapes.
+            for count, j in enumerate(moving):
                 link = name if count == len(moving) - 1 else self._add_name(f"{name}_{count}")
-                frames[link] = pin.SE3(here.rotation, np.array(self.data.xanchor[j]))
-                joints[link] = self._joint(j, last, link, frames)
+                frames[link] = pin.SE3(placement.rotation, np.array(self.data.xanchor[j]))
+                joints[link] = self._read_joint(j, last, link, frames)
                 links[link] = Link(link)
                 last = link
             if not len(moving):
-                frames[name] = here
+                frames[name] = placement
                 if body:
-                    kind = "floating" if floats else "fixed"
+                    kind = "floating" if is_free else "fixed"
                     joints[name] = Joint(
-                        name=f"{name}_{kind}", kind=kind, parent=above, child=name, placement=frames[above].inverse() * here
+                        name=f"{name}_{kind}",
+                        kind=kind,
+                        parent=above,
+                        child=name,
+                        placement=frames[above].inverse() * placement,
                     )
-            links[name] = Link(name, *self._parts(body, frames[name]), self._inertia(body, frames[name]))
+            links[name] = Link(
+                name, *self._read_shapes(body, frames[name]), self._read_inertia(body, frames[name])
+            )
         return Description(self.file, links, joints, tuple(self.notes))
 
-    def _joint(self, number: int, parent: str, child: str, frames: dict[str, pin.SE3]) -> Joint:
+    def _read_joint(
+        self, number: int, parent: str, child: str, frames: dict[str, pin.SE3]
+    ) -> Joint:
         model = self.model
         kind = {2: "prismatic", 3: "revolute"}.get(int(model.jnt_type[number]), "fixed")
-        name = self._name("joint", number)
+        name = self._find_name("joint", number)
         if kind == "fixed":
-            self.notes.append(f"joint '{name}' is a ball: taken as fixed")
+            self.notes.append(f"joint '{name}' is a ball joint: taken as fixed")
         limits = None
         if model.jnt_limited[number]:
             zero = float(model.qpos0[model.jnt_qposadr[number]])
-            limits = (float(model.jnt_range[number][0]) - zero, float(model.jnt_range[number][1]) - zero)
+            limits = (
+                float(model.jnt_range[number][0]) - zero,
+                float(model.jnt_range[number][1]) - zero,
+            )
         return Joint(
             name=name,
             kind="continuous" if kind == "revolute" and limits is None else kind,
@@ -105,20 +124,31 @@ class _Reader:
             friction=float(model.dof_frictionloss[model.jnt_dofadr[number]]),
         )
 
-    def _inertia(self, body: int, frame: pin.SE3) -> pin.Inertia:
-        """Return what a body weighs: as stated, or as MuJoCo takes it from its geoms and their densities."""
+    def _read_inertia(self, body: int, frame: pin.SE3) -> pin.Inertia:
+        """Return a body's inertia as stated, or as MuJoCo computes it from its geoms' densities."""
         if not self.model.body_mass[body] > 0.0:
             return pin.Inertia.Zero()
-        principal = pin.Inertia(float(self.model.body_mass[body]), np.zeros(3), np.diag(self.model.body_inertia[body]))
-        return (frame.inverse() * _placement(self.data.xipos[body], self.data.ximat[body])).act(principal)
+        principal = pin.Inertia(
+            float(self.model.body_mass[body]), np.zeros(3), np.diag(self.model.body_inertia[body])
+        )
+        return (frame.inverse() * _placement(self.data.xipos[body], self.data.ximat[body])).act(
+            principal
+        )
 
-    def _parts(self, body: int, frame: pin.SE3) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
-        """Return what a body looks like, and what collides."""
+    def _read_shapes(self, body: int, frame: pin.SE3) -> tuple[tuple[Part, ...], tuple[Part, ...]]:
+        """Return the visual and the collision shapes of a body."""
         model, kinds = self.model, self.mujoco.mjtGeom
         visual, collision = list[Part](), list[Part]()
-        for geom in range(int(model.body_geomadr[body]), int(model.body_geomadr[body]) + int(model.body_geomnum[body])):
+        for geom in range(
+            int(model.body_geomadr[body]),
+            int(model.body_geomadr[body]) + int(model.body_geomnum[body]),
+        ):
             kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-            rgba = model.geom_rgba[geom] if model.geom_matid[geom] < 0 else model.mat_rgba[model.geom_matid[geom]]
+            rgba = (
+                model.geom_rgba[geom]
+                if model.geom_matid[geom] < 0
+                else model.mat_rgba[model.geom_matid[geom]]
+            )
             shape: tuple[str, tuple[float, ...]] | None = {
                 int(kinds.mjGEOM_BOX): ("box", tuple(2.0 * float(s) for s in size)),
                 int(kinds.mjGEOM_SPHERE): ("sphere", (float(size[0]),)),
@@ -127,17 +157,18 @@ class _Reader:
                 int(kinds.mjGEOM_ELLIPSOID): ("mesh", tuple(map(float, size))),
                 int(kinds.mjGEOM_MESH): ("mesh", (1.0, 1.0, 1.0)),
             }.get(kind)
-            name = self._name("geom", geom, otherwise=self._mesh_name(geom))
+            name = self._find_name("geom", geom, default=self._find_mesh_name(geom))
             if shape is None:
-                shown = f"geom '{name}' of body '{self.bodies[body]}'"
-                self.notes.append(f"{shown} has no volume (a plane): left out")
+                subject = f"geom '{name}' of body '{self.bodies[body]}'"
+                self.notes.append(f"{subject} has no volume (a plane): left out")
                 continue
             part = Part(
                 name=name,
-                placement=frame.inverse() * _placement(self.data.geom_xpos[geom], self.data.geom_xmat[geom]),
+                placement=frame.inverse()
+                * _placement(self.data.geom_xpos[geom], self.data.geom_xmat[geom]),
                 kind=shape[0],
                 size=shape[1],
-                triangles=self._triangles(geom) if shape[0] == "mesh" else None,
+                triangles=self._read_mesh(geom) if shape[0] == "mesh" else None,
                 colour=(float(rgba[0]), float(rgba[1]), float(rgba[2]), float(rgba[3])),
             )
             collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
@@ -147,31 +178,31 @@ class _Reader:
                 visual.append(part)
         return tuple(visual), tuple(collision)
 
-    def _triangles(self, geom: int) -> Any:
+    def _read_mesh(self, geom: int) -> Any:
         import trimesh
 
         number = int(self.model.geom_dataid[geom])
-        if number < 0:  # an ellipsoid: its half axes are the scale
+        if number < 0:  # an ellipsoid, whose semi-axes are the scale
             return trimesh.creation.icosphere(subdivisions=3)
         first, count = int(self.model.mesh_vertadr[number]), int(self.model.mesh_vertnum[number])
         start, faces = int(self.model.mesh_faceadr[number]), int(self.model.mesh_facenum[number])
         corners = np.array(self.model.mesh_vert[first : first + count], float)
         return trimesh.Trimesh(corners, np.array(self.model.mesh_face[start : start + faces]))
 
-    def _mesh_name(self, geom: int) -> str:
+    def _find_mesh_name(self, geom: int) -> str:
         number = int(self.model.geom_dataid[geom])
-        return self._name("mesh", number) if number >= 0 else ""
+        return self._find_name("mesh", number) if number >= 0 else ""
 
     def _add_name(self, name: str) -> str:
-        """Return a name for a link that the file does not name: `name`, with "_" if it is taken."""
+        """Return a name for a link without one: `name`, with "_" appended while it is taken."""
         while name in self.taken:
             name += "_"
         self.taken.add(name)
         return name
 
-    def _name(self, kind: str, number: int, otherwise: str | None = None) -> str:
+    def _find_name(self, kind: str, number: int, default: str | None = None) -> str:
         name = getattr(self.model, kind)(number).name
-        return str(name) or (f"{kind}_{number}" if otherwise is None else otherwise)
+        return str(name) or (f"{kind}_{number}" if default is None else default)
 
 
 def _placement(position: Any, matrix: Any) -> pin.SE3:

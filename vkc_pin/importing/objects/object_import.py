@@ -1,4 +1,4 @@
-"""Imports an object: from a file that somebody else made to a folder that `load_object` and scenes take."""
+"""Imports an object from a file of another program as a folder that scenes can use."""
 
 from __future__ import annotations
 
@@ -12,60 +12,61 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arguments import flag, instance, quantity, whole
-from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, shown
-from vkc_pin.files.documents import read_text
-from vkc_pin.files.resources import choose_file_names, file_path
-from vkc_pin.files.writing import folder_at_once
-from vkc_pin.files.xml import parse_xml
+from vkc_pin.importing.objects.clean_up import (
+    add_missing_limits,
+    compute_bounds,
+    extract_subtree,
+    find_closed_positions,
+    find_multiple_objects,
+    load_surfaces,
+    make_upright,
+    merge_fixed_links,
+    move_root,
+    rename_for_scenes,
+    scale_object,
+)
 from vkc_pin.importing.objects.description import WEIGHTLESS, Description
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
-from vkc_pin.importing.objects.pieces import with_pieces
+from vkc_pin.importing.objects.pieces import decompose_links
 from vkc_pin.importing.objects.sdf import read_object_sdf
-from vkc_pin.importing.objects.tidying import (
-    bounds,
-    closed,
-    only,
-    renamed,
-    rooted,
-    scaled,
-    several,
-    surfaces,
-    tidied,
-    upright,
-    with_limits,
-)
 from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
-from vkc_pin.importing.targets import check_target, made_by
-from vkc_pin.models.articulation import ArticulatedObject
-from vkc_pin.models.object_file import load_object
-from vkc_pin.models.proposals.proposal import Proposals
-from vkc_pin.models.proposals.propose import propose_attachments
-from vkc_pin.models.robot import Robot
-from vkc_pin.models.robot_file import load_robot
+from vkc_pin.importing.proposals.picture import plot_attachments
+from vkc_pin.importing.proposals.proposal import Proposals
+from vkc_pin.importing.proposals.propose import propose_attachments
+from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
-from vkc_pin.plotting.attachments import plot_attachments
+from vkc_pin.utils.arguments import flag, instance, quantity, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.resources import choose_file_names, file_path
+from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.world.files.xml import parse_xml
+from vkc_pin.world.models.articulated_object import ArticulatedObject
+from vkc_pin.world.models.object_file import load_object
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import load_robot
 
 __all__ = ["ImportedObject", "import_object", "read_description"]
 
 _COMMAND = "import-object"
-_GENERAL = ("mobility", "model", "object", "scene", "index", "main")  # names of files that say nothing
-_SMALL, _LARGE = 0.02, 3.5  # [m]: heights of what is opened by hand
+# Generic file names, which do not name an object
+_GENERAL = ("mobility", "model", "object", "scene", "index", "main")
+_SMALL, _LARGE = 0.02, 3.5  # [m] plausible heights of an object
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedObject:
-    """An object that was imported.
+    """An imported object.
 
     Attributes:
-        file: Its description, which `load_object` and scenes take.
-        object: The object, with the attachments that were proposed.
-        proposals: How good these are, and which joints have none.
-        size: Length, width, height of the closed object [m], shape (3,).
-        notes: What the file left out, and what was changed.
-        picture: A picture of its attachments.
+        file: Description file for `load_object` and scenes.
+        object: The object with its proposed attachments.
+        proposals: Proposed attachments, and joints that have none.
+        size: Length, width and height of the closed object [m], shape (3,).
+        notes: Changes and omissions.
+        picture: Image of the attachments.
     """
 
     file: Path
@@ -76,25 +77,34 @@ class ImportedObject:
     picture: Path
 
     def report(self) -> str:
-        """Return what came out, as text."""
-        pieces, joints = len(self.object.collision.geometryObjects), len(self.object.coordinates.names)
+        """Return a readable report."""
+        pieces, joints = (
+            len(self.object.collision.geometryObjects),
+            len(self.object.coordinates.names),
+        )
         size = " × ".join(f"{length:.2f}" for length in self.size)
-        head = f"{self.object.name}: {size} m, {joints} joint{'s' * (joints != 1)}, {pieces} convex pieces"
+        counts = f"{joints} joint{'s' * (joints != 1)}, {pieces} convex pieces"
+        head = f"{self.object.name}: {size} m, {counts}"
         notes = [f"  {note}" for note in self.notes]
-        lines = [head, *notes, f"attachments for the hand of {self.proposals.hand.robot}, best first:", self.proposals.report()]
+        lines = [
+            head,
+            *notes,
+            f"attachments for the hand of {self.proposals.hand.robot}, best first:",
+            self.proposals.report(),
+        ]
         return "\n".join(lines)
 
 
 def read_description(file: str | Path, *, free: bool = False) -> Description:
-    """Return what a URDF, MJCF or SDF file says; which it is, its first element tells.
+    """Read a URDF, MJCF or SDF file, whose first element tells its format.
 
     Args:
         file: The file.
-        free: Whether to keep what moves freely, on floating joints, which URDF and MJCF have.
+        free: Whether to keep free bodies, on floating joints (URDF and MJCF).
 
     Raises:
-        InputError: It is none of them, or cannot be read.
-        UnknownNameError: It names something that does not exist.
+        InputError: The format is unknown, or the file cannot be read.
+        UnknownNameError: The file refers to an unknown name.
     """
     path = file_path(file, "file", "a URDF, MJCF or SDF file")
     root = parse_xml(read_text(path, "URDF, MJCF or SDF"), path).tag
@@ -105,7 +115,9 @@ def read_description(file: str | Path, *, free: bool = False) -> Description:
     }
     if root not in readers:
         expected = "a URDF (<robot>), MJCF (<mujoco>) or SDF (<sdf>) file"
-        raise InputError("this is no object", file=path, expected=expected, got=f"<{root}>")
+        raise InputError(
+            "the file does not describe an object", file=path, expected=expected, got=f"<{root}>"
+        )
     return readers[root](path)
 
 
@@ -122,92 +134,127 @@ def import_object(
     most: int = 3,
     force: bool = False,
 ) -> ImportedObject:
-    """Make an object that can be planned with of a URDF, MJCF or SDF file.
+    """Import an object from a URDF, MJCF or SDF file.
 
-    Its shapes become convex pieces, fixed links part of what they are fixed to; links without shapes go, limits that nobody
-    states are chosen. Its lowest point is at z = 0, the origin below its middle. Attachments are proposed for every joint.
+    Its shapes become convex pieces and fixed links are merged. Links without shapes are dropped,
+    and missing limits chosen. The origin is below the centre, at the height of the lowest point.
+    Attachments are proposed for every joint.
 
     Args:
         file: The file.
-        folder: Where to write it, a new or empty folder; named like the file if it is not given.
-        height: How high the object is [m]: objects of PartNet-Mobility have no size of their own.
-        scale: By what to multiply the file's lengths instead.
-        up: Which of the file's axes points up, "z" or "y".
-        link: Import this link and what hangs on it alone.
-        robot: Whose hand the attachments are for.
-        options: Which clearances they must have.
-        most: How many attachments one joint gets at most.
-        force: Whether to replace a folder that this made before.
+        folder: Output folder, new or empty; defaults to one named like the file.
+        height: Height of the object [m]: objects of PartNet-Mobility have no size of their own.
+        scale: Factor for the file's lengths, instead of `height`.
+        up: Axis of the file that points up, "z" or "y".
+        link: Import only this link and its descendants.
+        robot: Robot whose hand the attachments are for.
+        options: Options with the clearances of attachments.
+        most: Largest number of attachments of one joint.
+        force: Whether to replace a folder that an earlier import wrote.
 
     Raises:
-        InputError: The file cannot be read or is no object, the folder holds something, or an argument is wrong.
-        UnknownNameError: There is no such link or robot, or the file names something that does not exist.
+        InputError: The file cannot be read or does not describe an object, the folder holds other
+            files, or an argument is invalid.
+        UnknownNameError: The link or robot is unknown, or the file refers to an unknown name.
     """
     path = file_path(file, "file", "a URDF, MJCF or SDF file")
     if up not in ("y", "z"):
-        raise InputError("not an axis that can point up", field="up", expected='"y" or "z"', got=shown(up))
+        raise InputError(
+            "`up` must be an axis of the file", field="up", expected='"y" or "z"', got=shown(up)
+        )
     for name, value in (("height", height), ("scale", scale)):
         if value is not None and quantity(value, name) <= 0.0:
-            raise InputError("not a size", field=name, expected="a number above 0", got=value)
+            raise InputError(
+                f"`{name}` must be positive", field=name, expected="a number above 0", got=value
+            )
     if height is not None and scale is not None:
-        raise InputError("both a height and a scale", field="height, scale", expected="one of them")
+        raise InputError(
+            "`height` and `scale` exclude each other", field="height, scale", expected="one of them"
+        )
     whole(most, "most", low=1, high=100)
     options = Options() if options is None else instance(options, Options, "options")
     clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
-    name = _name(path, link)
+    name = _choose_name(path, link)
     target = Path(name) if folder is None else file_path(folder, "folder", "a folder")
     check_target(target, _COMMAND, force=flag(force, "force"))
     description = read_description(path)
     description = (
-        only(description, link) if link else dataclasses.replace(description, notes=description.notes + several(description))
+        extract_subtree(description, link)
+        if link
+        else dataclasses.replace(
+            description, notes=description.notes + find_multiple_objects(description)
+        )
     )
-    description = upright(tidied(renamed(description)), up)
-    description, size = _sized(description, height, scale)
-    meshes = surfaces(description)
-    description = _settled(with_limits(description, meshes))
-    if description.weightless:
+    description = make_upright(merge_fixed_links(rename_for_scenes(description)), up)
+    description, size = _scale_to_size(description, height, scale)
+    meshes = load_surfaces(description)
+    description = _place_on_floor(add_missing_limits(description, meshes))
+    if description.is_massless:
         description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
-    description = with_pieces(description, surfaces(description))
-    with folder_at_once(target, force=True) as made:  # what is there may be replaced
-        yaml, urdf, picture = made / f"{name}.yaml", made / f"{name}.urdf", made / "attachments.png"
+    description = decompose_links(description, load_surfaces(description))
+    with folder_at_once(target, force=True) as staging:  # `check_target` allowed replacing it
+        yaml, urdf, picture = (
+            staging / f"{name}.yaml",
+            staging / f"{name}.urdf",
+            staging / "attachments.png",
+        )
         write_urdf(description, urdf)
-        about = [f"Made of {path.name} {made_by(_COMMAND)}."]
+        about = [f"Made of {path.name} {get_origin_marker(_COMMAND)}."]
         if link is not None and link != name:
             about.append(f"Name of the link: {link}")
         write_description(yaml, urdf.name, (), about=about)
         proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
         about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
-        about += [f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()]
-        write_description(yaml, urdf.name, [item.description() for item in proposals.found], about=about)
+        about += [
+            f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()
+        ]
+        write_description(
+            yaml, urdf.name, [item.description() for item in proposals.found], about=about
+        )
         plot_attachments(proposals, picture)
-    done = load_object(target / yaml.name)
-    proposals = dataclasses.replace(proposals, object=dataclasses.replace(done, attachments={}))  # where its files are now
-    return ImportedObject(target / yaml.name, done, proposals, size, description.notes, target / picture.name)
+    loaded = load_object(target / yaml.name)
+    # The files have moved.
+    proposals = dataclasses.replace(proposals, object=dataclasses.replace(loaded, attachments={}))
+    return ImportedObject(
+        target / yaml.name, loaded, proposals, size, description.notes, target / picture.name
+    )
 
 
-def _name(path: Path, link: str | None) -> str:
-    """Return what to call an object: by its link, its file, or the folder of a file whose name says nothing."""
+def _choose_name(path: Path, link: str | None) -> str:
+    """Return a name from the link, the file, or the folder of a file with a generic name."""
     stem = link or (path.resolve().parent.name if path.stem.lower() in _GENERAL else path.stem)
     name = re.sub(r"[^A-Za-z0-9_]+", "_", stem).strip("_") or "object"
     (name,) = choose_file_names([name if name[0].isalpha() else f"object_{name}"])
     return name
 
 
-def _sized(description: Description, height: float | None, scale: float | None) -> tuple[Description, Floats]:
-    """Return the object in its size, and that [m]; what is not plausible is noted."""
-    low, high = bounds(description, surfaces(description))
+def _scale_to_size(
+    description: Description, height: float | None, scale: float | None
+) -> tuple[Description, Floats]:
+    """Return the object in its size, and the size [m]; implausible sizes are noted."""
+    low, high = compute_bounds(description, load_surfaces(description))
     if not (high > low).all():
-        raise InputError("the object is flat", file=description.file, expected="shapes around a volume")
+        raise InputError(
+            "the object is flat", file=description.file, expected="shapes that enclose a volume"
+        )
     factor = height / float(high[2] - low[2]) if height is not None else scale or 1.0
     size = factor * (high - low)
     if height is None and not _SMALL <= size[2] <= _LARGE:
-        note = f"it is {size[2]:.3g} m high: if it is not, say how high it is (height) or in which unit the file is (scale)"
+        note = (
+            f"the object is {size[2]:.3g} m high: "
+            "if this is wrong, state its height (height) or the unit of the file (scale)"
+        )
         description = dataclasses.replace(description, notes=(*description.notes, note))
-    return scaled(description, factor), size
+    return scale_object(description, factor), size
 
 
-def _settled(description: Description) -> Description:
-    """Return the object with its root's frame on the floor, below its middle, joints closed."""
-    low, high = bounds(description, surfaces(description), closed(description))
-    return rooted(description, pin.SE3(np.eye(3), -np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])))
+def _place_on_floor(description: Description) -> Description:
+    """Return the object with its root's frame on the floor, below its closed shape's centre."""
+    low, high = compute_bounds(
+        description, load_surfaces(description), find_closed_positions(description)
+    )
+    return move_root(
+        description,
+        pin.SE3(np.eye(3), -np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])),
+    )

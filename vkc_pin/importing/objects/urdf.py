@@ -1,4 +1,4 @@
-"""Reads the URDF of an object as it was downloaded, with what it leaves out."""
+"""Reads an object from a URDF file, and completes missing elements."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.files.kinematic_tree import check_tree, inertial_of, numbers_of, origin_of
-from vkc_pin.files.urdf import UrdfFile
-from vkc_pin.files.xml import read_xml
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part, inertia
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_inertia
+from vkc_pin.world.files.kinematic_tree import check_tree, inertial_of, numbers_of, origin_of
+from vkc_pin.world.files.urdf import UrdfFile
+from vkc_pin.world.files.xml import read_xml
 
 __all__ = ["read_object_urdf"]
 
@@ -21,46 +21,72 @@ _KINDS = ("fixed", "revolute", "continuous", "prismatic")
 
 
 def read_object_urdf(file: Path, *, free: bool = False) -> Description:
-    """Return what a URDF says about an object, or a home.
+    """Read the description of an object or a home from a URDF.
 
     Args:
         file: The file.
-        free: Whether joints may be floating; else they are taken as fixed.
+        free: Whether joints may be floating; otherwise floating joints count as fixed.
 
     Raises:
-        InputError: It cannot be read, its links are no tree, or a mesh file is missing.
-        UnknownNameError: A joint names a link that does not exist.
+        InputError: The file cannot be read, its links do not form a tree, or a mesh file is
+            missing.
+        UnknownNameError: A joint refers to an unknown link.
     """
     _, root = read_xml(file, "URDF")
     notes = list[str]()
-    stated = {joint.get("name", ""): _stated(file, joint, notes) for joint in root.findall("joint")}
+    stated = {
+        joint.get("name", ""): _read_limits(file, joint, notes) for joint in root.findall("joint")
+    }
     for joint in root.findall("joint"):
-        if joint.get("type") not in (*_KINDS, "floating") or (joint.get("type") == "floating" and not free):
+        if joint.get("type") not in (*_KINDS, "floating") or (
+            joint.get("type") == "floating" and not free
+        ):
             notes.append(f"joint '{joint.get('name')}' is {joint.get('type')}: taken as fixed")
             joint.set("type", "fixed")
         if (mimic := joint.find("mimic")) is not None:
-            notes.append(f"joint '{joint.get('name')}' mimics '{mimic.get('joint')}': it moves on its own now")
+            notes.append(
+                f"joint '{joint.get('name')}' mimics '{mimic.get('joint')}': made independent"
+            )
             joint.remove(mimic)
     check_tree(file, root)
     urdf = UrdfFile(file.resolve(), "", root)
-    names = _names(root)
-    parts: dict[str, dict[str, list[Part]]] = {kind: {link: [] for link in urdf.links} for kind in ("visual", "collision")}
-    for kind, of_links in parts.items():
+    names = _find_shape_names(root)
+    parts: dict[str, dict[str, list[Part]]] = {
+        kind: {link: [] for link in urdf.links} for kind in ("visual", "collision")
+    }
+    for kind, by_link in parts.items():
         for shape in urdf.shapes(kind):
             name = names.get((kind, shape.name)) or names.get(("mesh", str(shape.file))) or ""
-            of_links[shape.link].append(
-                Part(name=name, placement=shape.placement, kind=shape.kind, size=shape.size, file=shape.file, colour=shape.colour)
+            by_link[shape.link].append(
+                Part(
+                    name=name,
+                    placement=shape.placement,
+                    kind=shape.kind,
+                    size=shape.size,
+                    file=shape.file,
+                    colour=shape.colour,
+                )
             )
-            if name and shape.file is not None:  # PartNet-Mobility names what is seen; what collides are the same files
+            # PartNet-Mobility names only visual shapes; collision shapes use the same files.
+            if name and shape.file is not None:
                 names["mesh", str(shape.file)] = name
-    weight = {link.get("name", ""): _inertia(file, link, notes) for link in root.findall("link")}
-    links = {name: Link(name, tuple(parts["visual"][name]), tuple(parts["collision"][name]), weight[name]) for name in urdf.links}
-    joints = [_joint(file, joint, stated[joint.get("name", "")]) for joint in root.findall("joint")]
+    inertias = {
+        link.get("name", ""): _read_inertia(file, link, notes) for link in root.findall("link")
+    }
+    links = {
+        name: Link(
+            name, tuple(parts["visual"][name]), tuple(parts["collision"][name]), inertias[name]
+        )
+        for name in urdf.links
+    }
+    joints = [
+        _read_joint(file, joint, stated[joint.get("name", "")]) for joint in root.findall("joint")
+    ]
     return Description(file, links, {joint.child: joint for joint in joints}, tuple(notes))
 
 
-def _names(root: ElementTree.Element) -> dict[tuple[str, str], str]:
-    """Return what elements are called: (kind, `<link>_<k>`) → name."""
+def _find_shape_names(root: ElementTree.Element) -> dict[tuple[str, str], str]:
+    """Map each shape (kind, `<link>_<k>`) to its name in the file."""
     return {
         (kind, f"{link.get('name')}_{number}"): element.get("name", "")
         for link in root.findall("link")
@@ -69,63 +95,84 @@ def _names(root: ElementTree.Element) -> dict[tuple[str, str], str]:
     }
 
 
-def _stated(file: Path, joint: ElementTree.Element, notes: list[str]) -> tuple[float, float] | None:
-    """Return the limits that a joint states, and write some that any reader takes; None if it states none."""
+def _read_limits(
+    file: Path, joint: ElementTree.Element, notes: list[str]
+) -> tuple[float, float] | None:
+    """Return the limits of a joint, or None if the file states none.
+
+    The element is changed so that any URDF reader accepts it.
+    """
     limit, name = joint.find("limit"), joint.get("name", "")
     if limit is None:
         joint.append(ElementTree.Element("limit", {"lower": "0", "upper": "0"}))
         return None
     if limit.get("lower") is None and limit.get("upper") is None:
         return None
-    low, high = (numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)[0] for key in ("lower", "upper"))
+    low, high = (
+        numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)[0]
+        for key in ("lower", "upper")
+    )
     if low > high:
-        notes.append(f"joint '{name}' has its limits the wrong way round, {low:g} and {high:g}: exchanged")
+        notes.append(
+            f"joint '{name}' has a lower limit above its upper limit, {low:g} and {high:g}: swapped"
+        )
         low, high = high, low
         limit.set("lower", str(low))
         limit.set("upper", str(high))
     return low, high
 
 
-def _inertia(file: Path, link: ElementTree.Element, notes: list[str]) -> pin.Inertia:
-    """Return what a link weighs; nothing if its <inertial> is not whole, which is noted."""
+def _read_inertia(file: Path, link: ElementTree.Element, notes: list[str]) -> pin.Inertia:
+    """Return a link's inertia; an incomplete <inertial> counts as none, with a note."""
     name, stated = link.get("name", ""), link.find("inertial")
     if stated is None:
         return pin.Inertia.Zero()
     try:
         mass, moments, origin = inertial_of(file, stated, name)
-        return inertia(mass, moments, _placed(origin))
+        return make_inertia(mass, moments, _make_placement(origin))
     except InputError as error:
         notes.append(f"link '{name}': {error}: its <inertial> counts as none")
         return pin.Inertia.Zero()
 
 
-def _placed(origin: tuple[tuple[float, ...], tuple[float, ...]]) -> pin.SE3:
-    """Return the placement that an <origin> states."""
+def _make_placement(origin: tuple[tuple[float, ...], tuple[float, ...]]) -> pin.SE3:
+    """Return the placement of an <origin>."""
     position, angles = origin
     return pin.SE3(pin.rpy.rpyToMatrix(*angles), np.array(position))
 
 
-def _joint(file: Path, element: ElementTree.Element, limits: tuple[float, float] | None) -> Joint:
+def _read_joint(
+    file: Path, element: ElementTree.Element, limits: tuple[float, float] | None
+) -> Joint:
     name, kind = element.get("name", ""), element.get("type", "")
     axis, limit = element.find("axis"), element.find("limit")
     direction = np.array([1.0, 0.0, 0.0])
     if axis is not None and kind not in ("fixed", "floating"):
         direction = np.array(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name))
-    velocity = numbers_of(file, limit, "velocity", 1, default="0", where=name)[0] if limit is not None else 0.0
+    velocity = (
+        numbers_of(file, limit, "velocity", 1, default="0", where=name)[0]
+        if limit is not None
+        else 0.0
+    )
     dynamics = element.find("dynamics")
-    resists = {
-        key: 0.0 if dynamics is None else max(0.0, numbers_of(file, dynamics, key, 1, default="0", where=name)[0])
+    resistance = {
+        key: 0.0
+        if dynamics is None
+        else max(0.0, numbers_of(file, dynamics, key, 1, default="0", where=name)[0])
         for key in ("damping", "friction")
     }
-    ends = [(found.get("link", "") if (found := element.find(key)) is not None else "") for key in ("parent", "child")]
+    ends = [
+        (found.get("link", "") if (found := element.find(key)) is not None else "")
+        for key in ("parent", "child")
+    ]
     return Joint(
         name=name,
         kind=kind,
         parent=ends[0],
         child=ends[1],
-        placement=_placed(origin_of(file, element, name)),
+        placement=_make_placement(origin_of(file, element, name)),
         axis=direction / np.linalg.norm(direction),
         limits=None if kind == "continuous" else limits,
         velocity=velocity if velocity > 0.0 else None,
-        **resists,
+        **resistance,
     )

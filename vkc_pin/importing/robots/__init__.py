@@ -1,1 +1,1 @@
-"""Robots from URDF, xacro and MJCF: what a robot.yaml needs is found in names and shapes."""
+"""Imports robots from URDF, xacro and MJCF files, and derives a robot.yaml."""

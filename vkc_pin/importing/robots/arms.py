@@ -1,4 +1,4 @@
-"""Finds the arms of a robot in the tree of its joints, by its shape and by names."""
+"""Finds the arms of a robot from the structure of its joint tree and from names."""
 
 from __future__ import annotations
 
@@ -11,20 +11,32 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.urdf import UrdfFile
+from vkc_pin.world.files.urdf import UrdfFile
 
-__all__ = ["Arm", "Body", "base_kind", "bodies", "choose", "find_arms", "own_base", "telescopes"]
+__all__ = [
+    "Arm",
+    "Body",
+    "build_body_tree",
+    "choose_arm",
+    "find_arms",
+    "find_own_base",
+    "find_telescopes",
+    "guess_base_kind",
+]
 
 _MOVING = ("revolute", "continuous", "prismatic")
-_FINGER = 7  # joints in the longest finger of a hand
-_ARM = 3  # joints, at least, that carry a hand; one more without a hand
-_PARALLEL = 1.0 - 1e-6  # cosine between axes along which the segments of a telescope slide
+_FINGER = 7  # largest number of joints of a finger
+_ARM = 3  # smallest number of joints of an arm with a hand; one more without a hand
+_PARALLEL = 1.0 - 1e-6  # smallest cosine between the axes of a telescope's segments
 _HAND_WORDS = re.compile(r"finger|thumb|gripper|jaw|knuckle|claw|fngr|grip", re.IGNORECASE)
-_ARM_WORDS = re.compile(r"arm|shoulder|elbow|wrist|hand|gripper|ur\d|panda|lift|flange", re.IGNORECASE)
+_ARM_WORDS = re.compile(
+    r"arm|shoulder|elbow|wrist|hand|gripper|ur\d|panda|lift|flange", re.IGNORECASE
+)
 _TRUNK_WORDS = re.compile(r"shoulder|elbow|arm(?!ature)|neck|head|hip", re.IGNORECASE)
 _WRIST_WORDS = re.compile(r"wrist|yaw|roll|pitch", re.IGNORECASE)
 _OTHER_WORDS = re.compile(
-    r"leg(?!o)|hip|knee|ankle|foot|feet|thigh|calf|shank|haa|hfe|kfe|toe|wheel|caster|head|neck|eye|camera|antenna|tail|propell|rotor"
+    r"leg(?!o)|hip|knee|ankle|foot|feet|thigh|calf|shank|haa|hfe|kfe|toe|wheel|caster|head|neck"
+    r"|eye|camera|antenna|tail|propell|rotor"
     r"|_h[xy]_|_kn_|laser|tilt_mount|ear",
     re.IGNORECASE,
 )
@@ -36,13 +48,13 @@ _SIDES = {
 
 @dataclass(eq=False)
 class Body:
-    """Links that fixed joints make one.
+    """Links that fixed joints connect rigidly.
 
     Attributes:
-        links: Their names, the first one nearest to the root.
-        joint: The joint above, None for the root.
-        parent: The body above.
-        children: Those below.
+        links: Names of the links, the one nearest to the root first.
+        joint: Parent joint, None for the root.
+        parent: Parent body.
+        children: Child bodies.
     """
 
     links: list[str]
@@ -52,25 +64,29 @@ class Body:
 
     @property
     def name(self) -> str:
-        """The name of the joint above, "" for the root."""
+        """Name of the parent joint, "" for the root."""
         return "" if self.joint is None else self.joint.get("name", "")
 
     @property
-    def plans(self) -> bool:
-        """Whether the joint above can be planned: it moves by one coordinate, of its own."""
-        return self.joint is not None and self.joint.get("type") in _MOVING and self.joint.find("mimic") is None
+    def is_planned(self) -> bool:
+        """Whether the parent joint can be planned: it moves by one independent coordinate."""
+        return (
+            self.joint is not None
+            and self.joint.get("type") in _MOVING
+            and self.joint.find("mimic") is None
+        )
 
     def path(self) -> list[Body]:
-        """Return the bodies from below the root to this one."""
+        """Return the bodies from the first one below the root to this one."""
         return [] if self.parent is None else [*self.parent.path(), self]
 
-    def below(self) -> list[Body]:
-        """Return this body and all that hang on it."""
-        return [self, *(body for child in self.children for body in child.below())]
+    def subtree(self) -> list[Body]:
+        """Return this body and all its descendants."""
+        return [self, *(body for child in self.children for body in child.subtree())]
 
     def depth(self) -> int:
-        """Return the largest number of joints one after the other below it that can be planned."""
-        return max((child.plans + child.depth() for child in self.children), default=0)
+        """Return the largest number of planned joints on a path below this body."""
+        return max((child.is_planned + child.depth() for child in self.children), default=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +94,13 @@ class Arm:
     """An arm.
 
     Attributes:
-        name: "left", "right", the group's name in an SRDF, or that of the body that carries the hand.
-        joints: The joints that are planned, from the root on; not those of an own planar base.
-        palm: The body at its end, which fingers hang on.
-        fingers: The first body of each finger.
-        sure: "sure", "likely" or "guess".
-        why: What speaks for it.
+        name: "left", "right", the name of its SRDF group, or that of the body with the hand.
+        joints: Planned joints from the root on, without those of a base in the file.
+        palm: Body at its end, to which the fingers are attached.
+        fingers: First body of each finger.
+        sure: Confidence: "sure", "likely" or "guess".
+        why: Evidence.
+        score: Rank among the arms.
     """
 
     name: str
@@ -95,37 +112,38 @@ class Arm:
     score: float
 
 
-def bodies(file: UrdfFile) -> Body:
+def build_body_tree(file: UrdfFile) -> Body:
     """Return the root of a robot's tree of bodies."""
     below: dict[str, list[ElementTree.Element]] = {}
     children = set()
     for joint in file.root.findall("joint"):
-        below.setdefault(_link(joint, "parent"), []).append(joint)
-        children.add(_link(joint, "child"))
+        below.setdefault(_get_link(joint, "parent"), []).append(joint)
+        children.add(_get_link(joint, "child"))
     root = Body([next(link for link in file.links if link not in children)])
     waiting = [root]
     while waiting:
         body = waiting.pop(0)
-        for link in body.links:  # grows
+        for link in body.links:  # the list grows in the loop
             for joint in below.get(link, ()):
                 if joint.get("type") == "fixed":
-                    body.links.append(_link(joint, "child"))
+                    body.links.append(_get_link(joint, "child"))
                 else:
-                    body.children.append(Body([_link(joint, "child")], joint, body))
+                    body.children.append(Body([_get_link(joint, "child")], joint, body))
         waiting += body.children
     return root
 
 
-def own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
-    """Return the joints by which a robot drives in its own file: the first ones below the root, of links without shapes.
+def find_own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
+    """Return the joints of a mobile base in the robot's file.
 
-    They slide, or turn about the vertical, and there are at least two of them.
+    These are at least two joints in sequence from the root whose parent links have no shapes, and
+    that are prismatic or rotate about the vertical.
 
     Args:
-        root: See `bodies`.
-        solid: The links that have shapes.
+        root: Root of the tree of bodies.
+        solid: Links that have shapes.
     """
-    found, body = [], root
+    joints, body = [], root
     while len(body.children) == 1 and not solid & set(body.links):
         body = body.children[0]
         axis = None if body.joint is None else body.joint.find("axis")
@@ -133,148 +151,212 @@ def own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
         kind = None if body.joint is None else body.joint.get("type")
         if not (kind == "prismatic" or (kind in ("revolute", "continuous") and z > 0.99)):
             break
-        found.append(body.name)
-    return tuple(found) if len(found) > 1 else ()
+        joints.append(body.name)
+    return tuple(joints) if len(joints) > 1 else ()
 
 
-def base_kind(root: ElementTree.Element) -> tuple[str, str]:
-    """Return how a base moves, by its wheels, and what speaks for it."""
-    turning = [joint.get("name", "").lower() for joint in root.findall("joint") if joint.get("type") == "continuous"]
+def guess_base_kind(root: ElementTree.Element) -> tuple[str, str]:
+    """Guess from the wheels how a base moves; return its kind and the evidence."""
+    turning = [
+        joint.get("name", "").lower()
+        for joint in root.findall("joint")
+        if joint.get("type") == "continuous"
+    ]
     wheels = [name for name in turning if "wheel" in name]
     names = " ".join(link.get("name", "").lower() for link in root.findall("link"))
     casters = "caster" in names
     if any(word in names for word in ("mecanum", "omni", "swerve", "suspension_steer")):
-        return "omni", "wheels that are named so"
+        return "omni", "names of wheels"
     if wheels and casters and len(wheels) > 4:
-        return "omni", "wheels on casters that turn"
+        return "omni", "wheels on steered casters"
     if wheels:
         return "differential", f"{len(wheels)} wheels"
-    return "omni", "no wheels: a base that can go anywhere is put under it; `fixed` for an arm on a table"
+    return (
+        "omni",
+        "no wheels: an omnidirectional base is assumed; use `fixed` for an arm on a table",
+    )
 
 
-def find_arms(file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], solid: Set[str]) -> list[Arm]:
-    """Return the arms of a robot, the best first.
+def find_arms(
+    file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], solid: Set[str]
+) -> list[Arm]:
+    """Find the arms of a robot, best first.
 
-    A hand is a body below at least three joints from which fingers branch: at least two of at most seven joints each, or
-    one whose name says that it is a jaw. Chains without a hand are arms if they have four joints and their names are not those of
-    legs, heads and wheels.
+    A hand is a body below at least three joints with fingers: at least two of at most seven joints
+    each, or one that is named as a jaw. Chains without a hand are arms if they have four joints and
+    are not named as legs, heads or wheels.
 
     Args:
         file: The robot.
-        root: See `bodies`.
+        root: Root of the tree of bodies.
         groups: Groups of an SRDF, which name arms.
-        solid: The links that have shapes.
+        solid: Links that have shapes.
     """
-    base = own_base(root, solid)
-    everything, found = root.below(), []
+    base = find_own_base(root, solid)
+    everything, arms = root.subtree(), []
     palms: list[Body] = []
     for body in everything:
-        if any(above in palms for above in body.path()[:-1]) or len(_planned(body, base)) < _ARM:
+        if (
+            any(above in palms for above in body.path()[:-1])
+            or len(_find_planned_joints(body, base)) < _ARM
+        ):
             continue
         if _is_palm(body):
             palms.append(body)
-    inside = {id(below) for palm in palms for below in palm.below()}
+    inside = {id(below) for palm in palms for below in palm.subtree()}
     carrying = {id(above) for palm in palms for above in palm.path()}
     tips = [body for body in everything if not body.children and id(body) not in inside | carrying]
     for body in palms + tips:
-        fingers = tuple(child for child in body.children if any(solid & set(below.links) for below in child.below()))
-        joints = _planned(body, base)
+        fingers = tuple(
+            child
+            for child in body.children
+            if any(solid & set(below.links) for below in child.subtree())
+        )
+        joints = _find_planned_joints(body, base)
         own = [*joints[-5:], *body.links[:2]]
         other = sum(bool(_OTHER_WORDS.search(name)) for name in own)
         words = sum(bool(_ARM_WORDS.search(name)) for name in own)
         if not joints or other > words or (body in tips and (len(joints) <= _ARM or other)):
             continue
         score = 3.0 * bool(fingers) + 2.0 * bool(words) + min(len(joints), 7) / 7.0
-        sure = "sure" if fingers and words and len(joints) > _ARM else "likely" if fingers or words else "guess"
+        sure = (
+            "sure"
+            if fingers and words and len(joints) > _ARM
+            else "likely"
+            if fingers or words
+            else "guess"
+        )
         why = f"{len(joints)} joints, " + (f"{len(fingers)} fingers" if fingers else "no fingers")
-        why += ", named like an arm" if words else ""
-        found.append(Arm(_named(joints, body, groups), joints, body, fingers, sure, why, score))
-    if sum(arm.sure == "guess" for arm in found) > 2:  # fingers of a hand, legs
-        found = [arm for arm in found if arm.sure != "guess"]
-    found.sort(key=lambda arm: -arm.score)
-    names = [arm.name for arm in found]
-    return [arm if names.count(arm.name) == 1 else Arm(arm.palm.links[0], *_rest(arm)) for arm in found]
+        why += ", named as an arm" if words else ""
+        arms.append(
+            Arm(_choose_name(joints, body, groups), joints, body, fingers, sure, why, score)
+        )
+    if sum(arm.sure == "guess" for arm in arms) > 2:  # fingers of a hand, legs
+        arms = [arm for arm in arms if arm.sure != "guess"]
+    arms.sort(key=lambda arm: -arm.score)
+    names = [arm.name for arm in arms]
+    return [
+        arm if names.count(arm.name) == 1 else Arm(arm.palm.links[0], *_get_other_fields(arm))
+        for arm in arms
+    ]
 
 
-def choose(arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mapping[str, Sequence[str]]) -> Arm:
-    """Return the arm of a name, or that a group of this name has the last joints of, or whose name contains it, or the best one.
+def choose_arm(
+    arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mapping[str, Sequence[str]]
+) -> Arm:
+    """Choose the arm with a name, of an SRDF group, whose name contains it, or the best one.
+
+    Args:
+        arms: Arms, best first.
+        name: Name of an arm or part of it, or of a group with the arm's last joints; None for the
+            best arm.
+        file: The robot.
+        groups: Groups of an SRDF.
 
     Raises:
-        InputError: There is no arm.
-        UnknownNameError: There is none of that name.
+        InputError: The robot has no arm.
+        UnknownNameError: No arm has this name.
     """
     if not arms:
-        expected = "at least four joints one after the other, or a hand on three; or tool_frame, its name"
+        expected = (
+            "at least four joints in a chain, or a hand after three; or the name of a tool_frame"
+        )
         raise InputError("no arm was found", file=file.path, expected=expected)
     if name is None:
         return arms[0]
     fitting = [arm for arm in arms if arm.name == name]
-    fitting = fitting or [arm for arm in arms if _last(arm.joints) <= set(groups.get(name, ()))]
+    fitting = fitting or [
+        arm for arm in arms if _get_last_joints(arm.joints) <= set(groups.get(name, ()))
+    ]
     fitting = fitting or [arm for arm in arms if name.lower() in arm.name.lower()]
     if not fitting:
-        also = [group for group, joints in groups.items() if any(_last(arm.joints) <= set(joints) for arm in arms)]
-        raise UnknownNameError("arm", name, dict.fromkeys([*(arm.name for arm in arms), *also]), file=file.path, field="arm")
+        also = [
+            group
+            for group, joints in groups.items()
+            if any(_get_last_joints(arm.joints) <= set(joints) for arm in arms)
+        ]
+        raise UnknownNameError(
+            "arm",
+            name,
+            dict.fromkeys([*(arm.name for arm in arms), *also]),
+            file=file.path,
+            field="arm",
+        )
     return fitting[0]
 
 
-def telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return joints of an arm, one right after the other, that slide alike along one direction and equally far.
+def find_telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, ...]]:
+    """Find telescopes: consecutive prismatic joints of an arm with equal axes and limits.
 
-    Nothing but a telescope has a use for them, and one motor moves all its segments.
+    One motor moves all segments of a telescope.
 
     Args:
         full: The robot with all its joints.
-        joints: The arm's, from the root on.
+        joints: The arm's joints, from the root on.
     """
-    data, found = full.createData(), list[list[str]]()
+    data, telescopes = full.createData(), list[list[str]]()
     pin.forwardKinematics(full, data, pin.neutral(full))
     before, along = 0, np.zeros(3)
     for name in joints:
         number = full.getJointId(name)
-        axis = data.oMi[number].rotation @ np.asarray(data.joints[number].S, float).ravel()[:3]  # 0 of one that turns
+        # The axis is zero for revolute joints.
+        axis = data.oMi[number].rotation @ np.asarray(data.joints[number].S, float).ravel()[:3]
         bounds = (full.lowerPositionLimit, full.upperPositionLimit)
         if (
             full.parents[number] == before
             and axis @ along > _PARALLEL
-            and all(np.isclose(bound[full.joints[number].idx_q], bound[full.joints[before].idx_q]) for bound in bounds)
+            and all(
+                np.isclose(bound[full.joints[number].idx_q], bound[full.joints[before].idx_q])
+                for bound in bounds
+            )
         ):
-            found[-1].append(name)
+            telescopes[-1].append(name)
         else:
-            found.append([name])
+            telescopes.append([name])
         before, along = number, axis
-    return [tuple(group) for group in found if len(group) > 1]
+    return [tuple(group) for group in telescopes if len(group) > 1]
 
 
-def _last(joints: Sequence[str]) -> set[str]:
-    """Return the joints by which an arm is known."""
+def _get_last_joints(joints: Sequence[str]) -> set[str]:
+    """Return the joints that identify an arm."""
     return set(joints[-4:])
 
 
-def _rest(arm: Arm) -> tuple[tuple[str, ...], Body, tuple[Body, ...], str, str, float]:
+def _get_other_fields(arm: Arm) -> tuple[tuple[str, ...], Body, tuple[Body, ...], str, str, float]:
     return arm.joints, arm.palm, arm.fingers, arm.sure, arm.why, arm.score
 
 
 def _is_palm(body: Body) -> bool:
-    """Return whether fingers hang on a body: two or more, or one jaw that is called so."""
-    if not body.children or body.depth() > _FINGER or not any(below.plans for below in body.below()[1:]):
+    """Return whether a body has fingers: two or more, or one that is named as a jaw."""
+    if (
+        not body.children
+        or body.depth() > _FINGER
+        or not any(below.is_planned for below in body.subtree()[1:])
+    ):
         return False
     if any(_TRUNK_WORDS.search(f"{child.name} {child.links[0]}") for child in body.children):
         return False
     if len(body.children) == 1:
         jaw = body.children[0]
-        return bool(_HAND_WORDS.search(jaw.name)) and not _WRIST_WORDS.search(jaw.name) and not jaw.children
+        return (
+            bool(_HAND_WORDS.search(jaw.name))
+            and not _WRIST_WORDS.search(jaw.name)
+            and not jaw.children
+        )
     named = [bool(_HAND_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
     other = [bool(_OTHER_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
     return any(named) or not any(other)
 
 
-def _planned(body: Body, base: Collection[str]) -> tuple[str, ...]:
-    return tuple(above.name for above in body.path() if above.plans and above.name not in base)
+def _find_planned_joints(body: Body, base: Collection[str]) -> tuple[str, ...]:
+    return tuple(above.name for above in body.path() if above.is_planned and above.name not in base)
 
 
-def _named(joints: Sequence[str], palm: Body, groups: Mapping[str, Sequence[str]]) -> str:
-    """Return what an arm is called: by the smallest group that has its last joints, by its side, or by its end."""
-    if fitting := [name for name, members in groups.items() if _last(joints) <= set(members)]:
+def _choose_name(joints: Sequence[str], palm: Body, groups: Mapping[str, Sequence[str]]) -> str:
+    """Return an arm's name: that of the smallest group with its joints, its side, or its palm."""
+    if fitting := [
+        name for name, members in groups.items() if _get_last_joints(joints) <= set(members)
+    ]:
         return min(fitting, key=lambda name: (len(groups[name]), name))
     for side, pattern in _SIDES.items():
         if sum(bool(pattern.search(name)) for name in [*joints[-3:], palm.links[0]]) >= 2:
@@ -282,6 +364,6 @@ def _named(joints: Sequence[str], palm: Body, groups: Mapping[str, Sequence[str]
     return palm.links[0]
 
 
-def _link(joint: ElementTree.Element, key: str) -> str:
+def _get_link(joint: ElementTree.Element, key: str) -> str:
     element = joint.find(key)
     return "" if element is None else element.get("link", "")

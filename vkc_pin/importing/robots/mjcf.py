@@ -1,6 +1,7 @@
-"""Writes what MuJoCo makes of an MJCF file as a URDF.
+"""Converts an MJCF file to a URDF.
 
-MuJoCo's compiler resolves includes, defaults, classes and units; what it makes is read here, not the file.
+MuJoCo's compiler resolves includes, defaults, classes and units; its result is read here, not the
+file.
 """
 
 from __future__ import annotations
@@ -13,25 +14,25 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError
-from vkc_pin.files.resources import choose_file_names
-from vkc_pin.files.xml import replace_forbidden
-from vkc_pin.needed import optional_package
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.world.files.resources import choose_file_names
+from vkc_pin.world.files.xml import replace_forbidden
 
-__all__ = ["Converted", "convert"]
+__all__ = ["ConvertedRobot", "convert_mjcf"]
 
-_FAR = 20.0  # [m] limits of a joint that slides without any
+_FAR = 20.0  # [m] limits of prismatic joints without limits
 
 
 @dataclass
-class Converted:
-    """A URDF made of an MJCF file.
+class ConvertedRobot:
+    """A URDF converted from an MJCF file.
 
     Attributes:
         root: The URDF.
-        states: Name of a key frame → joint → position, [m] or [rad].
-        notes: What could not be kept as it was.
+        states: Maps the name of each key frame to joint positions, [m] or [rad].
+        notes: Changes and omissions.
     """
 
     root: ElementTree.Element
@@ -39,36 +40,43 @@ class Converted:
     notes: list[str] = field(default_factory=list)
 
 
-def convert(file: Path, folder: Path) -> Converted:
-    """Return the largest tree of joints in an MJCF file as a URDF, with its meshes as STL files in `folder`.
+def convert_mjcf(file: Path, folder: Path) -> ConvertedRobot:
+    """Convert the largest joint tree of an MJCF file to a URDF, with STL meshes in `folder`.
 
-    Bodies become links, several joints of a body a chain of links. What cannot be said in a URDF is named in the notes: balls
-    and free joints below the root are locked, planes left out. What else stands in the world is left out.
+    Bodies become links, and several joints of a body a chain of links. Notes name everything that a
+    URDF cannot express: ball joints and free joints below the root are locked, planes left out.
+    Other trees are left out.
 
     Raises:
-        InputError: MuJoCo is not installed, or does not understand the file; the error says what it says.
+        InputError: MuJoCo is not installed or cannot read the file; the error contains its message.
     """
     mujoco = optional_package("mujoco", "import", what="an MJCF file", file=file)
     try:
         model = mujoco.MjModel.from_xml_path(str(file.resolve()))
     except (ValueError, RuntimeError) as error:
-        raise InputError(f"MuJoCo does not understand this: {' '.join(str(error).split())}", file=file) from error
+        raise InputError(
+            f"MuJoCo cannot read the file: {' '.join(str(error).split())}", file=file
+        ) from error
     return _Converter(mujoco, model, file, folder).convert()
 
 
 class _Converter:
     def __init__(self, mujoco: Any, model: Any, file: Path, folder: Path) -> None:
         self._mujoco, self._model, self._folder, self._file = mujoco, model, folder, file
-        self._result = Converted(ElementTree.Element("robot", name=replace_forbidden(file.stem)))
+        self._result = ConvertedRobot(
+            ElementTree.Element("robot", name=replace_forbidden(file.stem))
+        )
         self._names: dict[tuple[str, int], str] = {}
         counts = {"body": model.nbody, "joint": model.njnt}
-        self._given = {self._plain_name(kind, k) for kind in counts for k in range(counts[kind])}
+        self._given = {
+            self._get_plain_name(kind, k) for kind in counts for k in range(counts[kind])
+        }
         self._added: set[str] = set()  # names of links and joints that the MJCF file lacks
         self._meshes: dict[int, Path] = {}
         self._stems: list[str] = []  # of files of meshes
 
-    def convert(self) -> Converted:
-        """Return the largest tree as a URDF."""
+    def convert(self) -> ConvertedRobot:
+        """Return the largest joint tree as a URDF."""
         model = self._model
         bodies = range(1, model.nbody)
         sizes: dict[int, int] = {}
@@ -76,27 +84,31 @@ class _Converter:
             root = int(model.body_rootid[body])
             sizes[root] = sizes.get(root, 0) + int(model.body_jntnum[body])
         if not sizes or max(sizes.values()) == 0:
-            raise InputError("nothing moves here", file=self._file, expected="a body with joints")
+            raise InputError(
+                "the file has no joints", file=self._file, expected="a body with joints"
+            )
         chosen = max(sizes, key=lambda root: sizes[root])
-        if others := [self._name("body", root) for root in sizes if root != chosen]:
+        if others := [self._get_name("body", root) for root in sizes if root != chosen]:
             listed = ", ".join(others[:8]) + (", ..." if len(others) > 8 else "")
-            self._result.notes.append(f"left out what else stands in the world: {listed}")
+            self._result.notes.append(f"left out other bodies in the world: {listed}")
         for body in bodies:
             if model.body_rootid[body] == chosen:
-                self._body(body, root=body == chosen)
-        self._couplings()
+                self._convert_body(body, root=body == chosen)
+        self._convert_couplings()
         for key in range(model.nkey):
-            self._result.states[self._name("key", key)] = {
-                self._name("joint", j): float(model.key_qpos[key, address] - model.qpos0[address])
-                for j in self._scalars()
+            self._result.states[self._get_name("key", key)] = {
+                self._get_name("joint", j): float(
+                    model.key_qpos[key, address] - model.qpos0[address]
+                )
+                for j in self._find_scalar_joints()
                 if (address := model.jnt_qposadr[j]) >= 0
             }
         return self._result
 
-    def _name(self, kind: str, index: int) -> str:
-        """Return the URDF's name of a body, joint, shape or mesh; no two have the same one."""
+    def _get_name(self, kind: str, index: int) -> str:
+        """Return a unique URDF name of a body, joint, shape or mesh."""
         if (kind, index) not in self._names:
-            plain = name = self._plain_name(kind, index)
+            plain = name = self._get_plain_name(kind, index)
             number = 1
             while name in self._names.values() or name in self._added:
                 name = f"{plain}_{kind}" if number == 1 else f"{plain}_{kind}_{number}"
@@ -104,8 +116,8 @@ class _Converter:
             self._names[kind, index] = name
         return self._names[kind, index]
 
-    def _plain_name(self, kind: str, index: int) -> str:
-        """Return the name that the file states, with "_" for characters that frames cannot have."""
+    def _get_plain_name(self, kind: str, index: int) -> str:
+        """Return the name in the file, with "_" for characters that frame names cannot have."""
         code = getattr(self._mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         given = self._mujoco.mj_id2name(self._model, code, index) or f"{kind}_{index}"
         return "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in given)
@@ -119,164 +131,228 @@ class _Converter:
         self._added.add(new)
         return new
 
-    def _scalars(self) -> list[int]:
-        """Return the joints that turn or slide, and belong to the robot."""
+    def _find_scalar_joints(self) -> list[int]:
+        """Return the revolute and prismatic joints of the robot."""
         named = {joint.get("name") for joint in self._result.root.findall("joint")}
-        return [j for j in range(self._model.njnt) if self._name("joint", j) in named]
+        return [j for j in range(self._model.njnt) if self._get_name("joint", j) in named]
 
-    def _body(self, body: int, *, root: bool) -> None:
-        model, kinds, name = self._model, self._mujoco.mjtJoint, self._name("body", body)
-        placement = pin.SE3(_rotation(model.body_quat[body]), model.body_pos[body].copy())
+    def _convert_body(self, body: int, *, root: bool) -> None:
+        model, kinds, name = self._model, self._mujoco.mjtJoint, self._get_name("body", body)
+        placement = pin.SE3(_to_rotation(model.body_quat[body]), model.body_pos[body].copy())
         parent = int(model.body_parentid[body])
-        above = self._add_name(f"{name}_root") if root else self._name("body", parent)
+        above = self._add_name(f"{name}_root") if root else self._get_name("body", parent)
         if root:
             ElementTree.SubElement(self._result.root, "link", name=above)
-        for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body])):
+        for joint in range(
+            int(model.body_jntadr[body]), int(model.body_jntadr[body] + model.body_jntnum[body])
+        ):
             kind = int(model.jnt_type[joint])
             if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 if not root:
-                    self._result.notes.append(f"joint {self._name('joint', joint)} is locked: a URDF has no such joint")
+                    self._result.notes.append(
+                        f"joint {self._get_name('joint', joint)} is locked: a URDF has no such joint"
+                    )
                 elif kind == kinds.mjJNT_FREE:
-                    placement = pin.SE3.Identity()  # it drives: where it stands is not part of it
+                    placement = pin.SE3.Identity()  # a mobile robot, independent of its pose
                 continue
             anchor = pin.SE3(np.eye(3), model.jnt_pos[joint].copy())
-            below = self._add_name(f"{self._name('joint', joint)}_link")
+            below = self._add_name(f"{self._get_name('joint', joint)}_link")
             ElementTree.SubElement(self._result.root, "link", name=below)
-            self._joint(joint, above, below, placement * anchor)
+            self._convert_joint(joint, above, below, placement * anchor)
             above, placement = below, anchor.inverse()
         link = ElementTree.SubElement(self._result.root, "link", name=name)
         added = self._add_name(f"{name}_fixed")
         fixed = ElementTree.SubElement(self._result.root, "joint", name=added, type="fixed")
-        _connect(fixed, above, name, placement)
-        self._inertia(link, body)
-        self._shapes(link, body)
+        _add_connection(fixed, above, name, placement)
+        self._convert_inertia(link, body)
+        self._convert_shapes(link, body)
 
-    def _joint(self, joint: int, above: str, below: str, placement: pin.SE3) -> None:
-        model, name = self._model, self._name("joint", joint)
+    def _convert_joint(self, joint: int, above: str, below: str, placement: pin.SE3) -> None:
+        model, name = self._model, self._get_name("joint", joint)
         turns = model.jnt_type[joint] == self._mujoco.mjtJoint.mjJNT_HINGE
         limited = bool(model.jnt_limited[joint])
         kind = ("revolute" if limited else "continuous") if turns else "prismatic"
         element = ElementTree.SubElement(self._result.root, "joint", name=name, type=kind)
-        _connect(element, above, below, placement)
-        ElementTree.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
+        _add_connection(element, above, below, placement)
+        ElementTree.SubElement(element, "axis", xyz=_format_numbers(model.jnt_axis[joint]))
         low, high = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]
         if not limited and not turns:
             low, high = -_FAR, _FAR
         limit = {"lower": f"{low:.9g}", "upper": f"{high:.9g}"} if kind != "continuous" else {}
-        effort = {"effort": f"{value:.9g}"} if (value := self._effort(joint)) > 0.0 else {}
+        effort = {"effort": f"{value:.9g}"} if (value := self._find_effort(joint)) > 0.0 else {}
         ElementTree.SubElement(element, "limit", {**limit, **effort})
 
-    def _effort(self, joint: int) -> float:
-        """Return the largest force [N] or torque [N m] of a joint; 0 if none is named."""
+    def _find_effort(self, joint: int) -> float:
+        """Return the effort limit of a joint [N] or [N·m]; 0 if none is stated."""
         model = self._model
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).max())
         by_joint = model.actuator_trntype == int(self._mujoco.mjtTrn.mjTRN_JOINT)
         for actuator in np.flatnonzero(by_joint & (model.actuator_trnid[:, 0] == joint)):
             if model.actuator_forcelimited[actuator]:
-                return float(np.abs(model.actuator_forcerange[actuator]).max() * abs(model.actuator_gear[actuator, 0]))
+                return float(
+                    np.abs(model.actuator_forcerange[actuator]).max()
+                    * abs(model.actuator_gear[actuator, 0])
+                )
         return 0.0
 
-    def _inertia(self, link: ElementTree.Element, body: int) -> None:
+    def _convert_inertia(self, link: ElementTree.Element, body: int) -> None:
         model = self._model
         if model.body_mass[body] <= 0.0:
             return
         inertial = ElementTree.SubElement(link, "inertial")
-        _origin(inertial, pin.SE3(_rotation(model.body_iquat[body]), model.body_ipos[body].copy()))
+        _add_origin(
+            inertial, pin.SE3(_to_rotation(model.body_iquat[body]), model.body_ipos[body].copy())
+        )
         ElementTree.SubElement(inertial, "mass", value=f"{model.body_mass[body]:.9g}")
-        moments = dict(zip(("ixx", "iyy", "izz"), (f"{moment:.9g}" for moment in model.body_inertia[body]), strict=True))
+        moments = dict(
+            zip(
+                ("ixx", "iyy", "izz"),
+                (f"{moment:.9g}" for moment in model.body_inertia[body]),
+                strict=True,
+            )
+        )
         ElementTree.SubElement(inertial, "inertia", {**moments, "ixy": "0", "ixz": "0", "iyz": "0"})
 
-    def _shapes(self, link: ElementTree.Element, body: int) -> None:
+    def _convert_shapes(self, link: ElementTree.Element, body: int) -> None:
         model = self._model
-        geoms = range(int(model.body_geomadr[body]), int(model.body_geomadr[body] + model.body_geomnum[body]))
-        solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-        seen = [g for g in geoms if g not in solid] or solid
-        for kind, chosen in (("visual", seen), ("collision", solid)):
+        geoms = range(
+            int(model.body_geomadr[body]), int(model.body_geomadr[body] + model.body_geomnum[body])
+        )
+        collision = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        visual = [g for g in geoms if g not in collision] or collision
+        for kind, chosen in (("visual", visual), ("collision", collision)):
             for geom in chosen:
-                self._shape(link, kind, geom)
+                self._convert_shape(link, kind, geom)
 
-    def _shape(self, link: ElementTree.Element, kind: str, geom: int) -> None:
+    def _convert_shape(self, link: ElementTree.Element, kind: str, geom: int) -> None:
         import trimesh
 
         model, types = self._model, self._mujoco.mjtGeom
         size, shape = model.geom_size[geom], int(model.geom_type[geom])
         shapes: dict[int, tuple[str, dict[str, str]]] = {
             int(types.mjGEOM_SPHERE): ("sphere", {"radius": f"{size[0]:.9g}"}),
-            int(types.mjGEOM_CAPSULE): ("capsule", {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"}),
-            int(types.mjGEOM_CYLINDER): ("cylinder", {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"}),
-            int(types.mjGEOM_BOX): ("box", {"size": _text(2.0 * size)}),
+            int(types.mjGEOM_CAPSULE): (
+                "capsule",
+                {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"},
+            ),
+            int(types.mjGEOM_CYLINDER): (
+                "cylinder",
+                {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"},
+            ),
+            int(types.mjGEOM_BOX): ("box", {"size": _format_numbers(2.0 * size)}),
         }
         if shape == types.mjGEOM_MESH:
             data = int(model.geom_dataid[geom])
             if data not in self._meshes:
                 vertices = model.mesh_vert[model.mesh_vertadr[data] :][: model.mesh_vertnum[data]]
                 faces = model.mesh_face[model.mesh_faceadr[data] :][: model.mesh_facenum[data]]
-                self._meshes[data] = self._write(self._name("mesh", data), trimesh.Trimesh(vertices, faces, process=False))
+                self._meshes[data] = self._write_mesh(
+                    self._get_name("mesh", data), trimesh.Trimesh(vertices, faces, process=False)
+                )
             shapes[shape] = ("mesh", {"filename": str(self._meshes[data])})
         elif shape == types.mjGEOM_ELLIPSOID:
             ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-            file = self._write(self._name("geom", geom), ball.apply_transform(np.diag([*size, 1.0])))
+            file = self._write_mesh(
+                self._get_name("geom", geom), ball.apply_transform(np.diag([*size, 1.0]))
+            )
             shapes[shape] = ("mesh", {"filename": str(file)})
         if shape not in shapes:
-            self._result.notes.append(f"a shape of {link.get('name')} is left out: neither a solid nor a mesh")
+            self._result.notes.append(
+                f"left out a shape of {link.get('name')}: neither a solid nor a mesh"
+            )
             return
         element = ElementTree.SubElement(link, kind)
-        _origin(element, pin.SE3(_rotation(model.geom_quat[geom]), model.geom_pos[geom].copy()))
+        _add_origin(
+            element, pin.SE3(_to_rotation(model.geom_quat[geom]), model.geom_pos[geom].copy())
+        )
         tag, attributes = shapes[shape]
         ElementTree.SubElement(ElementTree.SubElement(element, "geometry"), tag, attributes)
         if kind == "visual":
             material = int(model.geom_matid[geom])
             colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
             named = ElementTree.SubElement(element, "material", name=f"{link.get('name')}_{geom}")
-            ElementTree.SubElement(named, "color", rgba=_text(colour))
+            ElementTree.SubElement(named, "color", rgba=_format_numbers(colour))
 
-    def _write(self, name: str, mesh: Any) -> Path:
+    def _write_mesh(self, name: str, mesh: Any) -> Path:
         self._stems += choose_file_names([name], taken=self._stems)
         file = self._folder / f"{self._stems[-1]}.stl"
         self._folder.mkdir(parents=True, exist_ok=True)
         file.write_bytes(mesh.export(file_type="stl"))
         return file
 
-    def _couplings(self) -> None:
-        """Write couplings of two joints as <mimic>: the first follows the second; if it does already, the other way round."""
-        model, joints = self._model, {joint.get("name", ""): joint for joint in self._result.root.findall("joint")}
+    def _convert_couplings(self) -> None:
+        """Write couplings of two joints as <mimic>.
+
+        The first joint follows the second; if it follows another one already, the second follows
+        it.
+        """
+        model, joints = (
+            self._model,
+            {joint.get("name", ""): joint for joint in self._result.root.findall("joint")},
+        )
         leads: dict[str, str] = {}
-        for k in np.flatnonzero((model.eq_type == int(self._mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 > 0)):
-            names = [self._name("joint", int(ids[k])) for ids in (model.eq_obj1id, model.eq_obj2id) if ids[k] >= 0]
+        for k in np.flatnonzero(
+            (model.eq_type == int(self._mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 > 0)
+        ):
+            names = [
+                self._get_name("joint", int(ids[k]))
+                for ids in (model.eq_obj1id, model.eq_obj2id)
+                if ids[k] >= 0
+            ]
             if len(names) < 2 or not joints.keys() >= {*names}:
                 continue
-            (joint, leader), (offset, factor) = names, (float(value) for value in model.eq_data[k, :2])
+            (joint, leader), (offset, factor) = (
+                names,
+                (float(value) for value in model.eq_data[k, :2]),
+            )
             if model.eq_data[k, 2:5].any():
-                self._result.notes.append(f"joint {joint} follows {leader} along a curve: it is taken as a line")
+                self._result.notes.append(
+                    f"joint {joint} follows {leader} by a nonlinear function: it is linearized"
+                )
             if joint in leads and leader not in leads and factor:
-                (joint, leader), (offset, factor) = (leader, joint), (-offset / factor, 1.0 / factor)
-            last = leader
-            while last in leads:
-                last = leads[last]
-            if joint in leads or last == joint:
-                self._result.notes.append(f"joint {joint} follows {leads.get(joint, leader)}; another coupling of it is left out")
+                (joint, leader), (offset, factor) = (
+                    (leader, joint),
+                    (-offset / factor, 1.0 / factor),
+                )
+            follower = leader
+            while follower in leads:
+                follower = leads[follower]
+            if joint in leads or follower == joint:
+                self._result.notes.append(
+                    f"joint {joint} follows {leads.get(joint, leader)}; "
+                    "another coupling of it is left out"
+                )
                 continue
             leads[joint] = leader
-            ElementTree.SubElement(joints[joint], "mimic", joint=leader, multiplier=f"{factor:.9g}", offset=f"{offset:.9g}")
+            ElementTree.SubElement(
+                joints[joint],
+                "mimic",
+                joint=leader,
+                multiplier=f"{factor:.9g}",
+                offset=f"{offset:.9g}",
+            )
 
 
-def _rotation(quaternion: Floats) -> Floats:
-    """Return the rotation, shape (3, 3), of a quaternion w, x, y, z."""
+def _to_rotation(quaternion: Floats) -> Floats:
+    """Return the rotation matrix, shape (3, 3), of a quaternion w, x, y, z."""
     return np.array(pin.Quaternion(*(float(part) for part in quaternion)).normalized().matrix())
 
 
-def _text(values: Any) -> str:
+def _format_numbers(values: Any) -> str:
     return " ".join(f"{value:.9g}" for value in values)
 
 
-def _origin(element: ElementTree.Element, placement: pin.SE3) -> None:
+def _add_origin(element: ElementTree.Element, placement: pin.SE3) -> None:
     ElementTree.SubElement(
-        element, "origin", xyz=_text(placement.translation), rpy=_text(pin.rpy.matrixToRpy(placement.rotation))
+        element,
+        "origin",
+        xyz=_format_numbers(placement.translation),
+        rpy=_format_numbers(pin.rpy.matrixToRpy(placement.rotation)),
     )
 
 
-def _connect(joint: ElementTree.Element, above: str, below: str, placement: pin.SE3) -> None:
-    _origin(joint, placement)
+def _add_connection(joint: ElementTree.Element, above: str, below: str, placement: pin.SE3) -> None:
+    _add_origin(joint, placement)
     ElementTree.SubElement(joint, "parent", link=above)
     ElementTree.SubElement(joint, "child", link=below)

@@ -1,4 +1,4 @@
-"""Makes a robot's folder of a file that was downloaded: robot.yaml, URDF, SRDF, meshes and a home."""
+"""Imports a robot from a file as a folder with robot.yaml, URDF, SRDF and meshes."""
 
 from __future__ import annotations
 
@@ -13,45 +13,62 @@ from typing import Any
 import pinocchio as pin
 import yaml
 
-from vkc_pin.arguments import flag, mapping, text, whole
-from vkc_pin.arrays import Floats
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.files.resources import choose_file_names, file_path
-from vkc_pin.files.urdf import UrdfFile
-from vkc_pin.files.writing import folder_at_once
-from vkc_pin.files.xml import replace_forbidden
-from vkc_pin.importing.robots.arms import Arm, base_kind, bodies, choose, find_arms, own_base, telescopes
+from vkc_pin.importing.robots.arms import (
+    Arm,
+    build_body_tree,
+    choose_arm,
+    find_arms,
+    find_own_base,
+    find_telescopes,
+    guess_base_kind,
+)
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
-from vkc_pin.importing.robots.envelopes import envelopes, leave_out
-from vkc_pin.importing.robots.hands import Hand, look_at
-from vkc_pin.importing.robots.homes import HOME_ROOM, Home, arm_at, find_home, never_apart, standing
-from vkc_pin.importing.robots.pieces import Piece, own_meshes
-from vkc_pin.importing.robots.sources import Source, free_name, read_source
-from vkc_pin.importing.targets import check_target, format_comment, made_by
-from vkc_pin.models.robot import Robot
-from vkc_pin.models.robot_file import load_robot
-from vkc_pin.models.robot_model import full_model
-from vkc_pin.models.self_collisions import sample_allowed_pairs, with_collision_pairs
+from vkc_pin.importing.robots.envelopes import find_envelopes, remove_collision_shapes
+from vkc_pin.importing.robots.hands import Hand, analyze_hand
+from vkc_pin.importing.robots.mesh_pieces import Piece, write_meshes
+from vkc_pin.importing.robots.rest_configuration import (
+    HOME_ROOM,
+    Home,
+    find_arm_positions,
+    find_home,
+    find_inseparable_pairs,
+    measure_floor_heights,
+)
+from vkc_pin.importing.robots.sources import Source, choose_free_name, read_source
+from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
 from vkc_pin.options import Options
+from vkc_pin.utils.arguments import flag, mapping, text, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.resources import choose_file_names, file_path
+from vkc_pin.world.files.urdf import UrdfFile
+from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.world.files.xml import replace_forbidden
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.robot_model import build_full_model
+from vkc_pin.world.models.self_collisions import sample_allowed_pairs, set_collision_pairs
 
 __all__ = ["ImportedRobot", "import_robot"]
 
 _SAMPLES, _PIECES = 2000, 8
-_NEAR, _MOSTLY = 300, 0.75  # of them, to find pairs that so many leave closer than
-_NEIGHBOURS = Options().dist_safe + 0.005  # [m]: neighbours by design, such as the segments of a telescope
-_STANDING = 0.005  # [m]: a root that is closer to the floor stands on it
+# Samples, and the smallest fraction of them in which a pair of neighbours is close
+_NEAR, _MOSTLY = 300, 0.75
+# [m] Distance up to which links are neighbours by design, such as the segments of a telescope
+_NEIGHBOURS = Options().dist_safe + 0.005
+_STANDING = 0.005  # [m] height up to which a root stands on the floor
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedRobot:
-    """A robot that was imported.
+    """An imported robot.
 
     Attributes:
-        folder: Where its files are; `load_robot` takes it.
+        folder: Output folder, for `load_robot`.
         robot: The robot.
-        arms: The names of all arms that were found, the one that was taken first.
-        pieces: What became of the meshes that collide.
-        diagnosis: What was guessed, and what `doctor` finds.
+        arms: Names of all arms, the chosen one first.
+        pieces: Decompositions of the collision meshes.
+        diagnosis: Assumptions, and findings of `doctor`.
     """
 
     folder: Path
@@ -78,27 +95,32 @@ def import_robot(
     seed: int = 0,
     force: bool = False,
 ) -> ImportedRobot:
-    """Make a robot's folder of a URDF, xacro or MJCF file.
+    """Import a robot from a URDF, xacro or MJCF file.
 
-    The folder holds robot.yaml, a URDF with a frame `tool` where the hand grasps, an SRDF with sampled pairs that need no check,
-    and meshes, those that collide as convex pieces. What the file does not say is guessed from names and shapes, and told.
+    The output folder holds robot.yaml, a URDF with a frame `tool` where the hand grasps, an SRDF
+    with sampled pairs that need no check, and meshes, with convex pieces for collision. Missing
+    information is guessed from names and shapes, and reported.
 
     Args:
-        file: The file; its first element says what it is.
-        folder: Where to write, a new or empty folder; by default one of the file's name in the current one.
-        arm: Which arm to plan: a name of `ImportedRobot.arms`, or a part of one ("left"), or a group of the SRDF with its joints.
-        tool_frame: The frame that grasps, if it is not to be guessed; see docs/robots.md for how it has to lie.
-        srdf: An SRDF; by default the one beside the file.
-        packages: Folders for `package://` and `$(find ...)`; others are looked for around the file.
-        arguments: Of a xacro file.
-        most_pieces: The largest number of convex pieces of a mesh; 1 keeps hulls.
-        samples: How many configurations are looked at for pairs that need no check.
-        seed: Of the random numbers.
-        force: Whether to replace a folder that this made before.
+        file: The file; its first element tells its format.
+        folder: Output folder, new or empty; defaults to one named like the file in the current
+            folder.
+        arm: The arm to plan for: a name of `ImportedRobot.arms`, a part of one ("left"), or an SRDF
+            group with its joints.
+        tool_frame: Tool frame, if it is not to be guessed; see docs/robots.md for its orientation.
+        srdf: An SRDF; defaults to the one beside the file.
+        packages: Folders for `package://` and `$(find ...)`; others are searched for around the
+            file.
+        arguments: Arguments of a xacro file.
+        most_pieces: Largest number of convex pieces of a mesh; 1 keeps hulls.
+        samples: Number of configurations for finding pairs that need no check.
+        seed: Random seed.
+        force: Whether to replace a folder that an earlier import wrote.
 
     Raises:
-        InputError: The file cannot be read, no arm was found, the folder holds something, or the extra `import` is missing.
-        UnknownNameError: There is no such arm or frame; the error names the nearest one.
+        InputError: The file cannot be read, no arm is found, the folder holds other files, or the
+            extra `import` is missing.
+        UnknownNameError: The arm or frame is unknown; the error names the nearest one.
     """
     path = file_path(file, "file", "a URDF, xacro or MJCF file")
     (name,) = choose_file_names([path.name.split(".")[0]], fallback="robot")
@@ -108,16 +130,26 @@ def import_robot(
             text(given, field, "a name")
     whole(most_pieces, "most_pieces", low=1)
     whole(samples, "samples", low=1)
-    places = {key: file_path(place, f"packages.{key}") for key, place in mapping(packages or {}, "packages").items()}
-    given_arguments = {key: str(value) for key, value in mapping(arguments or {}, "arguments").items()}
-    beside = None if srdf is None else file_path(srdf, "srdf")
+    places = {
+        key: file_path(place, f"packages.{key}")
+        for key, place in mapping(packages or {}, "packages").items()
+    }
+    given_arguments = {
+        key: str(value) for key, value in mapping(arguments or {}, "arguments").items()
+    }
+    srdf_path = None if srdf is None else file_path(srdf, "srdf")
     check_target(target, "import-robot", force=flag(force, "force"))
-    with folder_at_once(target, force=True) as staging:  # what is there may be replaced
-        source = read_source(path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=beside)
+    with folder_at_once(target, force=True) as staging:  # `check_target` allowed replacing it
+        source = read_source(
+            path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=srdf_path
+        )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they name files that are gone soon; loading the whole folder warns of the same
-            made = _Importer(source, staging, target.resolve().name).make(arm, tool_frame, most_pieces, samples, seed)
-    return dataclasses.replace(made, folder=target, robot=load_robot(target / "robot.yaml"))
+            # They name temporary files, and loading the folder repeats them.
+            warnings.simplefilter("ignore")
+            imported = _Importer(source, staging, target.resolve().name).run(
+                arm, tool_frame, most_pieces, samples, seed
+            )
+    return dataclasses.replace(imported, folder=target, robot=load_robot(target / "robot.yaml"))
 
 
 class _Importer:
@@ -127,78 +159,121 @@ class _Importer:
         self._settings: dict[str, Any] = {"urdf": f"{stem}.urdf", "srdf": f"{stem}.srdf"}
         self._findings = [Finding("note", "file", note) for note in source.notes]
 
-    def make(self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int) -> ImportedRobot:
-        """Write everything into the folder."""
+    def run(
+        self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int
+    ) -> ImportedRobot:
+        """Write all files into the folder."""
         solid = {shape.link for shape in self._file.shapes("collision")}
         if not solid:
-            self._collide_as_seen()
+            self._use_visual_shapes()
             solid = {shape.link for shape in self._file.shapes("collision")}
-        if tool_frame is not None and tool_frame not in (names := sorted(self._names())):
-            raise UnknownNameError("frame", tool_frame, names, file=self._file.path, field="tool_frame")
-        tree = bodies(self._file)
-        driving = own_base(tree, solid)
+        if tool_frame is not None and tool_frame not in (names := sorted(self._get_names())):
+            raise UnknownNameError(
+                "frame", tool_frame, names, file=self._file.path, field="tool_frame"
+            )
+        tree = build_body_tree(self._file)
+        base_joints = find_own_base(tree, solid)
         arms = find_arms(self._file, tree, self._source.groups, solid)
-        chosen = None if tool_frame is not None and not arms else choose(arms, arm, self._file, self._source.groups)
-        self._arm(chosen, arms, driving)
-        root, pieces, notes = own_meshes(self._file, self._folder, most_pieces=most_pieces)
+        chosen = (
+            None
+            if tool_frame is not None and not arms
+            else choose_arm(arms, arm, self._file, self._source.groups)
+        )
+        self._set_arm(chosen, arms, base_joints)
+        root, pieces, notes = write_meshes(self._file, self._folder, most_pieces=most_pieces)
         self._findings += [Finding("warning", "shapes", note) for note in notes]
         text = ElementTree.tostring(root, encoding="unicode")
         self._file = UrdfFile(self._folder / self._settings["urdf"], text, root)
         if chosen is not None:
-            self._hand(look_at(self._file, full_model(self._file), chosen), tool_frame)
+            self._set_hand(
+                analyze_hand(self._file, build_full_model(self._file), chosen), tool_frame
+            )
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
-        robot = self._on_the_floor(self._without_envelopes(self._loaded()), seed)
-        self._told(pieces, self._rest(robot, samples, seed))
-        return self._result(load_robot(self._folder / "robot.yaml"), arms, chosen, pieces)
+        robot = self._place_on_floor(self._remove_envelopes(self._write_and_load()), seed)
+        self._report(pieces, self._find_home(robot, samples, seed))
+        return self._make_result(load_robot(self._folder / "robot.yaml"), arms, chosen, pieces)
 
-    def _result(self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]) -> ImportedRobot:
+    def _make_result(
+        self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]
+    ) -> ImportedRobot:
         findings = (*doctor(robot).findings, *self._findings)
-        names = [] if chosen is None else [chosen.name, *(arm.name for arm in arms if arm is not chosen)]
-        return ImportedRobot(self._folder, robot, tuple(names), tuple(pieces), Diagnosis(self._name, findings))
+        names = (
+            []
+            if chosen is None
+            else [chosen.name, *(arm.name for arm in arms if arm is not chosen)]
+        )
+        return ImportedRobot(
+            self._folder, robot, tuple(names), tuple(pieces), Diagnosis(self._name, findings)
+        )
 
-    def _collide_as_seen(self) -> None:
-        """Let links collide as they are seen: nothing else is there."""
+    def _use_visual_shapes(self) -> None:
+        """Use visual shapes for collision if the file has no collision shapes."""
         for link in self._file.root.findall("link"):
             for visual in link.findall("visual"):
                 element = ElementTree.SubElement(link, "collision")
                 element.extend(child for child in visual if child.tag in ("origin", "geometry"))
         if not self._file.shapes("collision"):
-            raise InputError("this robot has no shapes", file=self._file.path, expected="<collision> or <visual> elements")
-        self._guess("guess", "no link has a shape that collides: those that are seen do")
+            raise InputError(
+                "the robot has no shapes",
+                file=self._file.path,
+                expected="<collision> or <visual> elements",
+            )
+        self._guess("guess", "no link has a collision shape: visual shapes are used")
 
     def _guess(self, sure: str, text: str, hint: str = "") -> None:
-        self._findings.append(Finding("warning" if sure == "guess" else "note", "guessed", f"{text} [{sure}]", hint))
+        self._findings.append(
+            Finding("warning" if sure == "guess" else "note", "guessed", f"{text} [{sure}]", hint)
+        )
 
-    def _arm(self, chosen: Arm | None, arms: list[Arm], driving: tuple[str, ...]) -> None:
-        if driving:
-            self._settings.setdefault("locked_joints", {}).update(dict.fromkeys(driving, 0.0))
-            self._guess("sure", f"the file has a base of its own, which the planner's replaces: {', '.join(driving)} are locked")
-        kind, why = base_kind(self._file.root)
+    def _set_arm(self, chosen: Arm | None, arms: list[Arm], base_joints: tuple[str, ...]) -> None:
+        if base_joints:
+            self._settings.setdefault("locked_joints", {}).update(dict.fromkeys(base_joints, 0.0))
+            self._guess(
+                "sure",
+                "the planner's base replaces that of the file: "
+                f"{', '.join(base_joints)} are locked",
+            )
+        kind, why = guess_base_kind(self._file.root)
         sure = "likely" if kind != "omni" else "guess"
-        self._guess(sure, f"base: {kind} ({why})", "scenes and `load_robot` choose it: `base: ...`")
+        self._guess(sure, f"base: {kind} ({why})", "set it in scenes or `load_robot`: `base: ...`")
         if chosen is not None:
-            for leader, *others in telescopes(full_model(self._file), chosen.joints):
+            for leader, *others in find_telescopes(build_full_model(self._file), chosen.joints):
                 self._settings.setdefault("couplings", {}).update(dict.fromkeys(others, leader))
-                told = f"{', '.join(others)} slide along with {leader}, as a telescope: one coordinate"
-                self._guess("likely", told, "if each has a motor of its own: remove `couplings` from robot.yaml")
+                text = f"{', '.join(others)} follow {leader} as a telescope: one coordinate"
+                self._guess(
+                    "likely",
+                    text,
+                    "if each has a motor of its own: remove `couplings` from robot.yaml",
+                )
             others = [other.name for other in arms if other is not chosen]
             also = f"; others: {', '.join(others)}" if others else ""
-            self._guess(chosen.sure, f"arm: {chosen.name}, {chosen.why}{also}", "another one: arm=..., `--arm`" if others else "")
+            self._guess(
+                chosen.sure,
+                f"arm: {chosen.name}, {chosen.why}{also}",
+                "another one: arm=..., `--arm`" if others else "",
+            )
 
-    def _hand(self, hand: Hand, tool_frame: str | None) -> None:
+    def _set_hand(self, hand: Hand, tool_frame: str | None) -> None:
         links = [link for link in hand.touch_links if link in set(self._file.links)]
         self._settings["touch_links"] = links
-        for key, said in hand.settings().items():
-            self._settings.setdefault(key, {}).update(said)
+        for key, values in hand.settings().items():
+            self._settings.setdefault(key, {}).update(values)
         if tool_frame is None:
-            tool = free_name("tool", self._names())
+            tool = choose_free_name("tool", self._get_names())
             self._add_link(tool, hand.link, hand.tool)
             self._settings["tool_frame"] = tool
-            self._guess(hand.sure, f"hand: frame '{tool}' {hand.why}", "if it is wrong: `tool_frame`, see docs/robots.md")
+            self._guess(
+                hand.sure,
+                f"hand: frame '{tool}' {hand.why}",
+                "if it is wrong: `tool_frame`, see docs/robots.md",
+            )
 
-    def _loaded(self) -> Robot:
-        """Write what there is and return the robot; with fingers that are locked if the gripper, as guessed, does not open."""
+    def _write_and_load(self) -> Robot:
+        """Write the files and return the robot.
+
+        If the guessed gripper does not open, its fingers are locked.
+        """
         self._write()
         try:
             return load_robot(self._folder / "robot.yaml", pairs="all")
@@ -206,79 +281,132 @@ class _Importer:
             if not str(error.field).startswith("gripper"):
                 raise
             fingers = self._settings.pop("gripper")
-            self._settings.setdefault("locked_joints", {}).update({joint: ends["open"] for joint, ends in fingers.items()})
-            self._guess("guess", f"the fingers stand still: {error.problem}, {error.got}", "`gripper`, see docs/robots.md")
-            return self._loaded()
+            self._settings.setdefault("locked_joints", {}).update(
+                {joint: ends["open"] for joint, ends in fingers.items()}
+            )
+            self._guess(
+                "guess",
+                f"the fingers are locked: {error.problem}, {error.got}",
+                "`gripper`, see docs/robots.md",
+            )
+            return self._write_and_load()
 
-    def _names(self) -> set[str]:
-        return {element.get("name", "") for tag in ("link", "joint") for element in self._file.root.findall(tag)}
+    def _get_names(self) -> set[str]:
+        return {
+            element.get("name", "")
+            for tag in ("link", "joint")
+            for element in self._file.root.findall(tag)
+        }
 
     def _add_link(self, name: str, parent: str, placement: pin.SE3) -> None:
         root = self._file.root
         ElementTree.SubElement(root, "link", name=name)
         joint = ElementTree.SubElement(root, "joint", name=f"{name}_joint", type="fixed")
         angles = pin.rpy.matrixToRpy(placement.rotation)
-        xyz, rpy = (" ".join(f"{value:.9g}" for value in values) for values in (placement.translation, angles))
+        xyz, rpy = (
+            " ".join(f"{value:.9g}" for value in values)
+            for values in (placement.translation, angles)
+        )
         ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
         ElementTree.SubElement(joint, "parent", link=parent)
         ElementTree.SubElement(joint, "child", link=name)
 
     def _write(self) -> None:
-        settings = {key: value for key, value in self._settings.items() if key != "srdf" or (self._folder / value).is_file()}
+        settings = {
+            key: value
+            for key, value in self._settings.items()
+            if key != "srdf" or (self._folder / value).is_file()
+        }
         ElementTree.indent(self._file.root)
-        source = f"{self._source.file.path.name} ({self._source.kind}) {made_by('import-robot')}"
+        source = f"{self._source.file.path.name} ({self._source.kind}) {get_origin_marker('import-robot')}"
         head = format_comment(f"Made of {source}. Units: m, rad, s.")
         body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
         (self._folder / "robot.yaml").write_text(head + body, encoding="utf-8")
         tree = ElementTree.ElementTree(self._file.root)
         tree.write(self._file.path, encoding="utf-8", xml_declaration=True)
 
-    def _without_envelopes(self, robot: Robot) -> Robot:
-        """Return the robot without shapes that are but around its hand."""
-        if not (found := envelopes(robot)):
+    def _remove_envelopes(self, robot: Robot) -> Robot:
+        """Return the robot without shapes that merely enclose its hand."""
+        if not (envelopes := find_envelopes(robot)):
             return robot
-        leave_out(self._file.root, found)
-        self._settings["touch_links"] = [link for link in self._settings.get("touch_links", ()) if link not in found]
-        told = [f"{link} is a shape around the hand, {share:.0%} of which is in it: left out" for link, share in found.items()]
-        self._findings += [Finding("warning", "hand", text) for text in told]
-        return self._loaded()
+        remove_collision_shapes(self._file.root, envelopes)
+        self._settings["touch_links"] = [
+            link for link in self._settings.get("touch_links", ()) if link not in envelopes
+        ]
+        texts = [
+            f"{link} encloses {share:.0%} of the hand: left out"
+            for link, share in envelopes.items()
+        ]
+        self._findings += [Finding("warning", "hand", text) for text in texts]
+        return self._write_and_load()
 
-    def _on_the_floor(self, robot: Robot, seed: int) -> Robot:
-        """Return the robot with a root that stands on the floor, so high that its arm can be clear of it."""
-        low, above = standing(robot, seed=seed)
+    def _place_on_floor(self, robot: Robot, seed: int) -> Robot:
+        """Return the robot with its root raised onto the floor, with the arm clear of it."""
+        low, reachable = measure_floor_heights(robot, seed=seed)
         lift = -low if abs(low) > _STANDING else 0.0
-        raised = max(0.0, HOME_ROOM - above - lift)
+        raised = max(0.0, HOME_ROOM - reachable - lift)
         if lift + raised == 0.0:
             return robot
-        floor, root = free_name("floor", self._names()), bodies(self._file).links[0]
+        floor, root = (
+            choose_free_name("floor", self._get_names()),
+            build_body_tree(self._file).links[0],
+        )
         self._file.root.insert(0, ElementTree.Element("link", name=floor))
-        joint = ElementTree.SubElement(self._file.root, "joint", name=f"{floor}_joint", type="fixed")
+        joint = ElementTree.SubElement(
+            self._file.root, "joint", name=f"{floor}_joint", type="fixed"
+        )
         ElementTree.SubElement(joint, "origin", xyz=f"0 0 {lift + raised:.6g}", rpy="0 0 0")
         ElementTree.SubElement(joint, "parent", link=floor)
         ElementTree.SubElement(joint, "child", link=root)
-        why = f"{1e3 * raised:.0f} mm of it so that no link of the arm is always at the floor" if raised else ""
-        why = why or "it stands on what is lowest of it"
-        self._guess("likely", f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}")
-        return self._loaded()
+        why = (
+            f"{1e3 * raised:.0f} mm of it keep all links of the arm clear of the floor"
+            if raised
+            else ""
+        )
+        why = why or "it stands on its lowest point"
+        self._guess(
+            "likely",
+            f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}",
+        )
+        return self._write_and_load()
 
-    def _rest(self, robot: Robot, samples: int, seed: int) -> Home:
-        """Write SRDF and home of a robot that is loaded with all pairs, and return the home."""
-        allowed = {**self._source.srdf.allowed, **sample_allowed_pairs(robot, samples=samples, seed=seed)}
-        sampled = with_collision_pairs(robot, allowed)
-        for one, other in never_apart(sampled, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed):
-            text = f"{one} and {other} are hardly ever {1e3 * _NEIGHBOURS:.0f} mm apart: they are not kept apart"
+    def _find_home(self, robot: Robot, samples: int, seed: int) -> Home:
+        """Write the SRDF and home of a robot that is loaded with all pairs; return the home."""
+        allowed = {
+            **self._source.srdf.allowed,
+            **sample_allowed_pairs(robot, samples=samples, seed=seed),
+        }
+        sampled = set_collision_pairs(robot, allowed)
+        for one, other in find_inseparable_pairs(
+            sampled, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed
+        ):
+            text = (
+                f"{one} and {other} are rarely {1e3 * _NEIGHBOURS:.0f} mm apart: "
+                "the pair is not checked"
+            )
             self._findings.append(Finding("note", "pairs", text))
             allowed[min(one, other), max(one, other)] = "Near"
-        apart, arm = with_collision_pairs(robot, allowed), robot.coordinates.names[3:]
-        states = [(name, state) for name, state in self._source.srdf.states.items() if set(arm) <= set(state)]
-        named = [(f"the state '{name}' of the file", arm_at(robot, state)) for name, state in states]
-        home = find_home(apart, [*named, ("joints at 0, or in the middle", robot.home)], seed=seed)
-        self._settings["home"] = {joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)}
+        checked, arm = set_collision_pairs(robot, allowed), robot.coordinates.names[3:]
+        states = [
+            (name, state)
+            for name, state in self._source.srdf.states.items()
+            if set(arm) <= set(state)
+        ]
+        named = [
+            (f"the state '{name}' of the file", find_arm_positions(robot, state))
+            for name, state in states
+        ]
+        home = find_home(checked, [*named, ("joints at 0 or mid-range", robot.home)], seed=seed)
+        self._settings["home"] = {
+            joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)
+        }
         self._write_srdf(self._folder / self._settings["srdf"], robot, home.positions, allowed)
         self._write()
         return home
 
-    def _write_srdf(self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]) -> None:
+    def _write_srdf(
+        self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]
+    ) -> None:
         root = ElementTree.Element("robot", name=replace_forbidden(self._name))
         arm = ElementTree.SubElement(root, "group", name="arm")
         state = ElementTree.SubElement(root, "group_state", name="home", group="arm")
@@ -286,15 +414,26 @@ class _Importer:
             ElementTree.SubElement(arm, "joint", name=joint)
             ElementTree.SubElement(state, "joint", name=joint, value=f"{value:.9g}")
         for (one, other), reason in sorted(allowed.items()):
-            ElementTree.SubElement(root, "disable_collisions", link1=one, link2=other, reason=reason)
+            ElementTree.SubElement(
+                root, "disable_collisions", link1=one, link2=other, reason=reason
+            )
         ElementTree.indent(root)
         ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
-    def _told(self, pieces: list[Piece], home: Home) -> None:
+    def _report(self, pieces: list[Piece], home: Home) -> None:
         values = ", ".join(f"{value:.2f}" for value in home.positions)
         sure = "sure" if home.clearance > 0.0 else "guess"
         self._guess(sure, f"home: {home.how} ({values}), clearance {1e3 * home.clearance:.0f} mm")
         for piece in {piece.mesh: piece for piece in pieces if piece.count > 1}.values():
-            what = f"{piece.mesh} in {piece.count} pieces, {100.0 * piece.overhead:.0f} % more than its volume"
+            what = (
+                f"{piece.mesh} in {piece.count} pieces, "
+                f"{100.0 * piece.overhead:.0f} % more than its volume"
+            )
             hull = f"its hull: {100.0 * piece.hull:.0f} %"
-            self._findings.append(Finding("note", "shapes", f"{piece.link}: {what} ({hull}), off by {1e3 * piece.error:.0f} mm"))
+            self._findings.append(
+                Finding(
+                    "note",
+                    "shapes",
+                    f"{piece.link}: {what} ({hull}), protruding by {1e3 * piece.error:.0f} mm",
+                )
+            )

@@ -1,4 +1,4 @@
-"""Expands xacro files. Packages are found around the file, as for the meshes of URDFs, not through an installation of ROS."""
+"""Expands xacro files, with packages in folders around the file and without a ROS installation."""
 
 from __future__ import annotations
 
@@ -10,38 +10,46 @@ from types import ModuleType
 from typing import Any
 
 from vkc_pin.errors import InputError
-from vkc_pin.needed import optional_package
+from vkc_pin.utils.optional_imports import optional_package
 
-__all__ = ["expand"]
+__all__ = ["expand_xacro"]
 
 
-def expand(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
-    """Return the URDF that a xacro file stands for.
+def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
+    """Return the URDF of a xacro file.
 
     Args:
         file: The file.
-        packages: Package name → folder, for `$(find NAME)`; others are looked for in the folders around the file.
-        arguments: What `<xacro:arg>` get, instead of their defaults.
+        packages: Maps package names to folders, for `$(find NAME)`; others are searched for in the
+            folders around the file.
+        arguments: Values of `<xacro:arg>` elements, instead of their defaults.
 
     Raises:
-        InputError: xacro is not installed, or the file is not understood; the error says what xacro says.
+        InputError: xacro is not installed, or it cannot process the file; the error contains its
+            message.
     """
     xacro = optional_package("xacro", "import", what="a xacro file", file=file)
-    substitution = optional_package("xacro.substitution_args", "import", what="a xacro file", file=file)
-    said = io.StringIO()
+    substitution = optional_package(
+        "xacro.substitution_args", "import", what="a xacro file", file=file
+    )
+    messages = io.StringIO()
     try:
-        with _finding(substitution, file, packages), contextlib.redirect_stderr(said):
+        with _search_packages(substitution, file, packages), contextlib.redirect_stderr(messages):
             document = xacro.process_file(str(file), mappings=dict(arguments))
     except InputError:
         raise
-    except (Exception, SystemExit) as error:  # of macros, Python expressions and XML: any kind
-        raise InputError(f"xacro does not understand this: {error or said.getvalue().strip()}", file=file) from error
+    except (Exception, SystemExit) as error:  # macros, expressions and XML raise any type
+        raise InputError(
+            f"xacro cannot process the file: {error or messages.getvalue().strip()}", file=file
+        ) from error
     return str(document.toprettyxml(indent="  "))
 
 
 @contextlib.contextmanager
-def _finding(substitution: ModuleType, file: Path, packages: Mapping[str, Path]) -> Iterator[None]:
-    """Let `$(find NAME)` look around `file`; xacro itself would ask ROS."""
+def _search_packages(
+    substitution: ModuleType, file: Path, packages: Mapping[str, Path]
+) -> Iterator[None]:
+    """Let `$(find NAME)` search around `file`; xacro itself would ask ROS."""
 
     def find(name: str) -> str:
         places = [packages[name]] if name in packages else []
@@ -51,12 +59,14 @@ def _finding(substitution: ModuleType, file: Path, packages: Mapping[str, Path])
             if place.is_dir():
                 return str(place)
         expected = f"a folder {name} around the file, or packages={{'{name}': folder}}"
-        raise InputError("there is no such package", file=file, field=f"$(find {name})", expected=expected)
+        raise InputError(
+            f"package '{name}' was not found", file=file, field=f"$(find {name})", expected=expected
+        )
 
     module: Any = substitution
-    before = module._eval_find
+    original = module._eval_find
     module._eval_find = find
     try:
         yield
     finally:
-        module._eval_find = before
+        module._eval_find = original

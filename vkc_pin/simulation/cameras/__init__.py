@@ -1,1 +1,1 @@
-"""Cameras on a robot, and what they see of what happened in physics."""
+"""Models cameras on a robot, and renders their images of an executed motion."""

@@ -1,4 +1,4 @@
-"""What cameras on the robot see of what happened: colours, distances, and what is where, drawn by MuJoCo without a screen."""
+"""Renders colour, depth and segmentation images of cameras on the robot with MuJoCo."""
 
 from __future__ import annotations
 
@@ -11,36 +11,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.arrays import Floats
-from vkc_pin.models.robot import Robot
 from vkc_pin.simulation.cameras.mount import Camera
-from vkc_pin.simulation.model import Builder, quaternion
-from vkc_pin.simulation.replay import Executed
-from vkc_pin.simulation.snapshots import Stage, drawing_context
+from vkc_pin.simulation.model import Builder, to_mujoco_quaternion
+from vkc_pin.simulation.replay import Execution
+from vkc_pin.simulation.snapshots import RenderedScene, open_gl_context
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.robot import Robot
 
-__all__ = ["ROBOT", "Images", "taken"]
+__all__ = ["ROBOT", "Images", "render_images"]
 
 ROBOT = "robot"
-"""What a robot's links are called where it is said what is where."""
-_FARTHEST = 65_535  # [mm] of 16 bits; what is further is as nothing
+"""Name of the robot's links in segmentation images."""
+_MAX_DEPTH = 65_535  # [mm] in 16 bits; pixels further away count as empty
 
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """What cameras saw.
+    """Images of cameras.
 
     Attributes:
-        pictures: By `<camera>_image`: colours, shape (N, height, width, 3), 8 bits; `<camera>_depth`: distance along the camera's
-            axis [mm], shape (N, height, width), 16 bits, 0 where there is nothing; `<camera>_segmentation`: place in `segments`
-            of what is seen, shape (N, height, width), 16 bits.
-        segments: What there is to see: "" for nothing, `ROBOT`, the floor, obstacles by name, links of objects as `door.panel`.
+        pictures: Maps `<camera>_image` to colours, shape (N, height, width, 3), 8 bits;
+            `<camera>_depth` to distances along the camera's axis [mm], shape (N, height, width), 16
+            bits, 0 where nothing is visible; `<camera>_segmentation` to indices into `segments`,
+            shape (N, height, width), 16 bits.
+        segments: Names of visible bodies: "" for nothing, `ROBOT`, the floor, names of obstacles,
+            links of objects such as `door.panel`.
     """
 
     pictures: Mapping[str, NDArray[np.generic]]
     segments: tuple[str, ...]
 
     def to_bytes(self) -> bytes:
-        """Return them as bytes, compressed, which `from_bytes` reads."""
+        """Return the images as compressed bytes that `from_bytes` reads."""
         buffer = io.BytesIO()
         names: Any = np.array(json.dumps([list(self.pictures), self.segments]))
         pictures: Any = {f"picture_{k}": pixels for k, pixels in enumerate(self.pictures.values())}
@@ -49,93 +51,124 @@ class Images:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Images:
-        """Return those that `to_bytes` made bytes of."""
+        """Return the images that `to_bytes` encoded."""
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             names, segments = json.loads(str(archive["names"]))
-            return cls({name: archive[f"picture_{k}"] for k, name in enumerate(names)}, tuple(segments))
+            return cls(
+                {name: archive[f"picture_{k}"] for k, name in enumerate(names)}, tuple(segments)
+            )
 
 
-def taken(executed: Executed, cameras: Sequence[Camera], times: Floats) -> Images:
-    """Return what cameras saw at some times [s], shape (N,).
+def render_images(executed: Execution, cameras: Sequence[Camera], times: Floats) -> Images:
+    """Render the images of cameras at some times.
 
     Args:
-        executed: What happened.
-        cameras: On the robot.
-        times: When.
+        executed: The executed motion.
+        cameras: Cameras on the robot.
+        times: Times, shape (N,) [s].
 
     Raises:
         UnknownNameError: The robot lacks a camera's frame.
-        VkcError: There is no OpenGL without a screen.
+        VkcError: OpenGL is not available without a display.
     """
 
-    def mounted(builder: Builder) -> None:
-        builder.spec.visual.quality.offsamples = 0  # a pixel is one thing at one distance
+    def add_cameras(builder: Builder) -> None:
+        builder.spec.visual.quality.offsamples = 0  # no anti-aliasing: each pixel shows one body
         for camera in cameras:
-            body, place = builder.frame(camera.on(robot))
-            seat = place * camera.placement
-            body.add_camera(name=camera.name, pos=seat.translation, quat=quaternion(seat), fovy=camera.fov)
+            body, place = builder.find_frame(camera.find_frame(robot))
+            camera_placement = place * camera.placement
+            body.add_camera(
+                name=camera.name,
+                pos=camera_placement.translation,
+                quat=to_mujoco_quaternion(camera_placement),
+                fovy=camera.fov,
+            )
 
     robot: Robot = executed.scene.robot
     size = (max(camera.width for camera in cameras), max(camera.height for camera in cameras))
-    stage = Stage(executed, size=size, veil=1.0, more=mounted)
-    segments, numbers = _segments(stage)
+    scene = RenderedScene(executed, size=size, wall_opacity=1.0, add_extras=add_cameras)
+    segments, numbers = _number_segments(scene)
     found: dict[str, list[NDArray[np.generic]]] = {}
-    for camera, picture in _drawn(stage, cameras, times, size):
+    for camera, picture in _render(scene, cameras, times, size):
         for kind, pixels in zip(("image", "depth", "segmentation"), picture, strict=True):
-            found.setdefault(f"{camera}_{kind}", []).append(numbers[pixels] if kind == "segmentation" else pixels)
+            found.setdefault(f"{camera}_{kind}", []).append(
+                numbers[pixels] if kind == "segmentation" else pixels
+            )
     return Images({name: np.array(values) for name, values in found.items()}, segments)
 
 
-def _drawn(stage: Stage, cameras: Sequence[Camera], times: Floats, size: tuple[int, int]) -> Any:
-    """Yield a camera's name and its colours, distances [mm] and geoms, of every camera at every moment; geom 0 is none."""
-    mj, model = stage.mj, stage.model
-    data, option, eye = mj.MjData(model), mj.MjvOption(), mj.MjvCamera()
-    near, far = (float(limit * model.stat.extent) for limit in (model.vis.map.znear, model.vis.map.zfar))
-    eye.type = mj.mjtCamera.mjCAMERA_FIXED
-    with drawing_context(size):
-        scene, render = mj.MjvScene(model, maxgeom=20_000), mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100)
-        mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN, render)
-        for row in stage.rows(times):
-            data.qpos[:] = stage.qpos(row)
+def _render(
+    scene: RenderedScene, cameras: Sequence[Camera], times: Floats, size: tuple[int, int]
+) -> Any:
+    """Yield the images of every camera at every time.
+
+    Each item is the camera's name with colours, distances [mm] and geoms; geom 0 is none.
+    """
+    mj, model = scene.mj, scene.model
+    data, option, view = mj.MjData(model), mj.MjvOption(), mj.MjvCamera()
+    near, far = (
+        float(limit * model.stat.extent) for limit in (model.vis.map.znear, model.vis.map.zfar)
+    )
+    view.type = mj.mjtCamera.mjCAMERA_FIXED
+    with open_gl_context(size):
+        gl_scene, gl_context = (
+            mj.MjvScene(model, maxgeom=20_000),
+            mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100),
+        )
+        mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN, gl_context)
+        for row in scene.sample(times):
+            data.qpos[:] = scene.to_qpos(row)
             mj.mj_forward(model, data)
             for camera in cameras:
-                eye.fixedcamid = model.camera(camera.name).id
-                mj.mjv_updateScene(model, data, option, mj.MjvPerturb(), eye, mj.mjtCatBit.mjCAT_ALL, scene)
-                window, shape = mj.MjrRect(0, 0, camera.width, camera.height), (camera.height, camera.width)
+                view.fixedcamid = model.camera(camera.name).id
+                mj.mjv_updateScene(
+                    model, data, option, mj.MjvPerturb(), view, mj.mjtCatBit.mjCAT_ALL, gl_scene
+                )
+                window, shape = (
+                    mj.MjrRect(0, 0, camera.width, camera.height),
+                    (camera.height, camera.width),
+                )
                 colours, codes = np.zeros((2, *shape, 3), np.uint8)
                 depth = np.zeros(shape, np.float32)
-                mj.mjr_render(window, scene, render)
-                mj.mjr_readPixels(colours, depth, window, render)
+                mj.mjr_render(window, gl_scene, gl_context)
+                mj.mjr_readPixels(colours, depth, window, gl_context)
                 flags = [int(mj.mjtRndFlag.mjRND_SEGMENT), int(mj.mjtRndFlag.mjRND_IDCOLOR)]
-                scene.flags[flags] = 1
-                mj.mjr_render(window, scene, render)
-                mj.mjr_readPixels(codes, None, window, render)
-                scene.flags[flags] = 0
-                yield camera.name, (colours[::-1], _millimetres(depth, near, far)[::-1], _geoms(scene, codes)[::-1])
-        render.free()
+                gl_scene.flags[flags] = 1
+                mj.mjr_render(window, gl_scene, gl_context)
+                mj.mjr_readPixels(codes, None, window, gl_context)
+                gl_scene.flags[flags] = 0
+                yield (
+                    camera.name,
+                    (
+                        colours[::-1],
+                        _to_millimetres(depth, near, far)[::-1],
+                        _decode_geoms(gl_scene, codes)[::-1],
+                    ),
+                )
+        gl_context.free()
 
 
-def _millimetres(depth: Any, near: float, far: float) -> NDArray[np.generic]:
-    """Return distances [mm] of what OpenGL keeps of them, from 0 at `near` to 1 at `far` [m]."""
-    away = near / (1.0 - np.asarray(depth, float) * (1.0 - near / far))
-    whole = np.round(1000.0 * away)
-    return np.where((depth >= 1.0) | (whole > _FARTHEST), 0.0, whole).astype(np.uint16)
+def _to_millimetres(depth: Any, near: float, far: float) -> NDArray[np.generic]:
+    """Return distances [mm] from OpenGL's depth, which is 0 at `near` and 1 at `far` [m]."""
+    distances = near / (1.0 - np.asarray(depth, float) * (1.0 - near / far))
+    whole = np.round(1000.0 * distances)
+    return np.where((depth >= 1.0) | (whole > _MAX_DEPTH), 0.0, whole).astype(np.uint16)
 
 
-def _geoms(scene: Any, codes: Any) -> NDArray[np.generic]:
-    """Return one more than the geom that is seen at every pixel, of the colours that MuJoCo codes what it draws with."""
-    drawn = np.zeros(scene.ngeom + 1, np.intp)
+def _decode_geoms(scene: Any, codes: Any) -> NDArray[np.generic]:
+    """Return one plus the geom visible at every pixel, decoded from MuJoCo's segment colours."""
+    visible_geoms = np.zeros(scene.ngeom + 1, np.intp)
     for geom in scene.geoms[: scene.ngeom]:
-        drawn[geom.segid + 1] = geom.objid + 1
+        visible_geoms[geom.segid + 1] = geom.objid + 1
     code = codes[..., 0] + 256 * codes[..., 1].astype(int) + 65_536 * codes[..., 2].astype(int)
-    return drawn[code]
+    return visible_geoms[code]
 
 
-def _segments(stage: Stage) -> tuple[tuple[str, ...], NDArray[np.generic]]:
-    """Return what there is to see, and for one more than a geom its place there."""
-    names, numbers = [""], np.zeros(stage.model.ngeom + 1, np.uint16)
-    for geom, label, robots in stage.drawn:
-        label = ROBOT if robots else label
+def _number_segments(scene: RenderedScene) -> tuple[tuple[str, ...], NDArray[np.generic]]:
+    """Return the names of visible bodies, and for one plus each geom the index of its name."""
+    names, numbers = [""], np.zeros(scene.model.ngeom + 1, np.uint16)
+    for geom, label, is_robot in scene.visible_geoms:
+        label = ROBOT if is_robot else label
         if label not in names:
             names.append(label)
         numbers[geom + 1] = names.index(label)

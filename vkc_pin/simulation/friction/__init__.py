@@ -1,1 +1,1 @@
-"""Holding by friction alone: fingers that close, the pauses in which they do, and what they hold."""
+"""Simulates grasps by friction: fingers, the pauses in which they close, and their loads."""

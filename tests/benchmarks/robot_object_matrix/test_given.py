@@ -1,0 +1,125 @@
+"""Robots and objects as they are asked for: what texts mean, and files that are imported once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.arm_urdf import write_arms
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.robot_object_matrix.given import Given, parsed, ready_object, ready_robot
+from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of
+
+# A box with a drawer that is pulled towards +y, and a lamp beside it.
+DESK = """<robot name="desk">
+  <link name="room"/>
+  <link name="case"><collision><origin xyz="0 0 0.4"/><geometry><box size="0.5 0.5 0.8"/></geometry></collision></link>
+  <link name="tray"><collision><geometry><box size="0.3 0.02 0.1"/></geometry></collision>
+    <collision name="handle"><origin xyz="0 0.08 0"/><geometry><box size="0.3 0.02 0.02"/></geometry></collision></link>
+  <link name="lamp"><collision><origin xyz="1 0 0.5"/><geometry><box size="0.2 0.2 1.0"/></geometry></collision></link>
+  <joint name="stands" type="fixed"><parent link="room"/><child link="case"/></joint>
+  <joint name="beside" type="fixed"><parent link="room"/><child link="lamp"/></joint>
+  <joint name="slide" type="prismatic"><parent link="case"/><child link="tray"/><origin xyz="0 0.28 0.6"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="0.3" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+def test_what_texts_mean() -> None:
+    texts = [
+        "default",
+        "my_oven=kitchens/kitchen.xml#oven",
+        "kitchens/kitchen.xml#sink top",
+        "home/desk.yaml",
+        "drawer",
+    ]
+    assert parsed(texts, "objects", ("oven_0", "door")) == [
+        Given("oven_0", "oven_0"),
+        Given("door", "door"),
+        Given("my_oven", "kitchens/kitchen.xml", "oven"),
+        Given("sink top", "kitchens/kitchen.xml", "sink top"),
+        Given("desk", "home/desk.yaml"),
+        Given("drawer", "drawer"),
+    ]
+    assert [
+        one.imported for one in parsed(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())
+    ] == [True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [[], ["oven_0", "oven_0"], ["default", "oven_0"], ["a=oven_0", "a=oven_1"], [""], ["#link"]],
+)
+def test_what_is_no_choice(texts: list[str]) -> None:
+    with pytest.raises(vkc.InputError, match="objects: not a choice"):
+        parsed(texts, "objects", ("oven_0",))
+
+
+def test_a_file_is_imported_once_with_its_front_to_the_robot(tmp_path: Path) -> None:
+    (tmp_path / "flat.urdf").write_text(DESK, encoding="utf-8")
+    (one,) = parsed([f"desk={tmp_path / 'flat.urdf'}#case"], "objects", ())
+    made = ready_object(one, tmp_path / "objects")
+    item = vkc.load_object(description_of(made))
+    assert sorted(item.links) == ["case", "front", "tray"], "not the lamp"
+    best = item.attachment()
+    approach = (item.link_placement(best.link, [0.0]) * best.placement).rotation[:, 2]
+    np.testing.assert_allclose(approach, [1.0, 0.0, 0.0], atol=1e-9)
+    shut, drawn = (item.link_placement("tray", [value]).translation for value in (0.0, 0.3))
+    np.testing.assert_allclose(drawn - shut, [-0.3, 0.0, 0.0], atol=1e-9)
+    written = {file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()}
+    assert ready_object(one, tmp_path / "objects") == made
+    assert {
+        file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()
+    } == written
+    assert not list((tmp_path / "objects").glob(".*")), "nothing is left over"
+
+
+def test_what_cannot_be_imported_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "bad.urdf").write_text(
+        "<robot name='bad'><link name='a'/></robot>", encoding="utf-8"
+    )
+    with pytest.raises(vkc.InputError):
+        ready_object(Given("bad", str(tmp_path / "bad.urdf")), tmp_path / "objects")
+    assert not list((tmp_path / "objects").iterdir())
+    with pytest.raises(vkc.InputError, match="only a link of a file"):
+        ready_object(Given("oven", "oven_0", "door"), tmp_path)
+
+
+@pytest.mark.parametrize("link", ["../../evil", "..", "a/b", "/evil", ".hidden"])
+def test_a_link_whose_name_is_not_that_of_a_file(tmp_path: Path, link: str) -> None:
+    (tmp_path / "evil").mkdir()
+    (tmp_path / "evil" / "letter.txt").write_text("mine")
+    desk = DESK.replace("case", link)
+    (tmp_path / "flat.urdf").write_text(desk, encoding="utf-8")
+    (one,) = parsed([f"{tmp_path / 'flat.urdf'}#{link}"], "objects", ())
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(vkc.InputError, match="objects: not a plain file name"):
+        ready_object(one, tmp_path / "a" / "objects")
+    with pytest.raises(vkc.InputError, match="robots: not a plain file name"):
+        ready_robot(Given(link, "husky_ur5e"), tmp_path / "a" / "robots")
+    assert sorted(tmp_path.rglob("*")) == before
+    (one,) = parsed([f"desk={tmp_path / 'flat.urdf'}#{link}"], "objects", ())
+    assert ready_object(one, tmp_path / "objects") == str(tmp_path / "objects/desk/desk.yaml")
+
+
+def test_files_of_others_are_not_deleted(tmp_path: Path) -> None:
+    (tmp_path / "flat.urdf").write_text(DESK, encoding="utf-8")
+    (tmp_path / "objects" / "desk").mkdir(parents=True)
+    (tmp_path / "objects" / "desk" / "letter.txt").write_text("mine")
+    (one,) = parsed([f"desk={tmp_path / 'flat.urdf'}#case"], "objects", ())
+    with pytest.raises(vkc.InputError, match=r"would delete .*letter\.txt"):
+        ready_object(one, tmp_path / "objects")
+    assert (tmp_path / "objects" / "desk" / "letter.txt").read_text() == "mine"
+
+
+def test_a_robot_that_says_what_its_hand_is_stays_as_it_is(tmp_path: Path) -> None:
+    assert ready_robot(Given("husky", "husky_ur5e"), tmp_path) == "husky_ur5e"
+    assert not list(tmp_path.iterdir())
+    file = write_arms(tmp_path / "given")
+    made = Path(ready_robot(Given("two_arms", str(file)), tmp_path / "robots"))
+    assert made == tmp_path / "robots" / "two_arms"
+    assert vkc.load_robot(made).touch_links
+    changed = (made / "robot.yaml").stat().st_mtime_ns
+    ready_robot(Given("two_arms", str(file)), tmp_path / "robots")
+    assert (made / "robot.yaml").stat().st_mtime_ns == changed

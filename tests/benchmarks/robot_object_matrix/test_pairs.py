@@ -1,0 +1,201 @@
+"""A robot and a thing that opens, alone in a hall."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.robot_object_matrix import pairs
+from vkc_pin.benchmarks.robot_object_matrix.pairs import (
+    OBJECTS,
+    SHARE,
+    description_of,
+    hall,
+    kind_of,
+    pair,
+)
+from vkc_pin.planning.diagnosis.diagnosis import BlockedGoal
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.procedural.furniture.catalogue import KINDS
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.models.shapes import compute_world_box
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import START_CLEARANCE
+
+SMOOTH = """<robot name="smooth"><link name="frame"/>
+<link name="block"><collision><geometry><box size="0.4 0.4 0.4"/></geometry></collision></link>
+<joint name="slide" type="prismatic"><parent link="frame"/><child link="block"/><origin xyz="0 0 0.5"/><axis xyz="-1 0 0"/>
+<limit lower="0" upper="0.3" effort="1" velocity="1"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def husky() -> vkc.Robot:
+    return vkc.load_robot("husky_ur5e")
+
+
+def test_what_there_is() -> None:
+    assert len(set(OBJECTS)) >= 25
+    assert {kind_of(name) for name in OBJECTS} == set(KINDS), (
+        "and what scenes/objects has is of the same kinds"
+    )
+    assert [
+        kind_of(name) for name in ("oven_12", "narrow_door", "counter_drawer", "home/oven_1.yaml")
+    ] == [*("oven", "door", "drawers", "oven")]
+
+
+def test_descriptions_are_the_same_wherever_they_are_read() -> None:
+    stored = folder("scenes") / "objects" / "narrow_door.yaml"
+    by_name, by_path = description_of("narrow_door"), description_of(str(stored))
+    assert by_name == by_path
+    assert Path(by_name["urdf"]).is_absolute()
+    assert vkc.load_object(by_name).name == "narrow_door"
+    assert description_of("oven_7") == vkc.random_object("oven", 7)
+    with pytest.raises(vkc.UnknownNameError, match="did you mean 'oven_0'"):
+        description_of("ofen_0")
+
+
+def test_an_object_must_say_what_it_is_made_of(tmp_path: Path) -> None:
+    file = tmp_path / "thing.yaml"
+    file.write_text("attachments: []\n", encoding="utf-8")
+    with pytest.raises(vkc.InputError, match=r"thing\.yaml.*urdf"):
+        description_of(str(file))
+
+
+@pytest.mark.parametrize("name", ["drawers_0", "faucet_0", "narrow_door", "low_drawer"])
+def test_everything_stands_where_it_belongs(name: str) -> None:
+    scene = hall("husky_ur5e", name, description_of(name))
+    boxes = np.array(
+        [
+            compute_world_box(shape.geometry, shape.placement)
+            for shape in make_world_shapes(scene.objects["it"])
+        ]
+    )
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    counters = [label for label in scene.obstacle_names if "worktop" in label]
+    assert bool(counters) == (name == "faucet_0")
+    assert (low[2] > 0.7) if counters else (0.0 <= low[2] < 0.05)
+    in_wall = name == "narrow_door"
+    assert (high[0] > 4.0) == in_wall, "a door is in the wall at x = 4 m, the others are before it"
+    assert scene.arena[1] == (6.0 if in_wall else 4.0), "there is floor beyond a door"
+    assert low[0] > 2.9, "the robot starts 2 m away"
+    start = scene.sample_start(np.random.default_rng(0))
+    assert start.start_clearance() >= START_CLEARANCE
+    assert not np.array_equal(start.start, scene.start)
+
+
+def test_half_of_the_range_by_what_was_proposed(husky: vkc.Robot) -> None:
+    found = pair(husky, "husky_ur5e", "drawers_0")
+    assert found.scene is not None
+    assert found.step is not None
+    item = found.scene.objects["it"].object
+    proposals = vkc.propose_attachments(vkc.load_object(vkc.random_object("drawers", 0)), husky)
+    ((joint, goal),) = found.step.joints.items()
+    assert found.step.attachment is None, "planning chooses"
+    assert goal == pytest.approx(
+        SHARE * (item.upper - item.lower)[item.coordinates.index(joint)], abs=1e-3
+    )
+    opening = {
+        proposal.attachment.name: proposal.opens[joint] for proposal in proposals.opening(joint)
+    }
+    assert list(item.attachments) == [name for name, value in opening.items() if value >= goal]
+
+
+def test_what_is_reached_shut_but_not_open_is_not_taken_first(
+    husky: vkc.Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is there but for one configuration is as good as what is not there: the next one is first then."""
+    looked: list[str] = []
+    real = pairs.diagnose_goals
+
+    def diagnose_goals(problem: TrajectoryProblem, seed: int) -> list[BlockedGoal]:
+        (hold,) = problem.task.holds
+        looked.append(hold.attachment)
+        return (
+            [BlockedGoal("move it.lid: out of reach", 0.3)]
+            if len(looked) == 1
+            else real(problem, seed)
+        )
+
+    monkeypatch.setattr(pairs, "diagnose_goals", diagnose_goals)
+    found = pair(husky, "husky_ur5e", "chest_0")
+    assert found.scene is not None
+    assert found.step == vkc.Actuate("it", found.step.joints if found.step else {})
+    first, second = looked
+    assert list(found.scene.objects["it"].object.attachments)[:2] == [second, first], (
+        "it is left to planning, after the other"
+    )
+    monkeypatch.setattr(
+        pairs, "diagnose_goals", lambda *_: [BlockedGoal("move it.lid: out of reach", 0.3)]
+    )
+    nowhere = pair(husky, "husky_ur5e", "chest_0")
+    assert (nowhere.step, nowhere.because.split("; ")[0]) == (
+        None,
+        f"{first}: move it.lid: out of reach",
+    )
+
+
+@pytest.mark.parametrize(("height", "raised"), [(0.4, True), (0.8, False)])
+def test_what_is_low_stands_on_a_counter(tmp_path: Path, height: float, raised: bool) -> None:
+    urdf = SMOOTH.replace("0.4 0.4 0.4", f"0.4 0.4 {height}").replace(
+        "0 0 0.5", f"0 0 {height / 2}"
+    )
+    file = _written(tmp_path / "box.yaml", urdf=urdf)
+    scene = hall("husky_ur5e", file, description_of(file))
+    boxes = np.array(
+        [
+            compute_world_box(shape.geometry, shape.placement)
+            for shape in make_world_shapes(scene.objects["it"])
+        ]
+    )
+    counters = [label for label in scene.obstacle_names if "worktop" in label]
+    assert bool(counters) == raised
+    assert boxes[:, 0].min(axis=0)[2] == pytest.approx(0.801 if raised else 0.0, abs=1e-6)
+    assert not [pair for pair in vkc.check_scene(scene).close if pair.distance < 0.0]
+
+
+def _written(path: Path, **more: Any) -> str:
+    description: Mapping[str, Any] = {"urdf": SMOOTH, "attachments": [], **more}
+    return str(vkc.write_object(description, path))
+
+
+def test_what_no_hand_can_hold_is_out_of_reach(husky: vkc.Robot, tmp_path: Path) -> None:
+    found = pair(husky, "husky_ur5e", _written(tmp_path / "smooth.yaml"))
+    assert found.step is None
+    assert found.because.startswith("slide: nothing of it fits between the fingers")
+
+
+def test_what_must_be_opened_further_than_the_hand_goes(
+    husky: vkc.Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pairs, "SHARE", 1.0)
+    found = pair(husky, "husky_ur5e", "dishwasher_0")
+    assert found.step is None
+    assert found.because == "door_bar ends with door at 1.31", "of 1.5"
+
+
+def test_a_robot_without_a_hand_opens_nothing() -> None:
+    found = pair(vkc.load_robot("ur5"), "ur5", "drawers_0")
+    assert (found.scene, found.step) == (None, None)
+    assert "the hand of 'ur5_robot' is not known" in found.because
+
+
+def test_what_the_arm_does_not_get_to_is_out_of_reach(husky: vkc.Robot, tmp_path: Path) -> None:
+    foot = (
+        '<link name="frame"><collision><origin xyz="0 0 0.1"/>'
+        '<geometry><box size="0.2 0.2 0.2"/></geometry></collision></link>'
+    )
+    bar = '<link name="bar"><collision><geometry><box size="0.02 0.2 0.02"/></geometry></collision></link>'
+    fixed = '<joint name="on" type="fixed"><parent link="block"/><child link="bar"/><origin xyz="-0.26 0 0"/></joint>'
+    high = SMOOTH.replace("0 0 0.5", "0 0 3.5").replace('<link name="frame"/>', foot)
+    found = pair(
+        husky,
+        "husky_ur5e",
+        _written(tmp_path / "high.yaml", urdf=high.replace("</robot>", f"{bar}{fixed}</robot>")),
+    )
+    assert found.step is None
+    assert found.because.startswith("bar_bar: ")

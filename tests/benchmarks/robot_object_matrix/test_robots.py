@@ -1,0 +1,111 @@
+"""Robots from their files from the command line: one that reaches its poses, and one that is none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.arm_urdf import write_arms
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.robot_object_matrix.robots import ROBOTS, report, run
+from vkc_pin.cli import main
+from vkc_pin.world.models.robot_file import list_robots
+
+
+@pytest.fixture(autouse=True)
+def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sources may be worked on while the tests run."""
+    monkeypatch.setattr(runner, "_sources", lambda: "abc")
+
+
+def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = write_arms(tmp_path / "good")
+    legless = tmp_path / "legless.urdf"
+    box = "<link name='{}'><collision><geometry><box size='1 1 1'/></geometry></collision></link>"
+    legless.write_text(f"<robot name='legless'>{box.format('a')}</robot>", encoding="utf-8")
+    out = tmp_path / "out"
+    command = [
+        "bench",
+        "robots",
+        "--goals",
+        "2",
+        "--robots",
+        str(good),
+        str(legless),
+        "--quiet",
+        "--out",
+        str(out),
+    ]
+    assert main(command) == 0
+    table = (out / "table.md").read_text(encoding="utf-8")
+    assert table in capsys.readouterr().out
+    records = json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
+    assert [(r["robot"], r["status"]) for r in records if not r["success"]] == [
+        ("legless", "not imported")
+    ]
+    reached = [r for r in records if r["robot"] == "robot"]
+    assert [(r["success"], r["violations"], r["number"]) for r in reached] == [
+        (True, [], 0),
+        (True, [], 1),
+    ]
+    assert all(r["base_effort"] + r["arm_effort"] > 0.1 for r in reached), "it has to move"
+    assert reached[0]["home_room"] >= 0.03
+    assert reached[0]["joints"] == 5
+    assert reached[0]["load_time"] > 0.0
+    assert "no arm was found" in table
+    assert "| 2/2 |" in table
+    assert vkc.load_robot(out / "robots" / "robot").home.tolist() != []
+
+    journal = (out / "trials.jsonl").read_bytes()
+    assert main(command) == 0
+    assert (out / "trials.jsonl").read_bytes() == journal, "nothing was run again"
+
+
+def test_what_fails_is_told_by_robot() -> None:
+    about = {"robots": ["one", "two"], "goals": 2, "seed": 0, "time_limit": 5.0, "versions": {}}
+    about["machine"] = {"cores": 2, "processor": "x", "machine": "x", "system": "x", "python": "3"}
+    facts = {"import_time": 4.0, "load_time": 0.5, "joints": 6, "pairs": 7, "home_room": -0.004}
+    trials = [
+        {"robot": "one", **facts, "success": True, "status": "success", "planning_time": 1.0},
+        {
+            "robot": "one",
+            **facts,
+            "success": False,
+            "status": "infeasible",
+            "planning_time": 3.0,
+            "violations": ["too deep"],
+        },
+        {
+            "robot": "two",
+            **facts,
+            "home_room": None,
+            "success": False,
+            "status": "hardly free",
+            "because": "only 1 of 9",
+        },
+    ]
+    text = report({"meta": about, "trials": trials})
+    assert "| one | 6 | 7 | 4.00 | 0.50 | -4 | 1/2 | 2.00 | 2.90 |" in text
+    assert "| two | 6 | 7 | 4.00 | 0.50 | – | – |" in text
+    assert "| one | infeasible | too deep |" in text
+    assert "| two | hardly free | only 1 of 9 |" in text
+
+
+def test_what_cannot_be_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(vkc.InputError, match="goals: out of range"):
+        run(out=tmp_path, goals=0)
+    with pytest.raises(vkc.InputError, match="robots: not a choice"):
+        run(out=tmp_path, robots=["panda", "panda"])
+    with pytest.raises(vkc.InputError, match="robots: not a choice"):
+        run(out=tmp_path, robots=[])
+    with pytest.raises(vkc.InputError, match="there is no such file"):
+        run(out=tmp_path, robots=[str(tmp_path / "none.urdf")])
+    with pytest.raises(vkc.UnknownNameError, match="did you mean 'panda'"):
+        run(out=tmp_path, robots=["pandas"])
+
+
+def test_robots_that_there_are() -> None:
+    assert set(ROBOTS) <= set(list_robots())

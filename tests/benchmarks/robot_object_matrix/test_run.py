@@ -1,0 +1,94 @@
+"""Robots × objects from the command line: one robot, one thing that it opens and one that it cannot take hold of."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.arm_urdf import write_arms
+
+import vkc_pin as vkc
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.robot_object_matrix.pairs import SHARE
+from vkc_pin.benchmarks.robot_object_matrix.run import run
+from vkc_pin.cli import main
+
+
+@pytest.fixture(autouse=True)
+def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sources may be worked on while the tests run."""
+    monkeypatch.setattr(runner, "_sources", lambda: "abc")
+
+
+def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    description = vkc.random_object("drawers", 0)
+    slide = vkc.load_object(description)
+    urdf = (
+        '<robot name="smooth"><link name="frame"/>'
+        '<link name="block"><collision><geometry><box size="0.4 0.4 0.4"/></geometry></collision></link>'
+        '<joint name="slide" type="prismatic"><parent link="frame"/><child link="block"/><axis xyz="-1 0 0"/>'
+        '<limit lower="0" upper="0.3" effort="1" velocity="1"/></joint></robot>'
+    )
+    smooth = vkc.write_object({"urdf": urdf, "attachments": []}, tmp_path / "smooth.yaml")
+    out = tmp_path / "out"
+    command = [
+        "bench",
+        "anything",
+        "--starts",
+        "1",
+        "--robots",
+        "husky_ur5e",
+        "--objects",
+        "drawers_0",
+        str(smooth),
+        "--quiet",
+    ]
+    assert main([*command, "--out", str(out)]) == 0
+    table = (out / "table.md").read_text(encoding="utf-8")
+    assert table in capsys.readouterr().out
+    assert "| drawers_0 | 1/1 |" in table
+    assert "| smooth | – |" in table
+    assert "nothing of it fits between the fingers" in table
+    assert (out / "success.png").stat().st_size > 5000
+    records = {
+        r["object"]: r
+        for r in json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
+    }
+    opened, other = records["drawers_0"], records["smooth"]
+    assert (opened["success"], opened["violations"], opened["kind"]) == (True, [], "drawers")
+    reach = (slide.upper - slide.lower)[slide.coordinates.index(opened["joint"])]
+    assert opened["goal"] == pytest.approx(SHARE * reach, abs=1e-3)
+    assert opened["base_effort"] > 0.5, "it starts 2 m away"
+    assert (other["success"], other["status"]) == (False, "unreachable")
+
+    journal = (out / "trials.jsonl").read_bytes()
+    assert main([*command, "--out", str(out)]) == 0
+    again = (out / "trials.jsonl").read_bytes()
+    assert again == journal, "nothing was run again"
+
+
+def test_a_robot_whose_hand_nobody_described_is_imported(tmp_path: Path) -> None:
+    file = write_arms(tmp_path / "given")
+    result = run(
+        out=tmp_path / "out", starts=1, robots=[str(file)], objects=["drawers_0"], progress=False
+    )
+    (trial,) = result["trials"]
+    made = tmp_path / "out" / "robots" / trial["robot"]
+    assert vkc.load_robot(made).touch_links
+    assert not vkc.load_robot(file).touch_links
+    assert trial["status"] != "no hand"
+    assert trial["because"] or trial["success"]
+
+
+def test_what_cannot_be_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(vkc.InputError, match="starts: out of range"):
+        run(out=tmp_path, starts=0)
+    with pytest.raises(vkc.InputError, match="robots: not a choice"):
+        run(out=tmp_path, robots=["husky_ur5e", "husky_ur5e"])
+    with pytest.raises(vkc.InputError, match="objects: not a choice"):
+        run(out=tmp_path, objects=[])
+    with pytest.raises(vkc.UnknownNameError, match="husky_ur5e"):
+        run(out=tmp_path, robots=["husky_ur5"])
+    with pytest.raises(vkc.UnknownNameError, match="did you mean 'oven_0'"):
+        run(out=tmp_path, objects=["ofen_0"])

@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.downloads import partnet
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+
+from vkc_pin.errors import UnknownNameError
+from vkc_pin.importing.objects.clean_up import (
+    add_missing_limits,
+    choose_name,
+    compute_bounds,
+    extract_subtree,
+    find_multiple_objects,
+    load_surfaces,
+    make_upright,
+    merge_fixed_links,
+    move_root,
+    rename_for_scenes,
+    scale_object,
+)
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.world.files.fields import Name
+
+
+@pytest.fixture
+def cabinet(tmp_path: Path) -> Description:
+    return read_object_urdf(partnet(tmp_path))
+
+
+def test_fixed_links_become_one_and_dead_ones_go(cabinet: Description) -> None:
+    found = merge_fixed_links(cabinet)
+    assert set(found.links) == {"base", "link_0", "link_1"}
+    assert found.joints["link_0"].parent == "base"
+    assert any("joint_3" in note and "no" in note for note in found.notes)
+    before, after = (
+        compute_bounds(cabinet, load_surfaces(cabinet)),
+        compute_bounds(found, load_surfaces(found)),
+    )
+    assert np.allclose(before, after)
+    assert "link_2_frame-1" in [part.name for part in found.links["base"].visual]
+
+
+def test_a_handle_fixed_to_a_door_is_part_of_it_and_keeps_its_name() -> None:
+    box = Part(name="", placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
+    place = pin.SE3(np.eye(3), np.array([0.0, 0.5, 0.0]))
+    joints = {
+        "door": Joint(
+            name="hinge",
+            kind="revolute",
+            parent="case",
+            child="door",
+            placement=place,
+            limits=(0.0, 1.0),
+        ),
+        "handle": Joint(name="weld", kind="fixed", parent="door", child="handle", placement=place),
+        "flap": Joint(
+            name="stuck",
+            kind="revolute",
+            parent="handle",
+            child="flap",
+            placement=place,
+            limits=(0.3, 0.3),
+        ),
+    }
+    links = {
+        "case": Link("case", (), (box,)),
+        "door": Link("door", (box,)),
+        "handle": Link("handle", (), (box,)),
+        "flap": Link("flap", (), (box,)),
+    }
+    weights = {
+        name: pin.Inertia(k + 1.0, np.array([0.1, 0.0, 0.0]), 0.01 * np.eye(3))
+        for k, name in enumerate(links)
+    }
+    links = {name: dataclasses.replace(link, inertia=weights[name]) for name, link in links.items()}
+    found = merge_fixed_links(Description(Path("f"), links, joints))
+    assert set(found.links) == {"case", "door"}
+    assert found.links["case"].inertia.mass == 1.0
+    assert found.links["door"].inertia.mass == 2.0 + 3.0 + 4.0
+    middles = [
+        weights["door"].lever,
+        place.act(weights["handle"].lever),
+        2.0 * place.translation + weights["flap"].lever,
+    ]
+    assert np.allclose(
+        found.links["door"].inertia.lever, np.average(middles, axis=0, weights=[2.0, 3.0, 4.0])
+    )
+    assert [part.name for part in found.links["door"].collision] == ["", "handle", "flap"]
+    turned = found.links["door"].collision[2].placement
+    assert np.allclose(turned.translation, [0.0, 1.0, 0.0])
+    assert np.allclose(turned.rotation, pin.rpy.rpyToMatrix(0.3, 0.0, 0.0))
+    assert any("stuck" in note for note in found.notes)
+
+
+@settings(max_examples=20, deadline=None)
+@given(factor=st.floats(0.1, 10.0), slide=st.floats(0.0, 0.36))
+def test_scaling_scales_everything(
+    factor: float, slide: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    cabinet = read_object_urdf(partnet(tmp_path_factory.mktemp("p") / "x"))
+    large = scale_object(cabinet, factor)
+    one = compute_bounds(cabinet, load_surfaces(cabinet), {"joint_0": slide})
+    other = compute_bounds(large, load_surfaces(large), {"joint_0": factor * slide})
+    assert np.allclose(factor * np.array(one), other, rtol=1e-9, atol=1e-9)
+    assert large.joints["link_0"].limits == pytest.approx((0.0, factor * 0.36))
+
+
+def test_masses_stay_as_stated_when_scaled_and_turn_with_the_root() -> None:
+    weight = pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.25]))
+    one = Description(Path("f"), {"a": Link("a", inertia=weight)}, {})
+    large = scale_object(one, 3.0).links["a"].inertia
+    assert large.mass == 2.0
+    assert np.allclose(large.lever, 3.0 * weight.lever)
+    assert np.allclose(large.inertia, 9.0 * weight.inertia)
+    turned = make_upright(one, "y").links["a"].inertia
+    assert np.allclose(turned.lever, [0.1, -0.3, 0.2])
+    assert sorted(np.diag(turned.inertia)) == pytest.approx([0.1, 0.2, 0.25])
+    assert not one.is_massless
+    assert Description(Path("f"), {"a": Link("a")}, {}).is_massless
+
+
+def test_limits_that_are_missing_open_outwards(cabinet: Description) -> None:
+    found = merge_fixed_links(cabinet)
+    meshes = load_surfaces(found)
+    limited = add_missing_limits(found, meshes)
+    low, high = limited.joints["link_1"].limits or (0.0, 0.0)
+    assert sorted(map(abs, (low, high))) == pytest.approx([0.0, np.pi / 2])
+    shut, opened = (
+        compute_bounds(limited, load_surfaces(limited), {"joint_1": value})
+        for value in (0.0, low if abs(low) > high else high)
+    )
+    front = shut[0][0] < opened[0][0] or shut[1][0] > opened[1][0]
+    assert not front  # it comes out of the front, x after the file's own turn
+    assert any("joint_1" in note and "1.57" in note for note in limited.notes)
+    assert limited.joints["link_0"].limits == (0.0, 0.36)
+    little = dataclasses.replace(
+        limited.joints["link_1"], limits=(0.0, 0.0274)
+    )  # 1.57, taken for degrees
+    noted = add_missing_limits(
+        dataclasses.replace(limited, joints={**limited.joints, "link_1": little}),
+        load_surfaces(limited),
+    ).notes
+    assert any("only 1.6°" in note or "only 2°" in note for note in noted)
+
+
+def test_up_root_and_part_of_it(cabinet: Description) -> None:
+    found = make_upright(extract_subtree(cabinet, "link_2"), "y")
+    low, high = compute_bounds(found, load_surfaces(found))
+    assert (high - low)[2] == pytest.approx(1.0)
+    moved = move_root(found, pin.SE3(np.eye(3), np.array([0.0, 0.0, -low[2]])))
+    assert compute_bounds(moved, load_surfaces(moved))[0][2] == pytest.approx(0.0)
+    with pytest.raises(UnknownNameError, match="link_2"):
+        extract_subtree(cabinet, "link2")
+
+
+def test_names_without_dots_and_slashes_that_differ() -> None:
+    links = {name: Link(name) for name in ("a/b", "a.b", "c d")}
+    joints = {
+        name: Joint(
+            name=f"j.{k % 1}", kind="fixed", parent="a/b", child=name, placement=pin.SE3.Identity()
+        )
+        for k, name in enumerate(("a.b", "c d"))
+    }
+    found = rename_for_scenes(Description(Path("f"), links, joints))
+    assert list(found.links) == ["a_b", "a_b_2", "c_d"]
+    assert [joint.name for joint in found.joints.values()] == ["j_0", "j_0_2"]
+    assert {joint.parent for joint in found.joints.values()} == {"a_b"}
+
+
+def test_a_file_of_several_things_is_told_from_one_with_several_joints(tmp_path: Path) -> None:
+    def box(name: str, parent: str, kind: str) -> str:
+        link = f'<link name="{name}"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>'
+        ends = f'<parent link="{parent}"/><child link="{name}"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
+        return f'{link}<joint name="{name}_read_joint" type="{kind}">{ends}</joint>'
+
+    def said(*parts: str) -> tuple[str, ...]:
+        (tmp_path / "it.urdf").write_text(
+            f'<robot name="it"><link name="world"/>{"".join(parts)}</robot>'
+        )
+        return find_multiple_objects(read_object_urdf(tmp_path / "it.urdf"))
+
+    oven = box("oven", "world", "fixed") + box("door", "oven", "revolute")
+    (note,) = said(
+        oven,
+        box("chest", "world", "fixed"),
+        box("lid", "chest", "revolute"),
+        box("rack", "chest", "prismatic"),
+    )
+    assert "'oven' (1 joint), 'chest' (2 joints)" in note
+    assert said(oven) == said(oven, box("wall", "world", "fixed")) == ()
+    assert said(box("upper", "world", "prismatic"), box("lower", "world", "prismatic")) == ()
+
+
+@given(st.lists(st.text(max_size=5), max_size=8))
+def test_chosen_names_are_names_of_scenes_and_differ(wanted: list[str]) -> None:
+    taken = set[str]()
+    names = [choose_name(name, taken) for name in wanted]
+    assert len(set(names)) == len(names)
+    assert taken == set(names)
+    for name in names:
+        TypeAdapter(Name).validate_python(name)
+
+
+def test_names_that_scenes_accept_stay() -> None:
+    taken = set[str]()
+    names = ["a+b", "a b", "шкаф", "a\x7fb\u200b", "a_b"]
+    assert [choose_name(name, taken) for name in names] == ["a+b", "a_b", "шкаф", "a_b_2", "a_b_3"]

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from helpers.furniture import BAR, flap
+
+import vkc_pin as vkc
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> vkc.Proposals:
+    return vkc.propose_attachments(
+        flap(tmp_path_factory.mktemp("flap"), BAR.format(' name="handle"'))
+    )
+
+
+def test_descriptions_load_as_the_same_attachments(found: vkc.Proposals, tmp_path: Path) -> None:
+    written = yaml.safe_dump([proposal.description() for proposal in found.found])
+    loaded = flap(
+        tmp_path,
+        BAR.format(""),
+        attachments=yaml.safe_dump(yaml.safe_load(written), default_flow_style=True).strip(),
+    )
+    assert list(loaded.attachments) == [proposal.attachment.name for proposal in found.found]
+    for proposal in found.found:
+        wanted, got = proposal.attachment, loaded.attachment(proposal.attachment.name)
+        assert np.allclose(wanted.placement.homogeneous, got.placement.homogeneous, atol=1e-5)
+        assert (wanted.joint, wanted.coordinates) == (got.joint, got.coordinates)
+        assert wanted.standoff == pytest.approx(got.standoff, abs=1e-5)
+        for one, other in zip(wanted.freedoms, got.freedoms, strict=True):
+            assert (one.lower, one.upper) == (other.lower, other.upper)
+            assert np.allclose(one.axis, other.axis)
+
+
+def test_applied_gives_the_object_the_best_one_first(found: vkc.Proposals) -> None:
+    item = found.applied()
+    assert item.attachment().name == found.found[0].attachment.name == "flap_bar"
+    assert found.opening("hinge") == found.found
+    assert "flap_bar" in repr(found)
+
+
+def test_a_line_names_few_of_the_joints_that_must_be_open(found: vkc.Proposals) -> None:
+    first = found.found[0]
+    ends = {
+        0: "1.5 rad",
+        2: "1.5 rad, while j0 is at 1, j1 is at 1",
+        5: "j2 is at 1 and 2 more joints are open",
+    }
+    for count, said in ends.items():
+        one = dataclasses.replace(first, when={f"j{k}": 1.0 for k in range(count)})
+        assert dataclasses.replace(found, found=(one,)).report().splitlines()[1].endswith(said)
+
+
+def test_the_report_says_what_opens_and_how_far(found: vkc.Proposals) -> None:
+    lines = found.report().splitlines()
+    assert lines[0] == "hinge, 0 to 1.5 rad"
+    assert "flap_bar (bar, named as a handle): 20 mm thick, cylindrical" in lines[1]
+    assert "opens to 1.5 rad" in lines[1]

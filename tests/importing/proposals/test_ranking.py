@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import dataclasses
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.furniture import BAR, flap
+
+import vkc_pin as vkc
+from vkc_pin.importing.proposals.candidates import Candidate
+from vkc_pin.importing.proposals.ranking import (
+    Opening,
+    find_named_handles,
+    find_openings,
+    score_grasp,
+)
+from vkc_pin.importing.proposals.sections import Piece
+
+FRONT = np.column_stack(
+    [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+)  # approaches along x, closes along y
+
+
+def opening_of(name_or_path: str | Path) -> Opening:
+    item = vkc.load_object(name_or_path)
+    pieces: dict[int, list[Piece]] = {}
+    for shape in item.collision.geometryObjects:
+        pieces.setdefault(shape.parentJoint, []).append(Piece.from_shape(shape))
+    return find_openings(item, pieces)[1]
+
+
+def test_how_a_hinge_and_a_slide_open(tmp_path: Path) -> None:
+    flap(tmp_path, BAR.format(""))
+    hinge = opening_of(tmp_path / "flap.yaml")
+    assert (hinge.turns, hinge.closed, hinge.opened) == (True, 0.0, 1.5)
+    assert np.allclose(hinge.axis, [0.0, 0.0, 1.0])
+    assert hinge.reach == pytest.approx(np.hypot(0.6, 0.01))
+    slide = opening_of("drawer")
+    assert not slide.turns
+    assert np.allclose(slide.axis, [-1.0, 0.0, 0.0])
+    assert slide.low[0] < -0.12
+
+
+def test_leverage_side_pull_and_name_count(tmp_path: Path) -> None:
+    flap(tmp_path, BAR.format(""))
+    hinge = opening_of(tmp_path / "flap.yaml")
+    bar = Candidate(
+        Piece("flap", "flap_1", np.zeros((0, 3)), np.zeros((0, 3), int)),
+        "bar",
+        pin.SE3.Identity(),
+        0.02,
+        (0, 0),
+        0,
+    )
+
+    def at(
+        *place: float, rotation: np.ndarray = FRONT, named: bool = False, grasp: Candidate = bar
+    ) -> float:
+        return score_grasp(grasp, pin.SE3(rotation, np.array(place)), hinge, named=named)
+
+    best = at(-0.08, 0.55, 0.5)
+    assert best > at(-0.08, 0.3, 0.5) > at(-0.08, 0.05, 0.5) > 0.0  # leverage
+    assert best > at(-0.08, 0.55, 0.85)  # in the middle of the flap's height
+    behind = FRONT @ np.diag([-1.0, 1.0, -1.0])
+    assert best > at(
+        -0.08, 0.55, 0.5, rotation=behind
+    )  # the hand comes from where the flap goes to
+    along = np.column_stack([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    assert best > 2.0 * at(
+        -0.08, 0.55, 0.5, rotation=along
+    )  # a bar along the pull slips through the fingers
+    assert at(-0.08, 0.55, 0.5, named=True) > best
+    assert best > at(-0.08, 0.55, 0.5, grasp=dataclasses.replace(bar, kind="edge"))
+
+
+def test_what_is_called_a_handle() -> None:
+    text = """<robot><link name="door"><collision/><collision name="Handle-3"/>
+    <collision><geometry><mesh filename="meshes/knob_7.obj"/></geometry></collision></link>
+    <link name="lever"><collision/></link></robot>"""
+    assert find_named_handles(ElementTree.fromstring(text)) == {
+        "door_0": False,
+        "door_1": True,
+        "door_2": True,
+        "lever_0": True,
+    }

@@ -1,0 +1,168 @@
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+import trimesh
+
+import vkc_pin as vkc
+from vkc_pin.importing.robots.mesh_pieces import write_meshes
+from vkc_pin.world.files.meshes import load_parts
+from vkc_pin.world.files.urdf import UrdfFile, read_urdf
+
+TEXT = """<robot name="r">
+  <link name="a">
+    <visual><geometry><mesh filename="seen.obj" scale="2 2 2"/></geometry></visual>
+    <visual><geometry><mesh filename="gone.obj"/></geometry></visual>
+    <collision><geometry><box size="1 1 1"/></geometry></collision>
+    <collision><origin xyz="0 0 3"/><geometry><mesh filename="angle.stl" scale="0.5 0.5 0.5"/></geometry></collision>
+    <collision><geometry><mesh filename="sheet.stl"/></geometry></collision>
+  </link></robot>"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    box = trimesh.creation.box
+    arms = [
+        box((2, 0.2, 1)).apply_translation((1.2, 0, 0)),
+        box((0.2, 2, 1)).apply_translation((0, 1.2, 0)),
+    ]
+    angle = trimesh.util.concatenate(arms)
+    angle.export(tmp_path / "angle.stl")
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(tmp_path / "sheet.stl")
+    (tmp_path / "seen.obj").write_text(
+        "mtllib paint.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
+    )
+    (tmp_path / "paint.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    path = tmp_path / "r.urdf"
+    path.write_text(TEXT, encoding="utf-8")
+    return path
+
+
+def test_pieces_stand_where_the_mesh_stood(file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "own"
+    root, pieces, notes = write_meshes(read_urdf(file), folder, most_pieces=4)
+    (folder / "r.urdf").write_bytes(ElementTree.tostring(root))
+    shapes = read_urdf(folder / "r.urdf").shapes("collision")
+    assert [shape.kind for shape in shapes] == ["box", "mesh", "mesh"]
+    before = next(
+        shape
+        for shape in read_urdf(file).shapes("collision")
+        if shape.file and shape.file.name == "angle.stl"
+    ).mesh()
+    after = trimesh.util.concatenate([shape.mesh() for shape in shapes[1:]])
+    assert after.bounds == pytest.approx(before.bounds)
+    assert after.volume == pytest.approx(before.volume, rel=1e-5)
+    (piece,) = pieces
+    assert (piece.link, piece.count) == ("a", 2)
+    assert piece.hull > 1.0 > 0.05 > abs(piece.overhead)
+    assert any("sheet.stl is flat" in note for note in notes)
+    assert any("left out unreadable visual meshes of a" in note for note in notes)
+
+
+def test_what_is_seen_is_copied_with_its_colours(file: Path, tmp_path: Path) -> None:
+    root, _, _ = write_meshes(read_urdf(file), tmp_path / "own", most_pieces=1)
+    assert {path.name for path in (tmp_path / "own" / "visual").iterdir()} == {
+        "seen.obj",
+        "paint.mtl",
+    }
+    (mesh,) = root.findall("link/visual/geometry/mesh")
+    assert mesh.attrib == {"filename": "visual/seen.obj", "scale": "2 2 2"}
+
+
+def test_a_mesh_that_collides_must_be_there(file: Path, tmp_path: Path) -> None:
+    (tmp_path / "angle.stl").unlink()
+    with pytest.raises(vkc.InputError, match="there is no such mesh"):
+        write_meshes(read_urdf(file), tmp_path / "own", most_pieces=4)
+
+
+def write_obj(file: Path, size: float, colour: str) -> Path:
+    """Write a cube as an OBJ file whose material, paint.mtl, has a colour; return it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    cube = trimesh.creation.box((size,) * 3).export(
+        file_type="obj", include_normals=False, include_texture=False
+    )
+    file.write_text(f"mtllib paint.mtl\nusemtl own\n{cube}", encoding="utf-8")
+    (file.parent / "paint.mtl").write_text(f"newmtl own\nKd {colour}\n", encoding="utf-8")
+    return file
+
+
+def link(name: str, seen: str, solid: str) -> str:
+    shapes = f'<visual><geometry><mesh filename="{seen}"/></geometry></visual>'
+    shapes += f'<collision><geometry><mesh filename="{solid}"/></geometry></collision>'
+    ends = f'<parent link="root"/><child link="{name}"/>'
+    joint = f'<joint name="{name}_joint" type="fixed">{ends}</joint>'
+    return f'<link name="{name}">{shapes}</link>{joint}'
+
+
+def own(folder: Path, *links: str) -> UrdfFile:
+    """Return a robot with these links below its root, with meshes of its own."""
+    (folder / "r.urdf").write_text(
+        f'<robot name="r"><link name="root"/>{"".join(links)}</robot>', encoding="utf-8"
+    )
+    root, _, _ = write_meshes(read_urdf(folder / "r.urdf"), folder / "own", most_pieces=1)
+    (folder / "own" / "r.urdf").write_bytes(ElementTree.tostring(root))
+    return read_urdf(folder / "own" / "r.urdf")
+
+
+@pytest.mark.parametrize(
+    ("small", "large", "files"),
+    [
+        ("left", "right", {"left_0.stl", "right_0.stl"}),
+        ("é", "ü", {"part_0.stl", "part_2_0.stl"}),
+        ("a+b", "a b", {"a_b_0.stl", "a_b_2_0.stl"}),
+        ("a#", "a$", {"a__0.stl", "a__2_0.stl"}),
+        ("A", "a", {"A_0.stl", "a_2_0.stl"}),
+    ],
+)
+def test_links_whose_names_look_alike_keep_their_own_pieces(
+    small: str, large: str, files: set[str], tmp_path: Path
+) -> None:
+    for name, size in (("s", 0.1), ("l", 0.2)):
+        trimesh.creation.box((size,) * 3).export(tmp_path / f"{name}.stl")
+    made = own(tmp_path, link(small, "s.stl", "s.stl"), link(large, "l.stl", "l.stl"))
+    volumes = {shape.link: shape.mesh().volume for shape in made.shapes("collision")}
+    assert volumes == pytest.approx({small: 0.1**3, large: 0.2**3})
+    assert {path.name for path in (tmp_path / "own" / "collision").iterdir()} == files
+
+
+def test_meshes_of_one_name_in_several_folders_keep_their_shapes_and_colours(
+    tmp_path: Path,
+) -> None:
+    colours = {"a": (1.0, 0.0, 0.0, 1.0), "b": (0.0, 1.0, 0.0, 1.0), "c": (0.0, 0.0, 1.0, 1.0)}
+    seen = {
+        name: write_obj(
+            tmp_path / name / file, size, " ".join(f"{value:g}" for value in colours[name][:3])
+        )
+        for name, file, size in (("a", "x_2.obj", 0.1), ("b", "x.obj", 0.2), ("c", "x.obj", 0.3))
+    }
+    made = own(
+        tmp_path,
+        *(link(name, str(file.relative_to(tmp_path)), str(file)) for name, file in seen.items()),
+    )
+    shapes = {shape.link: shape for shape in made.shapes("visual")}
+    assert {name: shape.mesh().volume for name, shape in shapes.items()} == pytest.approx(
+        {"a": 0.1**3, "b": 0.2**3, "c": 0.3**3}
+    )
+    for name, shape in shapes.items():
+        assert shape.file is not None
+        (part,) = load_parts(shape.file)
+        assert part.colour == pytest.approx(colours[name], abs=0.01)
+    folder = tmp_path / "own" / "visual"
+    assert {path.name for path in folder.iterdir()} == {
+        *("x.obj", "x_2.obj", "x_3.obj"),
+        *("paint.mtl", "paint_2.mtl", "paint_3.mtl"),
+    }
+    assert (folder / "x_2.obj").read_bytes() == seen["a"].read_bytes(), "nothing to rename"
+
+
+def test_names_of_meshes_become_portable(tmp_path: Path) -> None:
+    for name in ("con", "a b", "x" * 200):
+        write_obj(tmp_path / f"{name}.obj", 0.1, "1 0 0")
+    meshes = {"a": "con.obj", "b": "a b.obj", "c": f"{'x' * 200}.obj"}
+    made = own(tmp_path, *(link(name, file, file) for name, file in meshes.items()))
+    files = {
+        shape.link: shape.file.name for shape in made.shapes("visual") if shape.file is not None
+    }
+    assert files == {"a": "con_.obj", "b": "a_b.obj", "c": f"{'x' * 64}.obj"}

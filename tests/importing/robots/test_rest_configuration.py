@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.arm_urdf import HEIGHT, write_arms
+
+import vkc_pin as vkc
+from vkc_pin.importing.robots.rest_configuration import (
+    HOME_ROOM,
+    Clearances,
+    find_home,
+    find_inseparable_pairs,
+    measure_floor_heights,
+)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> vkc.Robot:
+    return vkc.load_robot(write_arms(tmp_path_factory.mktemp("robot")))
+
+
+def test_distances_are_those_of_coal(robot: vkc.Robot) -> None:
+    look, rng = Clearances(robot), np.random.default_rng(2)
+    data, geometry = robot.model.createData(), robot.collision.createData()
+    for _ in range(10):
+        arm = rng.uniform(robot.lower[3:], robot.upper[3:])
+        look.place(arm)
+        q = robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
+        pin.computeDistances(robot.model, data, robot.collision, geometry, q)
+        least = min(result.min_distance for result in geometry.distanceResults)
+        lowest = min(height for _, height in look.floor())
+        assert look.least() == pytest.approx(min(least, lowest), abs=1e-6)
+        assert look.least(0.05) == pytest.approx(min(least, lowest, 0.05), abs=1e-6)
+        close = look.links(0.05)
+        assert [distance for *_, distance in close] == sorted(distance for *_, distance in close)
+
+
+def test_the_first_state_with_room_is_home(robot: vkc.Robot) -> None:
+    folded, up = np.array([0.0, 1.9, 1.9, 0.0, 0.0]), np.zeros(5)
+    home = find_home(robot, [("folded", folded), ("up", up)])
+    assert home.how == "up"
+    np.testing.assert_array_equal(home.positions, up)
+    assert home.clearance >= HOME_ROOM
+
+
+def test_home_is_searched_for_where_none_is_named(robot: vkc.Robot) -> None:
+    home = find_home(robot, [("folded", np.array([0.0, 1.9, 1.9, 0.0, 0.0]))], seed=1)
+    again = find_home(robot, [], seed=1)
+    assert home.how == "found by search"
+    np.testing.assert_array_equal(home.positions, again.positions)
+    look = Clearances(robot)
+    look.place(home.positions)
+    assert look.least() == pytest.approx(home.clearance)
+    assert home.clearance >= HOME_ROOM
+    assert ((home.positions >= robot.lower[3:]) & (home.positions <= robot.upper[3:])).all()
+
+
+def test_pairs_that_stay_close_are_found(tmp_path: Path) -> None:
+    robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
+    near = find_inseparable_pairs(
+        robot, 0.035, samples=50
+    )  # the first link turns about the vertical, 30 mm above the body
+    assert near[("body", "arm_1")] == pytest.approx(0.03)
+    assert ("body", "arm_5") not in near
+    assert ("arm_1", "arm_2") not in near
+    assert find_inseparable_pairs(robot, 0.025, samples=50) == {}
+
+
+def test_pairs_that_are_close_mostly(tmp_path: Path) -> None:
+    """The boxes of arm_2 and arm_3 are 40 mm apart where they are in line, and closer by the more they turn."""
+    robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
+    assert ("arm_2", "arm_3") not in find_inseparable_pairs(robot, 0.035, samples=50)
+    assert ("arm_2", "arm_3") in find_inseparable_pairs(robot, 0.035, samples=50, share=0.5)
+
+
+def test_what_stands_and_what_the_arm_can_clear(robot: vkc.Robot) -> None:
+    low, above = measure_floor_heights(robot)
+    assert low == pytest.approx(-HEIGHT)
+    assert above == pytest.approx(0.16 + 0.02, abs=0.01)  # its first link turns about the vertical

@@ -1,0 +1,177 @@
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.base_scenes import (
+    BLINK,
+    MARGIN,
+    arm,
+    at,
+    between,
+    chassis,
+    clutter,
+    distance,
+    wedge,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.planning.base_paths.base_clearance import (
+    DIRECTIONS,
+    MovingShapes,
+    Obstacles,
+    Shape,
+    compute_hull_points,
+)
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
+    """Return random shapes on the base, obstacles, and the moving shapes."""
+    rng = np.random.default_rng(seed)
+    shapes = [*chassis(), *arm()[:3], (wedge(), at(0.3, -0.1, 0.6, 0.4))]
+    standing = [
+        *clutter(int(rng.integers(1000)), 8, reach=1.5),
+        (wedge(), at(*rng.uniform(-1.5, 1.5, 2), 0.3, 1.0)),
+    ]
+    return shapes, standing, MovingShapes(shapes, Obstacles(standing), MARGIN)
+
+
+@settings(max_examples=30, deadline=None)
+@given(SEEDS)
+def test_drives_agree_with_coal(seed: int) -> None:
+    shapes, standing, body = scene(seed)
+    rng = np.random.default_rng(seed + 1)
+    a, yaw = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
+    b = a + rng.uniform(0.0, 1.0) * rng.uniform(-1.0, 1.0, 2)
+    nearest = min(
+        distance(shapes, standing, pose) for pose in between([*a, yaw], [*b, yaw], length=0.004)
+    )
+    if body.is_drive_free(a, b, yaw):
+        assert nearest >= MARGIN - BLINK
+    else:
+        assert nearest < MARGIN + 0.004
+
+
+@settings(max_examples=30, deadline=None)
+@given(SEEDS)
+def test_turns_agree_with_coal(seed: int) -> None:
+    shapes, standing, body = scene(seed)
+    rng = np.random.default_rng(seed + 1)
+    place, start = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
+    end = start + rng.uniform(-2.0, 2.0) * rng.uniform()
+    nearest = min(
+        distance(shapes, standing, pose)
+        for pose in between([*place, start], [*place, end], angle=0.004)
+    )
+    if body.is_turn_free(place, start, end):
+        assert nearest >= MARGIN - BLINK
+    else:
+        assert nearest < MARGIN + 0.004
+
+
+def test_random_cases_include_free_and_blocked() -> None:
+    """The two tests above need enough free and blocked cases."""
+    answers = []
+    for seed in range(60):
+        _, _, body = scene(seed)
+        rng = np.random.default_rng(seed)
+        a = rng.uniform(-2.0, 2.0, 2)
+        answers += [body.is_drive_free(a, a + 0.3, 0.5), body.is_turn_free(a, 0.0, 1.0)]
+    assert 0.2 < np.mean(answers) < 0.8
+
+
+def test_drive_along_a_wall_needs_few_distance_queries(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    distance_of = MovingShapes._compute_distance
+    monkeypatch.setattr(
+        MovingShapes, "_compute_distance", lambda *args: asked.append(args) or distance_of(*args)
+    )
+    ball: list[Shape] = [(coal.Sphere(0.3), at(0.0, 0.0, 0.4))]
+    wall = [(coal.Box(10.0, 0.1, 1.0), at(0.0, 0.355 + MARGIN, 0.5, 0.003))]
+    body = MovingShapes(ball, Obstacles(wall), MARGIN)
+    assert body.is_drive_free(np.array([0.0, 0.0]), np.array([3.0, 0.0]), 0.0)
+    assert len(asked) < 30  # every two millimetres it would be 1500
+    assert not body.is_drive_free(np.array([0.0, 0.0]), np.array([-3.0, 0.0]), 0.0)
+
+
+def test_shapes_at_different_heights_form_no_pairs() -> None:
+    table = [(coal.Box(2.0, 2.0, 0.05), at(0.0, 0.0, 0.775))]
+    body = MovingShapes([*chassis(), *arm()], Obstacles(table), MARGIN)
+    assert 0 not in body.moving
+    assert len(body.moving) > 0
+    assert MovingShapes(chassis(), Obstacles(table), MARGIN).is_drive_free(
+        np.zeros(2), np.ones(2), 0.3
+    )
+
+
+def test_everything_is_free_without_obstacles() -> None:
+    for body in (
+        MovingShapes([], Obstacles(clutter(0, 5)), MARGIN),
+        MovingShapes(chassis(), Obstacles([]), MARGIN),
+    ):
+        assert body.is_drive_free(np.zeros(2), np.ones(2), 0.0)
+        assert body.is_turn_free(np.zeros(2), 0.0, 6.0)
+
+
+def test_exit_margins_keep_the_initial_distance() -> None:
+    box = (coal.Box(1.0, 1.0, 1.0), at(1.01, 0.0, 0.5))
+    near, far = (
+        (coal.Box(1.0, 1.0, 1.0), at(0.0, 0.845, 0.5)),
+        (coal.Box(1.0, 1.0, 1.0), at(-3.0, 0.0, 0.5)),
+    )
+    body = MovingShapes(
+        [(coal.Box(1.0, 0.67, 0.4), at(0.0, 0.0, 0.2))], Obstacles([box, near, far]), MARGIN
+    )
+    margins = body.compute_exit_margins(np.zeros(2), 0.0)
+    assert margins == pytest.approx([0.01, 0.01, MARGIN], abs=1e-5)
+    assert body.is_drive_free(np.zeros(2), np.array([-1.0, 0.0]), 0.0, margins)
+    assert not body.is_drive_free(np.zeros(2), np.array([-1.0, 0.0]), 0.0)
+    assert not body.is_drive_free(np.zeros(2), np.array([0.005, 0.0]), 0.0, margins)
+    inside = body.compute_exit_margins(np.array([0.2, 0.0]), 0.0)
+    assert inside[0] == -np.inf
+
+
+SHAPES = [
+    coal.Box(0.3, 0.5, 0.9),
+    coal.Sphere(0.4),
+    coal.Cylinder(0.3, 0.8),
+    coal.Capsule(0.2, 0.6),
+    coal.Cone(0.3, 0.7),
+    coal.Ellipsoid(0.2, 0.3, 0.5),
+    wedge(),
+]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_hull_points_bound_shapes_from_inside_and_outside(
+    shape: coal.CollisionGeometry, seed: int
+) -> None:
+    """Along any direction, coal's support is between the inner and the outer points."""
+    rng = np.random.default_rng(seed)
+    placement = pin.SE3(
+        pin.Quaternion(rng.normal(size=4)).normalized().matrix(), rng.uniform(-1.0, 1.0, 3)
+    )
+    where = coal.Transform3s(placement.rotation, placement.translation)
+    (inner, nothing), (outer, radius) = (
+        compute_hull_points(shape, placement, outer=side) for side in (False, True)
+    )
+    assert nothing == 0.0
+    for u in DIRECTIONS[:: int(rng.integers(1, 8))]:
+        normal = np.array([*u, 0.0])
+        # How far the shape reaches along u, from its distance to a half-space far away.
+        wall = coal.Halfspace(-normal, -10.0)
+        gap = coal.distance(
+            shape, where, wall, coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult()
+        )
+        reach = 10.0 - gap
+        assert (outer @ normal).max() + radius >= reach - 1e-6
+        if len(inner):
+            assert (inner @ normal).max() <= reach + 1e-6
+    if not isinstance(shape, coal.Ellipsoid):
+        assert len(inner)

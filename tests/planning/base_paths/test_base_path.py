@@ -1,0 +1,393 @@
+from __future__ import annotations
+
+import itertools
+
+import coal
+import numpy as np
+import pytest
+from helpers.base_scenes import (
+    BLINK,
+    HALL,
+    MARGIN,
+    arm,
+    at,
+    between,
+    chassis,
+    clutter,
+    distance,
+    furniture,
+)
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError
+from vkc_pin.planning.base_paths.base_clearance import Shape
+from vkc_pin.planning.base_paths.base_path import BasePath, sample_poses, shortest_path
+from vkc_pin.planning.base_paths.grid import BaseGrid
+from vkc_pin.planning.base_paths.lattice_search import _Search
+from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS
+
+TURNING = 0.3  # [m/rad] where a grid is not told
+
+NEAR = 1.0
+
+
+def wall_with_a_gap(width: float, *, height: float = 1.0) -> list[Shape]:
+    """A wall along x = 0 from one side of the hall to the other, with a gap around y = 0."""
+    side = 5.5 - width / 2
+    return [
+        (coal.Box(0.2, side, height), at(0.0, sign * (width + side) / 2, height / 2))
+        for sign in (-1, 1)
+    ]
+
+
+def check(
+    path: BasePath,
+    start: NDArray[np.float64],
+    goals: NDArray[np.float64],
+    base: list[Shape],
+    carried: list[Shape],
+    standing: list[Shape],
+) -> None:
+    """Check a path against coal, all shapes with all obstacles at poses a centimetre apart."""
+    poses, goal = path.poses, goals[path.goal]
+    np.testing.assert_array_equal(poses[0], start)
+    np.testing.assert_array_equal(poses[-1][:2], goal[:2])
+    assert (poses[-1, 2] - goal[2]) / (2 * np.pi) == pytest.approx(
+        round((poses[-1, 2] - goal[2]) / (2 * np.pi)), abs=1e-12
+    )
+    cost = 0.0
+    for a, b in itertools.pairwise(poses):
+        way = b[:2] - a[:2]
+        length = np.hypot(*way)
+        if length > 1e-9:  # a drive: straight ahead or back
+            assert abs(a[2] - b[2]) < 1e-9  # the path takes headings that are closer for one
+            ahead = way @ (np.cos(a[2]), np.sin(a[2]))
+            if abs(ahead) == pytest.approx(length, abs=1e-9):
+                cost += length * (1.0 if ahead > 0.0 else BACKWARDS)
+            else:  # it slides, next to the start or the goal
+                assert length <= 0.6
+                assert any(
+                    np.array_equal(p[:2], place[:2]) for p in (a, b) for place in (start, goal)
+                )
+                cost += SIDEWAYS * length
+        else:
+            cost += TURNING * abs(b[2] - a[2])
+        for pose in between(a, b):
+            assert distance(base, standing, pose) >= MARGIN - BLINK
+            if min(np.hypot(*(pose[:2] - place[:2])) for place in [start, *goals]) > NEAR + 1e-9:
+                assert distance(carried, standing, pose) >= MARGIN - BLINK
+    assert path.cost == pytest.approx(cost, abs=1e-9)
+
+
+def find(
+    standing: list[Shape],
+    start: list[float],
+    goals: list[list[float]],
+    *,
+    base: list[Shape] | None = None,
+    **options: object,
+) -> BasePath | None:
+    """Return the path of a bare base."""
+    grid = BaseGrid(base or chassis(), [], standing, HALL, MARGIN)
+    return shortest_path(grid, start, np.array(goals), **options)  # type: ignore[arg-type]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+@example(280)  # a drive whose ends differ in heading by a rounding error
+@example(955485)  # a move from near the start to near a goal, which in between is near neither
+def test_paths_are_collision_free(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    standing = [*furniture(), *clutter(int(rng.integers(10_000)), 12)]
+    grid = BaseGrid(chassis(), arm(), standing, HALL, MARGIN, near=NEAR)
+    poses = rng.uniform([-4.5, -4.5, -7.0], [4.5, 4.5, 7.0], size=(100, 3))
+    start = next(pose for pose in poses if grid.is_pose_free(*pose))
+    goals = poses[-4:]
+    path, plain = (shortest_path(grid, start, goals, smooth=smooth) for smooth in (True, False))
+    assert (path is None) == (plain is None)
+    if path is not None and plain is not None:
+        assert path.cost <= plain.cost + 1e-9
+        check(path, start, goals, chassis(), arm(), standing)
+        check(plain, start, goals, chassis(), arm(), standing)
+
+
+def test_path_in_an_empty_hall_is_straight() -> None:
+    path = find([], [-3.0, -2.0, 0.3], [[3.1, 1.7, -0.4]])
+    assert path is not None
+    ahead = np.arctan2(3.7, 6.1)
+    np.testing.assert_allclose(
+        path.poses,
+        [[-3.0, -2.0, 0.3], [-3.0, -2.0, ahead], [3.1, 1.7, ahead], [3.1, 1.7, -0.4]],
+        atol=1e-9,
+    )
+    assert path.cost == pytest.approx(np.hypot(6.1, 3.7) + TURNING * (2 * ahead + 0.1))
+
+
+def test_base_drives_backwards_where_that_is_cheaper() -> None:
+    path = find([], [0.0, 0.0, 0.0], [[-1.0, 0.0, 0.0]])
+    assert path is not None
+    assert path.cost == pytest.approx(BACKWARDS)
+    assert np.all(path.poses[:, 2] == 0.0)
+
+
+def test_base_drives_sideways_where_it_cannot_turn() -> None:
+    """Both poses are along a wall; in the open the base turns instead."""
+    walls: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), at(x, 0.0, 0.5)) for x in (-2.0, 2.0)]
+    y = 0.05 + 0.335 + 0.03
+    start, goals = np.array([-2.0, y, 0.0]), np.array([[2.0, y, 0.0]])
+    path = find(walls, start, goals)  # type: ignore[arg-type]
+    assert path is not None
+    check(path, start, goals, chassis(), [], walls)
+    free = find([], [0.0, 0.0, 0.0], [[0.0, 2.0, 0.0]])
+    assert free is not None
+    assert free.cost == pytest.approx(2.0 + TURNING * np.pi)
+
+
+def test_turning_in_place_and_staying() -> None:
+    turned, stayed = (
+        find([], [0.0, 0.0, 3.0], [[0.0, 0.0, -3.0]]),
+        find([], [0.0, 0.0, 3.0], [[0.0, 0.0, 3.0]]),
+    )
+    assert turned is not None
+    assert stayed is not None
+    np.testing.assert_allclose(turned.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 2 * np.pi - 3.0]])
+    np.testing.assert_array_equal(stayed.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]])
+    assert stayed.cost == 0.0
+    np.testing.assert_array_equal(sample_poses(stayed, 3, turning=TURNING), [[0.0, 0.0, 3.0]] * 3)
+
+
+def test_narrow_gap_is_passed_lengthwise() -> None:
+    standing, start, goals = wall_with_a_gap(0.85), [-2.5, 1.0, np.pi / 2], [[2.5, -1.0, np.pi / 2]]
+    path = find(standing, start, goals)
+    assert path is not None
+    check(path, np.array(start), np.array(goals), chassis(), [], standing)
+    waypoints = sample_poses(path, 400, turning=TURNING)
+    inside = waypoints[np.abs(waypoints[:, 0]) < 0.2]
+    assert len(inside) > 5
+    assert np.all(np.abs(np.sin(inside[:, 2])) < 0.5)
+    assert find(standing, start, goals, base=chassis(1.0, 0.85)) is None
+    assert find(wall_with_a_gap(1.2), start, goals, base=chassis(1.0, 0.85)) is not None
+
+
+def test_load_does_not_fit_through_a_gap() -> None:
+    standing, start, goals = (
+        wall_with_a_gap(1.0),
+        np.array([-2.5, 0.0, 0.0]),
+        np.array([[2.5, 0.0, 0.0]]),
+    )
+    across: list[Shape] = [(coal.Box(0.05, 1.4, 0.05), at(0.4, 0.0, 0.8))]
+    along_it: list[Shape] = [(coal.Box(1.4, 0.05, 0.05), at(0.4, 0.0, 0.8))]
+    for carried, fits in (([], True), (along_it, True), (across, False)):
+        path = shortest_path(BaseGrid(chassis(), carried, standing, HALL, MARGIN), start, goals)
+        assert (path is not None) == fits
+    low = shortest_path(
+        BaseGrid(chassis(), across, wall_with_a_gap(1.0, height=0.6), HALL, MARGIN), start, goals
+    )
+    assert low is not None  # it passes over
+
+
+def test_only_the_base_counts_near_start_and_goals() -> None:
+    """The arm reaches over tables at either end, but does not pass under a third."""
+    rod: list[Shape] = [(coal.Box(0.4, 0.05, 0.4), at(0.6, 0.0, 0.8))]
+    tables = [(coal.Box(1.0, 2.0, 0.1), at(x, 0.0, 0.85)) for x in (-3.5, 3.5)]
+    start, goals = np.array([-2.5, 0.0, np.pi]), np.array([[2.5, 0.0, 0.0]])
+    grid = BaseGrid(chassis(), rod, tables, HALL, MARGIN, near=NEAR)
+    assert not grid.is_pose_free(*start)
+    assert not grid.is_pose_free(*goals[0])
+    path = shortest_path(grid, start, goals)
+    assert path is not None
+    check(path, start, goals, chassis(), rod, tables)
+    between_them = [*tables, (coal.Box(0.4, 20.0, 0.1), at(0.0, 0.0, 0.85))]
+    assert (
+        shortest_path(BaseGrid(chassis(), rod, between_them, HALL, MARGIN, near=NEAR), start, goals)
+        is None
+    )
+    assert (
+        shortest_path(BaseGrid(chassis(), rod, between_them, HALL, MARGIN, near=3.0), start, goals)
+        is not None
+    )
+    assert (
+        shortest_path(BaseGrid(chassis(), rod, tables, HALL, MARGIN, near=0.0), start, goals)
+        is None
+    )
+
+
+def test_start_within_the_margin_is_left() -> None:
+    """The base comes no closer to the obstacle, and does not cross it."""
+    wall: list[Shape] = [(coal.Box(4.0, 0.1, 1.0), at(0.0, 0.0, 0.5))]
+    start, goals = [0.0, -0.05 - 0.335 - 0.01, 0.0], [[0.0, 1.5, 0.0]]
+    path = find(wall, start, goals)
+    assert path is not None
+    distances = [
+        distance(chassis(), wall, pose)
+        for a, b in itertools.pairwise(path.poses)
+        for pose in between(a, b)
+    ]
+    assert distances[0] == pytest.approx(0.01)
+    assert min(distances) >= 0.01 - BLINK
+    last = max(k for k, d in enumerate(distances) if d < MARGIN - BLINK)
+    assert last < 200  # centimetres, or fiftieths of a radian
+    assert path.cost > 4.0
+
+
+def test_start_in_collision_is_left() -> None:
+    block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), at(0.0, 0.0, 0.5))]
+    start, goals = [-0.8, 0.0, 0.0], [[3.0, 0.0, 0.0]]
+    path = find(block, start, goals)
+    assert path is not None
+    distances = np.array(
+        [
+            distance(chassis(), block, p)
+            for a, b in itertools.pairwise(path.poses)
+            for p in between(a, b)
+        ]
+    )
+    assert distances[0] < -0.1
+    assert np.all(np.diff(np.flatnonzero(distances < MARGIN - BLINK)) == 1)  # it leaves once
+    leaves = np.concatenate([between(a, b) for a, b in itertools.pairwise(path.poses)])[
+        distances < MARGIN - BLINK
+    ]
+    assert leaves[:, 0].max() <= -0.8  # the short way out, not through
+
+
+def test_start_deep_in_collision_has_no_path() -> None:
+    block: list[Shape] = [(coal.Box(6.0, 6.0, 1.0), at(0.0, 0.0, 0.5))]
+    assert find(block, [0.0, 0.0, 0.0], [[4.0, 4.0, 0.0]]) is None
+    assert (
+        find([], [20.0, 0.0, 0.0], [[4.0, 4.0, 0.0]]) is not None
+    )  # outside the arena nothing is in the way
+
+
+def test_blocked_goals_are_skipped() -> None:
+    block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), at(2.0, 0.0, 0.5))]
+    start, blocked, free = [0.0, 0.0, 0.0], [2.0, 0.2, 0.0], [-4.0, 0.0, 1.0]
+    path = find(block, start, [blocked, free])
+    assert path is not None
+    assert path.goal == 1
+    assert find(block, start, [blocked]) is None
+    assert (
+        shortest_path(BaseGrid(chassis(), [], block, HALL, MARGIN), start, np.empty((0, 3))) is None
+    )
+
+
+def test_additional_goal_costs_count() -> None:
+    start, goals = [0.0, 0.0, 0.0], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
+    found = [
+        find([], start, goals, costs=costs) for costs in (None, [0.0, 0.5], [1.5, 0.0], [1.5, 1.0])
+    ]
+    assert [path.goal for path in found if path is not None] == [0, 0, 1, 0]
+    assert [path.cost for path in found if path is not None] == pytest.approx([1.0, 1.0, 2.0, 2.5])
+
+
+def test_closed_room_has_no_path() -> None:
+    room: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-1.5, 1.5)]
+    room += [(coal.Box(0.1, 3.0, 1.0), at(x, 0.0, 0.5)) for x in (-1.5, 1.5)]
+    assert find(room, [3.0, 3.0, 0.0], [[0.0, 0.0, 0.0]]) is None
+    assert find(room, [0.0, 0.0, 0.0], [[3.0, 3.0, 0.0]]) is None
+    assert find(room, [0.3, 0.0, 0.0], [[-0.3, 0.0, 2.0]]) is not None
+
+
+def test_search_is_deterministic() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        start, goals = (
+            rng.uniform([-4, -4, -3], [4, 4, 3]),
+            rng.uniform([-4, -4, -3], [4, 4, 3], size=(5, 3)),
+        )
+        grid = BaseGrid(chassis(), arm(), [*furniture(), *clutter(1, 10)], HALL, MARGIN)
+        again = BaseGrid(chassis(), arm(), [*furniture(), *clutter(1, 10)], HALL, MARGIN)
+        shortest_path(again, goals[0], goals[1:])  # which leaves what it found out
+        paths = [shortest_path(g, start, goals) for g in (grid, grid, again)]
+        for other in paths[1:]:
+            assert (paths[0] is None) == (other is None)
+            if paths[0] is not None and other is not None:
+                np.testing.assert_array_equal(paths[0].poses, other.poses)
+                assert (paths[0].goal, paths[0].cost) == (other.goal, other.cost)
+
+
+@pytest.fixture(scope="module")
+def around_the_block() -> BasePath:
+    path = find(furniture(), [2.0, -4.3, 1.0], [[2.5, 2.8, 0.0], [1.3, 1.0, 0.0]])
+    assert path is not None
+    return path
+
+
+def test_smoothing_removes_turns(around_the_block: BasePath) -> None:
+    assert len(around_the_block.poses) <= 16
+    assert 5.5 < around_the_block.cost < 8.5
+
+
+@pytest.mark.parametrize("steps", [1, 7, 40])
+def test_poses_are_sampled_along_a_path(around_the_block: BasePath, steps: int) -> None:
+    path = around_the_block
+    waypoints = sample_poses(path, steps, turning=TURNING)
+    assert waypoints.shape == (steps, 3)
+    np.testing.assert_array_equal(waypoints[-1], path.poses[-1])
+    # Each is on the path, further along than the one before.
+    change = np.diff(path.poses, axis=0)
+    passed = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + TURNING * np.abs(change[:, 2]))]
+    )
+    dense = np.linspace(0.0, passed[-1], 20_001)
+    poses = np.column_stack([np.interp(dense, passed, column) for column in path.poses.T])
+    nearest = [np.abs(poses - waypoint).max(axis=1).argmin() for waypoint in waypoints]
+    assert np.abs(poses[nearest] - waypoints).max() < 1e-3
+    assert np.all(np.diff(nearest) > 0)
+    if steps == 40:
+        progress = np.diff(dense[[0, *nearest]])
+        assert progress[0] < 0.2 * progress.max()
+        assert progress[-1] < 0.2 * progress.max()
+        assert progress[0] == pytest.approx(passed[-1] * (3 / 40**2 - 2 / 40**3), abs=1e-3)
+
+
+def test_turning_takes_poses() -> None:
+    path = find([], [0.0, 0.0, 0.0], [[1.0, 0.0, 3.0]])
+    assert path is not None
+    waypoints = sample_poses(path, 50, turning=TURNING)
+    assert np.sum(waypoints[:, 0] > 1.0 - 1e-9) > 20
+    assert np.sum(sample_poses(path, 50, turning=0.01)[:, 0] > 1.0 - 1e-9) < 12
+
+
+@pytest.mark.parametrize(
+    ("start", "goals", "costs", "field"),
+    [
+        ([0.0, 0.0], [[1.0, 0.0, 0.0]], None, "start"),
+        ([0.0, 0.0, np.nan], [[1.0, 0.0, 0.0]], None, "start"),
+        ([0.0, 0.0, 0.0], [[1.0, 0.0]], None, "goals"),
+        ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], None, "goals"),
+        ([0.0, 0.0, 0.0], [[1.0, 0.0, 0.0]], [1.0, 2.0], "costs"),
+        ([0.0, 0.0, 0.0], [[1.0, 0.0, 0.0]], [-1.0], "costs"),
+    ],
+)
+def test_bad_input(
+    start: list[float], goals: list[list[float]], costs: list[float] | None, field: str
+) -> None:
+    with pytest.raises(InputError) as raised:
+        find([], start, goals, costs=costs)
+    assert raised.value.field == field
+
+
+def test_no_waypoints(around_the_block: BasePath) -> None:
+    with pytest.raises(InputError, match="steps"):
+        sample_poses(around_the_block, 0, turning=TURNING)
+
+
+def test_search_checks_few_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer than one in a thousand nodes is checked exactly."""
+    move, asked = _Search._is_move_free, 0
+
+    def counted(self: _Search, node: int, after: int) -> bool:
+        nonlocal asked
+        asked += 1
+        return move(self, node, after)
+
+    monkeypatch.setattr(_Search, "_is_move_free", counted)
+    rng, searches = np.random.default_rng(0), 11
+    grid = BaseGrid(chassis(), arm(), furniture(), HALL, MARGIN)
+    for _ in range(searches):
+        start = rng.uniform([1.2, -4.6, -np.pi], [2.8, -4.2, np.pi])
+        goals = rng.uniform([1.2, -0.5, -np.pi], [3.8, 2.8, np.pi], size=(8, 3))
+        assert shortest_path(grid, start, goals) is not None
+    assert searches <= asked < 1e-3 * searches * grid.blocked.size

@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pytest
+from helpers.base_scenes import MARGIN, at, chassis, clutter
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from vkc_pin.planning.base_paths.base_clearance import Shape
+from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
+from vkc_pin.planning.base_paths.lattice_search import find_cheapest_path
+from vkc_pin.planning.base_paths.motion_primitives import (
+    BACKWARDS,
+    SIDEWAYS,
+    SearchSpace,
+    wrap_angle,
+)
+
+TURNING = 0.3  # [m/rad] where a grid is not told
+
+CELLS, ROOM = 13, (-2.0, 2.0, -2.0, 2.0)
+ENTRY = 0.6  # [m] between start or goal and the cells from which the way over the grid goes on
+
+
+def reference(
+    grid: BaseGrid,
+    start: NDArray[np.float64],
+    goals: NDArray[np.float64],
+    extra: NDArray[np.float64],
+) -> float:
+    """Return the cost of the cheapest path over a graph of all states, or infinity."""
+    count = grid.cells**2 * HEADINGS
+    rows, columns, costs = [], [], []
+
+    def edge(a: int, b: int, cost: float) -> None:
+        rows.append(a)
+        columns.append(b)
+        costs.append(max(cost, 1e-12))
+
+    def node(i: int, j: int, heading: int) -> int:
+        return (i * grid.cells + j) * HEADINGS + heading % HEADINGS
+
+    for i, j, heading in np.ndindex(grid.cells, grid.cells, HEADINGS):
+        k, m = np.add((i, j), grid.moves[heading])
+        here, length = node(i, j, heading), grid.lengths[heading]
+        if 0 <= k < grid.cells and 0 <= m < grid.cells and grid.is_move_free(i, j, heading):
+            edge(here, node(k, m, heading), length)
+            edge(node(k, m, heading), here, BACKWARDS * length)
+        if grid.is_left_turn_free(i, j, heading):
+            turn = TURNING * abs(
+                wrap_angle(grid.yaws[(heading + 1) % HEADINGS] - grid.yaws[heading])
+            )
+            edge(here, node(i, j, heading + 1), turn)
+            edge(node(i, j, heading + 1), here, turn)
+
+    def toward(a: NDArray[np.float64], b: NDArray[np.float64], how: int, otherwise: float) -> float:
+        ahead = np.arctan2(*(b - a)[::-1]) if np.hypot(*(b - a)) > 1e-9 else otherwise
+        return float(ahead + np.pi * how if how < 2 else otherwise)
+
+    def way(
+        a: NDArray[np.float64],
+        b: NDArray[np.float64],
+        before: float,
+        yaw: float,
+        after: float,
+        how: int,
+    ) -> float:
+        """Return the cost of a drive with its turns, infinite if it is blocked."""
+        length = np.hypot(*(b - a))
+        yaw = before + wrap_angle(yaw - before)
+        after = yaw + wrap_angle(after - yaw)
+        free = (
+            grid.is_turn_free(a, before, yaw)
+            and grid.is_drive_free(a, b, yaw)
+            and grid.is_turn_free(b, yaw, after)
+        )
+        cost = length * (1.0, BACKWARDS, SIDEWAYS)[how] + TURNING * (
+            abs(yaw - before) + abs(after - yaw)
+        )
+        return float(cost) if free else np.inf
+
+    first, last = count, count + 1
+    radius = max(ENTRY, 1.5 * grid.step.max())
+    for i, j in np.ndindex(grid.cells, grid.cells):
+        center = np.array(grid.center(i, j))
+        for how in range(3):
+            if np.hypot(*(center - start[:2])) <= radius:
+                yaw = toward(start[:2], center, how, start[2])
+                heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
+                cost = way(start[:2], center, start[2], yaw, grid.yaws[heading], how)
+                if cost < np.inf:
+                    edge(first, node(i, j, heading), cost)
+            for goal, more in zip(goals, extra, strict=True):
+                if np.hypot(*(center - goal[:2])) <= radius and grid.is_pose_free(*goal):
+                    yaw = toward(center, goal[:2], how, goal[2])
+                    heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
+                    cost = way(center, goal[:2], grid.yaws[heading], yaw, goal[2], how)
+                    if cost < np.inf:
+                        edge(node(i, j, heading), last, cost + more)
+    for goal, more in zip(goals, extra, strict=True):
+        for how in range(3):
+            cost = way(
+                start[:2],
+                goal[:2],
+                start[2],
+                toward(start[:2], goal[:2], how, start[2]),
+                goal[2],
+                how,
+            )
+            if cost < np.inf and (how < 2 or np.hypot(*(goal - start)[:2]) <= ENTRY):
+                edge(first, last, cost + more)
+    order = np.argsort(costs, kind="stable")[
+        ::-1
+    ]  # of parallel edges the last, cheapest one counts
+    cheapest_of = dict(
+        zip(
+            zip(np.take(rows, order), np.take(columns, order), strict=True),
+            np.take(costs, order),
+            strict=True,
+        )
+    )
+    a, b = np.array(list(cheapest_of)).T
+    graph = csr_array((list(cheapest_of.values()), (a, b)), shape=(count + 2, count + 2))
+    return float(dijkstra(graph, indices=first)[last])
+
+
+def task(
+    seed: int,
+) -> tuple[BaseGrid, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return a small room with obstacles, a free start, three goals and their costs."""
+    rng = np.random.default_rng(seed)
+    rod: list[Shape] = [(coal.Box(0.1, 0.8, 0.05), at(0.2, 0.0, 0.7))]
+    standing = clutter(int(rng.integers(10_000)), 7, reach=1.8)
+    grid = BaseGrid(
+        chassis(0.7, 0.4), rod if seed % 2 else [], standing, ROOM, MARGIN, cells=CELLS, near=0.0
+    )
+    poses = rng.uniform([-1.8, -1.8, -3.0], [1.8, 1.8, 3.0], size=(200, 3))
+    start = next((pose for pose in poses if grid.is_pose_free(*pose)), poses[0])
+    return grid, start, poses[100:103], rng.choice([0.0, 1.0], 3)
+
+
+@pytest.mark.long
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_no_path_over_the_grid_is_cheaper(seed: int) -> None:
+    grid, start, goals, extra = task(seed)
+    expected = reference(grid, start, goals, extra)
+    fresh, *_ = task(seed)  # which remembers nothing
+    found = find_cheapest_path(SearchSpace(fresh, start, goals), extra)
+    if grid.is_pose_free(*start):
+        assert (np.inf if found is None else found[0]) == pytest.approx(expected, abs=1e-4)
+
+
+def test_random_cases_include_paths_and_none() -> None:
+    """The test above needs cases with and without a path, and with detours."""
+    found = []
+    for seed in range(30):
+        grid, start, goals, extra = task(seed)
+        way = find_cheapest_path(SearchSpace(grid, start, goals), extra)
+        found.append(0 if way is None else len(way[2]))
+    assert found.count(0) > 2
+    assert sum(drives > 3 for drives in found) > 5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_cached_moves_do_not_change_the_result(seed: int) -> None:
+    grid, start, goals, extra = task(seed)
+    first, second = (find_cheapest_path(SearchSpace(grid, start, goals), extra) for _ in range(2))
+    assert (first is None) == (second is None)
+    if first is not None and second is not None:
+        assert first[:2] == second[:2]
+        assert first[3] == second[3]
+        for one, other in zip(first[2], second[2], strict=True):
+            assert (*one.a, *one.b, one.yaw) == (*other.a, *other.b, other.yaw)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_earlier_searches_do_not_change_the_result(seed: int) -> None:
+    """The path does not depend on earlier searches with other starts and goals."""
+    grid, start, goals, extra = task(seed)
+    fresh, *_ = task(seed)
+    rng = np.random.default_rng(seed)
+    for grids in (grid, fresh):
+        grids.near = 0.5
+    for other in rng.uniform([-1.8, -1.8, -3.0], [1.8, 1.8, 3.0], size=(4, 3)):
+        find_cheapest_path(SearchSpace(grid, other, goals[:2]), extra[:2])
+        find_cheapest_path(SearchSpace(grid, start, other[None]), extra[:1])
+    first, second = (
+        find_cheapest_path(SearchSpace(one, start, goals), extra) for one in (grid, fresh)
+    )
+    assert (first is None) == (second is None)
+    if first is not None and second is not None:
+        assert first[:2] == second[:2]
+        for one, other in zip(first[2], second[2], strict=True):
+            assert (*one.a, *one.b, one.yaw) == (*other.a, *other.b, other.yaw)
+
+
+def test_start_and_goal_on_cells() -> None:
+    """Connections have zero length and cost at both ends."""
+    grid = BaseGrid(
+        chassis(0.7, 0.4),
+        [],
+        [(coal.Box(0.2, 2.5, 1.0), at(0.0, -0.75, 0.5))],
+        ROOM,
+        MARGIN,
+        cells=CELLS,
+        near=0.0,
+    )
+    start = np.array([*grid.center(2, 2), grid.yaws[4]])
+    goals = np.array([[*grid.center(10, 2), grid.yaws[12]]])
+    found = find_cheapest_path(SearchSpace(grid, start, goals), np.zeros(1))
+    assert found is not None
+    assert found[0] == pytest.approx(reference(grid, start, goals, np.zeros(1)), abs=1e-4)
+    same = find_cheapest_path(SearchSpace(grid, start, start[None]), np.zeros(1))
+    assert same is not None
+    assert same[0] == 0.0
+
+
+def test_path_much_longer_than_the_heuristic(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The obstacle on the short path is not known in advance."""
+    gate: list[Shape] = [(coal.Box(0.1, 1.4, 1.0), at(0.0, y, 0.5)) for y in (-1.3, 1.3)]
+    lid: list[Shape] = [
+        (coal.Ellipsoid(0.1, 0.6, 0.1), at(0.0, 0.0, 0.3))
+    ]  # whose inside is not looked at
+    walls: list[Shape] = [(coal.Box(8.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-2.0, 2.0)]
+    sides = [(coal.Box(0.1, 1.4, 1.0), at(0.0, 4.3, 0.5))]
+    grid = BaseGrid(
+        chassis(0.7, 0.4),
+        [],
+        [*gate, *lid, *walls[:1], *sides],
+        (-5.0, 5.0, -5.0, 5.0),
+        MARGIN,
+        cells=50,
+    )
+    start, goals = np.array([-1.0, 0.0, 0.0]), np.array([[1.0, 0.0, 0.0]])
+    found = find_cheapest_path(SearchSpace(grid, start, goals), np.zeros(1))
+    assert found is not None
+    assert found[0] > 4.0
+    assert any(drive.b[1] > 2.0 for drive in found[2])

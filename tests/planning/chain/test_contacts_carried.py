@@ -1,0 +1,237 @@
+"""Tests collision pairs of carried objects, and of objects released where the motion chooses."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.carrying import BALL, STICK, lifted, room, stand, table
+from helpers.small_problems import SHORT, program_of, random_configurations
+
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import GoTo, Grasp, Place, Reach, Release
+
+COAL = 5e-6  # [m] by which two answers of coal can differ: it starts from where it ended before
+MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance
+ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
+POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
+
+
+@cache
+def scene() -> Scene:
+    return room(table(gap=0.05), stand(gap=0.05), objects=("stick", "ball"))
+
+
+@cache
+def placing() -> TrajectoryProblem:
+    """Return the problem of taking the stick, putting it elsewhere, and driving away."""
+    return program_of(scene(), [Place("stick", ASIDE), GoTo(0.0, 0.0)], options=SHORT)
+
+
+@cache
+def fetching() -> TrajectoryProblem:
+    """Return the problem of grasping the ball with the stick, then releasing ball and stick."""
+    steps = [
+        Grasp("stick"),
+        Grasp("ball", "pull", "stick.tip"),
+        Reach(POSE),
+        Release("ball"),
+        GoTo(0.0, 0.0),
+    ]
+    return program_of(
+        scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT
+    )
+
+
+def margins(
+    problem: TrajectoryProblem, phase: int, *, at: str = ""
+) -> dict[tuple[str, str], set[float]]:
+    """Return (link, link or obstacle) → margins of pairs, "first" or "last", or unreduced."""
+    part, every = (
+        problem.contacts.phases[phase],
+        np.arange(len(problem.contacts.phases[phase].pairs)),
+    )
+    found: dict[tuple[str, str], set[float]] = {}
+    waypoint = problem.contacts.first_waypoint[phase + (at == "last")]
+    asked = part.margins_at(every, np.full(len(every), waypoint)) if at else part.margins
+    for (first, second), margin in zip(part.pairs, asked, strict=True):
+        found.setdefault((part.labels[first], part.labels[second]), set()).add(float(margin))
+    return found
+
+
+def partners(problem: TrajectoryProblem, phase: int, label: str) -> set[str]:
+    return {a if b == label else b for a, b in margins(problem, phase) if label in (a, b)}
+
+
+def test_static_objects_are_paired_with_robot_and_carried_object() -> None:
+    robots = set(scene().robot.links)
+    for phase in (0, 2):
+        for label in ("stick.stick", "stick.tip", "ball.ball"):
+            assert partners(placing(), phase, label) == robots
+    assert partners(placing(), 1, "ball.ball") == robots | {"stick.stick", "stick.tip"}
+
+
+def test_carried_object_is_paired_with_all_but_itself_and_the_hand() -> None:
+    robot = scene().robot
+    for label in ("stick.stick", "stick.tip"):
+        hand = set(robot.touch_links) if label == "stick.stick" else set()
+        assert partners(placing(), 1, label) == (set(robot.links) - hand) | {
+            "ball.ball",
+            "table",
+            "stand",
+            FLOOR,
+        }
+    for (first, second), found in margins(placing(), 1).items():
+        assert found == {CLOSE if first in robot.touch_links and second == "stick.tip" else MARGIN}
+
+
+def test_a_hand_comes_closer_to_what_it_will_take_or_has_let_go_of() -> None:
+    hand = set(scene().robot.touch_links)
+    for phase, at in ((0, "last"), (2, "first")):
+        for (first, second), found in margins(placing(), phase, at=at).items():
+            assert found == {CLOSE if first in hand and second.startswith("stick.") else MARGIN}
+
+
+def test_a_tip_touches_what_it_will_hold_and_holds_it() -> None:
+    before, held = margins(fetching(), 1, at="last"), margins(fetching(), 2)
+    assert before["stick.tip", "ball.ball"] == {0.0}
+    assert before["stick.stick", "ball.ball"] == {MARGIN}
+    assert before[scene().robot.touch_links[0], "ball.ball"] == {
+        MARGIN
+    }  # the hand is not what takes it
+    assert ("stick.tip", "ball.ball") not in held
+    assert held["stick.stick", "ball.ball"] == {MARGIN}
+    robots = set(scene().robot.links)
+    assert partners(fetching(), 2, "ball.ball") == robots | {"stick.stick", "table", "stand", FLOOR}
+    after = margins(fetching(), 3, at="first")
+    assert after["stick.tip", "ball.ball"] == {0.0}
+
+
+@pytest.mark.parametrize("phase", [0, 1, 2])
+def test_placed_object_is_at_its_target(phase: int) -> None:
+    part = placing().contacts.phases[phase]
+    for name, where in (("stick", (STICK, None, ASIDE)[phase]), ("ball", BALL)):
+        shapes = {shape.name: shape for shape in part.shapes if shape.parentJoint == 0}
+        own = make_world_shapes(scene().objects[name])
+        standing = [shape for shape in own if f"{name}.{shape.name}" in shapes]
+        assert len(standing) == (0 if where is None else len(own))
+        for shape in standing:
+            expected = where * scene().objects[name].placement.inverse() * shape.placement
+            np.testing.assert_allclose(
+                shapes[f"{name}.{shape.name}"].placement.homogeneous,
+                expected.homogeneous,
+                rtol=0.0,
+                atol=1e-12,
+            )
+
+
+def expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -> pin.SE3:
+    """Return where the chain has an object at a configuration."""
+    hold = next(hold for hold in problem.task.holds if hold.object == name)
+    closure, data = problem.chain.closures[hold], problem.chain.model.createData()
+    pin.forwardKinematics(problem.chain.model, data, problem.chain.coordinates.q(row))
+    return data.oMi[closure.joint] * closure.local
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_released_object_is_where_the_motion_released_it(seed: int) -> None:
+    """Planes, bounding volumes and distances of later phases refer to that placement."""
+    problem = fetching()
+    names = [phase.name for phase in problem.task.phases]
+    assert names[3:] == ["go to", "place stick", "go to"]
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
+    )
+    contacts = problem.contacts.with_released_objects(z)
+    left = {"ball": (problem.ends[2], (3, 4, 5)), "stick": (problem.ends[4], (5,))}
+    for name, (end, later) in left.items():
+        where = expected_placement(problem, name, z[end - 1])
+        there = make_world_shapes(dataclasses.replace(scene().objects[name], placement=where))
+        for number in later:
+            part = contacts.phases[number]
+            index = {
+                str(shape.name): i for i, shape in enumerate(part.shapes) if part.joint[i] == 0
+            }
+            for shape in there:
+                i = index[f"{name}.{shape.name}"]
+                expected = shape.placement.homogeneous
+                np.testing.assert_allclose(
+                    part.shapes[i].placement.homogeneous, expected, rtol=0.0, atol=1e-9
+                )
+                np.testing.assert_allclose(part.rotation[i], expected[:3, :3], rtol=0.0, atol=1e-9)
+                np.testing.assert_allclose(
+                    part.translation[i], expected[:3, 3], rtol=0.0, atol=1e-9
+                )
+
+
+def test_it_stands_where_the_task_says_until_a_motion_is_asked_about() -> None:
+    """And afterwards again: no answer depends on which motion was asked about before."""
+    problem = fetching()
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4)
+    )
+    waypoints = np.arange(1, problem.segments + 1)
+    before = problem.contacts.evaluate(z, waypoints, reach=0.3)
+    settled = problem.evaluate_contacts(z, reach=0.3)
+    after = problem.contacts.evaluate(z, waypoints, reach=0.3)
+    assert len(before.pair) != len(settled.pair) or not np.array_equal(
+        before.distance, settled.distance
+    )
+    for one, other in zip(before.arrays(), after.arrays(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_it_stands_where_the_motion_that_is_asked_about_leaves_it() -> None:
+    """Not where one before it did."""
+    problem = fetching()
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4)
+    )
+    first, other, again = (problem.evaluate_contacts(rows, reach=0.1) for rows in (z, z[::-1], z))
+    assert not np.array_equal(first.pair, other.pair)
+    np.testing.assert_array_equal(first.pair, again.pair)
+    np.testing.assert_allclose(first.distance, again.distance, rtol=0.0, atol=COAL)
+
+
+def test_distances_to_what_was_left_are_those_of_a_scene_in_which_it_stands_there() -> None:
+    """Compares with a problem of the last phase alone, in the scene that the motion leaves."""
+    problem = fetching()
+    z = random_configurations(
+        problem.chain.lower,
+        problem.chain.upper,
+        problem.segments,
+        np.random.default_rng(5),
+        arena=1.0,
+    )
+    contacts = problem.evaluate_contacts(z, reach=0.3)
+    stands = scene()
+    for name, end in (("ball", problem.ends[2]), ("stick", problem.ends[4])):
+        stands = stands.with_placement(name, expected_placement(problem, name, z[end - 1]))
+    alone = program_of(stands, [GoTo(1.0, 0.0)], options=SHORT)
+    rows = np.arange(problem.ends[4], problem.ends[5])
+    seen = alone.contacts.evaluate(
+        z[rows][:, : alone.chain.size], np.ones(len(rows), int), reach=0.3
+    )
+    labels, own = problem.contacts.phases[5].labels, alone.contacts.phases[0].labels
+
+    def table_of(found, labels, offset):  # type: ignore[no-untyped-def]
+        return sorted(
+            (int(row) - offset, labels[a], labels[b], round(float(distance), 5))
+            for row, (a, b), distance in zip(
+                found.waypoint, found.pair, found.distance, strict=True
+            )
+            if int(row) >= offset
+        )
+
+    first, second = table_of(contacts, labels, int(rows[0])), table_of(seen, own, 0)
+    assert [entry[:3] for entry in first] == [entry[:3] for entry in second]
+    np.testing.assert_allclose(
+        [entry[3] for entry in first], [entry[3] for entry in second], rtol=0.0, atol=2e-5
+    )
+    assert any("ball.ball" in entry for entry in first)

@@ -1,0 +1,159 @@
+"""Compares bounding volumes with coal's distances of random shapes on random joints."""
+
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pinocchio as pin
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
+
+JOINTS = 3
+COAL = 1e-5  # [m]
+
+
+def random_placement(rng: np.random.Generator, size: float) -> pin.SE3:
+    return pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))
+
+
+def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9) -> PhaseGeometry:
+    """Return boxes, balls and cylinders on joints and in a 3 m room, and 2/3 of all pairs."""
+    shapes = []
+    for k in range(moving + standing):
+        size = rng.uniform(0.02, 0.4, 3)
+        solid = [coal.Box(*size), coal.Sphere(size[0] / 2), coal.Cylinder(size[0] / 2, size[1])][
+            int(rng.integers(3))
+        ]
+        joint = 1 + int(rng.integers(JOINTS)) if k < moving else 0
+        shapes.append(
+            pin.GeometryObject(
+                f"s{k}", joint, 0, random_placement(rng, 0.3 if joint else 1.5), solid
+            )
+        )
+    every = [
+        (a, b)
+        for a in range(moving)
+        for b in range(a + 1, len(shapes))
+        if shapes[a].parentJoint != shapes[b].parentJoint
+    ]
+    pairs = np.array([pair for pair in every if rng.random() < 0.66]).reshape(-1, 2)
+    boxes = [compute_bounding_box(shape) for shape in shapes]
+    return PhaseGeometry(
+        shapes=shapes,
+        labels=tuple(shape.name for shape in shapes),
+        pairs=pairs,
+        margins=rng.uniform(0.01, 0.05, len(pairs)),
+        joint=np.array([shape.parentJoint for shape in shapes]),
+        center=np.array([center for center, _ in boxes]),
+        half=np.array([half for _, half in boxes]),
+        rotation=np.array([shape.placement.rotation for shape in shapes]),
+        translation=np.array([shape.placement.translation for shape in shapes]),
+    )
+
+
+def random_joints(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return universe and joint placements, shapes (count, J + 1, 3, 3) and (count, J + 1, 3)."""
+    rotations = np.array(
+        [[np.eye(3), *(pin.exp3(rng.normal(size=3)) for _ in range(JOINTS))] for _ in range(count)]
+    )
+    translations = rng.uniform(-1.5, 1.5, (count, JOINTS + 1, 3))
+    translations[:, 0] = 0.0
+    return rotations, translations
+
+
+def all_distances(
+    part: PhaseGeometry, rotations: np.ndarray, translations: np.ndarray
+) -> np.ndarray:
+    """Return coal's distance of every pair at every configuration, shape (W, P)."""
+    out = np.empty((len(rotations), len(part.pairs)))
+    for w in range(len(rotations)):
+        at = [
+            pin.SE3(rotations[w, s.parentJoint], translations[w, s.parentJoint]) * s.placement
+            for s in part.shapes
+        ]
+        for k, (a, b) in enumerate(part.pairs.tolist()):
+            out[w, k] = compute_shape_distance(
+                part.shapes[a].geometry, at[a], part.shapes[b].geometry, at[b]
+            )
+    return out
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.3]), st.booleans())
+def test_nothing_that_is_close_is_left_out(seed: int, reach: float, standing: bool) -> None:
+    rng = np.random.default_rng(seed)
+    part, joints = random_geometry(rng), random_joints(rng, 5)
+    distances = all_distances(part, *joints)
+    at, pairs, bounds = part.boxes.find_close_pairs(reach, *joints, include_fixed=standing)
+    assert (bounds <= distances[at, pairs] + COAL).all()
+    assert (bounds < reach).all()
+    assert (np.diff(at * len(part.pairs) + pairs) > 0).all(), "in order, none twice"
+    counts = np.ones(len(part.pairs), bool) if standing else part.joint[part.pairs[:, 1]] != 0
+    close = {(w, k) for w, k in np.argwhere(distances < reach - COAL).tolist() if counts[k]}
+    assert close <= set(zip(at.tolist(), pairs.tolist(), strict=True))
+    assert counts[pairs].all()
+
+
+def test_what_is_far_is_left_out() -> None:
+    """The volumes are no idle bound: of all pairs few are returned, and those are near."""
+    rng = np.random.default_rng(0)
+    part, joints = random_geometry(rng, 12, 60), random_joints(rng, 20)
+    distances = all_distances(part, *joints)
+    at, pairs, _ = part.boxes.find_close_pairs(0.05, *joints)
+    assert 0 < (distances < 0.05).sum() <= len(at) < 0.05 * distances.size
+    assert (distances[at, pairs] < 0.4).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_what_is_placed_elsewhere(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    part, joints = random_geometry(rng), random_joints(rng, 4)
+    part.boxes.find_close_pairs(0.1, *joints)  # what is kept must not be taken over
+    where = {geometry: random_placement(rng, 1.5) for geometry in (8, 11)}
+    moved = part.with_placements(where)
+    at, pairs, _ = moved.boxes.find_close_pairs(0.1, *joints)
+    for geometry, placement in where.items():
+        assert moved.shapes[geometry].placement.isApprox(placement)
+        assert not part.shapes[geometry].placement.isApprox(placement), (
+            "the first one stays as it is"
+        )
+    close = np.argwhere(all_distances(moved, *joints) < 0.1 - COAL).tolist()
+    assert {tuple(pair) for pair in close} <= set(zip(at.tolist(), pairs.tolist(), strict=True))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_what_stands_around_a_box(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    part = random_geometry(rng)
+    lower = rng.uniform(-1.5, 1.0, 3)
+    size = rng.uniform(0.05, 0.6, 3)
+    box, here = coal.Box(*size), pin.SE3(np.eye(3), lower + size / 2)
+    near = part.find_static_near(0.1, lower, lower + size).tolist()
+    for k in range(7, 16):
+        shape = part.shapes[k]
+        if compute_shape_distance(box, here, shape.geometry, shape.placement) < 0.1 - COAL:
+            assert k in near
+    assert min(near, default=7) >= 7, "what moves does not stand"
+    listed = part.pairs.tolist()
+    for first in range(7):
+        numbers = part.find_pairs(first, np.arange(7, 16)).tolist()
+        assert [listed[k] for k in numbers] == [
+            [first, b] for b in range(7, 16) if [first, b] in listed
+        ]
+
+
+def test_margins_are_reduced_between_waypoints() -> None:
+    part = random_geometry(np.random.default_rng(2))
+    object.__setattr__(
+        part, "reduced_margins", {3: [(2, 4, 0.001), (4, 6, 0.004)], 5: [(0, 1, 1.0)]}
+    )
+    pairs, waypoints = (grid.ravel() for grid in np.meshgrid([2, 3, 5], np.arange(8)))
+    expected = part.margins[pairs].copy()
+    expected[(pairs == 3) & (waypoints >= 2) & (waypoints <= 4)] = 0.001
+    expected[(pairs == 3) & (waypoints >= 5) & (waypoints <= 6)] = 0.004
+    np.testing.assert_array_equal(part.margins_at(pairs, waypoints), expected)  # and never widened

@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.carrying import STICK, TOP, above, box, reaching, room, table, tool_at
+from helpers.drives import hall
+from helpers.litter import BELOW, littered, shelf
+from helpers.small_problems import SHORT, door_scene, program_of
+
+import vkc_pin as vkc
+from vkc_pin.planning.diagnosis.diagnosis import (
+    diagnose_goal,
+    diagnose_goals,
+    find_impossible_conditions,
+)
+
+CRATE = {"name": "crate", "type": "box", "size": [0.6, 0.6, 0.4], "position": [1.5, 0.0, 0.2]}
+
+
+def problem(scene: vkc.Scene, *steps: vkc.steps.Step) -> vkc.TrajectoryProblem:
+    return program_of(scene, list(steps), options=SHORT)
+
+
+def test_demo_has_no_violations() -> None:
+    demo = problem(door_scene(), vkc.Actuate("door", {"hinge": 1.2}))
+    assert find_impossible_conditions(demo) == []
+    assert diagnose_goals(demo, 0) == []
+
+
+def test_goals_beyond_limits_of_every_kind() -> None:
+    drawer = problem(vkc.load_scene("drawer"), vkc.Actuate("drawer", {"slide": 0.6}))
+    (violation,) = find_impossible_conditions(drawer)
+    assert (violation.constraint, violation.subject, violation.unit) == (
+        "goal",
+        "drawer.slide",
+        "m",
+    )
+    assert violation.amount == pytest.approx(0.2)
+    assert violation.waypoint == drawer.segments
+    first, second = find_impossible_conditions(
+        problem(door_scene(), vkc.Actuate("door", {"hinge": -2.0}), vkc.GoTo(0.0, 3.0))
+    )
+    assert (first.subject, first.unit, second.subject, second.unit) == (
+        "door.hinge",
+        "rad",
+        "base_y",
+        "m",
+    )
+    assert (first.amount, second.amount) == (pytest.approx(0.43), pytest.approx(0.9))
+    assert first.waypoint < second.waypoint
+
+
+def test_goal_at_the_limit_is_allowed() -> None:
+    scene = door_scene()
+    assert find_impossible_conditions(problem(scene, vkc.Actuate("door", {"hinge": 1.57}))) == []
+    assert (
+        find_impossible_conditions(problem(scene, vkc.GoTo(scene.arena[1], scene.arena[3]))) == []
+    )
+
+
+def test_start_in_contact() -> None:
+    scene = hall(obstacles=[{**CRATE, "position": [0.7, 0.0, 0.2]}])
+    (violation, *_) = find_impossible_conditions(problem(scene, vkc.GoTo(-1.0, 0.0)))
+    assert (violation.constraint, violation.subject, violation.waypoint) == (
+        "start",
+        "base_link – crate",
+        0,
+    )
+    assert violation.amount == pytest.approx(0.495 + 0.3 - 0.7, abs=1e-6)
+
+
+def test_links_of_several_shapes_are_listed_once() -> None:
+    """The deepest pair counts; here many shapes of the base touch one URDF object."""
+    wall = "".join(
+        f'<collision><origin xyz="0 {y} 0.4"/>'
+        '<geometry><box size="0.2 0.5 0.8"/></geometry></collision>'
+        for y in (0, 0.3)
+    )
+    urdf = f'<robot name="wall"><link name="wall">{wall}</link></robot>'
+    item = {"name": "wall", "type": {"urdf": urdf, "attachments": []}, "position": [0.4, 0.0, 0.0]}
+    scene = vkc.Scene.from_document({**hall().document, "objects": [item]})
+    found = find_impossible_conditions(problem(scene, vkc.GoTo(-1.0, 0.0)))
+    subjects = [violation.subject for violation in found]
+    assert "base_link – wall.wall" in subjects
+    assert len(subjects) == len(set(subjects))
+
+
+@pytest.mark.parametrize("gap", [1e-3, 1e-17, 0.0, -5e-5, -2e-3])
+def test_attached_object_may_rest_on_another_at_the_start(gap: float) -> None:
+    down = reaching(tool_at(STICK), above(STICK))
+    held = room(table(gap=gap)).with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
+    assert find_impossible_conditions(problem(held, vkc.GoTo(0.0, 1.0))) == []
+    inside = box(
+        "table", [0.5, 2.4, 0.02], [0.8, 0.0, TOP - 0.01 + 0.002]
+    )  # the arm, which holds nothing there, in a block
+    block = room(inside, box("block", [0.2, 0.2, 0.2], [float(down[0]), float(down[1]), 0.3]))
+    start = block.with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
+    assert {
+        v.constraint for v in find_impossible_conditions(problem(start, vkc.GoTo(0.0, 1.0)))
+    } == {"start"}
+
+
+def test_residual_of_an_unreachable_target_is_reported() -> None:
+    ((line, short_by),) = diagnose_goals(
+        problem(hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))), 0
+    )
+    assert line.startswith("reach with tool: out of reach")
+    short = float(line.split("the nearest stays ")[1].split()[0])
+    assert short_by == pytest.approx(short, abs=1e-3)
+    assert 1.5 < short < 3.0
+
+
+def test_obstacles_of_all_goal_configurations_are_reported() -> None:
+    ((line, short_by),) = diagnose_goals(
+        problem(hall(obstacles=[CRATE]), vkc.GoTo(1.5, 0.0, 0.0)), 0
+    )
+    assert line.endswith("base_link – crate overlap by 270.0 mm")
+    assert short_by == pytest.approx(0.27 + SHORT.dist_safe)
+
+
+def test_phases_are_diagnosed_separately() -> None:
+    two = problem(hall(obstacles=[CRATE]), vkc.GoTo(0.2, 0.0, 0.0), vkc.GoTo(1.5, 0.0, 0.0))
+    assert diagnose_goal(two, 0, 0) is None
+    assert [diagnose_goal(two, 1, 0)] == diagnose_goals(two, 0)
+
+
+def test_goal_without_a_base_position_is_not_diagnosed() -> None:
+    grasp = problem(door_scene(), vkc.Grasp("door"))
+    assert diagnose_goals(grasp, 0) == diagnose_goals(grasp, 1) == []
+
+
+def test_diagnosis_is_deterministic() -> None:
+    crate = problem(hall(obstacles=[CRATE]), vkc.Reach((1.5, 0.0, 0.2, 0.0, np.pi, 0.0)))
+    assert diagnose_goals(crate, 3) == diagnose_goals(crate, 3)
+    assert diagnose_goals(crate, 3)
+
+
+def test_grasp_is_free_when_placing() -> None:
+    """Under a shelf the object can be placed from the side only, with another grasp."""
+    below = problem(littered(shelf(*BELOW[:2])), vkc.Place("litter", BELOW, "grip"))
+    assert [phase.kind for phase in below.task.phases] == ["grasp", "place"]
+    assert diagnose_goal(below, 1, 0) is None
+
+
+@pytest.mark.parametrize(("missing", "free"), [(-1e-4, True), (4e-4, True), (1e-3, False)])
+def test_tolerance_matches_the_solver(missing: float, free: bool) -> None:
+    """The base is near a crate with a given shortfall [m]; the solver accepts 0.5 mm."""
+    scene = hall(obstacles=[CRATE])
+    front = 1.5 - 0.3 - 0.495
+    stop = problem(scene, vkc.GoTo(front - vkc.Options().dist_safe + missing, 0.0, 0.0))
+    found = diagnose_goal(stop, 0, 0)
+    assert (found is None) == free
+    if found is not None:
+        assert "base_link – crate" in found.text
+        assert found.shortfall == pytest.approx(missing, abs=1e-5)

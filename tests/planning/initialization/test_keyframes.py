@@ -1,0 +1,199 @@
+"""Tests of keyframes: feasible by Pinocchio, within limits, and reproducible."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.small_problems import SHORT, all_pairs, door_scene, hand_off_the_handle
+
+import vkc_pin as vkc
+from vkc_pin.planning.initialization.keyframes import (
+    SAMPLE_COUNT,
+    KeyframeCache,
+    KeyframeSampler,
+    compute_shortfall,
+    interpolate_object_joints,
+    sample_goal_configurations,
+    sample_smoothstep,
+)
+
+OPEN = vkc.Actuate("door", {"hinge": 1.2})
+
+
+@pytest.fixture(scope="module")
+def problem() -> vkc.TrajectoryProblem:
+    return vkc.build(door_scene(), [OPEN], options=SHORT)
+
+
+@pytest.fixture(scope="module")
+def drive() -> vkc.TrajectoryProblem:
+    return vkc.build(door_scene(), [vkc.GoTo(0.3, 0.2)], options=SHORT)
+
+
+def knots(
+    problem: vkc.TrajectoryProblem, seed: int = 0, known: KeyframeCache | None = None
+) -> KeyframeSampler:
+    return KeyframeSampler(problem, np.random.default_rng(seed), known)
+
+
+def test_the_profile_starts_and_ends_at_rest() -> None:
+    s = np.concatenate([[0.0], sample_smoothstep(100)])
+    assert s[-1] == 1.0
+    assert (np.diff(s) > 0).all()
+    np.testing.assert_allclose(s + s[::-1], 1.0)  # the same from both ends
+    assert max(s[1], 1.0 - s[-2]) < 1e-3
+    assert np.diff(s).max() == pytest.approx(1.5 / 100, rel=1e-3)
+    np.testing.assert_array_equal(sample_smoothstep(1), [1.0])
+
+
+def test_object_joints_move_to_their_goals_phase_by_phase(problem: vkc.TrajectoryProblem) -> None:
+    z = interpolate_object_joints(problem, np.tile(problem.start, (problem.segments, 1)))
+    reach, turn, move = problem.ends.tolist()
+    hinge, knob = (z[:, problem.chain.index(f"door.{name}")] for name in ("hinge", "knob"))
+    assert (hinge[:turn] == 0.0).all()
+    assert (knob[:reach] == 0.0).all()
+    assert hinge[move - 1] == pytest.approx(1.2)
+    np.testing.assert_allclose(hinge[turn:], 1.2 * sample_smoothstep(move - turn))
+    np.testing.assert_allclose(knob[reach:turn], knob[turn - 1] * sample_smoothstep(turn - reach))
+    np.testing.assert_array_equal(z[:, :9], np.tile(problem.start[:9], (problem.segments, 1)))
+
+
+@pytest.mark.parametrize("how", ["scatter", "track", "shake"])
+def test_hand_is_at_the_handle_at_every_waypoint(problem: vkc.TrajectoryProblem, how: str) -> None:
+    search = knots(problem)
+    grasp = int(problem.ends[0])
+    first, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    assert found.sum() > 10
+    for waypoint in (grasp, grasp + 1, problem.segments):
+        z, found = search.sample(first, waypoint, how)
+        hinge, knob = (
+            search.object_motion[waypoint - 1, problem.chain.index(f"door.{name}")]
+            for name in ("hinge", "knob")
+        )
+        assert found.any()
+        for row in z[found]:
+            assert hand_off_the_handle(door_scene(), row[:9], hinge, knob) < 2e-4
+        np.testing.assert_array_equal(
+            z[:, search.object_columns],
+            np.tile(search.object_motion[waypoint - 1, search.object_columns], (len(z), 1)),
+        )
+        arms = slice(3, 9)
+        assert (z[found, arms] >= problem.lower[waypoint - 1, arms] - 1e-9).all()
+        assert (z[found, arms] <= problem.upper[waypoint - 1, arms] + 1e-9).all()
+
+
+def test_track_stays_near_and_scatter_does_not(problem: vkc.TrajectoryProblem) -> None:
+    search, grasp = knots(problem), int(problem.ends[0])
+    z, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    steps = {}
+    for how in ("scatter", "track", "shake"):
+        after, there = search.sample(z[found], grasp + 1, how)
+        steps[how] = np.median(np.abs(after - z[found])[there, 3:9].max(axis=1))
+    assert steps["track"] < steps["shake"] < steps["scatter"]
+
+
+def test_robots_stay_without_a_pose_constraint(drive: vkc.TrajectoryProblem) -> None:
+    search = knots(drive)
+    assert search.find_pose(1) is None
+    before = np.tile(drive.start, (3, 1)) + np.arange(3)[:, None] * 1e-3
+    z, found = search.sample(before, 1, "track")
+    assert found.all()
+    np.testing.assert_array_equal(z, before)
+    assert search.push_clear(z, 1) is z
+
+
+def test_cached_results_are_not_computed_again(
+    problem: vkc.TrajectoryProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The random generator continues as without a cache."""
+    known, grasp, start = KeyframeCache(), int(problem.ends[0]), np.tile(problem.start, (16, 1))
+    one, other, alone = knots(problem, 3, known), knots(problem, 3, known), knots(problem, 3)
+    first = one.sample(start, grasp, "scatter")
+    depths = one.compute_shortfall(first[0], grasp)
+    monkeypatch.setattr(KeyframeSampler, "_perturb_arms", None)
+    monkeypatch.setattr("vkc_pin.planning.initialization.keyframes.depth", None)
+    for values, same in zip(first, other.sample(start, grasp, "scatter"), strict=True):
+        np.testing.assert_array_equal(values, same)
+    assert one.rng.bit_generator.state == other.rng.bit_generator.state
+    np.testing.assert_array_equal(other.compute_shortfall(first[0][::-1], grasp), depths[::-1])
+    monkeypatch.undo()
+    np.testing.assert_array_equal(alone.sample(start, grasp, "scatter")[0], first[0])
+    assert alone.rng.bit_generator.state == one.rng.bit_generator.state
+    assert not np.array_equal(knots(problem, 4).sample(start, grasp, "scatter")[0], first[0])
+
+
+def test_shortfall_is_the_largest_of_any_pair(problem: vkc.TrajectoryProblem) -> None:
+    """Against Pinocchio's and coal's distances of all pairs, without culling."""
+    search, grasp = knots(problem), int(problem.ends[0])
+    z, _ = search.sample(np.tile(problem.start, (24, 1)), grasp, "scatter")
+    part, model = problem.contacts.phases[0], problem.chain.model
+    geometry, data = all_pairs(part), model.createData()
+    shapes, pairs = pin.GeometryData(geometry), np.arange(len(part.pairs))
+    margins, expected = part.margins_at(pairs, np.full(len(pairs), grasp)), []
+    for q in problem.chain.coordinates.q(z):
+        pin.updateGeometryPlacements(model, data, geometry, shapes, q)
+        pin.computeDistances(geometry, shapes)
+        distances = np.array([result.min_distance for result in shapes.distanceResults])
+        expected.append(max(0.0, float((margins - distances).max())))
+    assert min(expected) < 0.01 < max(expected)
+    np.testing.assert_allclose(compute_shortfall(problem, z, grasp), expected, atol=1e-5)
+
+
+def test_free_keyframes_satisfy_the_pose_constraint(problem: vkc.TrajectoryProblem) -> None:
+    search, grasp = knots(problem), int(problem.ends[0])
+    z, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    away = z[found] + 0.01 * np.eye(problem.chain.size)[0]  # a centimetre from the handle
+    assert (search.compute_shortfall(away, grasp) <= 0.0).any()
+    assert not search.has_free_keyframe(grasp)
+    depths = search.compute_shortfall(z[found], grasp)
+    assert 0 < np.count_nonzero(depths > 0.0) < len(depths)
+    assert search.has_free_keyframe(grasp)
+    assert not search.has_free_keyframe(grasp + 1)
+    other = knots(problem)
+    other.compute_shortfall(z[found][depths > 0.0], grasp)
+    assert not other.has_free_keyframe(grasp)
+
+
+def test_goal_configurations_report_their_residuals(problem: vkc.TrajectoryProblem) -> None:
+    drawn = sample_goal_configurations(problem, int(problem.ends[0]), np.random.default_rng(0))
+    assert drawn is not None
+    z, residuals = drawn
+    assert z.shape == (SAMPLE_COUNT, problem.chain.size)
+    for row, residual in zip(z, residuals, strict=True):
+        off = hand_off_the_handle(door_scene(), row[:9], 0.0, 0.0)
+        assert (off < 3e-4) == (
+            residual < 1e-4
+        ) or 1e-5 < residual < 1e-3  # the two measure angles alike only where small
+    assert (residuals < 1e-4).any()
+
+
+def test_goal_configurations_at_a_base_goal(drive: vkc.TrajectoryProblem) -> None:
+    assert sample_goal_configurations(drive, 1, np.random.default_rng(0)) is None, (
+        "nothing must hold there"
+    )
+    placed = sample_goal_configurations(drive, drive.segments, np.random.default_rng(0))
+    assert placed is not None
+    np.testing.assert_allclose(placed[0][:, :2], np.tile([0.3, 0.2], (SAMPLE_COUNT, 1)), atol=1e-9)
+    assert (placed[1] == 0.0).all()
+    assert np.ptp(placed[0][:, 2]) > 1.0, "at any heading"
+
+
+def test_weights_are_those_of_searches(problem: vkc.TrajectoryProblem) -> None:
+    """Angles cost 1, lengths what they move the hand, except sliding grasps."""
+    free = vkc.build(
+        vkc.load_scene("init_3"), [vkc.Touch("stick.tip", (-1.0, 3.9, 0.1))], options=SHORT
+    )
+    weights = dict(
+        zip(
+            free.chain.names,
+            KeyframeSampler(free, np.random.default_rng(0)).weights.tolist(),
+            strict=True,
+        )
+    )
+    assert weights["base_x"] == 1.0 / free.chain.robot.lever
+    assert weights["base_yaw"] == weights["elbow_joint"] == 1.0
+    grasp = {name: weight for name, weight in weights.items() if name.startswith("stick.grip")}
+    assert grasp
+    assert "m" in {free.unit(name) for name in grasp}
+    assert set(grasp.values()) == {1.0}

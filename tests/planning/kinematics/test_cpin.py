@@ -1,0 +1,380 @@
+"""Compares the CasADi functions of Pinocchio's algorithms with numeric Pinocchio."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+import types
+from collections.abc import Callable, Iterator
+
+import casadi
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from vkc_pin.errors import BuildError, InputError, UnknownNameError
+from vkc_pin.planning import kinematics as cpin
+from vkc_pin.planning.kinematics import backends
+from vkc_pin.world.models.coordinates import Coordinates
+
+TOLERANCE = 1e-12
+AXIS = np.array([0.36, -0.48, 0.8])
+
+
+def composite() -> pin.JointModelComposite:
+    """Return a joint made of three others, one of them continuous."""
+    joint = pin.JointModelComposite(pin.JointModelRX())
+    joint.addJoint(pin.JointModelPY(), pin.SE3.Random())
+    joint.addJoint(pin.JointModelRUBZ(), pin.SE3.Random())
+    return joint
+
+
+def unbounded_unaligned() -> pin.JointModel:
+    """Return a continuous joint about a slanted axis, as loaded from a URDF."""
+    axis = f'<parent link="a"/><child link="b"/><axis xyz="{" ".join(map(str, AXIS))}"/>'
+    joint = f'<joint name="j" type="continuous">{axis}</joint>'
+    urdf = f'<robot name="r"><link name="a"/><link name="b"/>{joint}</robot>'
+    return pin.buildModelFromXML(urdf).joints[1]
+
+
+JOINTS: dict[str, Callable[[], object]] = {
+    "planar": pin.JointModelPlanar,
+    "revolute_x": pin.JointModelRX,
+    "revolute_y": pin.JointModelRY,
+    "revolute_z": pin.JointModelRZ,
+    "revolute_unaligned": lambda: pin.JointModelRevoluteUnaligned(AXIS),
+    "unbounded_x": pin.JointModelRUBX,
+    "unbounded_y": pin.JointModelRUBY,
+    "unbounded_z": pin.JointModelRUBZ,
+    "unbounded_unaligned": unbounded_unaligned,
+    "prismatic_x": pin.JointModelPX,
+    "prismatic_y": pin.JointModelPY,
+    "prismatic_z": pin.JointModelPZ,
+    "prismatic_unaligned": lambda: pin.JointModelPrismaticUnaligned(AXIS),
+    "composite": composite,
+    "spherical": pin.JointModelSpherical,
+    "spherical_zyx": pin.JointModelSphericalZYX,
+    "translation": pin.JointModelTranslation,
+    "free_flyer": pin.JointModelFreeFlyer,
+    "universal": lambda: pin.JointModelUniversal(np.array([1.0, 0, 0]), np.array([0, 1.0, 0])),
+    "helical": lambda: pin.JointModelHelicalUnaligned(AXIS, 0.1),
+}
+MINIMAL = [
+    name for name in JOINTS if name.startswith(("planar", "revolute", "unbounded", "prismatic"))
+]
+
+
+def tree(*kinds: str) -> pin.Model:
+    """Return a model with a chain of one joint of each kind, each with a body and a fixed frame."""
+    pin.seed(7)
+    model, parent = pin.Model(), 0
+    for kind in kinds:
+        parent = model.addJoint(parent, JOINTS[kind](), pin.SE3.Random(), kind)
+        model.appendBodyToJoint(parent, pin.Inertia.Random(), pin.SE3.Random())
+        # What a fixed joint leaves behind: a frame with an inertia of its own.
+        model.addFrame(
+            pin.Frame(
+                f"{kind}_tip",
+                parent,
+                0,
+                pin.SE3.Random(),
+                pin.FrameType.FIXED_JOINT,
+                pin.Inertia.Random(),
+            )
+        )
+    return model
+
+
+def configurations(model: pin.Model, count: int = 5) -> Iterator[np.ndarray]:
+    pin.seed(3)
+    bound = 2.0 * np.ones(model.nq)
+    for _ in range(count):
+        yield pin.randomConfiguration(model, -bound, bound)
+
+
+def stacked(placements: list[pin.SE3]) -> np.ndarray:
+    return np.array(
+        [np.concatenate([m.rotation.T.ravel(), m.translation]) for m in placements]
+    ).T.reshape(12, len(placements))
+
+
+def numeric_placements(model: pin.Model, q: np.ndarray) -> np.ndarray:
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    return stacked([data.oMi[i] for i in range(1, model.njoints)])
+
+
+@pytest.fixture(scope="module")
+def arm() -> pin.Model:
+    """Every joint type with minimal coordinates in one chain."""
+    return tree(*MINIMAL)
+
+
+@pytest.mark.parametrize("kind", JOINTS)
+def test_kinematics_and_dynamics_equal_numeric_pinocchio(kind: str) -> None:
+    model = tree(*dict.fromkeys(("planar", kind, "revolute_unaligned")))
+    data = model.createData()
+    frames = [frame.name for frame in model.frames]
+    joints, tips = cpin.joint_placements(model), cpin.frame_placements(model, frames)
+    torque, com = cpin.rnea(model), cpin.center_of_mass(model)
+    random = np.random.default_rng(1)
+    for q in configurations(model):
+        v, a = random.normal(size=(2, model.nv))
+        pin.framesForwardKinematics(model, data, q)
+        np.testing.assert_allclose(
+            joints(q).full(), numeric_placements(model, q), atol=TOLERANCE, rtol=0
+        )
+        np.testing.assert_allclose(tips(q).full(), stacked(list(data.oMf)), atol=TOLERANCE, rtol=0)
+        expected = pin.rnea(model, data, q, v, a)
+        np.testing.assert_allclose(
+            torque(q, v, a).full().ravel(), expected, atol=TOLERANCE, rtol=TOLERANCE
+        )
+        np.testing.assert_allclose(
+            com(q).full().ravel(), pin.centerOfMass(model, data, q), atol=TOLERANCE, rtol=0
+        )
+
+
+@pytest.mark.parametrize("kind", JOINTS)
+@pytest.mark.parametrize("reference", ["local_world_aligned", "local", "world"])
+def test_frame_jacobian_equals_numeric_pinocchio(kind: str, reference: str) -> None:
+    model = tree(*dict.fromkeys(("planar", kind)))
+    frame = model.getFrameId(f"{kind}_tip")
+    jacobian = cpin.frame_jacobian(model, f"{kind}_tip", reference)  # type: ignore[arg-type]
+    axes = {"local_world_aligned": pin.LOCAL_WORLD_ALIGNED, "local": pin.LOCAL, "world": pin.WORLD}[
+        reference
+    ]
+    data = model.createData()
+    for q in configurations(model):
+        expected = pin.computeFrameJacobian(model, data, q, frame, axes)
+        np.testing.assert_allclose(jacobian(q).full(), expected, atol=TOLERANCE, rtol=0)
+
+
+def test_first_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> None:
+    coordinates = Coordinates(arm)
+    z = casadi.SX.sym("z", coordinates.size)
+    placements = casadi.vec(casadi.densify(cpin.joint_placements(arm)(coordinates.q_symbolic(z))))
+    jacobian = casadi.Function("jacobian", [z], [casadi.jacobian(placements, z)])
+    point, step = np.random.default_rng(2).normal(size=coordinates.size), 1e-6
+    for i, direction in enumerate(np.eye(coordinates.size)):
+        ahead, behind = (
+            numeric_placements(arm, coordinates.q(point + sign * step * direction))
+            for sign in (1, -1)
+        )
+        difference = ((ahead - behind) / (2 * step)).ravel(order="F")
+        np.testing.assert_allclose(jacobian(point).full()[:, i], difference, atol=1e-7)
+
+
+def test_second_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> None:
+    coordinates, random = Coordinates(arm), np.random.default_rng(4)
+    n, step = coordinates.size, 1e-4
+    weights = random.normal(size=(12, arm.njoints - 1))
+    z = casadi.SX.sym("z", n)
+    value = casadi.dot(weights, cpin.joint_placements(arm)(coordinates.q_symbolic(z)))
+    hessian = casadi.Function("hessian", [z], [casadi.hessian(value, z)[0]])
+    point = random.normal(size=n)
+
+    def numeric(at: np.ndarray) -> float:
+        return float(np.sum(weights * numeric_placements(arm, coordinates.q(at))))
+
+    for _ in range(20):
+        direction = random.normal(size=n)
+        difference = (
+            numeric(point + step * direction)
+            - 2 * numeric(point)
+            + numeric(point - step * direction)
+        ) / step**2
+        exact = direction @ hessian(point).full() @ direction
+        assert exact == pytest.approx(difference, rel=1e-5, abs=1e-4)
+
+
+def test_dynamics_derivatives_equal_numeric_pinocchio() -> None:
+    model = tree(
+        "revolute_x", "prismatic_unaligned", "revolute_unaligned", "prismatic_y", "revolute_z"
+    )
+    data, random = model.createData(), np.random.default_rng(5)
+    q, v, a = random.normal(size=(3, model.nv))
+    symbols = [casadi.SX.sym(name, model.nv) for name in "qva"]
+    torque = cpin.rnea(model)(*symbols)
+    derivatives = casadi.Function(
+        "d", symbols, [casadi.jacobian(torque, symbol) for symbol in symbols]
+    )(q, v, a)
+    for exact, expected in zip(
+        derivatives, pin.computeRNEADerivatives(model, data, q, v, a), strict=True
+    ):
+        np.testing.assert_allclose(exact.full(), expected, atol=1e-11)
+    com = cpin.center_of_mass(model)
+    slope = casadi.Function("c", symbols[:1], [casadi.jacobian(com(symbols[0]), symbols[0])])(q)
+    np.testing.assert_allclose(slope.full(), pin.jacobianCenterOfMass(model, data, q), atol=1e-11)
+
+
+def test_functions_name_their_inputs_and_outputs(arm: pin.Model) -> None:
+    joints, torque = cpin.joint_placements(arm), cpin.rnea(arm)
+    assert (joints.name(), joints.name_in(), joints.name_out()) == (
+        "joint_placements",
+        ["q"],
+        ["M"],
+    )
+    assert joints.size_in(0) == (arm.nq, 1)
+    assert joints.size_out(0) == (12, arm.njoints - 1)
+    assert (torque.name_in(), torque.name_out()) == (["q", "v", "a"], ["tau"])
+    assert torque.size_out(0) == (arm.nv, 1)
+    assert cpin.center_of_mass(arm).name_out() == ["com"]
+    assert cpin.frame_jacobian(arm, "planar_tip").name_out() == ["J"]
+
+
+def test_rounded_quarter_turns_add_no_instructions() -> None:
+    """Rounded quarter turns give the same expressions as exact ones, with constant entries."""
+    exact = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    counts = []
+    for rotation in (exact, pin.rpy.rpyToMatrix(0, 0, np.pi / 2)):
+        model, parent = pin.Model(), 0
+        for i in range(6):
+            parent = model.addJoint(
+                parent, pin.JointModelRX(), pin.SE3(rotation, np.array([0.1, 0, 0])), f"j{i}"
+            )
+        counts.append(cpin.joint_placements(model).n_instructions())
+    assert counts[0] == counts[1]
+    planar = tree("planar")
+    planar.jointPlacements[1].setIdentity()
+    assert cpin.joint_placements(planar).nnz_out() == 7  # c, s, -s, c, 1, x, y
+
+
+def test_infinite_limits_do_not_matter(arm: pin.Model) -> None:
+    model = arm.copy()
+    model.lowerPositionLimit, model.upperPositionLimit = (
+        np.full(model.nq, -np.inf),
+        np.full(model.nq, np.inf),
+    )
+    q = next(configurations(arm))
+    np.testing.assert_allclose(
+        cpin.joint_placements(model)(q).full(), numeric_placements(arm, q), atol=TOLERANCE
+    )
+
+
+def test_model_is_not_modified(arm: pin.Model) -> None:
+    before = arm.copy()
+    cpin.joint_placements(arm)
+    assert arm == before
+
+
+def test_models_without_joints_and_empty_frame_lists() -> None:
+    model = pin.Model()
+    assert cpin.joint_placements(model).size_out(0) == (12, 0)
+    assert cpin.frame_placements(model, []).size_out(0) == (12, 0)
+
+
+def test_frames_by_index_and_single_name(arm: pin.Model) -> None:
+    q, index = next(configurations(arm)), arm.getFrameId("revolute_x_tip")
+    by_name, by_index = (
+        cpin.frame_placements(arm, "revolute_x_tip"),
+        cpin.frame_placements(arm, [index]),
+    )
+    np.testing.assert_array_equal(by_name(q).full(), by_index(q).full())
+
+
+def test_unknown_names_are_rejected(arm: pin.Model) -> None:
+    with pytest.raises(UnknownNameError, match=r"frames\[1\].*did you mean 'revolute_x_tip'"):
+        cpin.frame_placements(arm, ["planar_tip", "revolut_x_tip"])
+    with pytest.raises(UnknownNameError, match="frame"):
+        cpin.frame_jacobian(arm, arm.nframes)
+    with pytest.raises(UnknownNameError, match="frame"):
+        cpin.frame_placements(arm, [-1])
+    with pytest.raises(UnknownNameError, match="reference"):
+        cpin.frame_jacobian(arm, "planar_tip", "locale")  # type: ignore[arg-type]
+
+
+def test_ambiguous_frame_names_are_refused(arm: pin.Model) -> None:
+    model = arm.copy()
+    for parent, kind in ((1, pin.FrameType.OP_FRAME), (2, pin.FrameType.SENSOR)):
+        model.addFrame(pin.Frame("twice", parent, 0, pin.SE3.Identity(), kind))
+    with pytest.raises(InputError, match="several frames are named 'twice'"):
+        cpin.frame_placements(model, ["twice"])
+
+
+@pytest.mark.parametrize("installed", ["4.10.0", "5.1.0", "4.0.3"])
+def test_another_release_is_refused(installed: str) -> None:
+    with pytest.raises(
+        BuildError, match=rf"pin 4\.1\.0, but {installed} is installed.*pip install 'pin==4\.1\.\*'"
+    ):
+        backends.check_versions(
+            {"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": installed, "casadi": "3.8.2"}
+        )
+
+
+def test_a_patch_release_is_accepted() -> None:
+    backends.check_versions(
+        {"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": "4.1.12", "casadi": "3.8.2+local"}
+    )
+
+
+def test_an_unreadable_version_is_a_build_error() -> None:
+    with pytest.raises(BuildError, match="cannot read the version 'unknown'"):
+        backends.check_versions({"pin": "4.1.0"}, {"pin": "unknown"})
+
+
+def test_a_missing_extension_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, arm: pin.Model
+) -> None:
+    monkeypatch.setitem(sys.modules, "vkc_pin.planning.kinematics._cpin", None)
+    backends._import_extension.cache_clear()
+    with pytest.raises(BuildError, match=r"apt install g\+\+"):
+        backends.build_compiled("joint_placements", arm)
+    backends._import_extension.cache_clear()
+
+
+def test_backend_is_upstreams_where_it_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, name in ((types.ModuleType("pinocchio.casadi"), "upstream"), (None, "compiled")):
+        monkeypatch.setitem(sys.modules, "pinocchio.casadi", module)
+        cpin._get_backend.cache_clear()
+        assert cpin.backend_name() == name
+    cpin._get_backend.cache_clear()
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("pinocchio.casadi") is None,
+    reason="this pinocchio has no casadi binding",
+)
+def test_upstream_equals_compiled(arm: pin.Model) -> None:
+    q, (v, a) = next(configurations(arm)), np.random.default_rng(6).normal(size=(2, arm.nv))
+    frame = arm.getFrameId("planar_tip")
+    for name, arguments, inputs in (
+        ("joint_placements", (), (q,)),
+        ("frame_placements", ([frame],), (q,)),
+        ("frame_jacobian", (frame, 2), (q,)),
+        ("rnea", (), (q, v, a)),
+        ("center_of_mass", (), (q,)),
+    ):
+        one, other = (
+            backend(name, arm, *arguments)(*inputs).full()
+            for backend in (backends.build_upstream, backends.build_compiled)
+        )
+        np.testing.assert_allclose(one, other, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    "first",
+    ["casadi", "pinocchio", "vkc_pin.planning.kinematics", "vkc_pin.planning.kinematics.backends"],
+)
+def test_any_order_of_import_works(first: str) -> None:
+    code = f"""
+import {first}
+import casadi, pinocchio, vkc_pin.planning.kinematics
+model = pinocchio.Model()
+model.addJoint(0, pinocchio.JointModelRZ(), pinocchio.SE3.Identity(), "j")
+print(vkc_pin.planning.kinematics.joint_placements(model)(0.5)[0])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == pytest.approx(np.cos(0.5))
+
+
+def test_the_compiled_module_is_loaded_at_first_use() -> None:
+    name = "vkc_pin.planning.kinematics"
+    code = f"import sys, {name}; print('{name}._cpin' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.strip() == "False"

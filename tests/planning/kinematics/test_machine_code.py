@@ -1,0 +1,414 @@
+"""Tests that compiled functions equal interpreted ones bit for bit, and the fallback."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers.small_problems import door_scene, program_of
+
+import vkc_pin as vkc
+from vkc_pin.options import Options
+from vkc_pin.planning.kinematics import batch, machine_code
+from vkc_pin.planning.kinematics.batch import BatchFunction
+from vkc_pin.planning.kinematics.libraries import VARIABLE, Libraries
+from vkc_pin.planning.kinematics.machine_code import MachineCode, compile_jobs, wait
+from vkc_pin.planning.nlp.transcription import Transcription, transcribe
+from vkc_pin.planning.nlp.waypoint import WaypointFunctions
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.task.steps import Actuate, Grasp
+
+OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
+TASKS = {"reach": [Grasp("door")], "whole": [Actuate("door", {"hinge": 1.2})]}
+QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.delenv("CC", raising=False)
+    found = Libraries.open_default()
+    assert found is not None
+    return found
+
+
+def make(factor: float = 3.0) -> ca.Function:
+    x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
+    branch = ca.if_else(x[1] > 0.3, ca.sqrt(ca.fabs(x[0])), ca.atan2(y[0], y[1]))
+    values = [
+        ca.sin(x[0]) * ca.cos(x[0]) + x[1] * x[2] + factor / 7.0,
+        ca.log(ca.fabs(x[2])),
+        branch,
+        ca.norm_2(x),
+    ]
+    return ca.Function("f", [x, y], [ca.vertcat(*values), ca.densify(x @ y.T)], {"cse": True})
+
+
+def equal(one: ca.Function, other: ca.Function, draws: int = 50) -> bool:
+    rng = np.random.default_rng(7)
+    for _ in range(draws):
+        inputs = [
+            ca.DM(one.sparsity_in(i), rng.normal(size=one.nnz_in(i))) for i in range(one.n_in())
+        ]
+        for a, b in zip(one.call(inputs), other.call(inputs), strict=True):
+            if np.array(a.nonzeros()).tobytes() != np.array(b.nonzeros()).tobytes():
+                return False
+    return True
+
+
+def do(folder: Libraries) -> None:
+    """Compile here what was asked for."""
+    lock = folder.lock()
+    assert lock is not None
+    compile_jobs(str(folder.path), lock)
+    os.close(lock)
+
+
+def script(path: Path, text: str) -> str:
+    path.write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_waypoints_are_equal_bit_for_bit(task: str, folder: Libraries) -> None:
+    structure = program_of(door_scene(), TASKS[task], options=OPTIONS).transcription.structure
+    for poses in ((), structure.poses):
+        functions = WaypointFunctions(structure.model, structure.slots, poses, Cache())
+        given = (functions.value, functions.jacobian, functions.hessian)
+        assert not functions.code.try_load()
+        assert functions.code.functions == given
+        assert wait()
+        assert functions.code.try_load()
+        for one, other in zip(given, functions.code.functions, strict=True):
+            assert other.class_name() == "External"
+            assert equal(one, other)
+            assert equal(one.map(5), other.map(5), 5)
+    assert folder.list_jobs() == []
+
+
+def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) -> None:
+    short = program_of(door_scene(), TASKS["reach"], options=OPTIONS).transcription
+    assert not short.uncompiled_functions, "three waypoints are not worth it"
+    options = Options(reach_waypoints=8, contact_slots=2)
+    structure, cache = (
+        program_of(door_scene(), TASKS["reach"], options=options).transcription.structure,
+        Cache(),
+    )
+    first = transcribe(structure, cache)
+    solver = first.solver(rates=True, options=QUIET)
+    assert len(first.uncompiled_functions) == 1
+    assert len(folder.list_jobs()) <= 1
+    assert transcribe(structure, cache) is first
+    assert wait()
+    second = transcribe(structure, cache)
+    assert second is not first
+    assert second.solver(rates=True, options=QUIET) is not solver
+    assert transcribe(structure, cache) is second
+    assert not second.uncompiled_functions
+    rng = np.random.default_rng(0)
+    x, parameters = rng.normal(size=first.size), rng.normal(size=first.parameters.numel())
+    rows, others = (evaluated(program, x, parameters) for program in (first, second))
+    assert rows == others
+
+
+def evaluated(program: Transcription, x: np.ndarray, parameters: np.ndarray) -> tuple[bytes, bytes]:
+    function = ca.Function("rows", [program.x, program.parameters], [program.g, program.jacobian])
+    values, jacobian = function(x, parameters)
+    return np.array(values.nonzeros()).tobytes(), np.array(jacobian.nonzeros()).tobytes()
+
+
+def test_frequently_used_batch_functions_are_compiled(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
+    function = BatchFunction(make())
+    expected = [part.tobytes() for part in function(x, y)]
+    assert folder.list_jobs() == [], "not worth it yet"
+    monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 30 * make().n_instructions())
+    assert [part.tobytes() for part in function(x, y)] == expected
+    assert wait()
+    assert [part.tobytes() for part in function(x, y)] == expected
+    assert function._code.is_compiled
+    assert [part.tobytes() for part in function(x, y)] == expected
+    assert function.nbytes > 0
+
+
+def test_another_process_finds_it_even_if_the_first_does_not_stay(folder: Libraries) -> None:
+    code = "from test_machine_code import *; MachineCode(make()).try_load()"
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
+    }
+    run = [sys.executable, "-c", code]
+    processes = [subprocess.Popen(run, env=environment, stderr=subprocess.PIPE) for _ in range(2)]
+    for process in processes:
+        _, said = process.communicate(timeout=120)
+        assert process.returncode == 0, said.decode()
+        assert said == b""
+    until(lambda: not folder.list_jobs())
+    assert len(list(folder.path.glob("*.so"))) == 1
+    mine = MachineCode(make())
+    assert mine.try_load()
+    assert equal(make(), mine.functions[0])
+
+
+def test_the_process_that_compiles_leaves_no_zombie(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+    run = machine_code._start_process
+    monkeypatch.setattr(
+        machine_code, "_start_process", lambda *a: started.append(run(*a)) or started[-1]
+    )
+    MachineCode(make()).try_load()
+    (process,) = started
+    until(lambda: process.returncode is not None)  # somebody asked; we did not
+    assert process.returncode == 0
+    assert folder.list_jobs() == []
+
+
+def test_concurrent_loading(folder: Libraries) -> None:
+    MachineCode(make()).try_load()
+    assert wait()
+    right: list[bool] = []
+
+    def load() -> None:
+        for _ in range(5):
+            code = MachineCode(make())
+            right.append(code.try_load() and equal(make(), code.functions[0], 5))
+
+    threads = [threading.Thread(target=load) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert right == [True] * 20
+
+
+def test_functions_that_differ_have_libraries_of_their_own(folder: Libraries) -> None:
+    codes = [MachineCode(make(3.0)), MachineCode(make(np.nextafter(3.0, 4.0)))]
+    for code in codes:
+        code.try_load()
+    assert wait()
+    assert len(list(folder.path.glob("*.so"))) == 2
+    assert all(code.try_load() for code in codes)
+    assert equal(make(3.0), codes[0].functions[0])
+    assert not equal(*(code.functions[0] for code in codes))
+
+
+@pytest.mark.parametrize("options", ["-O2 -w", "-O0"])
+def test_the_compiler_may_have_options(
+    options: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = MachineCode(make())
+    code.try_load()
+    monkeypatch.setenv("CC", f"cc {options}")
+    other = MachineCode(make())
+    other.try_load()
+    assert wait()
+    assert code.try_load()
+    assert other.try_load()
+    assert len(list(folder.path.glob("*.so"))) == 2
+    assert equal(code.functions[0], other.functions[0])
+
+
+@pytest.mark.parametrize("command", ["/nowhere/cc", "no-such-compiler", "'unbalanced"])
+def test_nothing_is_requested_without_a_compiler(
+    command: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", command)
+    code = MachineCode(make())
+    assert not code.try_load()
+    assert folder.list_jobs() == []
+    assert code.functions[0](1.0, 2.0) is not None
+
+
+BROKEN = {
+    "fails": "echo nonsense >&2; exit 1",
+    "writes nothing": "echo done; exit 0",
+    "writes garbage": "echo garbage > functions.so",
+    "computes something else": "sed -i 's/sin(/cos(/' functions.c; exec cc \"$@\"",
+    "rounds otherwise": "sed -i 's/4.2857142857142855e-01/4.2857142857142861e-01/' functions.c; "
+    'exec cc "$@"',
+    "lacks the function": "sed -i 's/int f(/int g(/' functions.c; exec cc \"$@\"",
+    "kills": "kill -9 $PPID",
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_broken_compiler_is_tried_once(
+    how: str, folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", script(tmp_path / "broken", BROKEN[how]))
+    code = MachineCode(make())
+    assert not code.try_load()
+    assert wait(), how
+    assert not code.try_load()
+    assert not code.is_compiled
+    assert list(folder.path.glob("*.so")) == []
+    assert len(list(folder.path.glob("*.failed"))) == 1
+    assert not MachineCode(make()).try_load()
+    assert folder.list_jobs() == [], "not again today"
+
+
+def test_hanging_compiler_is_killed(
+    folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pid = tmp_path / "pid"
+    monkeypatch.setenv(
+        "CC",
+        script(tmp_path / "hangs", f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"),
+    )
+    monkeypatch.setattr(machine_code, "_COMPILER_TIMEOUT", 1.0)
+    monkeypatch.setattr(machine_code, "_has_python", lambda: False)
+    assert not MachineCode(make()).try_load()
+    assert not wait(), "nobody is there to do it"
+    do(folder)
+    assert folder.list_jobs() == []
+    assert len(list(folder.path.glob("*.failed"))) == 1
+    until(lambda: ended(int(pid.read_text())))
+
+
+def test_unwritable_library_is_tried_once(
+    folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine_code, "_has_python", lambda: False)
+    MachineCode(make()).try_load()
+    monkeypatch.setattr(Libraries, "remove", lambda self, name: None)
+    do(folder)
+    assert len(folder.list_jobs()) == 1
+
+
+def test_wait_times_out(folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(
+        "CC",
+        script(
+            tmp_path / "slow", f'while [ ! -e {tmp_path}/go ]; do sleep 0.05; done; exec cc "$@"'
+        ),
+    )
+    code = MachineCode(make())
+    code.try_load()
+    assert not wait(0.2)
+    (tmp_path / "go").touch()
+    assert wait()
+    assert code.try_load()
+
+
+def test_truncated_library_is_rebuilt(folder: Libraries) -> None:
+    MachineCode(make()).try_load()
+    assert wait()
+    (path,) = folder.path.glob("*.so")
+    path.write_bytes(path.read_bytes()[:5000])
+    code = MachineCode(make())
+    assert not code.try_load()
+    assert not code.try_load()
+    assert not MachineCode(make()).try_load()
+    assert wait()
+    assert MachineCode(make()).try_load()
+
+
+@pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
+def test_embedding_program_is_not_started_as_worker(
+    executable: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "executable", executable)
+    assert not MachineCode(make()).try_load()
+    assert not wait()
+    assert len(folder.list_jobs()) == 1, "another process may see to it"
+
+
+def until(done: Callable[[], bool]) -> None:
+    for _ in range(6000):
+        if done():
+            return
+        time.sleep(0.02)
+    raise AssertionError("it does not come to an end")
+
+
+def ended(pid: int) -> bool:
+    """Whether a process is no more, but for its entry."""
+    try:
+        return (
+            Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+            == "Z"
+        )
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+def planned(planner: vkc.Planner | None = None) -> list[bytes]:
+    """Return a plan by the given planner, or by a new one without caches."""
+    steps, options = [Grasp("door")], vkc.Options(reach_waypoints=10)
+    plan = vkc.plan(door_scene(), steps, options=options, planner=planner or vkc.Planner())
+    assert plan.success, plan.report()
+    return [plan.trajectory.times.tobytes(), plan.trajectory.positions.tobytes()]
+
+
+@pytest.fixture(scope="module")
+def expected() -> list[bytes]:
+    """Return the motion that is found without libraries."""
+    assert os.environ[VARIABLE] == "off"
+    return planned()
+
+
+def test_plans_are_equal_bit_for_bit(
+    folder: Libraries, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 0)  # all that can be compiled is
+    planner = vkc.Planner()
+    assert planned(planner) == expected, "asks for them"
+    assert wait()
+    monkeypatch.setattr(machine_code, "_has_python", lambda: False)
+    assert list(folder.path.glob("*.failed")) == []
+    loaded: list[Any] = []
+    external = ca.external
+    monkeypatch.setattr(ca, "external", lambda *a: loaded.append(a) or external(*a))
+    assert planned(planner) == expected, "goes on with them"
+    assert len(loaded) > 2
+    loaded.clear()
+    assert planned() == expected, "begins with them"
+    assert len(loaded) > 2
+
+
+@pytest.mark.parametrize(
+    "trouble", ["no compiler", "broken compiler", "truncated", "open to others", "no folder", "off"]
+)
+def test_planning_works_without_a_compiler(
+    trouble: str,
+    folder: Libraries,
+    tmp_path: Path,
+    expected: list[bytes],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if trouble == "no compiler":
+        monkeypatch.setenv("PATH", str(tmp_path))
+    elif trouble == "broken compiler":
+        monkeypatch.setenv("CC", script(tmp_path / "broken", BROKEN["writes garbage"]))
+    elif trouble == "truncated":
+        monkeypatch.setattr(
+            Libraries,
+            "exists",
+            lambda self, key: (self.path / f"{key}.so").write_bytes(b"\x7fELF" * 99) > 0,
+        )
+    elif trouble == "open to others":
+        folder.path.chmod(0o777)
+    elif trouble == "no folder":
+        monkeypatch.setenv(VARIABLE, "/proc/nowhere")
+    elif trouble == "off":
+        monkeypatch.setenv(VARIABLE, "off")
+    planner = vkc.Planner()
+    assert planned(planner) == expected
+    assert wait() == (trouble not in ("open to others", "no folder", "off"))
+    assert planned(planner) == expected
+    assert list(folder.path.glob("*.so")) == []

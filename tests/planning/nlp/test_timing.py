@@ -1,0 +1,93 @@
+"""Tests step durations: the profile fits, and runs that exceed a bound are stretched."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.planning.nlp.timing import Timing, compute_step_times, split_at_stops
+
+
+def test_runs_lie_between_rests() -> None:
+    assert list(split_at_stops([], 7)) == [(0, 7)]
+    assert list(split_at_stops([2, 5], 7)) == [(0, 2), (2, 5), (5, 7)]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 30.0]))
+def test_the_profile_fits_into_the_time(seed: int, size: float) -> None:
+    """A motion along 3s² − 2s³ in each run keeps both limits, by finite differences."""
+    rng = np.random.default_rng(seed)
+    rests = sorted(rng.choice(np.arange(1, 12), 2, replace=False).tolist())
+    runs, limits = split_at_stops(rests, 12), (rng.uniform(0.3, 3.0, 4), rng.uniform(0.3, 6.0, 4))
+    path = np.cumsum(size * rng.normal(size=(13, 4)), axis=0)
+    times = compute_step_times(path, 0.1, runs, limits)
+    assert (times >= 0.1).all()
+    fine = np.linspace(0.0, 1.0, 401)
+    profile = fine**2 * (3.0 - 2.0 * fine)
+    for first, last in runs:
+        assert np.ptp(times[first:last]) == 0.0
+        way, duration = (
+            np.abs(np.diff(path[first : last + 1], axis=0)).sum(axis=0),
+            times[first:last].sum(),
+        )
+        step = duration / 400
+        speed, strength = (
+            np.abs(np.diff(profile, order)).max() / step**order * way for order in (1, 2)
+        )
+        assert (speed <= limits[0]).all()
+        assert (strength <= limits[1]).all()
+        if times[first] > 0.1:  # and it is not given more than it needs, but for what may be spared
+            assert (
+                max((1.15 * speed / limits[0]).max(), (1.15**2 * strength / limits[1]).max()) > 0.98
+            )
+
+
+def differences(path: np.ndarray, runs: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return steps and their differences, which in every run begin and end with 0."""
+    steps = np.diff(path, axis=0)
+    zero = np.zeros((1, path.shape[1]))
+    return steps, np.vstack([np.diff(np.vstack([zero, steps[a:b], zero]), axis=0) for a, b in runs])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.8))
+def test_stretching_gives_what_is_needed_and_no_more_than_allowed(seed: int, size: float) -> None:
+    rng, runs = np.random.default_rng(seed), [(0, 5), (5, 6), (6, 12)]
+    limits, dt = (np.full(3, 1.0), np.full(3, 4.0)), np.repeat([0.5, 1.0, 0.8], [5, 1, 6])
+    timing = Timing(dt, dt, runs, limits)
+    first, second = differences(
+        np.cumsum(0.5 * size * rng.uniform(-0.5, 0.5, (13, 3)), axis=0), runs
+    )
+    assert timing.velocity.shape == first.shape
+    assert timing.acceleration.shape == second.shape
+    longer = timing.stretch(first, second)
+    for number, (a, b) in enumerate(runs):
+        part, strong = first[a:b], second[a + number : b + number + 1]
+        excess = max(np.abs(part).max() / dt[a], np.sqrt(np.abs(strong).max() / 4.0) / dt[a])
+        assert longer.dt[a:b] == pytest.approx(dt[a] * np.clip(1.001 * excess, 1.0, 1.5))
+    assert timing.compute_violation(first, second) == pytest.approx(
+        max(
+            max(
+                np.abs(first[a:b]).max() / dt[a],
+                np.abs(second[a + k : b + k + 1]).max() / 4.0 / dt[a] ** 2,
+            )
+            for k, (a, b) in enumerate(runs)
+        )
+        - 1.0
+    )
+    if (longer.dt < 1.5 * dt).all():
+        assert longer.compute_violation(first, second) <= 0.0
+    np.testing.assert_array_equal(timing.dt, dt)
+
+
+def test_a_motion_that_is_slow_enough_keeps_its_time() -> None:
+    runs = list(itertools.pairwise([0, 4]))
+    timing = Timing(np.full(4, 0.5), np.full(4, 0.5), runs, (np.ones(2), np.full(2, 4.0)))
+    first, second = differences(np.linspace(0.0, 0.1, 5)[:, None] * np.ones(2), runs)
+    assert timing.compute_violation(first, second) < 0.0
+    np.testing.assert_array_equal(timing.stretch(first, second).dt, timing.dt)

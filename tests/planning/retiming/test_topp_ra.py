@@ -1,0 +1,59 @@
+"""Tests speeds along paths against analytic results."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vkc_pin.planning.retiming.spline_path import fit_path
+from vkc_pin.planning.retiming.topp_ra import compute_speeds
+
+FREE = (np.full(2, -np.inf), np.full(2, np.inf))
+
+
+def duration(places: np.ndarray, speeds: np.ndarray) -> float:
+    return float((2.0 * np.diff(places) / (speeds[1:] + speeds[:-1])).sum())
+
+
+@pytest.mark.parametrize(("length", "fastest", "strongest"), [(1.0, 10.0, 2.0), (3.0, 0.5, 1.0)])
+def test_duration_of_a_straight_path(length: float, fastest: float, strongest: float) -> None:
+    """Full acceleration, a phase at full speed if the path is long enough, and braking."""
+    path = fit_path(np.array([[0.0, 0.0], [length, 0.0]]), np.ones(2), FREE)
+    places = np.linspace(0.0, length, 201)
+    speeds = compute_speeds(
+        path, places, np.array([fastest, np.inf]), np.array([strongest, np.inf])
+    )
+    assert speeds is not None
+    ramp = fastest / strongest
+    shortest = (
+        2.0 * np.sqrt(length / strongest) if fastest * ramp > length else length / fastest + ramp
+    )
+    assert duration(places, speeds) == pytest.approx(shortest, rel=1e-2)
+    assert speeds[[0, -1]].tolist() == [0.0, 0.0]
+    assert speeds.max() <= fastest * (1 + 1e-6)
+
+
+@given(st.integers(0, 10**5))
+def test_limits_hold_all_along(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    path = fit_path(np.cumsum(rng.normal(size=(6, 2)), axis=0), np.ones(2), FREE)
+    places = np.unique(
+        np.concatenate([np.linspace(a, b, 9) for a, b in zip(path.x, path.x[1:], strict=False)])
+    )
+    velocity, acceleration = rng.uniform(0.5, 3.0, 2), rng.uniform(0.5, 3.0, 2)
+    speeds = compute_speeds(path, places, velocity, acceleration)
+    assert speeds is not None
+    assert (speeds[1:-1] > 0.0).all()
+    assert (np.abs(path(places, 1)) * speeds[:, None] <= velocity * (1 + 1e-3)).all()
+    change = np.diff(speeds**2) / (2.0 * np.diff(places))
+    middle = (places[1:] + places[:-1]) / 2.0
+    squared = (speeds[1:] ** 2 + speeds[:-1] ** 2) / 2.0
+    found = path(middle, 1) * change[:, None] + path(middle, 2) * squared[:, None]
+    assert (np.abs(found) <= acceleration * 1.3).all()
+
+
+def test_no_speeds_without_limits() -> None:
+    path = fit_path(np.array([[0.0, 0.0], [1.0, 0.0]]), np.ones(2), FREE)
+    assert compute_speeds(path, path.x, np.full(2, np.inf), np.full(2, np.inf)) is None

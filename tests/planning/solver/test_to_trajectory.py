@@ -1,0 +1,144 @@
+"""Tests of the conversion of waypoints to trajectories with pauses."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.carrying import STICK, lifted, room, stand, table
+from helpers.small_problems import SHORT, door_scene, program_of, random_configurations
+
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Release, Step
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
+
+
+@cache
+def fetching() -> TrajectoryProblem:
+    scene = room(stand(), objects=("stick", "ball")).with_held(
+        {"stick": "grip"}, at={"stick": (0.02, -0.1)}
+    )
+    return program_of(
+        scene,
+        [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), GoTo(0.0, 0.0)],
+        options=SHORT,
+    )
+
+
+@cache
+def placing() -> TrajectoryProblem:
+    return program_of(room(table()), [Place("stick", ASIDE)], options=SHORT)
+
+
+def unfolded(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
+    z = random_configurations(
+        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
+    )
+    return z, make_trajectory(problem, z, problem.timing_for(problem.still).dt)
+
+
+def pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
+    """Return the waypoints at which the robot has waited for the gripper."""
+    robot = motion.robot_size
+    still = (np.diff(motion.positions[:, :robot], axis=0) == 0.0).all(axis=1)
+    times = np.diff(motion.times)
+    np.testing.assert_allclose(times[still], problem.options.grasp_time)
+    np.testing.assert_allclose(times[~still], problem.timing_for(problem.still).dt)
+    return (np.flatnonzero(still) + 1).tolist()
+
+
+def test_phases_list_attached_objects() -> None:
+    _, motion = unfolded(fetching())
+    names = ["reach ball.pull by stick.tip", "place ball", "go to"]
+    assert [phase.name for phase in motion.phases] == names
+    both = {"stick": "grip", "ball": "pull"}
+    assert [dict(phase.held) for phase in motion.phases] == [
+        {"stick": "grip"},
+        both,
+        {"stick": "grip"},
+    ]
+    assert [phase["by"] for phase in motion.to_dict()["phases"]] == [{}, {"ball": "stick.tip"}, {}]
+    n = SHORT.reach_waypoints
+    assert [(phase.first, phase.last) for phase in motion.phases] == [
+        (0, n),
+        (n, 2 * n + 1),
+        (2 * n + 1, 3 * n + 2),
+    ]
+    assert pauses(fetching(), motion) == [n + 1, 2 * n + 2]
+
+
+def test_last_object_is_released_at_the_end() -> None:
+    _, motion = unfolded(placing())
+    assert [phase.name for phase in motion.phases] == ["reach stick.grip", "place stick", "let go"]
+    assert [dict(phase.held) for phase in motion.phases] == [{}, {"stick": "grip"}, {}]
+    n = SHORT.reach_waypoints
+    assert pauses(placing(), motion) == [n + 1, 2 * n + 2]
+    assert motion.phases[-1].last == len(motion.times) - 1
+
+
+@pytest.mark.parametrize(
+    ("steps", "held", "last"),
+    [
+        ([Grasp("door"), Release()], {"door": "handle"}, "let go"),
+        ([Actuate("door", {"knob": 0.3})], {}, "move door.knob"),
+        ([Actuate("door", {"knob": 0.3}), Release()], {}, "let go"),
+        ([Grasp("door")], {}, "reach door.handle"),
+        ([Release()], {"door": "handle"}, "let go"),
+    ],
+)
+def test_hand_opens_at_the_end_only_on_request(
+    steps: list[Step], held: dict[str, str], last: str
+) -> None:
+    scene = door_scene().with_held(held) if steps[0] == Release() else door_scene()
+    motion = unfolded(program_of(scene, steps, options=SHORT))[1]
+    assert motion.phases[-1].name == last
+    if last == "let go":
+        assert dict(motion.phases[-1].held) == {}
+        assert motion.phases[-1].last - motion.phases[-1].first == 1
+
+
+def test_object_grasped_at_the_start_is_released_first() -> None:
+    """A door grasped at the start is attached in no phase; its grasp keeps its value."""
+    for attachment in ("handle", "handle_free"):
+        problem = program_of(
+            door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT
+        )
+        motion = unfolded(problem)[1]
+        assert [dict(phase.held) for phase in motion.phases] == [{}]
+    assert np.all(motion.column("door.handle_free") == 0.0)
+
+
+@pytest.mark.parametrize("make", [fetching, placing])
+def test_robot_follows_the_waypoints(make) -> None:  # type: ignore[no-untyped-def]
+    problem = make()
+    z, motion = unfolded(problem)
+    rows = np.delete(motion.positions, pauses(problem, motion), axis=0)
+    robot = motion.robot_size
+    np.testing.assert_array_equal(rows[:, :robot], problem.waypoints(z)[:, :robot])
+
+
+@pytest.mark.parametrize("make", [fetching, placing])
+def test_grasp_coordinates_hold_their_values(make) -> None:  # type: ignore[no-untyped-def]
+    """During the grasp, values are the program's; before and after, the nearest ones."""
+    problem = make()
+    z, motion = unfolded(problem)
+    path = problem.waypoints(z)
+    rows = np.delete(motion.positions, pauses(problem, motion), axis=0)
+    ends = [0, *problem.ends.tolist()]
+    for hold, names in problem.chain.virtual.items():
+        columns = [problem.chain.index(name) for name in names]
+        held = [k for k, phase in enumerate(problem.task.phases) if hold in phase.held]
+        first, last = ends[held[0]], ends[held[-1] + 1]
+        np.testing.assert_array_equal(
+            rows[first : last + 1, columns], path[first : last + 1, columns]
+        )
+        np.testing.assert_array_equal(
+            rows[:first, columns], np.tile(path[first, columns], (first, 1))
+        )
+        np.testing.assert_array_equal(
+            rows[last:, columns], np.tile(path[last, columns], (len(rows) - last, 1))
+        )

@@ -1,0 +1,79 @@
+"""Tests repairs that pull a curve towards straight lines until a check accepts it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.planning.retime_validated import retime_validated
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class FakeViolation:
+    waypoint: int
+    constraint: str = "closure"
+
+
+@dataclasses.dataclass(frozen=True)
+class FakeReport:
+    violations: tuple[FakeViolation, ...]
+
+    @property
+    def ok(self) -> bool:
+        return not self.violations
+
+
+def corner(scene: vkc.Scene) -> Trajectory:
+    """Return waypoints of a base that drives ahead, and then to the left."""
+    rows = np.tile(scene.start, (9, 1))
+    rows[:, 0] += 0.2 * np.minimum(np.arange(9), 4)
+    rows[:, 1] += 0.2 * np.maximum(np.arange(9) - 4, 0)
+    return Trajectory(
+        scene.robot.coordinates.names,
+        np.arange(9.0),
+        rows,
+        (vkc.PhaseSpan("go", 0, 8),),
+        rows.shape[1],
+    )
+
+
+def compute_deviation(scene: vkc.Scene, motion: Trajectory) -> np.ndarray:
+    """Return how far the base leaves the two straight lines in every segment [m]."""
+    far = []
+    for begin, end in zip(motion.times, motion.times[1:], strict=False):
+        x, y = (motion(np.linspace(begin, end, 50))[:, :2] - np.asarray(scene.start)[:2]).T
+        far.append(np.maximum(np.minimum(np.abs(y), np.abs(x - 0.8)), x - 0.8).max())
+    return np.array(far)
+
+
+@pytest.mark.parametrize(("allowed", "most"), [(1.0, 1), (5e-3, 4), (1e-9, 4)])
+def test_the_curve_comes_closer_where_it_is_wrong(allowed: float, most: int) -> None:
+    scene, looked = vkc.load_scene("door"), list[float]()
+
+    def check(motion: Trajectory) -> FakeReport:
+        far = compute_deviation(scene, motion)
+        looked.append(float(far.max()))
+        return FakeReport(tuple(FakeViolation(int(k)) for k in np.flatnonzero(far > allowed)))
+
+    motion, report = retime_validated(scene, corner(scene), check)
+    np.testing.assert_array_equal(motion.positions, corner(scene).positions)
+    assert len(looked) <= most
+    assert looked == sorted(looked, reverse=True)
+    assert report.ok == (allowed > 1e-6)
+    assert compute_deviation(scene, motion).max() == looked[-1]
+
+
+def test_without_repairs_it_is_looked_at_once() -> None:
+    scene, looked = vkc.load_scene("door"), list[Trajectory]()
+
+    def check(motion: Trajectory) -> FakeReport:
+        looked.append(motion)
+        return FakeReport((FakeViolation(0),))
+
+    motion, report = retime_validated(scene, corner(scene), check, repairs=0)
+    assert looked == [motion]
+    assert not report.ok

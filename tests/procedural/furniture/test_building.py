@@ -1,0 +1,121 @@
+"""Tests built objects: masses and inertias against Pinocchio, and their URDF."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder
+from vkc_pin.world.models.object_file import load_object
+
+
+def built() -> ObjectBuilder:
+    builder = ObjectBuilder("thing", LinkBuilder("base"))
+    builder.base.add_box((0.0, -0.2, 0.0), (0.3, 0.2, 0.5), "oak")
+    moved = builder.add_joint(
+        "slide",
+        "prismatic",
+        (0.0, 0.0, 0.6),
+        (-1, 0, 0),
+        0.3,
+        lower=-0.1,
+        link="tray",
+        acceleration=1.5,
+    )
+    moved.add_box((-0.1, -0.1, -0.05), (0.1, 0.1, 0.05), "white")
+    moved.add_cylinder((-0.2, 0.0, 0.0), 0.02, 0.3, "y", "steel")
+    moved.add_sphere((0.0, 0.0, 0.2), 0.05, "steel")
+    moved.add_rod((0.1, 0.0, 0.0), (0.3, -0.2, 0.4), 0.03, "steel")
+    builder.add_attachment(
+        "grip",
+        moved,
+        (-0.2, 0.0, 0.0),
+        (1, 0, 0),
+        (0, 0, 1),
+        joint="revolute",
+        axis=[0, 1, 0],
+        limits=(-0.5, 0.5),
+    )
+    return builder
+
+
+def test_masses_and_inertias_match_pinocchio() -> None:
+    thing = load_object(built().description)
+    shapes = (
+        (pin.Inertia.FromBox(500.0 * 0.2 * 0.2 * 0.1, 0.2, 0.2, 0.1), pin.SE3.Identity()),
+        (
+            pin.Inertia.FromCylinder(500.0 * np.pi * 0.02**2 * 0.3, 0.02, 0.3),
+            pin.SE3(pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), np.array([-0.2, 0.0, 0.0])),
+        ),
+        (
+            pin.Inertia.FromSphere(500.0 * 4 / 3 * np.pi * 0.05**3, 0.05),
+            pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.2])),
+        ),
+    )
+    rod = np.array([0.2, -0.2, 0.4])
+    turned = pin.Quaternion.FromTwoVectors(
+        np.array([0.0, 0.0, 1.0]), rod / np.linalg.norm(rod)
+    ).matrix()
+    length = float(np.linalg.norm(rod))
+    shapes += (
+        (
+            pin.Inertia.FromCylinder(500.0 * np.pi * 0.03**2 * length, 0.03, length),
+            pin.SE3(turned, np.array([0.2, -0.1, 0.2])),
+        ),
+    )
+    expected = pin.Inertia.Zero()
+    for inertia, where in shapes:
+        expected += where.act(inertia)
+    found = thing.model.inertias[1]
+    assert found.mass == pytest.approx(expected.mass, abs=1e-4)
+    np.testing.assert_allclose(found.lever, expected.lever, rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(found.inertia, expected.inertia, rtol=0.0, atol=1e-4)
+
+
+def test_limits_and_rates_match_the_request() -> None:
+    thing = load_object(built().description)
+    assert (thing.name, thing.links, thing.urdf) == ("thing", ("base", "tray"), None)
+    assert (thing.lower[0], thing.upper[0], thing.velocity[0], thing.acceleration[0]) == (
+        -0.1,
+        0.3,
+        0.5,
+        1.5,
+    )
+    np.testing.assert_allclose(
+        thing.link_placement("tray", [0.2]).translation, [-0.2, 0.0, 0.6], rtol=0.0, atol=1e-12
+    )
+
+
+def test_visual_shapes_equal_collision_shapes() -> None:
+    thing = load_object(built().description)
+    drawn, solid = (
+        [
+            (type(shape.geometry).__name__, shape.placement.homogeneous.tolist())
+            for shape in geometry.geometryObjects
+        ]
+        for geometry in (thing.visual, thing.collision)
+    )
+    assert drawn == solid
+    assert len(drawn) == 5
+
+
+def test_a_case_is_open_in_front_and_closed_elsewhere() -> None:
+    link = LinkBuilder("case")
+    link.add_case((0.0, -0.3, 0.1), (0.5, 0.3, 0.9), 0.02, "white", "oak")
+    builder = ObjectBuilder("case", link)
+    builder.add_attachment("grip", link, (0, 0, 0), (1, 0, 0), (0, 0, 1))
+    shapes = load_object(builder.description).collision.geometryObjects
+    middle = np.array([0.25, 0.0, 0.5])
+    blocked = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            end = middle + sign * np.eye(3)[axis]
+            ray = [middle + t * (end - middle) for t in np.linspace(0.0, 1.0, 401)]
+            hit = any(
+                (np.abs(shape.placement.actInv(point)) <= shape.geometry.halfSide + 1e-9).all()
+                for shape in shapes
+                for point in ray
+            )
+            blocked.append(hit)
+    assert blocked == [False, True, True, True, True, True]  # but for -x

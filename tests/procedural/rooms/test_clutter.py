@@ -1,0 +1,86 @@
+"""Tests that clutter rests or hangs on surfaces without collisions."""
+
+from __future__ import annotations
+
+import itertools
+from functools import cache
+
+import coal
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError
+from vkc_pin.procedural.rooms.clutter import add_clutter
+from vkc_pin.world.models.shapes import compute_clearance, compute_shape_distance
+from vkc_pin.world.scene.placed_object import make_world_shapes
+
+PLACE = ((-3.0, 1.3, 1.051), 0.2)
+
+
+@cache
+def home() -> vkc.Scene:
+    return vkc.load_scene("household")
+
+
+def parts(scene: vkc.Scene) -> tuple[list, list]:
+    """Return what stood there before, and the clutter."""
+    new = [shape for shape in scene.obstacles if shape.name.startswith("clutter_")]
+    old = [shape for shape in scene.obstacles if not shape.name.startswith("clutter_")]
+    return old + [
+        shape for placed in scene.objects.values() for shape in make_world_shapes(placed)
+    ], new
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 60))
+def test_clutter_rests_or_hangs_without_collisions(seed: int, things: int) -> None:
+    old, new = parts(add_clutter(home(), things, seed=seed, clear=[PLACE]))
+    assert len(new) == things
+    for shape in new:
+        picture = isinstance(shape.geometry, coal.Box) and 2 * min(shape.geometry.halfSide) == 0.025
+        gaps = sorted(
+            compute_shape_distance(shape.geometry, shape.placement, other.geometry, other.placement)
+            for other in old
+        )
+        if picture:  # let into one wall, away from all else
+            assert gaps[0] == pytest.approx(-0.005, abs=1e-4)
+        else:
+            assert abs(gaps[0]) < 1e-4
+        assert gaps[1] > -1e-4  # two boards side by side may carry it
+    for one, other in itertools.combinations(new, 2):
+        assert (
+            compute_shape_distance(one.geometry, one.placement, other.geometry, other.placement)
+            > 0.0
+        )
+
+
+def test_clutter_keeps_free_places_clear() -> None:
+    _, new = parts(add_clutter(home(), 250, seed=2, clear=[PLACE]))
+    shapes = [(shape.geometry, shape.placement) for shape in new]
+    ball = vkc.load_scene("household").objects["cup"].placement.copy()
+    for middle, radius in [
+        PLACE,
+        *((p.placement.translation, 0.15) for p in home().objects.values() if p.object.free),
+    ]:
+        ball.translation = np.array(middle)
+        assert compute_clearance(shapes, [(coal.Sphere(radius), ball)]) > -1e-6
+
+
+def test_clutter_depends_on_the_seed() -> None:
+    one, same, other = (add_clutter(home(), 20, seed=seed).document for seed in (3, 3, 4))
+    assert one == same
+    assert one != other
+
+
+def test_too_much_clutter_is_rejected() -> None:
+    with pytest.raises(InputError, match="no space"):
+        add_clutter(home(), 5000)
+    with pytest.raises(InputError, match="no space"):
+        add_clutter(
+            vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}), 1
+        )
+    with pytest.raises(InputError, match="things"):
+        add_clutter(home(), -1)

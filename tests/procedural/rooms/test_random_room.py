@@ -1,0 +1,248 @@
+"""Tests random rooms: reproducible, free of overlaps, with reachable places for the robot."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from helpers.grippers import write_gripper
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.procedural.furniture.catalogue import KINDS
+from vkc_pin.procedural.rooms.fixtures import OPENABLE, make_fixture
+from vkc_pin.procedural.rooms.random_room import Layout, sample_layout
+from vkc_pin.world.models.shapes import (
+    compute_clearance,
+    compute_shape_distance,
+    compute_world_box,
+    list_placed_shapes,
+)
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import START_CLEARANCE
+
+NUMBERS = st.integers(0, 10_000)
+KNOWN = sorted([*OPENABLE, *(f"random_{kind}" for kind in KINDS)])
+OBJECTS = st.one_of(st.none(), st.lists(st.sampled_from(KNOWN), max_size=2).map(tuple))
+
+
+def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
+    """Return the collision shapes of every part and of the walls."""
+    found: dict[str, list] = {part.name: [] for part in layout.parts}
+    owners = {
+        entry["name"]: part.name
+        for part in layout.parts
+        for entry in part.obstacles
+        if not part.objects
+    }
+    counters = {entry["name"] for part in layout.parts for entry in part.obstacles if part.objects}
+    for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True):
+        if label in counters:
+            found.setdefault("counters", []).append(shape)
+        elif label != FLOOR:
+            found.setdefault(owners.get(label, "walls"), []).append(shape)
+    for name, placed in scene.objects.items():
+        found[name] = make_world_shapes(placed)
+    return found
+
+
+@settings(max_examples=12, deadline=None, phases=[Phase.generate])
+@given(NUMBERS, st.floats(0.0, 1.0), OBJECTS, st.booleans())
+def test_a_room_is_sound(
+    number: int, clutter: float, objects: tuple[str, ...] | None, cup: bool
+) -> None:
+    layout = sample_layout(
+        number, clutter=clutter, objects=objects, carried=("cup",) if cup else ()
+    )
+    scene = layout.make_scene()
+    assert all(4.0 <= size <= 7.0 for size in (layout.floor.width, layout.floor.depth))
+
+    shapes = groups(layout, scene)
+    for one, other in itertools.combinations(shapes, 2):
+        distance = compute_clearance(
+            list_placed_shapes(shapes[one]), list_placed_shapes(shapes[other]), reach=0.05
+        )
+        carried = "cup" in (one, other) or (
+            "counters" in (one, other) and "walls" not in (one, other)
+        )
+        door = "walls" in (one, other) and any("door" in name for name in (one, other))
+        least = -2e-3 if door else 5e-4 if carried else 0.0 if "walls" in (one, other) else 0.05
+        assert distance >= least - 1e-9, (one, other, distance)
+
+    assert scene.start_clearance() >= START_CLEARANCE
+    for yaw in np.linspace(-np.pi, np.pi, 7):  # it can turn where it starts
+        assert (
+            scene.with_start(base=[*layout.start[:2], yaw]).start_clearance(reach=START_CLEARANCE)
+            >= START_CLEARANCE
+        )
+
+    for part in layout.parts:
+        if part.clear_floor is None:
+            continue
+        assert layout.floor.contains(part.clear_floor)
+        assert all(
+            part.clear_floor.compute_gap(other.footprint) > 0.0
+            for other in layout.parts
+            if other.footprint != part.footprint
+        )
+        assert part.standing_place is not None
+        for yaw in (0.0, 1.5, 3.0):  # and where it has to stand
+            there = scene.with_start(base=[*part.standing_place, yaw])
+            assert there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE, part.name
+    spots = [part.standing_place for part in layout.parts if part.standing_place is not None]
+    assert layout.floor.is_connected(
+        [p.footprint for p in layout.parts], layout.radius, [layout.start[:2], *spots]
+    )
+
+
+def test_random_rooms_are_reproducible() -> None:
+    one, same, other = (vkc.random_room(number, clutter=0.7).document for number in (5, 5, 6))
+    assert one == same
+    assert one != other
+    assert vkc.random_room(5, clutter=0.2).document != one
+    assert vkc.random_room(5, vkc.RoomSettings(clutter=0.7)).document == one
+    assert vkc.random_room(np.int64(5), clutter=0.7).document == one  # type: ignore[arg-type]
+
+
+def test_another_process_makes_the_same_room() -> None:
+    code = (
+        "import json, vkc_pin as vkc; print(json.dumps(vkc.random_room(8, clutter=0.4).document))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert yaml.safe_load(done.stdout) == vkc.random_room(8, clutter=0.4).document
+
+
+def test_one_room_in_numbers() -> None:
+    """It must stay what it is on all machines: results on record are of these rooms."""
+    layout = sample_layout(0)
+    assert (layout.floor.width, layout.floor.depth) == (5.54, 6.85)
+    assert [part.name for part in layout.parts][:2] == ["narrow_door", "table_1"]
+
+
+def test_a_room_can_be_saved(tmp_path: Path) -> None:
+    room = vkc.random_room(2, objects=("door",), carried=("cup",))
+    file = tmp_path / "room.yaml"
+    file.write_text(yaml.safe_dump(room.document), encoding="utf-8")
+    again = vkc.load_scene(file)
+    assert again.document == room.document
+    for one, other in zip(room.obstacles, again.obstacles, strict=True):
+        assert one.placement.isApprox(other.placement)
+        assert (
+            compute_shape_distance(one.geometry, one.placement, other.geometry, other.placement)
+            < 0.0
+        )
+
+
+def test_random_objects_differ_between_rooms_and_are_saved(
+    tmp_path: Path,
+) -> None:
+    asked = ("random_drawers", "random_drawers", "random_microwave", "refrigerator")
+    rooms = [vkc.random_room(number, objects=asked, clutter=0.1) for number in (4, 5)]
+    assert list(rooms[0].objects) == ["drawers_1", "drawers_2", "microwave", "refrigerator"]
+    sizes = {
+        tuple(placed.object.upper)
+        for room in rooms
+        for name, placed in room.objects.items()
+        if "drawers" in name
+    }
+    assert len(sizes) == 4
+    assert {"microwave_counter", "microwave_worktop"} <= set(rooms[0].obstacle_names)
+    file = tmp_path / "room.yaml"
+    file.write_text(yaml.safe_dump(rooms[0].document), encoding="utf-8")
+    again = vkc.load_scene(file)
+    assert again.document == rooms[0].document
+    assert again.objects["drawers_1"].object.model == rooms[0].objects["drawers_1"].object.model
+
+
+def test_objects_by_path_and_by_description(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    description = vkc.random_object("chest", 3)
+    vkc.write_object(description, tmp_path / "my.chest.yaml")
+    monkeypatch.chdir(tmp_path)
+    room = vkc.random_room(
+        1,
+        objects=["./my.chest.yaml", tmp_path / "my.chest.yaml", description, "dishwasher"],
+        clutter=0.0,
+    )
+    assert list(room.objects) == ["my_chest_1", "my_chest_2", "chest", "dishwasher"]
+    monkeypatch.chdir("/")
+    again = vkc.Scene.from_document(room.document, room.folder)  # paths are whole
+    assert again.document == room.document
+    for name in room.objects:
+        low = min(
+            compute_world_box(shape.geometry, shape.placement)[0][2]
+            for shape in make_world_shapes(room.objects[name])
+        )
+        assert low == pytest.approx(0.0, abs=1e-4)
+
+
+def test_requested_parts_are_present() -> None:
+    room = vkc.random_room(
+        3, objects=("drawer", "drawer", "door"), tables=2, carried=("cup", "ball"), clutter=0.0
+    )
+    assert list(room.objects) == ["drawer_1", "drawer_2", "door", "cup", "ball"]
+    assert sum(name.endswith("_top") for name in room.obstacle_names) == 2
+    few, many = (
+        len(vkc.random_room(3, objects=(), clutter=clutter).obstacle_names)
+        for clutter in (0.1, 1.0)
+    )
+    assert few < many
+
+
+@pytest.mark.parametrize("number", [-1, 1.5, True, "1"])
+def test_invalid_numbers_are_rejected(number: object) -> None:
+    with pytest.raises(vkc.InputError) as found:
+        vkc.random_room(number)  # type: ignore[arg-type]
+    assert (found.value.field, found.value.expected, found.value.got) == (
+        "number",
+        "a whole number of at least 0",
+        repr(number),
+    )
+
+
+def test_unknown_settings_and_parts_are_rejected() -> None:
+    with pytest.raises(vkc.UnknownNameError, match="did you mean 'clutter'"):
+        vkc.random_room(0, cluter=0.5)
+    with pytest.raises(vkc.UnknownNameError, match="table_9"):
+        sample_layout(0).find_part("table_9")
+
+
+def test_error_if_parts_do_not_fit() -> None:
+    with pytest.raises(vkc.InputError) as found:
+        vkc.random_room(0, width=(4.0, 4.0), objects=("cabinet",) * 6)
+    assert found.value.field == "clutter"
+    assert "fewer objects" in str(found.value.expected)
+
+
+def test_imported_objects_and_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Imported objects have their frame in the middle: the floor is free in front of their face."""
+    box = '<collision><origin xyz="{} 0 0.2"/><geometry><box size="{} 0.5 0.4"/></geometry></collision>'
+    body, door = box.format(0.03, 0.64), box.format(-0.3, 0.02)
+    ends = (
+        '<parent link="body"/><child link="door"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
+    )
+    joint = f'<joint name="hinge" type="revolute">{ends}</joint>'
+    urdf = f'<robot name="oven"><link name="body">{body}</link><link name="door">{door}</link>{joint}</robot>'
+    own = make_fixture({"urdf": urdf, "attachments": []})
+    assert own.face == pytest.approx(-0.29)
+    assert make_fixture("dishwasher").face == pytest.approx(0.0, abs=0.03)
+    write_gripper(tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    room = vkc.random_room(
+        7, objects=[{"urdf": urdf, "attachments": []}], robot="mine/robot.yaml", clutter=0.0
+    )
+    assert room.robot.name == "mine"
+    assert list(room.objects) == ["oven"]
+    assert (
+        vkc.random_room(7, objects=["drawer"], robot=Path("mine"), clutter=0.0).robot.name == "mine"
+    )  # type: ignore[arg-type]

@@ -1,0 +1,97 @@
+"""Tests possible and random tasks; all are planned and judged by the oracle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.procedural.furniture.catalogue import KINDS
+
+
+def test_goals_lists_every_joint_and_free_object_once() -> None:
+    home = vkc.load_scene("household")
+    offered = {
+        (step.object, *getattr(step, "joints", ())): step for step in vkc.goals(home, share=0.5)
+    }
+    assert {key for key in offered if len(key) == 2} == {
+        *(("door", "hinge"), ("drawer", "slide"), ("dishwasher", "rack"), ("dishwasher", "door")),
+        *(("refrigerator", "hinge"), ("cabinet", "hinge")),
+    }
+    grasped = {step.object for step in offered.values() if isinstance(step, vkc.Grasp)}
+    assert grasped == {name for name, placed in home.objects.items() if placed.object.free}
+    assert offered["refrigerator", "hinge"] == vkc.Actuate(
+        "refrigerator", {"hinge": 1.0}, "handle_free"
+    )
+
+
+def test_open_joints_are_closed() -> None:
+    scene = vkc.load_scene("drawer")
+    (step,) = vkc.goals(scene.with_state("drawer", {"slide": 0.4}), share=0.75)
+    assert isinstance(step, vkc.Actuate)
+    assert step.joints == {"slide": pytest.approx(0.1)}
+
+
+def test_joints_without_limits_turn_by_a_fraction_of_a_turn() -> None:
+    description = vkc.random_object("valve", 0)
+    urdf = description["urdf"].replace('type="revolute"', 'type="continuous"')
+    here = {"name": "valve", "type": {**description, "urdf": urdf}, "position": [2.0, 0.0, 0.0]}
+    scene = vkc.Scene.from_document(
+        {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "objects": [here]}
+    )
+    (step,) = vkc.goals(scene, share=0.25)
+    assert isinstance(step, vkc.Actuate)
+    assert step.joints["turn"] == pytest.approx(np.pi / 2, abs=1e-3)
+
+
+def test_no_goal_is_beyond_a_limit() -> None:
+    scene = vkc.load_scene("corridor_door")
+    door = scene.objects["door"].object
+    (step,) = vkc.goals(scene, share=0.5)
+    assert isinstance(step, vkc.Actuate)
+    assert step.joints["hinge"] == door.upper[door.coordinates.index("hinge")] == np.pi / 2.0, (
+        "rounded it would be 1.571"
+    )
+
+
+@pytest.mark.parametrize("share", [0.0, 1.1, -0.5, "half", float("nan")])
+def test_invalid_shares_are_rejected(share: object) -> None:
+    with pytest.raises(vkc.InputError) as found:
+        vkc.goals(vkc.load_scene("drawer"), share=share)  # type: ignore[arg-type]
+    assert found.value.field == "share"
+
+
+def test_random_tasks_are_reproducible() -> None:
+    (room, steps), (same, again), (other, _) = (vkc.random_task(seed) for seed in (3, 3, 4))
+    assert (room.document, steps) == (same.document, again)
+    assert room.document != other.document
+    kinds = tuple(f"random_{placed.object.name}" for placed in room.objects.values())
+    assert vkc.random_room(3, objects=kinds).document == room.document
+
+
+def test_random_tasks_accept_room_settings() -> None:
+    room, (step,) = vkc.random_task(2, clutter=0.0, objects=("drawer",), carried=("cup",))
+    assert list(room.objects) == ["drawer", "cup"]
+    assert step.object in room.objects  # type: ignore[union-attr]
+    with pytest.raises(vkc.InputError, match="no step is possible"):
+        vkc.random_task(2, clutter=0.0, objects=())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_opened(kind: str, tmp_path: Path) -> None:
+    """From a random start in a furnished room; the plan saves the object and is loaded elsewhere."""
+    room, steps = vkc.random_task(11, objects=(f"random_{kind}",), clutter=0.3)
+    plan = vkc.plan(room, steps)
+    assert plan.success, plan.validation
+    (step,) = steps
+    assert isinstance(step, vkc.Actuate)
+    (joint, value), *_ = step.joints.items()
+    assert plan.trajectory.positions[
+        -1, plan.trajectory.names.index(f"{kind}.{joint}")
+    ] == pytest.approx(value, abs=1e-3)
+    kept = vkc.Plan.load(plan.save(tmp_path / "plan.npz"))
+    assert kept.scene.document == room.document
+    assert kept.success
+    assert kept.scene.objects[kind].object.model == room.objects[kind].object.model

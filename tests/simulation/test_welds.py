@@ -1,0 +1,53 @@
+"""Welds carry the load of grasped objects for as long as the plan holds them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.executions import door_plan, holding, still, with_mass
+
+import vkc_pin as vkc
+from vkc_pin.simulation.execution import simulate
+from vkc_pin.simulation.welds import find_hold_spans
+from vkc_pin.world.trajectory.world_model import World
+
+
+@pytest.mark.parametrize("mass", [0.4, 3.0])
+def test_load_of_a_grip_is_the_object_weight(mass: float) -> None:
+    scene = with_mass(holding(), "stick", mass)
+    result = simulate(scene, [vkc.Grasp("stick")], still(scene, 2.0))
+    (grip,) = result.grips
+    world = World(scene)
+    model, data = world.model, world.model.createData()
+    pin.framesForwardKinematics(model, data, world.coordinates.q(result.rows[-1]))
+    joint = model.getJointId("stick.placement")
+    arm = (
+        data.oMi[joint].act(model.inertias[joint].lever)
+        - data.oMf[model.getFrameId(scene.robot.tool_frame)].translation
+    )
+    weight = np.array([0.0, 0.0, -9.81 * mass])
+    assert grip.force == pytest.approx(9.81 * mass, rel=0.02)
+    assert grip.torque == pytest.approx(np.linalg.norm(np.cross(arm, weight)), rel=0.05)
+    assert (
+        np.linalg.norm(data.oMi[joint].translation - scene.objects["stick"].placement.translation)
+        < 0.02
+    )
+
+
+def test_hold_spans_follow_the_plan() -> None:
+    plan = door_plan()
+    ((hold, begin, end),) = find_hold_spans(plan.scene, plan.trajectory)
+    first = next(phase for phase in plan.trajectory.phases if phase.holds)
+    assert str(hold) == "door.handle"
+    assert begin == plan.trajectory.times[first.first]
+    assert end == np.inf
+    scene = holding()
+    ((hold, begin, _),) = find_hold_spans(scene, still(scene))
+    assert hold.object == "stick"
+    assert begin == -np.inf
+
+
+def test_pushes_are_not_held() -> None:
+    scene = vkc.load_scene("door").with_held({"door": "push"})
+    assert find_hold_spans(scene, still(scene)) == []

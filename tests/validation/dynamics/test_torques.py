@@ -1,0 +1,126 @@
+"""Motions that are too heavy or too fast are named by joint, time and amount, here and by the oracle."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.closers import changed, closer
+from helpers.executions import door_plan, holding, still
+from oracle.judge import judge
+
+import vkc_pin as vkc
+from vkc_pin.planning.retiming.retime import retime_trajectory
+from vkc_pin.validation.dynamics.torques import TORQUE_TOLERANCE, MotorLoads
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.validate import validate
+
+HEAVY = {"stiffness": 120.0, "springref": -2.0}
+
+
+def said(scene: vkc.Scene, trajectory: vkc.Trajectory | None = None) -> Report:
+    plan = door_plan()
+    return validate(
+        scene, plan.steps, plan.trajectory if trajectory is None else trajectory, plan.options
+    )
+
+
+def test_a_door_that_is_too_heavy_is_named_by_joint_torque_and_time(tmp_path: Path) -> None:
+    report, plan = said(closer(**HEAVY)), door_plan()
+    assert {violation.constraint for violation in report.violations} == {"torque"}
+    worst = max(report.violations, key=lambda violation: violation.amount)
+    assert worst.subject == "shoulder_pan_joint"
+    assert worst.unit == "N·m"
+    assert worst.amount == pytest.approx(150.0 * (report.torque - 1.0))
+    assert 6.0 < worst.time <= plan.trajectory.times[-1], "where the spring pulls most"
+    assert "exceeds the motor's 150 N·m" in worst.detail
+    assert "even at rest" in worst.detail
+    planted = dataclasses.replace(plan, scene=closer(**HEAVY), validation=report, status="rejected")
+    verdict = judge(planted.save(tmp_path / "heavy.npz"))
+    assert verdict.agrees
+    assert {(found.rule, found.subject) for found in verdict.found} == {
+        (v.constraint, v.subject) for v in report.violations
+    }
+
+
+def test_a_door_that_damps_is_too_fast_until_it_is_timed_for_it() -> None:
+    scene, plan = closer(damping=400.0), door_plan()
+    fast = said(scene)
+    assert fast.violations
+    assert all(
+        violation.constraint == "torque" and "N·m at rest" in violation.detail
+        for violation in fast.violations
+    )
+    slower = retime_trajectory(scene, plan.trajectory)
+    report = said(scene, slower)
+    assert report.ok
+    assert 0.9 < report.torque <= 1.0 + TORQUE_TOLERANCE, "no slower than it has to be"
+    assert 1.0 < slower.times[-1] / plan.trajectory.times[-1] < 1.3
+    np.testing.assert_array_equal(slower.positions, plan.trajectory.positions)
+    assert any(bound.kind == "torque" for bound in report.bounds)
+
+
+def test_a_light_door_changes_nothing() -> None:
+    plan = door_plan()
+    light = closer(friction=1.5, damping=3.0, stiffness=5.0, springref=-2.0)
+    report = said(light)
+    assert report.ok
+    assert 0.0 < report.torque < 0.5
+    np.testing.assert_array_equal(
+        retime_trajectory(light, plan.trajectory).times,
+        retime_trajectory(plan.scene, plan.trajectory).times,
+    )
+
+
+def test_a_payload_that_is_too_heavy_to_hold_is_found_while_nothing_moves() -> None:
+    heavy = changed(vkc.load_scene("init_1"), "stick", mass=60.0).with_held({"stick": "grip"})
+    found = MotorLoads(Samples(heavy, still(heavy))).find_violations()
+    assert {violation.constraint for violation in found} == {"torque"}
+    assert "shoulder_lift_joint" in {violation.subject for violation in found}
+    assert all("even at rest" in violation.detail for violation in found)
+    assert MotorLoads(Samples(holding(), still(holding()))).find_violations() == []
+
+
+def test_without_masses_torques_are_not_looked_at_and_that_is_said_once() -> None:
+    scene = door_plan().scene
+    model = pin.Model(scene.robot.model)
+    for joint in range(1, model.njoints):
+        model.inertias[joint] = pin.Inertia.Zero()
+    scene = dataclasses.replace(
+        closer(**HEAVY), robot=dataclasses.replace(scene.robot, model=model)
+    )
+    report = said(scene)
+    assert report.ok
+    assert report.torque == 0.0
+    assert report.remarks == ("torques not checked: the URDF states no masses of the arm",)
+
+
+def test_what_is_carried_without_a_mass_is_named() -> None:
+    scene = changed(vkc.load_scene("init_1"), "stick", mass=0.0).with_held({"stick": "grip"})
+    (remark,) = MotorLoads(Samples(scene, still(scene))).summarize()["remarks"]
+    assert remark == "carried as massless, since no mass is given: stick"
+    assert MotorLoads(Samples(holding(), still(holding()))).summarize()["remarks"] == ()
+
+
+def test_jerk_bounds_nothing_unless_it_is_limited() -> None:
+    plan = door_plan()
+    motors = MotorLoads(Samples(plan.scene, plan.trajectory))
+    assert "jerk" not in {bound.kind for bound in motors.summarize()["bounds"]}
+    assert "jerk" in {bound.kind for bound in motors.summarize(1.0)["bounds"]}
+
+
+def test_reports_tell_of_torques_and_plans_keep_that(tmp_path: Path) -> None:
+    plan = door_plan()
+    assert plan.metrics["torque"] == plan.validation.torque > 0.0
+    assert (
+        f"torques     at most {100.0 * plan.validation.torque:.0f} % of the motors' limits"
+        in plan.report()
+    )
+    assert f"bounded by  {plan.validation.bounds[0]}" in plan.report()
+    assert plan.to_dict()["bounds"][0] == dataclasses.asdict(plan.validation.bounds[0])
+    loaded = vkc.Plan.load(plan.save(tmp_path / "door.npz"))
+    assert loaded.claimed == plan.validation == loaded.validation

@@ -1,0 +1,197 @@
+"""Own constraints on motions that nobody planned, whose violations are known from geometry."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers.carrying import STICK, TOP, carried_over, room, table
+from helpers.drives import DT, hall, moved, of_rows, through
+
+import vkc_pin as vkc
+from vkc_pin.validation.terms import INTERMEDIATE_FACTOR
+
+START = hall().start
+
+
+def found(
+    scene: vkc.Scene, trajectory: vkc.Trajectory, term: vkc.Constraint, steps: Any = None
+) -> list[vkc.Violation]:
+    """Return what validation says of a term alone."""
+    steps = steps or [vkc.GoTo(*trajectory.positions[-1, :2])]
+    report = vkc.validate(scene, steps, trajectory, terms=[term])
+    return [violation for violation in report.violations if violation.constraint == "term"]
+
+
+def low(upper: float, **fields: Any) -> vkc.Constraint:
+    return vkc.Constraint("low tip", lambda s: s.position("stick.tip")[2], upper=upper, **fields)
+
+
+def test_a_carried_link_is_where_the_hand_has_brought_it() -> None:
+    scene = room(table())
+    motion, place = carried_over(scene, aside=0.3).motion(), [vkc.Place("stick", (0.8, 0.3, 0.551))]
+    link = scene.objects["stick"].object.link_placement("tip", [])
+    highest = (STICK * link).translation[2] + 0.2
+    assert found(scene, motion, low(highest + 1e-4), place) == []
+    (violation,) = found(scene, motion, low(TOP + 0.1), place)
+    assert (violation.subject, violation.unit) == ("low tip", "")
+    assert violation.amount == pytest.approx(highest - TOP - 0.1, abs=1e-6)
+    assert f"{highest:.6g} is more than 0.6 by" in violation.detail
+    held = [phase for phase in motion.phases if phase.held]
+    assert motion.times[held[0].first] <= violation.time <= motion.times[held[-1].last]
+    # Nothing is wrong where it stands, before and after.
+    assert (
+        found(
+            scene,
+            motion,
+            low(TOP + 0.1, during=[motion.phases[0].name, motion.phases[-1].name]),
+            place,
+        )
+        == []
+    )
+    assert len(found(scene, motion, low(TOP + 0.1, holding="stick"), place)) == 1
+
+
+def test_the_worst_is_named_with_place_time_and_entry() -> None:
+    scene = hall()
+    motion = through(scene, START, moved(START, x=2.0), moved(START, x=2.0, y=1.0))
+    within = vkc.Constraint(
+        "within",
+        lambda s: ca.vertcat(s.coordinate("base_x"), s.position("base_link")[1]),
+        upper=[1.5, 0.25],
+    )
+    (violation,) = found(scene, motion, within)
+    assert violation.amount == pytest.approx(0.75, abs=1e-9)
+    assert violation.waypoint == len(motion.times) - 1
+    assert violation.time == pytest.approx(motion.times[-1])
+    assert violation.detail == "entry 1: 1 is more than 0.25 by 0.75"
+    (violation,) = found(scene, motion, dataclasses.replace(within, during="drive 1"))
+    assert violation.detail == "entry 0: 2 is more than 1.5 by 0.5"
+    assert violation.waypoint == 40
+    report = vkc.validate(scene, [vkc.GoTo(2.0, 1.0)], motion, terms=[within])
+    assert not report.ok
+    assert any("term within: entry 1: 1 is more than 0.25" in line for line in report.lines())
+    assert vkc.validate(scene, [vkc.GoTo(2.0, 1.0)], motion).ok
+
+
+def test_costs_are_nothing_to_check() -> None:
+    motion = through(hall(), START, moved(START, x=2.0))
+    assert vkc.validate(
+        hall(),
+        [vkc.GoTo(2.0, 0.0)],
+        motion,
+        terms=[vkc.Cost("far", lambda s: s.coordinate("base_x"))],
+    ).ok
+
+
+@pytest.mark.parametrize(
+    ("bound", "excess", "wrong"),
+    [("lower", 5e-4, False), ("upper", 5e-4, False), ("upper", 2e-3, True)],
+)
+def test_tolerance_at_waypoints(bound: str, excess: float, wrong: bool) -> None:
+    motion = through(hall(), START, moved(START, x=2.0))
+    limit = 2.0 - excess if bound == "upper" else excess
+    fields = {bound: limit, "during": "drive 1"}
+    term = vkc.Constraint(
+        "x",
+        lambda s: s.coordinate("base_x") if bound == "upper" else 2 - s.coordinate("base_x"),
+        **fields,
+    )
+    assert len(found(hall(), motion, term)) == wrong
+    assert found(hall(), motion, dataclasses.replace(term, tolerance=2 * excess)) == []
+
+
+@pytest.mark.parametrize(("turn", "wrong"), [(0.2, False), (0.6, True)])
+def test_between_waypoints(turn: float, wrong: bool) -> None:
+    """The hand swings out in the middle of a turn of the base, by r·(1 − cos(turn/2)), and is at its bound at both ends."""
+    scene, steps = hall(), 2
+    arm = scene.tool_placement().translation
+    ahead, away = np.arctan2(arm[1], arm[0]), float(np.hypot(*arm[:2]))
+    rows = [START, *(moved(START, yaw=-ahead + sign * turn / 2) for sign in (-1.0, 1.0))]
+    motion = of_rows(scene, np.array(rows), dt=5.0)
+    assert len(motion.times) == steps + 1
+    edge = away * np.cos(turn / 2)
+    term = vkc.Constraint("behind", lambda s: s.position("tool")[0], upper=edge)
+    out = away - edge
+    assert (out > INTERMEDIATE_FACTOR * term.tolerance) == wrong
+    violations = found(scene, motion, term)
+    assert len(violations) == wrong
+    for violation in violations:
+        assert violation.amount == pytest.approx(out, rel=1e-3)
+        assert violation.waypoint == 1
+        assert violation.time == pytest.approx(7.5, abs=0.1)
+        assert "between waypoints" in violation.detail
+    assert (
+        len(
+            found(
+                scene, motion, dataclasses.replace(term, tolerance=out / INTERMEDIATE_FACTOR * 0.9)
+            )
+        )
+        == 1
+    )
+
+
+def test_speeds_are_those_of_the_last_step() -> None:
+    scene = hall()
+    motion = through(scene, START, moved(START, x=2.0))
+    speeds = np.abs(np.diff(motion.positions[:, 0])) / DT
+    fastest = float(speeds.max())
+    for frame in ("tool", "base_link"):
+        slow = vkc.Constraint(
+            "slow", lambda s, frame=frame: ca.norm_2(s.velocity(frame)), upper=fastest + 1e-4
+        )
+        assert found(scene, motion, slow) == []
+        (violation,) = found(scene, motion, dataclasses.replace(slow, upper=0.9 * fastest))
+        assert violation.amount == pytest.approx(0.1 * fastest, rel=1e-3)
+        assert violation.waypoint in np.flatnonzero(speeds > 0.999 * fastest) + 1
+    rate = vkc.Constraint("rate", lambda s: s.rate("base_x"), upper=0.9 * fastest)
+    assert found(scene, motion, rate)[0].amount == pytest.approx(0.1 * fastest, rel=1e-6)
+    # Nothing jumps at waypoints, so that nothing is worse between them than at both.
+    brakes = vkc.Constraint(
+        "brakes", lambda s: s.rate("base_x") - 0.2 * (2.0 - s.coordinate("base_x")), upper=0.0
+    )
+    values = speeds - 0.2 * (2.0 - motion.positions[1:, 0])
+    assert values.max() > 0.1
+    (violation,) = found(scene, motion, brakes)
+    assert violation.amount == pytest.approx(values.max(), abs=1e-3)
+
+
+def test_a_constraint_begins_after_the_first_waypoint_of_its_phases() -> None:
+    scene = hall()
+    motion = through(scene, START, moved(START, x=2.0), moved(START, x=2.5))
+    ahead = vkc.Constraint("ahead", lambda s: s.coordinate("base_x"), lower=2.0)
+    assert len(found(scene, motion, ahead)) == 1
+    assert found(scene, motion, dataclasses.replace(ahead, during="drive 2")) == []
+    clear = dataclasses.replace(ahead, lower=motion.positions[41, 0], during="drive 2")
+    assert found(scene, motion, clear) == []  # although where the phase begins is before that
+    assert len(found(scene, motion, dataclasses.replace(clear, during=["drive 1", "drive 2"]))) == 1
+
+
+def test_waiting_for_the_gripper_belongs_to_the_phase_before() -> None:
+    scene = hall()
+    driven = through(scene, START, moved(START, x=1.0), moved(START, x=2.0), steps=10)
+    rows = np.vstack([driven.positions[:11], driven.positions[10:]])  # stands still for a step
+    phases = (vkc.PhaseSpan("drive 1", 0, 10), vkc.PhaseSpan("drive 2", 10, 21))
+    motion = of_rows(scene, rows, dt=0.5, phases=phases)
+    ahead = vkc.Constraint(
+        "ahead", lambda s: s.coordinate("base_x"), lower=rows[12, 0], during="drive 2"
+    )
+    assert found(scene, motion, ahead) == []
+    assert len(found(scene, motion, dataclasses.replace(ahead, lower=rows[13, 0]))) == 1
+    still = dataclasses.replace(
+        motion, positions=np.vstack([rows[:11], np.tile(rows[10], (11, 1))])
+    )
+    assert (
+        len(found(scene, still, ahead, [vkc.GoTo(1.0, 0.0)])) == 1
+    )  # who does not move at all does not get there
+
+
+def test_what_is_no_number_is_a_violation() -> None:
+    motion = through(hall(), START, moved(START, x=2.0))
+    term = vkc.Constraint("log", lambda s: ca.log(s.coordinate("base_x") - 1.0), lower=-100.0)
+    (violation,) = found(hall(), motion, term)
+    assert violation.amount == np.inf
+    assert "nan" in violation.detail

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.fake_plan import fake_plan
+
+from vkc_pin.planning.plan import Plan
+from vkc_pin.visualization.plots.clearance import ClearanceCurve, compute_clearance_curves
+from vkc_pin.world.trajectory.world_model import World
+
+TIMES = np.linspace(0.0, 6.0, 13)
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return fake_plan()
+
+
+@pytest.fixture(scope="module")
+def curves(plan: Plan) -> dict[str, ClearanceCurve]:
+    found = compute_clearance_curves(plan.scene, plan.trajectory, TIMES)
+    return {curve.name: curve for curve in found}
+
+
+def test_kinds_of_pairs(curves: dict[str, ClearanceCurve]) -> None:
+    kinds = [
+        "robot – itself",
+        "robot – objects",
+        "robot – obstacles",
+        "objects – surroundings",
+        "gripper – what it grasps",
+    ]
+    assert list(curves) == kinds
+    for curve in curves.values():
+        assert curve.distances.shape == TIMES.shape
+        assert len(curve.pairs) == len(TIMES)
+
+
+def test_distance_to_obstacles_is_coals(curves: dict[str, ClearanceCurve], plan: Plan) -> None:
+    """The smallest over all pairs, asked one by one, and the named pair really is that close."""
+    world, robot = World(plan.scene), plan.scene.robot
+    data, shapes = world.model.createData(), world.collision.createData()
+    curve = curves["robot – obstacles"]
+    arm = range(len(robot.collision.geometryObjects))
+    labels, objects = world.collision_labels, world.collision.geometryObjects
+    obstacles = [i for i in range(len(arm), len(labels)) if "." not in labels[i]]
+    for k in (0, 6, 12):
+        q = world.coordinates.q(world.compute_positions(plan.trajectory, [TIMES[k]])[0])
+        pin.updateGeometryPlacements(world.model, data, world.collision, shapes, q)
+        nearest = (np.inf, ("", ""))
+        for i in arm:
+            for j in obstacles:
+                if labels[j] == "floor" and objects[i].parentJoint == 1:
+                    continue
+                a, b = (
+                    coal.Transform3s(shapes.oMg[m].rotation, shapes.oMg[m].translation)
+                    for m in (i, j)
+                )
+                request, result = coal.DistanceRequest(), coal.DistanceResult()
+                distance = coal.distance(
+                    objects[i].geometry, a, objects[j].geometry, b, request, result
+                )
+                nearest = min(nearest, (distance, (labels[i], labels[j])))
+        assert curve.distances[k] == pytest.approx(nearest[0], abs=1e-5)
+        assert curve.pairs[k] == nearest[1]
+
+
+def test_the_closest_moment_is_named(curves: dict[str, ClearanceCurve]) -> None:
+    curve = curves["robot – objects"]
+    distance, when, pair = curve.closest()
+    assert distance == curve.distances.min()
+    assert when in TIMES
+    assert "door." in pair

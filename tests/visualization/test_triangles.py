@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+import trimesh
+
+from vkc_pin.errors import InputError
+from vkc_pin.visualization.plots.top_view import outline
+from vkc_pin.visualization.triangles import (
+    Solid,
+    box_solid,
+    coarse,
+    merge_solids,
+    shade,
+    to_solid,
+    tube,
+)
+from vkc_pin.world.files.meshes import MeshPart, to_bvh
+from vkc_pin.world.models.shapes import triangulate
+
+
+def as_mesh(solid: Solid) -> trimesh.Trimesh:
+    mesh = trimesh.Trimesh(solid.vertices, solid.faces, process=False)
+    mesh.merge_vertices(merge_norm=True)
+    return mesh
+
+
+def ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    return np.array(mesh.vertices), np.array(mesh.faces)
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume", "size"),
+    [
+        (coal.Box(1.0, 2.0, 3.0), 6.0, (1, 2, 3)),
+        (coal.Sphere(0.5), np.pi / 6, (1, 1, 1)),
+        (coal.Ellipsoid(1.0, 2.0, 3.0), 8 * np.pi, (2, 4, 6)),
+        (coal.Cylinder(0.5, 2.0), np.pi / 2, (1, 1, 2)),
+        (coal.Cone(0.5, 3.0), np.pi / 4, (1, 1, 3)),
+        (coal.Capsule(0.5, 2.0), np.pi / 2 + np.pi / 6, (1, 1, 3)),
+        (to_bvh(MeshPart(*ball())), np.pi / 6, (1, 1, 1)),
+    ],
+)
+def test_surface_of_every_shape(
+    shape: coal.CollisionGeometry, volume: float, size: tuple[float, ...]
+) -> None:
+    vertices, faces = triangulate(shape)
+    mesh = trimesh.Trimesh(vertices, faces)
+    assert mesh.volume == pytest.approx(volume, rel=0.05), "wound outwards, and nearly round"
+    assert np.allclose(np.ptp(vertices, axis=0), size, rtol=0.03)
+    assert np.allclose(vertices.min(axis=0) + vertices.max(axis=0), 0.0, atol=1e-6), (
+        "centred as coal's shapes are"
+    )
+
+
+def test_convex_shapes() -> None:
+    from vkc_pin.world.files.meshes import convex_hull
+
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
+    assert trimesh.Trimesh(*triangulate(convex_hull(corners))).volume == pytest.approx(6.0)
+
+
+def test_a_half_space_has_no_surface() -> None:
+    with pytest.raises(InputError, match="cannot be drawn"):
+        triangulate(coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0))
+
+
+def test_boxes_have_edges_and_balls_have_none() -> None:
+    box = to_solid(coal.Box(1.0, 1.0, 1.0))
+    assert np.allclose(np.sort(np.abs(box.normals), axis=1), [0, 0, 1], atol=0.02), (
+        "each side its own normal"
+    )
+    sphere = to_solid(coal.Sphere(1.0))
+    assert np.einsum("ij,ij->i", sphere.normals, sphere.vertices).min() > 0.97, (
+        "normals point straight out"
+    )
+
+
+def test_sides_of_a_box_face_outwards() -> None:
+    lower, upper = np.array([-1.0, 0.0, 2.0]), np.array([1.0, 3.0, 4.0])
+    whole = box_solid(lower, upper)
+    assert as_mesh(whole).volume == pytest.approx(12.0)
+    for side in range(6):
+        solid = box_solid(lower, upper, (side,))
+        axis, positive = divmod(side, 2)
+        assert np.allclose(solid.vertices[:, axis], (lower, upper)[positive][axis])
+        assert np.allclose(solid.normals, (2 * positive - 1) * np.eye(3)[axis])
+        corners = solid.vertices[solid.faces]
+        turn = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert (np.einsum("ij,ij->i", turn, solid.normals[:2]) > 0).all()
+
+
+def test_a_coarse_copy_is_lighter_and_as_large() -> None:
+    fine = shade(*ball())
+    light = coarse(fine, 0.1)
+    assert len(light.faces) < 0.8 * len(fine.faces)
+    assert as_mesh(light).volume == pytest.approx(as_mesh(fine).volume, rel=0.1)
+
+
+def test_moving_and_merging() -> None:
+    solid = box_solid(np.zeros(3), np.ones(3))
+    moved = solid.moved(
+        pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2), np.array([5.0, 0.0, 0.0]))
+    )
+    assert np.allclose(moved.vertices.min(axis=0), [4.0, 0.0, 0.0], atol=1e-6)
+    both = merge_solids([solid, moved])
+    assert len(both.vertices) == 2 * len(solid.vertices)
+    assert as_mesh(both).volume == pytest.approx(2.0, rel=1e-5)
+
+
+def test_a_tube_follows_its_line() -> None:
+    angle = np.linspace(0.0, 3.0, 60)
+    line = np.column_stack([np.cos(angle), np.sin(angle), 0.2 * angle])
+    solid = tube(line, 0.01)
+    assert solid is not None
+    away = np.linalg.norm(solid.vertices[:, None] - line[None], axis=2).min(axis=1)
+    assert np.allclose(away, 0.01, atol=1e-3)
+    corners = solid.vertices[solid.faces]
+    turn = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", turn, solid.normals[solid.faces[:, 0]]) > 0).all(), (
+        "wound outwards"
+    )
+    assert tube(np.zeros((5, 3)), 0.01) is None, "nothing moves"
+
+
+def test_outline_of_points_from_above() -> None:
+    corners = outline(np.array([[0, 0, 1], [2, 0, 5], [2, 1, 0], [0, 1, 0], [1, 0.5, 9]], float))
+    assert {tuple(c) for c in corners} == {(0, 0), (2, 0), (2, 1), (0, 1)}
+    assert len(outline(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))) == 2

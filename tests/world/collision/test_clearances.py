@@ -1,0 +1,198 @@
+"""Tests the search for margin violations against Pinocchio and coal, pair by pair."""
+
+from __future__ import annotations
+
+import itertools
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.world.collision import clearances as clearances_module
+from vkc_pin.world.collision.boxes import Boxes
+from vkc_pin.world.collision.clearances import Clearances
+from vkc_pin.world.collision.margins import MarginRegion, Margins
+from vkc_pin.world.collision.placements import ShapePlacements
+from vkc_pin.world.collision.shapes import Shapes
+
+SEEDS = st.integers(0, 2**32 - 1)
+MOVING, STANDING, STATES, WAYPOINTS = 6, 7, 10, 5
+
+
+def random_placement(rng: np.random.Generator, size: float) -> pin.SE3:
+    return pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))
+
+
+class Room:
+    """Boxes on an arm among fixed boxes; some pairs have reduced margins."""
+
+    def __init__(self, seed: int) -> None:
+        rng = self.rng = np.random.default_rng(seed)
+        self.model, self.geometry, parent = pin.Model(), pin.GeometryModel(), 0
+        for k, joint in enumerate((pin.JointModelPlanar, pin.JointModelRZ, pin.JointModelRX)):
+            parent = self.model.addJoint(parent, joint(), random_placement(rng, 0.3), f"j{k}")
+        self.halves = rng.uniform(0.02, 0.2, (MOVING + STANDING, 3))
+        self.shapes = [coal.Box(*(2 * half)) for half in self.halves]
+        for k in range(MOVING):
+            joint = 1 + int(rng.integers(3))
+            self.geometry.addGeometryObject(
+                pin.GeometryObject(f"s{k}", joint, 0, random_placement(rng, 0.2), self.shapes[k])
+            )
+        self.joints = np.array(
+            [*(s.parentJoint for s in self.geometry.geometryObjects), *[0] * STANDING]
+        )
+        self.standing = [random_placement(rng, 0.6) for _ in range(STANDING)]
+        self.pairs = np.array(
+            [(a, b) for a, b in itertools.combinations(range(MOVING + STANDING), 2) if a < MOVING]
+        )
+        self.usual = rng.choice([0.0, 0.02, 0.1], len(self.pairs))
+        self.q = np.array(
+            [
+                pin.integrate(self.model, pin.neutral(self.model), rng.normal(size=5))
+                for _ in range(STATES)
+            ]
+        )
+        self.z, self.waypoints = rng.normal(size=(STATES, 2)), rng.integers(0, WAYPOINTS, STATES)
+        eased = {int(pair): [(1, 3, -0.05)] for pair in rng.permutation(len(self.pairs))[:8]}
+        away = MarginRegion(
+            rng.permutation(len(self.pairs))[:20],
+            -np.inf,
+            np.array([1]),
+            np.zeros(1),
+            np.full(1, 9.0),
+        )
+        self.margins = Margins(self.usual, eased, [away])
+
+    def clearances(self) -> Clearances:
+        placed = [*(shape.placement for shape in self.geometry.geometryObjects), *self.standing]
+        rotations = np.array([placement.rotation for placement in placed])
+        centers = np.array([placement.translation for placement in placed])
+        shapes = Shapes(self.shapes, self.standing, threads=4)
+        boxes = Boxes(self.joints, rotations, centers, self.halves, self.pairs)
+        return Clearances(ShapePlacements(self.model, self.geometry), boxes, shapes, self.margins)
+
+    def all_pairs(
+        self, reach: float, standing: bool
+    ) -> list[list[tuple[float, float, int, float]]]:
+        """Return sorted (distance − margin, distance, pair, margin) of close pairs, by state."""
+        data, placed, found = self.model.createData(), pin.GeometryData(self.geometry), []
+        every = np.arange(len(self.pairs))
+        for state, q in enumerate(self.q):
+            pin.updateGeometryPlacements(self.model, data, self.geometry, placed, q)
+            where, rows = [*placed.oMg, *self.standing], []
+            margins = self.margins.compute_margins(
+                every,
+                np.full(len(every), self.waypoints[state]),
+                self.z,
+                np.full(len(every), state),
+            )
+            for k, (a, b) in enumerate(self.pairs.tolist()):
+                request, result = coal.DistanceRequest(), coal.DistanceResult()
+                ends = [coal.Transform3s(where[i].rotation, where[i].translation) for i in (a, b)]
+                distance = coal.distance(
+                    self.shapes[a], ends[0], self.shapes[b], ends[1], request, result
+                )
+                if distance < reach and margins[k] > -np.inf and (standing or b < MOVING):
+                    rows.append(
+                        (float(distance - margins[k]), float(distance), k, float(margins[k]))
+                    )
+            found.append(sorted(rows))
+        return found
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.sampled_from([None, 0, 1, 4]), st.sampled_from([0.0, 0.1, 2.0]), st.booleans())
+def test_closest_pairs_match_an_exhaustive_search(
+    seed: int, most: int | None, reach: float, standing: bool
+) -> None:
+    room = Room(seed)
+    expected = [
+        (state, *row)
+        for state, rows in enumerate(room.all_pairs(reach, standing))
+        for row in rows[:most]
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        for rows_per_thread in (1, 100):  # four threads, and one
+            patch.setattr(clearances_module, "_MIN_ROWS_PER_THREAD", rows_per_thread)
+            found = room.clearances().find_closest_pairs(
+                room.q, room.z, room.waypoints, reach=reach, max_pairs=most, include_fixed=standing
+            )
+            short = found.distance - found.margin
+            mine = zip(
+                *(
+                    part.tolist()
+                    for part in (found.row, short, found.distance, found.pair, found.margin)
+                ),
+                strict=True,
+            )
+            assert [*mine] == expected
+            along = np.einsum("ci,ci->c", found.normal, found.second - found.first)
+            np.testing.assert_allclose(along, found.distance, atol=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.sampled_from([0.0, 0.1]), st.sampled_from([-0.05, 0.0, 0.02, 0.12, 0.3]))
+def test_first_violation_matches_an_exhaustive_search(
+    seed: int, reach: float, allowed: float
+) -> None:
+    room = Room(seed)
+    room.waypoints[:] = waypoint = int(room.waypoints[0])
+    rows, order = room.all_pairs(reach, standing=True), room.rng.permutation(STATES)
+    hit = [
+        any(margin - distance > allowed for _, distance, _, margin in rows[state])
+        for state in order
+    ]
+    expected = hit.index(True) if True in hit else STATES
+    mine = room.clearances().find_first_violation(
+        room.q[order], room.z[order], waypoint, reach=reach, allowed=allowed
+    )
+    assert mine == expected
+    assert (
+        room.clearances().find_first_violation(
+            room.q[:0], room.z[:0], waypoint, reach=reach, allowed=allowed
+        )
+        == 0
+    )
+
+
+def test_fixed_shapes_can_be_moved() -> None:
+    room = Room(4)
+    before, place = room.clearances(), random_placement(room.rng, 0.6)
+    moved = np.array([MOVING + 2])
+    boxes = before.boxes.move_fixed(moved, place.rotation[None], place.translation[None])
+    after = before.move_fixed(boxes, {MOVING + 2: place})
+    room.standing[2] = place
+    for mine, anew in zip(
+        *(
+            c.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
+            for c in (after, room.clearances())
+        ),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(mine, anew)
+    unmoved = Room(4).clearances().find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
+    np.testing.assert_array_equal(
+        before.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3).distance,
+        unmoved.distance,
+    )
+
+
+def test_mismatched_parts_raise() -> None:
+    room = Room(0)
+    mine = room.clearances()
+    for q, z, waypoints in (
+        (room.q[:, :-1].copy(), room.z, room.waypoints),
+        (room.q, room.z[:-1], room.waypoints),
+        (room.q, room.z[:, :1].copy(), room.waypoints),
+        (room.q, room.z, room.waypoints[:-1]),
+    ):
+        with pytest.raises(ValueError, match=r"shape|waypoints"):
+            mine.find_closest_pairs(q, z, waypoints, reach=0.1)
+    fewer = Margins(room.usual[:-1], {})
+    with pytest.raises(ValueError, match="belong"):
+        Clearances(mine.placements, mine.boxes, mine.shapes, fewer).find_closest_pairs(
+            room.q, room.z, room.waypoints, reach=0.1
+        )

@@ -1,0 +1,69 @@
+"""Tests margin lookup against the same rules, pair by pair."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.world.collision.margins import MarginRegion, Margins
+
+PAIRS, COORDINATES = 12, 4
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_least_that_holds_there(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    usual = rng.uniform(0.0, 0.05, PAIRS)
+    eased = {
+        int(pair): [
+            (int(first), int(first + rng.integers(4)), float(rng.normal()))
+            for first in rng.integers(0, 8, 2)
+        ]
+        for pair in rng.permutation(PAIRS)[:4]
+    }
+    places = []
+    for _ in range(3):
+        columns, low = rng.permutation(COORDINATES)[: rng.integers(1, 3)], rng.normal(size=4)
+        lower = low[: len(columns)]
+        margin = float(rng.choice([-np.inf, -0.01, 0.01]))
+        places.append(MarginRegion(rng.permutation(PAIRS)[:5], margin, columns, lower, lower + 1.5))
+    pairs, waypoints = (grid.ravel() for grid in np.meshgrid(np.arange(PAIRS), np.arange(10)))
+    z, rows = rng.normal(size=(6, COORDINATES)), rng.integers(0, 6, len(pairs))
+    expected = []
+    for pair, waypoint, row in zip(pairs.tolist(), waypoints.tolist(), rows.tolist(), strict=True):
+        some = [
+            usual[pair],
+            *(margin for first, last, margin in eased.get(pair, ()) if first <= waypoint <= last),
+        ]
+        for place in places:
+            here = z[row, place.columns]
+            if pair in place.pairs and np.all((place.lower <= here) & (here <= place.upper)):
+                some.append(place.margin)
+        expected.append(min(some))
+    assert len(set(expected)) > PAIRS, "something changes"
+    np.testing.assert_array_equal(
+        Margins(usual, eased, places).compute_margins(pairs, waypoints, z, rows), expected
+    )
+
+
+def test_invalid_arrays_raise() -> None:
+    usual, one, z = np.zeros(3), np.zeros(1, int), np.zeros((1, 2))
+    with pytest.raises(IndexError, match="pair"):
+        Margins(usual, {3: [(0, 1, 0.0)]})
+    for place in (
+        MarginRegion(one + 3, 0.0, one, z[0, :1], z[0, :1]),
+        MarginRegion(one, 0.0, one - 1, z[0, :1], z[0, :1]),
+    ):
+        with pytest.raises(IndexError):
+            Margins(usual, {}, [place])
+    with pytest.raises(ValueError, match="limits"):
+        Margins(usual, {}, [MarginRegion(one, 0.0, one, z[0], z[0, :1])])
+    table = Margins(usual, {}, [MarginRegion(one, 0.0, one + 1, z[0, :1], z[0, :1])])
+    for pairs, rows in ((one + 3, one), (one - 1, one), (one, one + 1), (one, one - 1)):
+        with pytest.raises(IndexError):
+            table.compute_margins(pairs, one, z, rows)
+    with pytest.raises(ValueError, match="coordinates"):
+        table.compute_margins(one, one, z[:, :1], one)

@@ -1,0 +1,104 @@
+"""Tests that shape placements equal Pinocchio's bit for bit."""
+
+from __future__ import annotations
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.memory import growth
+from helpers.small_problems import door_scene, random_configurations
+
+from vkc_pin.world.collision.placements import ShapePlacements, flatten_placements
+from vkc_pin.world.trajectory.world_model import World
+
+
+def test_placements_are_flattened_by_columns() -> None:
+    rotation = pin.exp3(np.array([0.1, 0.2, 0.3]))
+    (numbers,) = flatten_placements([pin.SE3(rotation, np.array([4.0, 5.0, 6.0]))])
+    np.testing.assert_array_equal(
+        numbers, [*rotation[:, 0], *rotation[:, 1], *rotation[:, 2], 4.0, 5.0, 6.0]
+    )
+    assert flatten_placements([]).shape == (0, 12)
+
+
+def test_serialization_leaks_no_memory() -> None:
+    world = World(door_scene())
+    left, objects = growth(lambda: [ShapePlacements(world.model, world.bodies) for _ in range(50)])
+    assert left <= 50 * 8
+    assert objects <= 50 / 2
+
+
+def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
+    mine = ShapePlacements(model, geometry)
+    found = mine.compute_placements(q)
+    assert found.shape == (len(q), len(geometry.geometryObjects), 12)
+    data, placed = model.createData(), pin.GeometryData(geometry)
+    for row, configuration in zip(found, q, strict=True):
+        pin.updateGeometryPlacements(model, data, geometry, placed, configuration)
+        for numbers, placement in zip(row, placed.oMg, strict=True):
+            np.testing.assert_array_equal(numbers[:9].reshape(3, 3).T, placement.rotation)
+            np.testing.assert_array_equal(numbers[9:], placement.translation)
+    np.testing.assert_array_equal(
+        mine.compute_placements(q[:1]), found[:1]
+    )  # earlier results must not change
+
+
+def test_placements_match_pinocchio() -> None:
+    world = World(door_scene())
+    limits = (np.full(world.coordinates.size, limit) for limit in (-1.0, 1.0))
+    check(
+        world.model,
+        world.bodies,
+        world.coordinates.q(random_configurations(*limits, 5, np.random.default_rng(0))),
+    )
+
+
+JOINTS = [
+    *(getattr(pin, f"JointModel{kind}{axis}") for kind in ("R", "P", "RUB") for axis in "XYZ"),
+    lambda: pin.JointModelRevoluteUnaligned(np.array([0.6, 0.0, 0.8])),
+    lambda: pin.JointModelPrismaticUnaligned(np.array([0.0, -0.6, 0.8])),
+    pin.JointModelPlanar,
+    pin.JointModelFreeFlyer,
+    pin.JointModelSpherical,
+]
+
+
+def test_all_joint_types_are_supported() -> None:
+    rng, model, geometry, parent = np.random.default_rng(3), pin.Model(), pin.GeometryModel(), 0
+    for k, joint in enumerate(JOINTS):
+        parent = model.addJoint(parent, joint(), pin.SE3.Random(), f"j{k}")
+        shape = pin.GeometryObject(f"s{k}", parent, 0, pin.SE3.Random(), coal.Sphere(0.1))
+        geometry.addGeometryObject(shape)
+    geometry.addGeometryObject(
+        pin.GeometryObject("stands", 0, 0, pin.SE3.Random(), coal.Sphere(0.1))
+    )
+    neutral = pin.neutral(model)
+    check(
+        model,
+        geometry,
+        np.array([pin.integrate(model, neutral, rng.normal(size=model.nv)) for _ in range(4)]),
+    )
+
+
+def test_configurations_of_wrong_size_raise() -> None:
+    world = World(door_scene())
+    with pytest.raises(ValueError, match="nq"):
+        ShapePlacements(world.model, world.bodies).compute_placements(
+            np.zeros((2, world.model.nq + 1))
+        )
+
+
+def test_empty_input_gives_empty_output() -> None:
+    world = World(door_scene())
+    q = world.coordinates.q(np.zeros((2, world.coordinates.size)))
+    assert ShapePlacements(world.model, world.bodies).compute_placements(q[:0]).shape == (
+        0,
+        len(world.bodies.geometryObjects),
+        12,
+    )
+    assert ShapePlacements(world.model, pin.GeometryModel()).compute_placements(q).shape == (
+        2,
+        0,
+        12,
+    )

@@ -1,0 +1,150 @@
+"""Tests the conversion of coal shapes to compiled ones, and the check of library versions."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+import types
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from vkc_pin.errors import BuildError, InputError
+from vkc_pin.utils import optional_imports as needed
+from vkc_pin.world.collision import solids
+from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.solids import convert_solid
+from vkc_pin.world.files.meshes import convex_hull, indices
+
+NOWHERE = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
+
+
+def hull(seed: int) -> coal.Convex:
+    return convex_hull(np.random.default_rng(seed).normal(size=(30, 3)))
+
+
+def distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> float:
+    return float(
+        Shapes([first, second]).compute_distances(NOWHERE, np.zeros(1, int), np.array([[0, 1]]))[0]
+    )
+
+
+def test_unsupported_shapes_raise() -> None:
+    with pytest.raises(InputError, match="HeightFieldAABB"):
+        convert_solid(coal.HeightFieldAABB(1.0, 1.0, np.zeros((3, 3)), 0.0))
+    with pytest.raises(InputError, match="object"):
+        convert_solid(object())
+
+
+def test_hulls_are_cached_until_they_change() -> None:
+    shape = hull(0)
+    first = convert_solid(shape)
+    assert convert_solid(shape) is first
+    shape.setSweptSphereRadius(0.1)
+    assert convert_solid(shape) is not first
+    other = hull(1)
+    assert convert_solid(other) is not convert_solid(shape)
+    key = id(shape)
+    assert key in solids._cache
+    del shape
+    gc.collect()
+    assert key not in solids._cache
+
+
+def test_changed_dimensions_are_noticed() -> None:
+    """Primitives are converted at every call."""
+    box, ball = coal.Box(1.0, 1.0, 1.0), coal.Sphere(0.1)
+    where = NOWHERE.copy()
+    where[0, 1, 9] = 2.0
+    pair = np.zeros(1, int), np.array([[0, 1]])
+    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(1.4, abs=1e-6)
+    box.halfSide = np.array([1.0, 0.5, 0.5])
+    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(0.9, abs=1e-6)
+    ball.setSweptSphereRadius(0.2)
+    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(0.7, abs=1e-6)
+
+
+def test_triangles_keep_their_corners() -> None:
+    mesh = coal.BVHModelOBBRSS()
+    points, faces = np.eye(3), [[0, 2, 1]]
+    mesh.beginModel(1, 3)
+    mesh.addVertices(points)
+    mesh.addTriangles(np.array(faces))
+    mesh.endModel()
+    np.testing.assert_array_equal(indices(mesh), faces)
+    shape = hull(2)
+    corners = indices(shape)
+    assert corners.shape == (shape.num_polygons, 3)
+    assert set(corners.ravel().tolist()) == set(range(shape.num_points))
+
+
+@pytest.mark.parametrize("wrong", [np.array([[0, 1, 3]]), np.array([[0, -1, 2]])])
+def test_faces_without_points_raise(wrong: np.ndarray) -> None:
+    with pytest.raises(IndexError, match="corner"):
+        solids.load_compiled().convex(np.eye(3), wrong, 0.0)
+
+
+def test_incompatible_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module is missing, or was compiled against other releases."""
+    solids.load_compiled.cache_clear()
+    for theirs, mine, message in (
+        ("2.9.1", pin.__version__, r"against coal 2\.9\.1"),
+        (coal.__version__, "3.9.0", r"pin 3\.9\.0"),
+    ):
+        with monkeypatch.context() as patch:
+            built = types.SimpleNamespace(COAL_VERSION=theirs, PINOCCHIO_VERSION=mine)
+            patch.setattr(solids, "compiled_module", lambda _, built=built: built)
+            with pytest.raises(BuildError, match=message):
+                solids.load_compiled()
+
+    def missing(name: str) -> types.ModuleType:
+        raise ImportError(f"no {name}")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(needed, "import_module", missing)
+        with pytest.raises(BuildError, match="compiler"):
+            solids.load_compiled()
+    solids.load_compiled.cache_clear()
+    assert coal.__version__ == solids.load_compiled().COAL_VERSION
+
+
+_FIRST = """
+import numpy as np
+from vkc_pin.world.collision.shapes import Shapes
+import coal
+turn = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
+where = np.array([[[*turn, 0, 0, 0], [*turn, -2, 0, 0]]])
+shapes = Shapes([coal.Box(1.0, 1.0, 1.0), coal.Box(1.0, 1.0, 1.0)])
+print(float(shapes.compute_distances(where, np.zeros(1, int), np.array([[0, 1]]))[0]).hex())
+"""
+
+
+def test_box_sizes_do_not_depend_on_the_first_query() -> None:
+    """A first query along an axis would make coal enlarge boxes by 1e-10 from then on."""
+    answers = {
+        subprocess.run(
+            [sys.executable, "-c", before + _FIRST],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        ).stdout
+        for before in ("", "import vkc_pin as vkc; vkc.load_scene('door')\n")
+    }
+    assert len(answers) == 1
+    assert float.fromhex(answers.pop().strip()) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_no_leak_warnings_at_exit() -> None:
+    """Caches and globals hold shapes until the process ends."""
+    code = (
+        "import builtins, coal; from vkc_pin.world.collision.shapes import Shapes; "
+        "builtins.kept = Shapes([coal.Sphere(0.1)])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout + done.stderr == ""

@@ -1,0 +1,89 @@
+"""Tests the search for close axis-aligned boxes against an exhaustive one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.collision.world_boxes import WorldBoxes
+
+
+def gap(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> float:
+    """Return the distance of two boxes given by their corners; -inf if they overlap."""
+    apart = np.maximum(second[0] - first[1], first[0] - second[1])
+    return float(np.linalg.norm(np.maximum(apart, 0.0))) if apart.max() > 0.0 else -np.inf
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 40),
+    st.booleans(),
+    st.sampled_from([0.05, 0.5, np.inf]),
+)
+def test_close_pairs_match_an_exhaustive_search(
+    seed: int, states: int, moving: bool, limit: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    lower = np.cumsum(rng.normal(0.0, 0.2, (states, 5, 3)), axis=0) + rng.uniform(-2.0, 2.0, (5, 3))
+    upper = lower + rng.uniform(0.0, 0.8, (5, 3))
+    floor = rng.uniform(-2.0, 2.0, (7, 3))
+    ceiling = floor + rng.uniform(0.0, 1.0, (7, 3))
+    boxes = WorldBoxes(lower, upper, floor, ceiling)
+    bottoms, tops = (
+        np.concatenate([own, np.broadcast_to(standing, (states, 7, 3))], axis=1)
+        for own, standing in ((lower, floor), (upper, ceiling))
+    )
+    first = np.arange(states - moving)
+    last = first + moving
+    moved = np.zeros((len(first), 12))
+    moved[:, :5] = rng.uniform(0.0, 0.4, (len(first), 5)) * moving
+    moves = np.array([[True] * 5 + [False] * 7, [True, False, True, False, True] + [False] * 7])
+    phases = (np.arange(len(first)) > len(first) // 2).astype(int)
+    pairs = np.array([(i, j) for j in range(12) for i in range(min(j, 5))])
+    at, which = boxes.find_close_pairs(
+        first, last, pairs, moved=moved, moves=moves, phases=phases, limit=limit
+    )
+    expected = []
+    for k, (a, b) in enumerate(zip(first, last, strict=True)):
+        for p, (i, j) in enumerate(pairs.tolist()):
+            ends = sum(
+                gap((bottoms[s, i], tops[s, i]), (bottoms[s, j], tops[s, j])) for s in (a, b)
+            )
+            if moves[phases[k], [i, j]].any() and (ends - moved[k, i] - moved[k, j]) / 2 < limit:
+                expected.append((k, p))
+    assert list(zip(at.tolist(), which.tolist(), strict=True)) == expected
+
+
+def test_invalid_indices_raise() -> None:
+    corner = np.zeros((2, 1, 3))
+    boxes = WorldBoxes(corner, corner + 1.0, np.full((1, 3), 3.0), np.full((1, 3), 4.0))
+    good = {
+        "moved": np.zeros((1, 2)),
+        "moves": np.ones((1, 2), bool),
+        "phases": np.zeros(1, int),
+        "limit": 9.0,
+    }
+    here, pair = np.zeros(1, int), np.array([[0, 1]])
+    at, which = boxes.find_close_pairs(here, here, pair, **good)
+    assert (at.tolist(), which.tolist()) == ([0], [0])
+    for first, pairs, more in (
+        (here + 2, pair, {}),
+        (here - 1, pair, {}),
+        (here, pair + 1, {}),
+        (here, pair, {"phases": here + 1}),
+    ):
+        with pytest.raises(IndexError, match="no such"):
+            boxes.find_close_pairs(first, here, pairs, **{**good, **more})
+    for more in (
+        {"moved": np.zeros((1, 3))},
+        {"moves": np.ones((1, 3), bool)},
+        {"moved": np.zeros((2, 2))},
+    ):
+        with pytest.raises(ValueError, match=r"shape|moves|stretch"):
+            boxes.find_close_pairs(here, here, pair, **{**good, **more})
+    with pytest.raises(ValueError, match="shape"):
+        WorldBoxes(corner, corner[:1], np.zeros((1, 3)), np.zeros((1, 3)))

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vkc_pin.errors import UnknownNameError
+from vkc_pin.world.files.resources import available, choose_file_names, find, folder
+
+
+def test_what_travels_with_the_package() -> None:
+    assert {"door", "drawer"} <= set(available("scenes", "*.yaml"))
+    assert "husky_ur5e" in available("robots", "*")
+    for kind, pattern in (("scenes", "*.yaml"), ("robots", "*")):
+        for name, path in available(kind, pattern).items():
+            assert path.exists()
+            assert path.stem == name
+            assert path.parent == folder(kind)
+
+
+def test_names_work_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = find("scenes", "*.yaml", "door", what="scene")
+    monkeypatch.chdir(tmp_path)
+    assert find("scenes", "*.yaml", "door", what="scene") == before
+    assert before.is_absolute()
+
+
+def test_a_name_that_does_not_exist() -> None:
+    with pytest.raises(
+        UnknownNameError, match=r"there is no scene 'draw'; did you mean 'drawer'\?"
+    ) as caught:
+        find("scenes", "*.yaml", "draw", what="scene")
+    assert set(caught.value.choices) == set(available("scenes", "*.yaml"))
+
+
+def test_an_installed_package_has_them_inside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inside = tmp_path / "site-packages" / "vkc_pin"
+    (inside / "scenes").mkdir(parents=True)
+    (inside / "scenes" / "own.yaml").write_text("")
+    monkeypatch.setattr(
+        "vkc_pin.world.files.resources.__file__", str(inside / "files" / "resources.py")
+    )
+    assert folder("scenes") == inside / "scenes"
+    assert list(available("scenes", "*.yaml")) == ["own"]
+    assert folder("robots") == inside.parent / "robots"  # a source tree has them beside the package
+
+
+# Names of new files
+
+FINE = re.compile(r"[A-Za-z0-9_-]{1,64}")
+DEVICES = {
+    "con",
+    "prn",
+    "aux",
+    "nul",
+    *(f"{port}{k}" for port in ("com", "lpt") for k in range(10)),
+}
+NAMES = st.lists(
+    st.one_of(
+        st.text(max_size=80),
+        st.text("aA_-1 +", max_size=4),
+        st.sampled_from(["con", "COM1", "a_2", ".", "..", "", "a/b", "\0", "\n", "x" * 300]),
+    ),
+    max_size=12,
+)
+
+
+@given(NAMES)
+def test_file_names_are_portable_and_unique_in_a_folder(names: list[str]) -> None:
+    chosen = choose_file_names(names)
+    assert len(chosen) == len(names)
+    assert len({name.lower() for name in chosen}) == len(names)
+    for name in chosen:
+        assert FINE.fullmatch(name)
+        assert name.lower() not in DEVICES
+
+
+@given(NAMES)
+def test_portable_names_are_kept_and_the_choice_is_reproducible(names: list[str]) -> None:
+    chosen = choose_file_names(names)
+    assert choose_file_names(names) == chosen
+    assert choose_file_names(chosen) == chosen
+    seen = set[str]()
+    for name, new in zip(names, chosen, strict=True):
+        if FINE.fullmatch(name) and name.lower() not in DEVICES | seen:
+            assert new == name
+            seen.add(name.lower())
+
+
+@given(NAMES, NAMES)
+def test_file_names_avoid_existing_ones(names: list[str], others: list[str]) -> None:
+    taken = choose_file_names(others)
+    chosen = choose_file_names(names, taken=taken)
+    assert len({name.lower() for name in (*taken, *chosen)}) == len(names) + len(others)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["drawer", "left-door_2"], ["drawer", "left-door_2"]),
+        (["a+b", "a b", "a_b"], ["a_b_2", "a_b_3", "a_b"]),
+        (["шкаф", "стул"], ["part", "part_2"]),
+        (["Door", "door"], ["Door", "door_2"]),
+        (["door", "door"], ["door", "door_2"]),
+        (["con", "Lpt1", "conx"], ["con_", "Lpt1_", "conx"]),
+        (["../../etc/passwd"], ["______etc_passwd"]),
+        (["", "."], ["part", "part_2"]),
+        (["a" * 65, "a" * 64 + "b"], ["a" * 64, "a" * 62 + "_2"]),
+    ],
+)
+def test_file_names_of_examples(names: list[str], expected: list[str]) -> None:
+    assert choose_file_names(names) == expected
+
+
+def test_the_fallback_is_for_names_without_ascii_letters_and_digits() -> None:
+    assert choose_file_names(["робот", "r2", "+"], fallback="robot") == ["robot", "r2", "robot_2"]
+
+
+def test_a_thousand_names_that_look_alike() -> None:
+    assert choose_file_names("+" for _ in range(1000))[-1] == "part_1000"

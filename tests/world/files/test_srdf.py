@@ -1,0 +1,106 @@
+"""What an SRDF says: pairs that may touch, and named states."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.files.srdf import Srdf, group_tip, read_groups, read_srdf
+
+LINKS = ("base", "arm", "hand")
+
+
+def read(folder: Path, inside: str) -> Srdf:
+    (folder / "r.srdf").write_text(f'<robot name="r">\n{inside}\n</robot>')
+    return read_srdf(folder / "r.srdf", links=LINKS)
+
+
+def state(name: str, **joints: str) -> str:
+    values = "".join(f'<joint name="{joint}" value="{value}"/>' for joint, value in joints.items())
+    return f'<group_state name="{name}" group="all">{values}</group_state>'
+
+
+def test_pairs_are_sorted_and_keep_their_reason(tmp_path: Path) -> None:
+    pairs = '<disable_collisions link1="hand" link2="arm" reason="Adjacent"/>\n<disable_collisions link1="arm" link2="base"/>'
+    assert read(tmp_path, pairs).allowed == {("arm", "hand"): "Adjacent", ("arm", "base"): ""}
+
+
+def test_states_of_several_groups_are_put_together(tmp_path: Path) -> None:
+    """And joints with more than one coordinate are left out."""
+    srdf = read(
+        tmp_path,
+        state("home", a="0.5") + state("up", a="-1e-1", floating="1 0 0") + state("home", b="2"),
+    )
+    assert srdf.states == {"home": {"a": 0.5, "b": 2.0}, "up": {"a": -0.1}}
+
+
+@pytest.mark.parametrize(
+    ("names", "chosen"),
+    [
+        (["up", "rest", "home"], "home"),
+        (["up", "rest"], "rest"),
+        (["down", "up"], "down"),
+        (["up", "default", "rest"], "default"),
+    ],
+)
+def test_the_state_to_rest_in(tmp_path: Path, names: list[str], chosen: str) -> None:
+    values = {name: float(number) for number, name in enumerate(names)}
+    srdf = read(
+        tmp_path,
+        "".join(state(name, a=str(value), b="0") for name, value in values.items())
+        + state("home", c="1"),
+    )
+    assert srdf.state(["a", "b"])["a"] == values[chosen]
+    assert srdf.state(["a", "z"]) == {}
+
+
+def test_links_that_there_are_not(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        read(
+            tmp_path,
+            '<disable_collisions link1="base" link2="arm"/>\n<disable_collisions link1="base" link2="hnad"/>',
+        )
+    assert (caught.value.line, caught.value.nearest, caught.value.file) == (
+        3,
+        "hand",
+        tmp_path / "r.srdf",
+    )
+
+
+def test_what_is_no_srdf(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot read the SRDF"):
+        read_srdf(tmp_path / "none.srdf", links=LINKS)
+
+
+def test_groups_are_joints_or_chains(tmp_path: Path) -> None:
+    """A chain has the joints between its links, the last one first; groups of links alone are no groups of joints."""
+    chain = [("a", "base", "one"), ("b", "one", "two"), ("c", "two", "three")]
+    joints = (
+        f'<joint name="{name}"><parent link="{above}"/><child link="{below}"/></joint>'
+        for name, above, below in chain
+    )
+    urdf = ElementTree.fromstring(f"<robot>{''.join(joints)}</robot>")
+    file = tmp_path / "groups.srdf"
+    file.write_text(
+        '<robot name="r"><group name="arm"><chain base_link="one" tip_link="three"/></group>'
+        '<group name="shoulder"><joint name="a"/><joint name="b"/><joint name="elsewhere"/></group>'
+        '<group name="hand"><link name="three"/></group></robot>'
+    )
+    groups = read_groups(file, urdf)
+    assert {name: (group.joints, group.tip) for name, group in groups.items()} == {
+        "arm": (("c", "b"), "three"),
+        "shoulder": (("a", "b"), "two"),
+    }
+    assert group_tip(file, urdf, "arm") == "three"
+    with pytest.raises(UnknownNameError, match="There are: arm, shoulder") as caught:
+        group_tip(file, urdf, "shouldr")
+    assert (caught.value.nearest, caught.value.file, caught.value.field) == (
+        "shoulder",
+        file,
+        "arm",
+    )
+    with pytest.raises(UnknownNameError, match="there are: none"):
+        group_tip(None, urdf, "arm")

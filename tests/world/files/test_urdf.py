@@ -1,0 +1,181 @@
+"""URDFs: shapes by formulas, placements by Pinocchio's own reader, addresses of meshes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.files.urdf import _rotation, load_urdf, read_urdf
+
+WEDGE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+ANGLES = st.floats(-7.0, 7.0)
+
+
+def urdf(folder: Path, shapes: str, *, name: str = "thing.urdf") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(f'<robot name="r"><link name="a">{shapes}</link></robot>')
+    return folder / name
+
+
+def collision(shape: str, origin: str = "") -> str:
+    return f"<collision>{origin}<geometry>{shape}</geometry></collision>"
+
+
+@pytest.mark.parametrize("kind", ["visual", "collision"])
+def test_shapes_without_end_are_refused_before_anything_is_built_of_them(
+    tmp_path: Path, kind: str
+) -> None:
+    """Seven thousand of them took Pinocchio minutes."""
+    shape = collision('<sphere radius="0.2"/>')
+    many = shape.replace("collision", kind) * 7000
+    with pytest.raises(
+        InputError, match=f"too many <{kind}> elements.*expected at most 1000.*got 7000"
+    ):
+        load_urdf(urdf(tmp_path, shape + many if kind == "visual" else many))
+    enough = shape.replace("collision", kind) * 1000
+    _, collides, drawn = load_urdf(urdf(tmp_path, shape + enough if kind == "visual" else enough))
+    assert len((drawn if kind == "visual" else collides).geometryObjects) == 1000
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume"),
+    [
+        ('<box size="0.2 0.3 0.4"/>', 0.024),
+        ('<sphere radius="0.2"/>', 4 / 3 * np.pi * 0.008),
+        ('<cylinder radius="0.2" length="0.5"/>', np.pi * 0.04 * 0.5),
+        ('<capsule radius="0.2" length="0.5"/>', np.pi * 0.04 * 0.5 + 4 / 3 * np.pi * 0.008),
+        ('<mesh filename="wedge.obj" scale="2 1 3"/>', 1.0),
+    ],
+)
+def test_triangles_enclose_the_solid(tmp_path: Path, shape: str, volume: float) -> None:
+    """They are drawn around round shapes, with little more than their volume, where the element has its origin."""
+    (tmp_path / "wedge.obj").write_text(WEDGE)
+    (found,) = read_urdf(
+        urdf(tmp_path, collision(shape, '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'))
+    ).shapes("collision")
+    mesh, solid = found.mesh(), found.solid()
+    assert volume * (1 - 1e-3) <= mesh.volume <= 1.02 * volume
+    solid.computeLocalAABB()
+    box = solid.aabb_local
+    local = (mesh.vertices - found.placement.translation) @ found.placement.rotation
+    np.testing.assert_allclose(
+        [local.min(axis=0), local.max(axis=0)], [box.min_, box.max_], atol=5e-3
+    )
+    assert (found.link, found.name, found.kind) == ("a", "a_0", shape[1:].partition(" ")[0])
+
+
+def test_a_flat_mesh_is_named_by_link_and_file(tmp_path: Path) -> None:
+    (tmp_path / "sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 2 0\nv 0 2 0\nf 1 2 3\nf 1 3 4\n")
+    (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="sheet.obj"/>'))).shapes(
+        "collision"
+    )
+    with pytest.warns(UserWarning, match=rf"{found.link} of .*sheet\.obj is flat"):
+        assert found.solid().computeVolume() == pytest.approx(2e-3)
+
+
+def test_the_hull_of_a_mesh_is_its_solid(tmp_path: Path) -> None:
+    ring = trimesh.creation.annulus(0.3, 0.5, 1.0)
+    ring.export(tmp_path / "ring.stl")
+    (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="ring.stl"/>'))).shapes(
+        "collision"
+    )
+    assert found.solid().computeVolume() == pytest.approx(ring.convex_hull.volume, rel=1e-3)
+    assert found.mesh().volume == pytest.approx(ring.volume, rel=1e-3)
+    assert ring.volume < 0.9 * ring.convex_hull.volume
+
+
+@settings(max_examples=200, deadline=None)
+@given(ANGLES, ANGLES, ANGLES)
+def test_angles_are_those_of_pinocchio(roll: float, pitch: float, yaw: float) -> None:
+    np.testing.assert_allclose(
+        _rotation(roll, pitch, yaw), pin.rpy.rpyToMatrix(roll, pitch, yaw), atol=1e-14
+    )
+    origin = f'<origin rpy="{roll} {pitch} {yaw}"/>'
+    element = f'<link name="b"/><joint name="j" type="fixed"><parent link="a"/><child link="b"/>{origin}</joint>'
+    model = pin.buildModelFromXML(f'<robot name="r"><link name="a"/>{element}</robot>')
+    np.testing.assert_array_equal(
+        _rotation(roll, pitch, yaw), model.frames[model.getFrameId("b")].placement.rotation
+    )
+
+
+def test_colours_by_name_and_in_place(tmp_path: Path) -> None:
+    ball = '<geometry><sphere radius="1"/></geometry>'
+    own = f'<visual>{ball}<material name="red"><color rgba="1 0 0 1"/></material></visual>'
+    named, plain = f'<visual>{ball}<material name="red"/></visual>', f"<visual>{ball}</visual>"
+    shapes = read_urdf(
+        urdf(tmp_path, named + own + plain + collision('<sphere radius="1"/>'))
+    ).shapes("visual")
+    assert [shape.colour for shape in shapes] == [(1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0), None]
+    assert [shape.name for shape in shapes] == ["a_0", "a_1", "a_2"]
+
+
+def test_addresses_of_meshes(tmp_path: Path) -> None:
+    """In a package that is named, in a folder around the file of the package's name, beside the file, or absolute."""
+    for folder in ("elsewhere", "robots/pack/meshes", "robots/pack/urdf"):
+        (tmp_path / folder).mkdir(parents=True)
+    named, around, beside = (
+        tmp_path / "elsewhere" / "a.stl",
+        tmp_path / "robots" / "pack" / "meshes" / "b.stl",
+        tmp_path / "robots" / "pack" / "urdf" / "c.stl",
+    )
+    for file in (named, around, beside):
+        file.write_text("")
+    path = urdf(tmp_path / "robots" / "pack" / "urdf", collision('<sphere radius="1"/>'))
+    robot = read_urdf(path, {"other": tmp_path / "elsewhere"})
+    assert robot.resolve("package://other/a.stl") == named
+    assert robot.resolve("package://pack/meshes/b.stl") == around
+    assert (
+        robot.resolve("c.stl")
+        == robot.resolve(f"file://{beside}")
+        == robot.resolve(str(beside))
+        == beside
+    )
+    for address in ("package://other/b.stl", "package://nowhere/a.stl", "a.stl"):
+        with pytest.raises(InputError, match="no such mesh") as caught:
+            robot.resolve(address)
+        assert (caught.value.file, caught.value.field) == (path, address)
+
+
+def test_packages_are_looked_for_in_all_folders_above(tmp_path: Path) -> None:
+    """For objects as for robots: by the package's name or not, and above a link to the file as above the file itself."""
+    deep, other = tmp_path / "repository" / "robots" / "arm" / "urdf", tmp_path / "mine"
+    meshes = tmp_path / "repository" / "meshes"
+    for folder in (deep, other, meshes):
+        folder.mkdir(parents=True)
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(meshes / "box.stl")
+    path = urdf(deep, collision('<mesh filename="package://some_name/meshes/box.stl"/>'))
+    (other / "thing.urdf").symlink_to(path)
+    for file in (path, other / "thing.urdf"):
+        assert read_urdf(file).resolve("package://some_name/meshes/box.stl") == meshes / "box.stl"
+        _, found, _ = load_urdf(file)
+        found.geometryObjects[0].geometry.computeLocalAABB()
+        assert found.geometryObjects[0].geometry.aabb_local.height() == pytest.approx(2.0)
+
+
+def test_a_tree_is_as_pinocchio_reads_it(tmp_path: Path) -> None:
+    text = """<robot name="r"><link name="a"/><link name="b"><collision><origin xyz="0.1 0 0" rpy="0 0 1"/><geometry>
+    <box size="1 2 3"/></geometry></collision></link><link name="c"><collision><geometry><sphere radius="0.5"/></geometry>
+    </collision></link><joint name="turn" type="revolute"><parent link="a"/><child link="b"/><origin xyz="1 2 3" rpy="1 0.5 0"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="2" effort="1"/></joint><joint name="slide" type="prismatic">
+    <parent link="b"/><child link="c"/><origin xyz="0 0 1"/><axis xyz="1 0 0"/><limit lower="0" upper="1" velocity="1"
+    effort="1"/></joint></robot>"""
+    (tmp_path / "t.urdf").write_text(text)
+    (own, collision, _), model = load_urdf(tmp_path / "t.urdf"), pin.buildModelFromXML(text)
+    assert own == model
+    theirs = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
+    for ours, other in zip(collision.geometryObjects, theirs.geometryObjects, strict=True):
+        assert (ours.name, ours.parentJoint, ours.parentFrame) == (
+            other.name,
+            other.parentJoint,
+            other.parentFrame,
+        )
+        assert ours.placement.isApprox(other.placement, 1e-14)
+        assert ours.geometry == other.geometry
+    assert read_urdf(tmp_path / "t.urdf").links == ("a", "b", "c")

@@ -1,0 +1,156 @@
+"""Tests the opening of grippers and their description in robot.yaml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.grippers import WIDEST, write_gripper
+from helpers.robots import at_rest, placement
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.world.models.robot import Robot
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    return vkc.load_robot(write_gripper(tmp_path_factory.mktemp("gripper")))
+
+
+def finger_centers(robot: Robot) -> list[np.ndarray]:
+    """Return the centres of the fingers' shapes in the tool frame."""
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    pin.updateGeometryPlacements(
+        robot.model, data, robot.collision, shapes, robot.coordinates.q(at_rest(robot))
+    )
+    tool = placement(robot, robot.tool_frame, at_rest(robot))
+    fingers = [k for k in range(len(shapes.oMg)) if robot.link_of(k).startswith("finger")]
+    return [tool.actInv(shapes.oMg[k]).translation for k in fingers]
+
+
+def test_grippers_are_open_by_default_and_mimic_joints_follow(robot: Robot) -> None:
+    gripper = robot.gripper
+    assert gripper is not None
+    assert gripper.names == ("finger_a_joint", "finger_b_joint")
+    assert gripper.rest_opening == gripper.max_opening == pytest.approx(WIDEST, abs=2e-4)
+    assert gripper.min_opening == 0.0
+    assert robot.opened(None) is robot
+    np.testing.assert_allclose(gripper.compute_positions(None), [0.04, 0.04])
+    np.testing.assert_allclose(gripper.compute_positions(0.0), [0.0, 0.0])
+
+
+@settings(max_examples=20, deadline=None)
+@given(opening=st.floats(0.0, 0.0799))
+def test_fingers_are_symmetric_at_the_given_opening(robot: Robot, opening: float) -> None:
+    opened = robot.opened(opening)
+    for middle, side in zip(
+        finger_centers(opened), (1.0, -1.0), strict=True
+    ):  # fingers are 10 mm thick
+        assert middle[0] == pytest.approx(side * (opening / 2.0 + 0.005), abs=1e-5)
+    for link in ("finger_a", "finger_b", "hand", "tool"):
+        own = placement(opened, link, at_rest(robot)).actInv(placement(robot, link, at_rest(robot)))
+        away = WIDEST / 2.0 - opening / 2.0 if link.startswith("finger") else 0.0
+        assert np.linalg.norm(own.translation) == pytest.approx(away, abs=1e-5)
+
+
+def test_opening_moves_only_the_fingers(robot: Robot) -> None:
+    opened = robot.opened(0.03)
+    assert opened is robot.opened(0.03)
+    assert list(opened.model.names) == list(robot.model.names)
+    assert opened.own_margins(0.02) == robot.own_margins(0.02)
+    shapes = zip(robot.collision.geometryObjects, opened.collision.geometryObjects, strict=True)
+    moved = {
+        robot.link_of(k)
+        for k, (one, other) in enumerate(shapes)
+        if one.placement != other.placement
+    }
+    assert moved == {"finger_a", "finger_b"}
+
+
+def test_openings_are_clamped_to_the_range(robot: Robot) -> None:
+    gripper = robot.gripper
+    assert gripper is not None
+    assert robot.opening(None) is None
+    assert robot.opening(0.05) == 0.05
+    assert robot.opening(0.3) == gripper.max_opening
+    with pytest.raises(vkc.InputError, match=r"out of the gripper.s range.*0 to 0\.0799"):
+        robot.opened(0.3)
+
+
+def test_robots_without_gripper_have_no_opening() -> None:
+    robot = vkc.load_robot("husky_ur5e")
+    assert robot.opening(0.05) is None
+    with pytest.raises(vkc.InputError, match="no gripper that opens"):
+        robot.opened(0.05)
+
+
+def test_openings_of_revolute_fingers(tmp_path: Path) -> None:
+    """Inner faces pass through the joint axes; the near edge of the bar is 64 mm ahead."""
+    file = write_gripper(tmp_path, gripper="gripper: {finger_a_joint: {closed: 0.0, open: 0.5}}\n")
+    urdf = file.parent / "robot.urdf"
+    text = urdf.read_text(encoding="utf-8")
+    for name, sign in (("a", 1), ("b", -1)):
+        straight = f'<joint name="finger_{name}_joint" type="prismatic"><origin xyz="0 0 0.06"/>'
+        turning = (
+            f'<joint name="finger_{name}_joint" type="revolute">'
+            f'<origin xyz="0 {sign * 0.01} 0.06"/>'
+        )
+        assert straight in text
+        text = text.replace(straight, turning).replace(
+            f'<axis xyz="0 {sign} 0"/>', f'<axis xyz="{-sign} 0 0"/>'
+        )
+    urdf.write_text(text.replace('upper="0.04"', 'upper="0.5"'), encoding="utf-8")
+    gripper = vkc.load_robot(file).gripper
+    assert gripper is not None
+    assert gripper.min_opening == pytest.approx(0.02, abs=2e-4)
+    assert gripper.max_opening == pytest.approx(0.02 + 2.0 * 0.064 * np.tan(0.5), abs=2e-4)
+    for opening in (0.03, 0.05, 0.08):
+        angle = np.arctan((opening / 2.0 - 0.01) / 0.064)
+        np.testing.assert_allclose(gripper.compute_positions(opening), [angle, angle], atol=1e-4)
+
+
+def test_locked_joints_override_rest_positions(tmp_path: Path) -> None:
+    robot = vkc.load_robot(write_gripper(tmp_path), locked_joints={"finger_a_joint": 0.01})
+    gripper = robot.gripper
+    assert gripper is not None
+    assert gripper.rest_opening == pytest.approx(0.02, abs=2e-4)
+    assert gripper.max_opening == pytest.approx(WIDEST, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("gripper", "problem"),
+    [
+        ("gripper: {finger_c_joint: {closed: 0, open: 0.04}}", "finger_a_joint"),
+        ("gripper: {finger_a_joint: {closed: 0}}", r"gripper\.finger_a_joint\.open.*missing"),
+        (
+            "gripper: {finger_a_joint: {closed: 0, open: wide}}",
+            r"gripper\.finger_a_joint\.open.*number",
+        ),
+        ("gripper: {finger_a_joint: {closed: 0, opened: 0.04}}", "did you mean 'open'"),
+        ("gripper: {finger_a_joint: {closed: 0, open: 0.4}}", "between 0 and 0.04"),
+        (
+            "gripper: {finger_a_joint: {closed: -0.1, open: 0.04}}",
+            r"gripper\.finger_a_joint\.closed",
+        ),
+        ("gripper: {finger_a_joint: {closed: 0.04, open: 0.04}}", "does not move"),
+        ("gripper: {finger_a_joint: {closed: 0.04, open: 0.0}}", "does not open"),
+        (
+            "gripper: {finger_b_joint: {closed: 0, open: 0.04}}",
+            "'finger_a_joint', which it follows",
+        ),
+        ("gripper: {arm_5_joint: {closed: 0, open: 0.04}}", "not a finger joint"),
+        ("gripper: open", "gripper"),
+    ],
+)
+def test_invalid_grippers_raise_with_file_and_line(
+    tmp_path: Path, gripper: str, problem: str
+) -> None:
+    file = write_gripper(tmp_path, gripper=gripper + "\n")
+    with pytest.raises(vkc.InputError, match=problem) as caught:
+        vkc.load_robot(file)
+    assert caught.value.file == file
+    assert caught.value.line == 6

@@ -1,0 +1,160 @@
+"""Tests minimal coordinates: one per degree of freedom, and seven per free joint."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.models.coordinates import Coordinates, wrap_angle
+
+FREE = ("thing_x", "thing_y", "thing_z", "thing_qx", "thing_qy", "thing_qz", "thing_qw")
+
+
+def mixed() -> pin.Model:
+    """Return a planar base with a wheel, a free body with a lid, and a lift."""
+    model = pin.Model()
+    base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
+    model.addJoint(base, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
+    thing = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "thing")
+    limits = [np.array([value]) for value in (1.0, 2.0, -0.5, 0.7)]
+    model.addJoint(thing, pin.JointModelRX(), pin.SE3.Identity(), "lid", *limits)
+    model.addJoint(0, pin.JointModelPZ(), pin.SE3.Identity(), "lift", *limits)
+    return model
+
+
+def random_z(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    coordinates = Coordinates(mixed())
+    z = rng.uniform(-3.0, 3.0, (*shape, coordinates.size))
+    z[..., 7:11] /= np.linalg.norm(z[..., 7:11], axis=-1, keepdims=True)
+    return z
+
+
+def test_names_joints_and_limits_of_coordinates() -> None:
+    coordinates = Coordinates(mixed())
+    assert coordinates.names == ("base_x", "base_y", "base_yaw", "wheel", *FREE, "lid", "lift")
+    assert coordinates.joints == (1, 1, 1, 2, *[3] * 7, 4, 5)
+    assert coordinates.units == ("m", "m", "rad", "rad", *"mmm1111", "rad", "m")
+    assert coordinates.size == 13
+    assert coordinates.nq == 4 + 2 + 7 + 1 + 1
+    assert (coordinates.lower[2:11] == -np.inf).all()
+    assert (coordinates.upper[2:11] == np.inf).all()
+    np.testing.assert_array_equal(coordinates.lower[11:], [-0.5, -0.5])
+    np.testing.assert_array_equal(coordinates.upper[11:], [0.7, 0.7])
+    assert [coordinates.index(name) for name in coordinates.names] == list(range(13))
+    with pytest.raises(UnknownNameError) as caught:
+        coordinates.index("thing_quw")
+    assert caught.value.nearest == "thing_qw"
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_configurations_round_trip(seed: int) -> None:
+    coordinates, rng = Coordinates(mixed()), np.random.default_rng(seed)
+    z = random_z(rng, 4, 3)
+    q = coordinates.q(z)
+    assert q.shape == (4, 3, coordinates.nq)
+    assert pin.Model(mixed()).nq == coordinates.nq
+    for row in q.reshape(-1, coordinates.nq):
+        assert pin.isNormalized(mixed(), row, 1e-12)
+    np.testing.assert_allclose(coordinates.z(q), z, atol=1e-12)
+    np.testing.assert_array_equal(coordinates.q(z[0, 0]), q[0, 0])
+    # The length of a quaternion has no effect.
+    longer = z.copy()
+    longer[..., 7:11] *= rng.uniform(0.1, 9.0, (4, 3, 1))
+    np.testing.assert_allclose(coordinates.q(longer), q, atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_free_joints_are_placed_by_their_coordinates(seed: int) -> None:
+    model = mixed()
+    coordinates, data, (z,) = (
+        Coordinates(model),
+        model.createData(),
+        random_z(np.random.default_rng(seed), 1),
+    )
+    pin.forwardKinematics(model, data, coordinates.q(z))
+    np.testing.assert_allclose(
+        data.oMi[3].homogeneous, pin.XYZQUATToSE3(z[4:11]).homogeneous, atol=1e-12
+    )
+    np.testing.assert_allclose(data.oMi[1].translation[:2], z[:2])
+    np.testing.assert_allclose(data.oMi[1].rotation, pin.utils.rotate("z", z[2]), atol=1e-12)
+    np.testing.assert_allclose(
+        (data.oMi[3].inverse() * data.oMi[4]).rotation, pin.utils.rotate("x", z[11]), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.1, 1.0, 2.0, np.pi - 1e-6, np.pi])
+def test_quaternions_interpolate_about_one_axis(angle: float) -> None:
+    """Linear interpolation rotates about one axis; the midpoint is at half the angle, up to π."""
+    model, rng = mixed(), np.random.default_rng(0)
+    coordinates = Coordinates(model)
+    for _ in range(20):
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        first = pin.SE3.Random()
+        second = pin.SE3(
+            first.rotation @ pin.exp3(angle * axis), first.translation + rng.normal(size=3)
+        )
+        ends = np.zeros((2, coordinates.size))
+        ends[:, 4:11] = [pin.SE3ToXYZQUAT(first), pin.SE3ToXYZQUAT(second)]
+        if ends[0, 7:11] @ ends[1, 7:11] < 0.0:  # the nearer of both quaternions of an orientation
+            ends[1, 7:11] *= -1.0
+        data = model.createData()
+        angles = []
+        for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+            pin.forwardKinematics(
+                model, data, coordinates.q((1 - share) * ends[0] + share * ends[1])
+            )
+            at = data.oMi[3]
+            np.testing.assert_allclose(
+                at.translation,
+                (1 - share) * first.translation + share * second.translation,
+                atol=1e-12,
+            )
+            turn = pin.log3(first.rotation.T @ at.rotation)
+            if angle > 1e-3 and 0.0 < share < 1.0:
+                np.testing.assert_allclose(np.abs(turn @ axis), np.linalg.norm(turn), atol=1e-6)
+            angles.append(np.linalg.norm(turn))
+        assert angles[2] == pytest.approx(angle / 2, abs=1e-6)
+        assert angles[4] == pytest.approx(angle, abs=1e-5)
+        assert np.all(np.diff(angles) >= -1e-9)
+        assert angles[3] - angles[2] == pytest.approx(angles[2] - angles[1], abs=1e-6)  # symmetric
+
+
+def test_symbolic_configurations_match_numeric_ones() -> None:
+    model = pin.Model()
+    base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
+    model.addJoint(base, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
+    model.addJoint(base, pin.JointModelPZ(), pin.SE3.Identity(), "lift")
+    coordinates = Coordinates(model)
+    z = ca.SX.sym("z", coordinates.size)
+    function = ca.Function("q", [z], [coordinates.q_symbolic(z)])
+    for row in np.random.default_rng(1).uniform(-3.0, 3.0, (10, coordinates.size)):
+        np.testing.assert_allclose(
+            np.asarray(function(row)).ravel(), coordinates.q(row), atol=1e-15
+        )
+
+
+def test_invalid_arguments_raise() -> None:
+    coordinates = Coordinates(mixed())
+    with pytest.raises(InputError, match="coordinates"):
+        coordinates.q(np.zeros(12))
+    with pytest.raises(InputError, match="configuration"):
+        coordinates.z(np.zeros((2, 13)))
+    ball = pin.Model()
+    ball.addJoint(0, pin.JointModelSpherical(), pin.SE3.Identity(), "ball")
+    with pytest.raises(InputError, match="not supported") as caught:
+        Coordinates(ball)
+    assert (caught.value.field, caught.value.got) == ("ball", "JointModelSpherical")
+
+
+@given(st.floats(-50.0, 50.0))
+def test_angles_are_wrapped(angle: float) -> None:
+    assert -np.pi <= wrap_angle(angle) <= np.pi
+    assert np.exp(1j * wrap_angle(angle)) == pytest.approx(np.exp(1j * angle), abs=1e-9)

@@ -1,0 +1,229 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+import trimesh
+from helpers.robots import at_rest, placement, small_urdf
+
+from vkc_pin.world.models.robot import _MIN_LEVER, Robot
+from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.scene.scene import Scene
+
+ARM = [
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+]
+
+
+@pytest.fixture(scope="module")
+def husky() -> Robot:
+    return load_robot("husky_ur5e")
+
+
+def ur5e(q: np.ndarray) -> np.ndarray:
+    """Compute forward kinematics with the Denavit-Hartenberg parameters of the manufacturer."""
+    d, a = [0.1625, 0, 0, 0.1333, 0.0997, 0.0996], [0, -0.425, -0.3922, 0, 0, 0]
+    total = np.eye(4)
+    for k, twist in enumerate([np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]):
+        c, s, ct, st = np.cos(q[k]), np.sin(q[k]), np.cos(twist), np.sin(twist)
+        total = total @ [
+            [c, -s * ct, s * st, a[k] * c],
+            [s, c * ct, -c * st, a[k] * s],
+            [0, st, ct, d[k]],
+            [0, 0, 0, 1],
+        ]
+    return total
+
+
+def test_coordinates_and_limits_of_husky(husky: Robot) -> None:
+    assert husky.coordinates.names == ("base_x", "base_y", "base_yaw", *ARM)
+    assert husky.model.names[1] == "base"
+    assert husky.model.joints[1].shortname() == "JointModelPlanar"
+    turn = 2.0 * np.pi
+    np.testing.assert_allclose(husky.upper, [20, 20, np.inf, turn, turn, np.pi, turn, turn, turn])
+    np.testing.assert_allclose(husky.lower, -husky.upper)
+    np.testing.assert_allclose(husky.velocity, [1, 1, 2, *[np.pi] * 6])
+    np.testing.assert_allclose(husky.acceleration, [3, 3, 6, *[1.4] * 6])
+    np.testing.assert_allclose(husky.home, [1.57, -0.8678, -2.2043, -0.0347, 1.6315, 0])
+    assert husky.touch_links == ("gripper_link", "gripper_left_finger", "gripper_right_finger")
+
+
+def test_husky_dimensions_match_the_data_sheet(husky: Robot) -> None:
+    corners = [
+        husky.collision.geometryObjects[k].placement.act(point)
+        for k in range(husky.collision.ngeoms)
+        if husky.link_of(k) == "base_link"
+        for point in np.asarray(husky.collision.geometryObjects[k].geometry.points())
+    ]
+    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.990, 0.670, 0.390], atol=1e-3)
+    np.testing.assert_allclose(np.min(corners, axis=0)[2], 0.0, atol=5e-4)
+    assert placement(husky, "top_plate_link", np.zeros(9)).translation[2] == pytest.approx(0.39)
+
+
+def test_forward_kinematics_match_the_manufacturer(husky: Robot) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        z = np.concatenate([rng.uniform(-3, 3, 3), rng.uniform(-np.pi, np.pi, 6)])
+        base = pin.SE3(pin.rpy.rpyToMatrix(0, 0, z[2]), np.array([z[0], z[1], 0.0])).homogeneous
+        foot = pin.SE3(np.eye(3), np.array([0.25, 0.0, 0.39])).homogeneous
+        flange = base @ foot @ ur5e(z[3:])
+        np.testing.assert_allclose(placement(husky, "tool0", z).homogeneous, flange, atol=1e-12)
+        tool = flange @ pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.142224])).homogeneous
+        np.testing.assert_allclose(
+            placement(husky, husky.tool_frame, z).homogeneous, tool, atol=1e-12
+        )
+
+
+def test_arm_base_is_rotated_by_pi(husky: Robot) -> None:
+    np.testing.assert_allclose(
+        placement(husky, "ur_base_link", np.zeros(9)).rotation, np.diag([-1, -1, 1]), atol=1e-12
+    )
+
+
+def test_fingers_do_not_obstruct_the_opening(husky: Robot) -> None:
+    data, placed = husky.model.createData(), husky.collision.createData()
+    pin.updateGeometryPlacements(
+        husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky))
+    )
+    tool = placement(husky, "tool", at_rest(husky))
+
+    def gap(shape: coal.CollisionGeometry, offset: tuple[float, float, float]) -> float:
+        at = tool * pin.SE3(np.eye(3), np.array(offset))
+        place, result = coal.Transform3s(at.rotation, at.translation), coal.DistanceResult()
+        request = coal.DistanceRequest()
+        return min(
+            coal.distance(
+                shape,
+                place,
+                husky.collision.geometryObjects[k].geometry,
+                coal.Transform3s(m.rotation, m.translation),
+                request,
+                result,
+            )
+            for k, m in enumerate(placed.oMg)
+        )
+
+    assert (
+        0.0 < gap(coal.Box(0.085, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.002
+    )  # the fingers close along x
+    assert gap(coal.Box(0.09, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.0
+    assert gap(coal.Box(0.02, 0.3, 0.03), (0.0, 0.0, 0.0)) > 0.02  # the opening is free along y
+    assert gap(coal.Box(0.02, 0.02, 0.3), (0.0, 0.0, 0.15)) > 0.02  # z points away from the palm
+    assert gap(coal.Box(0.02, 0.02, 0.3), (0.0, 0.0, -0.15)) < 0.0
+
+
+def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
+    for link in husky.links:
+        shapes = [
+            shape
+            for shape in husky.collision.geometryObjects
+            if shape.name.rpartition("_")[0] == link
+        ]
+        assert all(
+            isinstance(shape.geometry, coal.Convex) and shape.geometry.num_points <= 40
+            for shape in shapes
+        )
+        frame = husky.model.frames[husky.model.getFrameId(link)].placement
+        skin = trimesh.util.concatenate(
+            [shape.mesh() for shape in husky.file.shapes("visual") if shape.link == link]
+        )
+        points = np.vstack([skin.vertices, trimesh.sample.sample_surface(skin, 3000, seed=0)[0]])
+        points = points @ frame.rotation.T + frame.translation
+        outside = np.full(len(points), np.inf)
+        for shape in shapes:
+            local = (points - shape.placement.translation) @ shape.placement.rotation
+            hull = trimesh.convex.convex_hull(np.asarray(shape.geometry.points()))
+            planes = np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])
+            outside = np.minimum(outside, (local @ hull.face_normals.T - planes).max(axis=1))
+        assert outside.max() < 1e-6, link
+
+
+def test_home_has_large_clearance(husky: Robot) -> None:
+    data, placed = husky.model.createData(), husky.collision.createData()
+    pin.computeDistances(
+        husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky))
+    )
+    assert min(result.min_distance for result in placed.distanceResults) > 0.05
+
+
+def test_collision_pairs_of_husky(husky: Robot) -> None:
+    everything = load_robot("husky_ur5e", pairs="all")
+    assert len(husky.collision.geometryObjects) == 18
+    # 4 shapes on the base, 1, 3, 2, 1, 1 on the arm's links, 6 on the hand: all but those on the
+    # same joint
+    counts = [4, 1, 3, 2, 1, 1, 6]
+    assert (
+        len(everything.collision.collisionPairs)
+        == (sum(counts) ** 2 - sum(count**2 for count in counts)) // 2
+    )
+    assert len(husky.collision.collisionPairs) == 95
+    links = {
+        frozenset((husky.link_of(pair.first), husky.link_of(pair.second)))
+        for pair in husky.collision.collisionPairs
+    }
+    assert frozenset(("base_link", "gripper_link")) in links
+    assert frozenset(("upper_arm_link", "forearm_link")) not in links
+
+
+def test_scenes_find_a_robot_yaml_beside_them(tmp_path: Path) -> None:
+    small_urdf(tmp_path)
+    (tmp_path / "mine.yaml").write_text("urdf: small.urdf\ntool_frame: l2\n")
+    document = {"robot": "mine.yaml", "start": {"base": [0, 0, 0]}}
+    assert Scene.from_document(document, tmp_path).robot.tool_frame == "l2"
+
+
+def test_lever_matches_finite_differences(husky: Robot) -> None:
+    """Differences of the hand position at random configurations; equal for equal robots."""
+    robot = husky
+    rng, steps = np.random.default_rng(1), []
+    tool = robot.model.getFrameId(robot.tool_frame)
+    data = robot.model.createData()
+
+    def hand(z: np.ndarray) -> np.ndarray:
+        pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
+        return np.array(data.oMf[tool].translation)
+
+    for z in rng.uniform(
+        np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi), (400, len(robot.lower))
+    ):
+        steps.append(
+            [np.linalg.norm(hand(z + 1e-6 * row) - hand(z)) / 1e-6 for row in np.eye(len(z))[3:]]
+        )
+    assert robot.lever == pytest.approx(np.sqrt(np.mean(np.square(steps), axis=0)).mean(), rel=0.05)
+    assert robot.lever == load_robot("husky_ur5e").lever
+
+
+def test_front_is_the_foremost_corner_of_the_hand(husky: Robot) -> None:
+    """Covers all corners of touch links; without touch links it is the tool frame."""
+    frame = husky.model.frames[husky.model.getFrameId(husky.tool_frame)]
+    hand = [
+        s
+        for k, s in enumerate(husky.collision.geometryObjects)
+        if husky.link_of(k) in husky.touch_links
+    ]
+    ahead = [
+        frame.placement.actInv(s.placement).act(point)[2]
+        for s in hand
+        for point in s.geometry.points()
+    ]
+    np.testing.assert_allclose(husky.front.translation, [0.0, 0.0, max(ahead)], rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(husky.front.rotation, np.eye(3))
+    np.testing.assert_array_equal(
+        dataclasses.replace(husky, touch_links=()).front.homogeneous, np.eye(4)
+    )
+
+
+def test_arms_without_revolute_joints_have_the_minimum_lever(husky: Robot) -> None:
+    units = tuple("m" for _ in husky.coordinates.units)
+    straight = dataclasses.replace(husky, coordinates=SimpleNamespace(units=units))  # type: ignore[arg-type]
+    assert straight.lever == _MIN_LEVER

@@ -1,0 +1,403 @@
+"""Tests the loading of robots: defaults, options and errors."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.arm_urdf import write_arms
+from helpers.robots import at_rest, placement, small_urdf
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.files import resources
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import find_robot, load_robot
+
+FOLDER = resources.folder("robots") / "husky_ur5e"
+
+
+@pytest.fixture(scope="module")
+def husky() -> Robot:
+    return load_robot("husky_ur5e")
+
+
+def test_base_types() -> None:
+    fixed = load_robot("husky_ur5e", base="fixed")
+    np.testing.assert_array_equal(fixed.lower[:3], fixed.upper[:3])
+    assert load_robot("husky_ur5e", base="differential").base == "differential"
+    with pytest.raises(InputError, match="base"):
+        load_robot("husky_ur5e", base="wheels")  # type: ignore[arg-type]
+
+
+def test_wheels_and_turning_radius(tmp_path: Path) -> None:
+    husky = load_robot("husky_ur5e", base="ackermann", turning_radius=0.8)
+    assert (husky.turning_radius, load_robot("husky_ur5e", base="differential").turning_radius) == (
+        0.8,
+        0.0,
+    )
+    assert husky.wheels is not None
+    assert husky.wheels.rim_speed == pytest.approx(husky.wheels.radius * husky.wheels.speed)
+    source = (FOLDER / "husky_ur5e.urdf").as_posix()
+    srdf = (FOLDER / "husky_ur5e.srdf").as_posix()
+    text = f"urdf: {source}\npackages: [airo_models]\ntool_frame: tool\nsrdf: {srdf}\n"
+    file = tmp_path / "robot.yaml"
+    file.write_text(text + "base: {turning_radius: 1.2}\n")
+    assert load_robot(file, base="ackermann").turning_radius == 1.2
+    assert load_robot(file, base="ackermann", turning_radius=0.7).turning_radius == 0.7
+    assert load_robot(file, base="ackermann").wheels is None
+    file.write_text(text)
+    for given, expected in (
+        ({"base": "ackermann"}, "turning_radius"),
+        ({"base": "ackermann", "turning_radius": -1.0}, "> 0"),
+        ({"base": "differential", "turning_radius": 1.0}, "or base='ackermann'"),
+    ):
+        with pytest.raises(InputError, match=expected) as caught:
+            load_robot(file, **given)  # type: ignore[arg-type]
+        assert caught.value.field == "turning_radius"
+    for wheels, field in (
+        ("{track: 0.5, radius: 0.1}", "speed"),
+        ("{track: -1, radius: 0.1, speed: 3}", "track"),
+    ):
+        file.write_text(text + f"base: {{wheels: {wheels}}}\n")
+        with pytest.raises(InputError, match=field):
+            load_robot(file)
+
+
+def test_locked_joints_and_tool_frame() -> None:
+    robot = load_robot("husky_ur5e", tool_frame="wrist_2_link", locked_joints={"elbow_joint": -1.5})
+    assert robot.coordinates.names[3:] == (
+        "shoulder_pan_joint",
+        "shoulder_lift_joint",
+        "wrist_1_joint",
+        "wrist_2_joint",
+    )
+    whole = load_robot("husky_ur5e")
+    arm = np.array([0.3, -1.0, -1.5, 0.4, 0.2, 0.0])
+    here = placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
+    there = placement(whole, "tool", np.concatenate([np.zeros(3), arm]))
+    assert here.isApprox(there, 1e-12)
+    with pytest.raises(UnknownNameError) as caught:
+        load_robot("husky_ur5e", locked_joints={"elbow": 0.0})
+    assert caught.value.nearest == "elbow_joint"
+
+
+@pytest.mark.parametrize(
+    ("name", "tool", "joints"),
+    [
+        ("panda", "panda_hand_tcp", 7),
+        ("tiago_no_hand", "wrist_ft_tool_link", 8),
+        ("ur5", "tool0", 6),
+        ("kinova", None, 6),
+    ],
+)
+def test_robots_of_example_robot_data_can_be_loaded(
+    name: str, tool: str | None, joints: int
+) -> None:
+    robot = load_robot(name)
+    assert tool in (None, robot.tool_frame)
+    assert len(robot.home) == joints == robot.coordinates.size - 3
+    assert len(robot.collision.collisionPairs) > 0
+    assert (robot.velocity > 0).all()
+    assert np.isfinite(robot.velocity).all()
+    assert len({frame.name for frame in robot.model.frames}) == robot.model.nframes
+    placement(robot, robot.tool_frame, at_rest(robot))
+
+
+def test_tiago_with_its_hand_can_be_loaded() -> None:
+    robot = load_robot("tiago", tool_frame="hand_tool_link", pairs="all")
+    assert robot.coordinates.names[3:] == (
+        "torso_lift_joint",
+        *(f"arm_{k}_joint" for k in range(1, 8)),
+    )
+
+
+def test_defaults_of_a_urdf(tmp_path: Path) -> None:
+    wheel = (
+        '<joint name="wheel" type="continuous"><parent link="l0"/><child link="w"/></joint>'
+        '<joint name="follower" type="revolute">'
+        '<parent link="l3"/><child link="f"/><mimic joint="j0"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
+    )
+    robot = load_robot(
+        small_urdf(tmp_path, joints=wheel, links='<link name="w"/><link name="f"/>'), pairs="all"
+    )
+    assert robot.coordinates.names[3:] == ("j0", "j1", "j2")
+    assert robot.name == "small"
+    np.testing.assert_allclose(
+        robot.velocity, [1, 1, 2, 1.0, 1.5, 1.5]
+    )  # the first is limited by its follower
+    np.testing.assert_allclose(robot.acceleration, [3, 3, 6, 1.4, 1.4, 1.4])
+    np.testing.assert_array_equal(
+        robot.model.jointPlacements[3].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    )
+
+
+def test_robot_yaml_beside_the_urdf_is_used(tmp_path: Path) -> None:
+    file = small_urdf(tmp_path)
+    (tmp_path / "robot.yaml").write_text(
+        "urdf: small.urdf\ntool_frame: l3\nhome: {j1: 0.5}\n"
+        "joints: {j2: {velocity: 0.2, acceleration: 9}}\n"
+    )
+    robot = load_robot(file, pairs="all")
+    assert (robot.tool_frame, robot.home.tolist(), robot.velocity[5], robot.acceleration[5]) == (
+        "l3",
+        [0.0, 0.5, 0.0],
+        0.2,
+        9.0,
+    )
+    assert load_robot(tmp_path / "robot.yaml", pairs="all", home={"j1": -1.0}).home.tolist() == [
+        0.0,
+        -1.0,
+        0.0,
+    ]
+
+
+def test_robots_are_named_after_folder_or_file(tmp_path: Path) -> None:
+    small_urdf(tmp_path)
+    for name, called in (("robot.yaml", tmp_path.name), ("mine.yaml", "mine")):
+        (tmp_path / name).write_text("urdf: small.urdf\n")
+        assert load_robot(tmp_path / name, pairs="all").name == called
+
+
+def test_copied_urdfs_find_meshes_of_example_robot_data(tmp_path: Path) -> None:
+    original = load_robot("panda", pairs="all")
+    copy = tmp_path / "copy.urdf"
+    copy.write_text(original.urdf.read_text())
+    assert "package://example-robot-data/" in copy.read_text()
+    found = load_robot(copy, pairs="all")
+    assert [shape.name for shape in found.collision.geometryObjects] == [
+        s.name for s in original.collision.geometryObjects
+    ]
+    copy.write_text(original.urdf.read_text().replace("/link0.stl", "/link00.stl"))
+    with pytest.raises(InputError, match=r"link00\.stl"):
+        load_robot(copy, pairs="all")
+
+
+def test_unknown_names_raise() -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        load_robot("husky_ur5")
+    assert caught.value.nearest == "husky_ur5e"
+    with pytest.raises(UnknownNameError) as caught:
+        load_robot("pandas")
+    assert caught.value.nearest == "panda"
+    with pytest.raises(UnknownNameError) as caught:
+        load_robot("husky_ur5e", tool_frame="tol")
+    assert caught.value.nearest == "tool"
+    with pytest.raises(InputError, match="this robot file does not exist"):
+        load_robot("nowhere/robot.urdf")
+
+
+def test_invalid_files_raise(tmp_path: Path) -> None:
+    (tmp_path / "a.urdf").write_text("<robot><link>")
+    with pytest.raises(InputError, match="XML") as caught:
+        load_robot(tmp_path / "a.urdf")
+    assert caught.value.line == 1
+    (tmp_path / "b.urdf").write_text("<sdf/>")
+    with pytest.raises(InputError, match="no URDF"):
+        load_robot(tmp_path / "b.urdf")
+    (tmp_path / "c.urdf").write_text('<robot name="c"><link name="a"/><link name="b"/></robot>')
+    with pytest.raises(InputError, match=r"c\.urdf:1: b: links that nothing connects"):
+        load_robot(tmp_path / "c.urdf")
+    mesh = '<link name="m"><collision><geometry><mesh filename="package://nowhere/m.stl"/></geometry></collision></link>'
+    joint = '<joint name="jm" type="fixed"><parent link="l3"/><child link="m"/></joint>'
+    with pytest.raises(InputError, match=r"package://nowhere/m\.stl"):
+        load_robot(small_urdf(tmp_path, links=mesh, joints=joint))
+    (tmp_path / "bad.stl").write_text("")
+    file = small_urdf(
+        tmp_path, links=mesh.replace("package://nowhere/m.stl", "bad.stl"), joints=joint
+    )
+    with pytest.raises(InputError, match=r"bad\.stl"):
+        load_robot(file)
+    bare = (
+        file.read_text()
+        .replace("<collision>", "<visual>")
+        .replace("</collision>", "</visual>")
+        .replace("bad.stl", "")
+    )
+    file.write_text(bare)
+    with pytest.raises(InputError, match="no collision geometry"):
+        load_robot(file)
+
+
+def test_unknown_links_in_an_srdf_raise(tmp_path: Path) -> None:
+    file = small_urdf(tmp_path)
+    (tmp_path / "small.srdf").write_text(
+        '<robot name="small">\n<disable_collisions link1="l0" link2="l5" reason="Never"/>\n</robot>'
+    )
+    with pytest.raises(UnknownNameError, match="there is no link 'l5'") as caught:
+        load_robot(file)
+    assert (caught.value.file, caught.value.line) == (tmp_path / "small.srdf", 2)
+    assert (
+        len(load_robot(file, pairs="sampled").collision.collisionPairs) == 0
+    )  # no self-collision is possible
+
+
+def test_srdf_that_allows_all_pairs_raises(tmp_path: Path) -> None:
+    pairs = "".join(
+        f'<disable_collisions link1="l{i}" link2="l{j}"/>' for i in range(4) for j in range(i)
+    )
+    (tmp_path / "small.srdf").write_text(f"<robot>{pairs}</robot>")
+    with pytest.raises(InputError, match="no pair of links"):
+        load_robot(small_urdf(tmp_path))
+
+
+def test_copied_robots_can_be_loaded(husky: Robot, tmp_path: Path) -> None:
+    shutil.copytree(FOLDER, tmp_path / "husky_ur5e")
+    copy = load_robot(tmp_path / "husky_ur5e" / "husky_ur5e.urdf")
+    assert copy.urdf.parent == (tmp_path / "husky_ur5e").resolve()
+    assert (copy.name, copy.tool_frame, len(copy.collision.collisionPairs)) == (
+        husky.name,
+        "tool",
+        95,
+    )
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        copy.name = "other"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("field", ["locked_joints", "home"])
+@pytest.mark.parametrize("by_file", [True, False])
+def test_positions_outside_limits_raise(tmp_path: Path, field: str, by_file: bool) -> None:
+    """Holds for planned and locked joints, in robot.yaml and as arguments."""
+    small_urdf(tmp_path)
+    for joint in ("j1", "j2"):
+        about = [
+            "urdf: small.urdf",
+            "tool_frame: l2",
+            *([f"{field}: {{{joint}: 2.5}}"] if by_file else []),
+        ]
+        (tmp_path / "robot.yaml").write_text("\n".join(about) + "\n")
+        with pytest.raises(
+            InputError, match=r"outside the joint.s limits .expected between -2 and 2, got 2.5"
+        ) as caught:
+            load_robot(tmp_path / "robot.yaml", **({} if by_file else {field: {joint: 2.5}}))  # type: ignore[arg-type]
+        assert caught.value.field == f"{field}.{joint}"
+        assert (caught.value.file, caught.value.line) == (
+            (tmp_path / "robot.yaml", 3) if by_file else (tmp_path / "small.urdf", None)
+        )
+        load_robot(tmp_path / "small.urdf", **{field: {joint: 2.0 + 1e-7}})  # type: ignore[arg-type]
+
+
+def driving_urdf(
+    folder: Path, *, order: str = "xyt", shape: bool = False, tilted: bool = False
+) -> Path:
+    """Write the small robot on a planar base of joints and empty links, as in simulators."""
+    file = small_urdf(folder)
+    names, joints, solid = (
+        ["world", *(f"m{k}" for k in range(2)), "l0"],
+        "",
+        "<collision><geometry><sphere radius='1'/></geometry>",
+    )
+    axes = {"x": "1 0 0", "y": "0 1 0", "t": "0 0 1"}
+    for k, letter in enumerate(order):
+        kind = "continuous" if letter == "t" else "prismatic"
+        axis, origin = axes[letter], '<origin rpy="0.3 0 0"/>' if tilted and not k else ""
+        joints += f'<joint name="drive_{k}" type="{kind}"><parent link="{names[k]}"/>'
+        joints += f'<child link="{names[k + 1]}"/>{origin}'
+        joints += f'<axis xyz="{axis}"/><limit lower="-9" upper="9"/></joint>'
+    links = "".join(f'<link name="{name}"/>' for name in names[:3])
+    text = file.read_text().replace("</robot>", f"{links}{joints}</robot>")
+    file.write_text(
+        text.replace('<link name="m1"/>', f'<link name="m1">{solid}</collision></link>')
+        if shape
+        else text
+    )
+    return file
+
+
+@pytest.mark.parametrize("order", ["xyt", "yxt", "txy", "xty"])
+def test_planar_bases_in_the_urdf_are_locked(tmp_path: Path, order: str) -> None:
+    file = driving_urdf(tmp_path, order=order)
+    with pytest.warns(
+        UserWarning, match=r"small.urdf: the virtual base .* are locked: drive_0, drive_1, drive_2$"
+    ):
+        robot = load_robot(file)
+    assert robot.coordinates.names == ("base_x", "base_y", "base_yaw", "j0", "j1", "j2")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # no warning if their positions are given
+        load_robot(file, locked_joints={f"drive_{k}": 0.0 for k in range(3)})
+    (tmp_path / "plain").mkdir()
+    plain = load_robot(small_urdf(tmp_path / "plain"))
+    z = np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
+    assert placement(robot, "l3", z).isApprox(placement(plain, "l3", z), 1e-12)
+
+
+def test_fixed_bases_keep_planar_joints_of_the_urdf(tmp_path: Path) -> None:
+    robot = load_robot(driving_urdf(tmp_path), base="fixed")
+    assert robot.coordinates.names[3:] == ("drive_0", "drive_1", "drive_2", "j0", "j1", "j2")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"shape": True}, {"tilted": True}, {"order": "xxt"}, {"order": "xyx"}, {"order": "ttx"}],
+)
+def test_other_joints_are_not_a_planar_base(tmp_path: Path, change: dict[str, object]) -> None:
+    """Collision shapes, non-horizontal axes or parallel axes exclude a planar base."""
+    assert len(load_robot(driving_urdf(tmp_path, **change)).coordinates.names) == 9  # type: ignore[arg-type]
+
+
+def test_height_of_the_root_link(tmp_path: Path) -> None:
+    """The whole robot is raised at any base pose; the argument overrides the file."""
+    file = small_urdf(tmp_path)
+    low, z = load_robot(file), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
+    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {height: 0.25}\n")
+    for robot, height in (
+        (load_robot(file), 0.25),
+        (load_robot(file, height=0.7), 0.7),
+        (load_robot(file, height=0.0), 0.0),
+    ):
+        assert robot.height == height
+        for frame in ("l0", "l3"):
+            raised = placement(low, frame, z)
+            raised.translation += np.array([0.0, 0.0, height])
+            assert placement(robot, frame, z).isApprox(raised, 1e-12)
+        for shape, other in zip(
+            robot.collision.geometryObjects[:1], low.collision.geometryObjects[:1], strict=True
+        ):
+            np.testing.assert_allclose(
+                shape.placement.translation - other.placement.translation,
+                [0.0, 0.0, height],
+                atol=1e-12,
+            )
+    with pytest.raises(InputError, match="height"):
+        load_robot(file, height=float("nan"))
+
+
+def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
+    file = small_urdf(tmp_path)
+    (tmp_path / "small.srdf").write_text(
+        '<robot name="small"><group name="short"><chain base_link="l0" tip_link="l2"/></group>'
+        '<group name="whole"><joint name="j0"/><joint name="j1"/><joint name="j2"/></group></robot>'
+    )
+    short, whole = (load_robot(file, arm=arm) for arm in ("short", "whole"))
+    assert (short.tool_frame, len(short.home)) == ("l2", 2)
+    assert (whole.tool_frame, len(whole.home)) == ("l3", 3)
+    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\narm: short\n")
+    assert load_robot(tmp_path).tool_frame == "l2"
+    assert load_robot(tmp_path, arm="whole").tool_frame == "l3"
+    assert load_robot(tmp_path, tool_frame="l1").tool_frame == "l1"
+    with pytest.raises(UnknownNameError, match="There are: short, whole") as caught:
+        load_robot(tmp_path, arm="shrt")
+    assert (caught.value.nearest, caught.value.field) == ("short", "arm")
+    with pytest.raises(InputError, match="exclude each other"):
+        load_robot(tmp_path, arm="short", tool_frame="l2")
+    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\ntool_frame: l3\narm: short\n")
+    with pytest.raises(InputError, match="exclude each other") as both:
+        load_robot(tmp_path)
+    assert (both.value.file, both.value.line) == (tmp_path / "robot.yaml", 3)
+
+
+def test_folders_do_not_shadow_robot_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Strings with a slash and `Path` objects are paths, even if a robot has that name."""
+    folder = write_arms(tmp_path / "husky_ur5e").parent
+    (folder / "robot.yaml").write_text("urdf: robot.urdf\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    for path in ("./husky_ur5e", "husky_ur5e/", Path("husky_ur5e"), str(folder)):
+        assert find_robot(path).resolve() == folder / "robot.yaml"
+        assert load_robot(path).urdf.resolve() == folder / "robot.urdf"
+    assert find_robot("husky_ur5e").parent != folder
+    with pytest.raises(InputError, match="this robot file does not exist"):
+        find_robot("./husky")

@@ -1,0 +1,309 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vkc_pin.options import Options
+from vkc_pin.utils import disk_cache as kept
+from vkc_pin.world.files import resources
+from vkc_pin.world.files.srdf import read_srdf
+from vkc_pin.world.models import self_collisions
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.self_collisions import (
+    analyze_self_collisions,
+    sample_allowed_pairs,
+    write_srdf,
+)
+
+SRDF = resources.folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"
+
+
+@pytest.fixture(scope="module")
+def husky() -> Robot:
+    return load_robot("husky_ur5e")
+
+
+def test_committed_srdf_matches_sampling(husky: Robot) -> None:
+    assert (
+        sample_allowed_pairs(husky, samples=3000, seed=7)
+        == read_srdf(SRDF, links=husky.file.links).allowed
+    )
+
+
+def test_home_distance_equals_the_planning_margin() -> None:
+    assert Options().self_distance == self_collisions.HOME_DISTANCE
+
+
+def test_same_seed_gives_same_pairs(husky: Robot) -> None:
+    assert sample_allowed_pairs(husky, samples=100, seed=3) == sample_allowed_pairs(
+        husky, samples=100, seed=3
+    )
+
+
+def test_reasons_of_allowed_pairs(husky: Robot) -> None:
+    allowed = read_srdf(SRDF, links=husky.file.links).allowed
+    assert allowed["shoulder_link", "upper_arm_link"] == "Adjacent"
+    assert allowed["gripper_link", "wrist_2_link"] == "Never"
+    assert ("base_link", "forearm_link") not in allowed
+    assert "Always" not in allowed.values()
+
+
+def test_pairs_that_always_or_never_collide(tmp_path: Path) -> None:
+    links = "".join(
+        f'<link name="{name}"><collision>'
+        f'<geometry><sphere radius="{radius}"/></geometry></collision></link>'
+        for name, radius in (("foot", 1.0), ("middle", 0.1), ("inner", 0.2), ("outer", 0.1))
+    )
+    joints = "".join(
+        f'<joint name="{child}_joint" type="revolute">'
+        f'<parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{x} 0 0"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
+        for parent, child, x in (
+            ("foot", "middle", 0.3),
+            ("middle", "inner", 0.2),
+            ("inner", "outer", 4.0),
+        )
+    )
+    (tmp_path / "odd.urdf").write_text(f'<robot name="odd">{links}{joints}</robot>')
+    robot = load_robot(tmp_path / "odd.urdf", pairs="all")
+    assert sample_allowed_pairs(robot, samples=50) == {
+        ("foot", "inner"): "Always",
+        ("foot", "middle"): "Adjacent",
+        ("foot", "outer"): "Never",
+        ("inner", "middle"): "Adjacent",
+        ("inner", "outer"): "Adjacent",
+        ("middle", "outer"): "Never",
+    }
+
+
+def test_written_srdf_can_be_read(husky: Robot, tmp_path: Path) -> None:
+    file = write_srdf(husky, tmp_path / "new.srdf", samples=50)
+    again = read_srdf(file, links=husky.file.links)
+    assert again.allowed == sample_allowed_pairs(husky, samples=50)
+    assert list(again.state(husky.coordinates.names[3:]).values()) == pytest.approx(
+        list(husky.home)
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["new.srdf"]
+    assert load_robot("husky_ur5e", srdf=file).home == pytest.approx(husky.home)
+
+
+def ball(name: str, radius: float, x: float = 0.0) -> str:
+    shape = f'<origin xyz="{x} 0 0"/><geometry><sphere radius="{radius}"/></geometry>'
+    return f'<link name="{name}"><collision>{shape}</collision></link>'
+
+
+def hinge(
+    parent: str,
+    child: str,
+    x: float = 0.0,
+    *,
+    kind: str = "revolute",
+    axis: str = "0 0 1",
+    upper: float = 1.5,
+) -> str:
+    limit = (
+        ""
+        if kind == "fixed"
+        else f'<axis xyz="{axis}"/>'
+        f'<limit lower="{-upper}" upper="{upper}" velocity="1" effort="1"/>'
+    )
+    return (
+        f'<joint name="{child}_joint" type="{kind}"><parent link="{parent}"/>'
+        f'<child link="{child}"/><origin xyz="{x} 0 0"/>'
+        f"{limit}</joint>"
+    )
+
+
+def arm(folder: Path, *parts: str, srdf: str | None = None) -> Path:
+    file = folder / "arm.urdf"
+    file.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    if srdf is not None:
+        (folder / "arm.srdf").write_text(f'<robot name="arm">{srdf}</robot>')
+    return file
+
+
+def bracket(folder: Path, *, far: float, srdf: str | None = None) -> Path:
+    """Write a post with a fixed bracket, and a shoulder with a fixed cover and a remote elbow."""
+    return arm(
+        folder,
+        *(
+            ball("post", 0.05),
+            ball("bracket", 0.02, 0.09),
+            ball("shoulder", 0.03),
+            ball("cover", 0.03, 0.05),
+            ball("elbow", 0.02),
+        ),
+        hinge("post", "bracket", 0.0, kind="fixed"),
+        hinge("post", "shoulder", 0.0),
+        hinge("shoulder", "cover", 0.0, kind="fixed"),
+        hinge("shoulder", "elbow", far),
+        srdf=srdf,
+    )
+
+
+def test_links_fixed_to_neighbours_are_adjacent(tmp_path: Path) -> None:
+    """Holds only if they are always close; links that can separate must be checked."""
+    robot = load_robot(bracket(tmp_path, far=0.5), pairs="all")
+    allowed = sample_allowed_pairs(robot, samples=200)
+    assert allowed["bracket", "cover"] == "Adjacent"  # from an overlap to a few cm
+    assert allowed["post", "shoulder"] == "Adjacent"
+    wide = (
+        (tmp_path / "arm.urdf")
+        .read_text()
+        .replace("0.05 0 0", "0.09 0 0")
+        .replace('"1.5"', '"3"')
+        .replace("-1.5", "-3")
+    )
+    (tmp_path / "arm.urdf").write_text(wide)
+    assert ("bracket", "cover") not in sample_allowed_pairs(
+        load_robot(tmp_path / "arm.urdf", pairs="all"), samples=200
+    )
+
+
+def test_close_neighbours_missing_in_the_srdf_are_adjacent(tmp_path: Path) -> None:
+    robot = load_robot(bracket(tmp_path, far=0.5, srdf=""))
+    kept_apart = {
+        tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
+        for p in robot.collision.collisionPairs
+    }
+    assert not kept_apart & {
+        ("post", "shoulder"),
+        ("bracket", "cover"),
+        ("cover", "post"),
+        ("bracket", "shoulder"),
+    }
+    assert ("elbow", "post") in kept_apart
+
+
+def slider(folder: Path, *, room: float, srdf: str | None = None, at: float = 0.0) -> Path:
+    """Write a finger of radius 20 mm on two slides, at most `room` away from the wall ahead."""
+    slides = [hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=room)]
+    slides.append(hinge("carriage", "finger", 0.0, kind="prismatic", axis="0 1 0", upper=1e-6))
+    return arm(
+        folder,
+        ball("wall", 0.02),
+        ball("carriage", 0.001, 2.0),
+        ball("finger", 0.02),
+        *slides,
+        srdf=srdf,
+    )
+
+
+def test_tight_pairs_have_half_their_distance_as_margin(tmp_path: Path) -> None:
+    robot = load_robot(slider(tmp_path, room=0.012, at=0.004))
+    assert list(robot.tight) == [("finger", "wall")]
+    assert robot.tight["finger", "wall"] == pytest.approx(
+        0.004, abs=1e-9
+    )  # at home; the maximum would be 16 mm
+    assert robot.own_margin(("finger", "wall"), 0.02) == pytest.approx(0.002, abs=1e-9)
+    assert robot.own_margin(("finger", "wall"), 0.001) == 0.001
+    assert robot.own_margin(("carriage", "wall"), 0.02) == 0.02
+    margins = {
+        tuple(sorted((robot.link_of(i), robot.link_of(j)))): value
+        for (i, j), value in robot.own_margins(0.02).items()
+    }
+    assert margins == {("finger", "wall"): pytest.approx(0.002, abs=1e-9)}
+
+
+@pytest.mark.parametrize("srdf", [None, ""], ids=["sampled", "srdf"])
+def test_links_that_always_touch_are_not_checked(tmp_path: Path, srdf: str | None) -> None:
+    file = slider(tmp_path, room=0.0005, srdf=srdf)
+    other = (
+        ball("far", 0.01)
+        + hinge("finger", "far", 0.5, upper=3.1)
+        + ball("end", 0.3)
+        + hinge("far", "end", 0.4)
+    )
+    file.write_text(file.read_text().replace("</robot>", f"{other}</robot>"))
+    if srdf is None:
+        robot = load_robot(file)
+    else:
+        with pytest.warns(
+            UserWarning,
+            match=r"arm.urdf: links that always overlap or touch are not checked: finger – wall$",
+        ):
+            robot = load_robot(file)
+    kept_apart = {
+        tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
+        for p in robot.collision.collisionPairs
+    }
+    assert ("finger", "wall") not in kept_apart
+    assert ("end", "wall") in kept_apart
+
+
+def test_overlap_at_a_stated_home_warns(tmp_path: Path) -> None:
+    file = slider(tmp_path, room=0.1, at=0.02, srdf="")
+    home = {"carriage_joint": -0.03, "finger_joint": 0.0}
+    with pytest.warns(
+        UserWarning, match=r"links that overlap at home are not checked: finger – wall$"
+    ):
+        robot = load_robot(file, home=home, srdf=file.with_suffix(".srdf"), pairs="sampled")
+    assert robot.home.tolist() == [-0.03, 0.0]
+
+
+def test_unstated_homes_are_collision_free(tmp_path: Path) -> None:
+    """Only joints without stated position are moved, as little as possible, reproducibly."""
+    file = slider(tmp_path, room=0.1, at=-0.01)
+    with pytest.warns(
+        UserWarning,
+        match=r"arm.urdf: links overlap at the default home; .* carriage_joint: 0.0\d+",
+    ):
+        robot = load_robot(file)
+    assert 0.03 - 1e-9 <= robot.home[0] < 0.06  # 20 mm of clearance
+    with pytest.warns(UserWarning, match="links overlap"):
+        np.testing.assert_array_equal(load_robot(file).home, robot.home)
+
+
+def test_analysis_is_cached_by_its_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second call does not sample; changed shapes, limits, homes or lists do."""
+    monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
+    sampled, real = [], self_collisions._compute_analysis
+    monkeypatch.setattr(
+        self_collisions, "_compute_analysis", lambda *rest: (sampled.append(rest), real(*rest))[1]
+    )
+    file = slider(tmp_path, room=0.012, at=0.004)
+    first, again = load_robot(file), load_robot(file)
+    assert len(sampled) == 1
+    assert (first.tight, first.home.tolist(), first.own_margins(0.02)) == (
+        again.tight,
+        again.home.tolist(),
+        again.own_margins(0.02),
+    )
+    text = file.read_text()
+    for count, change in enumerate(
+        [("0.02", "0.021"), ('upper="0.012"', 'upper="0.013"'), ("0.044", "0.045")], 2
+    ):
+        file.write_text(text.replace(*change))
+        assert text.count(change[0])
+        load_robot(file)
+        assert len(sampled) == count
+    file.write_text(text)
+    load_robot(file, home={"carriage_joint": 0.001})
+    assert len(sampled) == 5
+    assert analyze_self_collisions(first, {("finger", "wall"): "Never"}, samples=10).allowed == {
+        ("finger", "wall"): "Never"
+    }
+    assert len(sampled) == 6
+
+
+def test_home_of_tiago_is_collision_free(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="links overlap at the default home"):
+        robot = load_robot("tiago")
+    from vkc_pin.world.models.shapes import ShapeDistances
+
+    distances = ShapeDistances(robot.model, robot.coordinates.q, robot.collision.geometryObjects)
+    distances.set_configuration(np.array([0.0, 0.0, 0.0, *robot.home]))
+    for (i, j), margin in robot.own_margins(0.02).items():
+        assert distances.compute_distance([(i, j)]) >= margin
+
+
+def test_special_characters_in_robot_names_are_escaped(husky: Robot, tmp_path: Path) -> None:
+    robot = dataclasses.replace(husky, name='a\x01"b\udcff\n')
+    file = write_srdf(robot, tmp_path / "new.srdf", samples=20)
+    again = read_srdf(file, links=husky.file.links)
+    assert again.allowed == sample_allowed_pairs(husky, samples=20)

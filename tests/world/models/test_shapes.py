@@ -1,0 +1,218 @@
+"""Tests distances by brute force, and surfaces and boxes by formulas."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.files.meshes import MeshPart, to_bvh
+from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.shapes import (
+    LIMIT_SLACK,
+    LinkDistances,
+    ShapeDistances,
+    clamp_to_limits,
+    compute_bounding_box,
+    compute_clearance,
+    compute_shape_distance,
+    compute_world_box,
+    copy_shape,
+    get_link_name,
+    get_local_name,
+    list_placed_shapes,
+    triangulate,
+)
+
+Solid = tuple[coal.CollisionGeometry, pin.SE3]
+
+# Shape, its volume [m³].
+SOLIDS: list[tuple[Callable[[], coal.CollisionGeometry], float]] = [
+    (lambda: coal.Box(0.2, 0.3, 0.4), 0.024),
+    (lambda: coal.Sphere(0.2), 4 / 3 * np.pi * 0.008),
+    (lambda: coal.Ellipsoid(0.1, 0.2, 0.3), 4 / 3 * np.pi * 0.006),
+    (lambda: coal.Cylinder(0.1, 0.4), np.pi * 0.01 * 0.4),
+    (lambda: coal.Cone(0.1, 0.6), np.pi * 0.01 * 0.2),
+    (lambda: coal.Capsule(0.1, 0.4), np.pi * 0.01 * 0.4 + 4 / 3 * np.pi * 0.001),
+]
+
+
+def random_solids(rng: np.random.Generator, count: int, size: float) -> list[Solid]:
+    kinds = [SOLIDS[int(k)][0]() for k in rng.integers(len(SOLIDS), size=count)]
+    return [
+        (kind, pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))) for kind in kinds
+    ]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.4, 1.0, 3.0]))
+def test_clearance_is_the_smallest_pair_distance(seed: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    first, second = random_solids(rng, 4, size), random_solids(rng, 6, size)
+    least = min(compute_shape_distance(*one, *other) for one in first for other in second)
+    assert compute_clearance(first, second) == pytest.approx(least, abs=1e-6)
+    near = compute_clearance(first, second, reach=0.2)
+    assert near == (
+        pytest.approx(least, abs=1e-6) if least < 0.2 - 1e-6 else pytest.approx(max(0.2, near))
+    )
+
+
+def test_clearance_of_empty_groups() -> None:
+    some = random_solids(np.random.default_rng(0), 2, 1.0)
+    assert compute_clearance(some, []) == compute_clearance([], some) == np.inf
+
+
+@pytest.mark.parametrize("number", range(len(SOLIDS)))
+def test_surfaces_are_closed_and_have_the_right_volume(number: int) -> None:
+    make, volume = SOLIDS[number]
+    mesh = trimesh.Trimesh(*triangulate(make()))
+    assert mesh.is_watertight
+    assert 0.94 * volume <= mesh.volume <= volume * (1 + 1e-9)
+    shape = pin.GeometryObject("s", 0, 0, pin.SE3.Identity(), make())
+    center, half = compute_bounding_box(shape)
+    np.testing.assert_allclose(mesh.bounds, [center - half, center + half], atol=0.02)
+    assert (mesh.bounds[0] >= center - half - 1e-9).all()
+    assert (mesh.bounds[1] <= center + half + 1e-9).all()
+
+
+def test_meshes_keep_their_triangles() -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    mesh = to_bvh(MeshPart(np.asarray(box.vertices), np.asarray(box.faces)))
+    mesh.buildConvexRepresentation(False)
+    for shape in (mesh, mesh.convex):
+        vertices, faces = triangulate(shape)
+        assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(0.006)
+
+
+def test_unbounded_shapes_raise() -> None:
+    with pytest.raises(InputError, match="cannot be drawn"):
+        triangulate(coal.Halfspace(0.0, 0.0, 1.0, 0.0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_world_boxes_enclose_the_surface(seed: int) -> None:
+    ((shape, placement),) = random_solids(np.random.default_rng(seed), 1, 1.0)
+    low, high = compute_world_box(shape, placement)
+    points = triangulate(shape)[0] @ placement.rotation.T + placement.translation
+    assert (points >= low - 1e-9).all()
+    assert (points <= high + 1e-9).all()
+    diagonal = 2 * np.linalg.norm(
+        compute_bounding_box(pin.GeometryObject("s", 0, 0, placement, shape))[1]
+    )
+    assert (high - low <= diagonal + 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"), [(0.5, 0.5), (1.0 + LIMIT_SLACK / 2, 1.0), (-LIMIT_SLACK / 2, 0.0)]
+)
+def test_rounding_errors_are_clamped(value: float, expected: float) -> None:
+    assert clamp_to_limits(value, 0.0, 1.0, "joint") == expected
+
+
+@pytest.mark.parametrize("value", [1.0 + 2 * LIMIT_SLACK, -1.0, np.nan, np.inf])
+def test_values_outside_limits_raise(value: float) -> None:
+    with pytest.raises(InputError) as caught:
+        clamp_to_limits(value, 0.0, 1.0, "joint")
+    assert caught.value.field == "joint"
+
+
+def test_copies_are_fixed_in_the_world() -> None:
+    shape = pin.GeometryObject("arm_3", 4, 7, pin.SE3.Random(), coal.Sphere(0.1))
+    place = pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    copy = copy_shape(shape, "cup.arm_3", place)
+    assert (copy.name, copy.parentJoint, copy.parentFrame, shape.name) == (
+        "cup.arm_3",
+        0,
+        0,
+        "arm_3",
+    )
+    assert copy.placement.isApprox(place)
+    assert (
+        get_local_name(copy.name),
+        get_link_name(get_local_name(copy.name)),
+        get_link_name("upper_arm_link_12"),
+    ) == (
+        "arm_3",
+        "arm",
+        "upper_arm_link",
+    )
+    ((geometry, at),) = list_placed_shapes([copy])
+    assert compute_shape_distance(
+        geometry, at, coal.Sphere(0.1), pin.SE3.Identity()
+    ) == pytest.approx(np.sqrt(14) - 0.2)
+
+
+FIRST = """
+import numpy as np, coal, vkc_pin
+vkc_pin.load_scene
+def distance(shape, at, turned=np.eye(3)):
+    here, there = coal.Transform3s(), coal.Transform3s(turned, np.array(at))
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    return coal.distance(shape, here, coal.Box(1.0, 2.0, 0.04), there, request, result)
+turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+if {first}:
+    distance(coal.Capsule(0.1, 0.5), (3.0, 0.0, 0.0))
+capsule = coal.Capsule(0.1, 0.5)
+print(*(distance(capsule, (x, 0.1, 0.2), turned).hex() for x in (0.1, 0.2, 0.3, 3.0)))
+"""
+
+
+def test_distances_do_not_depend_on_the_first_query() -> None:
+    found = []
+    for first in (False, True):
+        command = [sys.executable, "-c", FIRST.format(first=first)]
+        found.append(
+            subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+        )
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("cutoff", [0.0, 0.05, np.inf])
+def test_link_distances_match_shape_distances(cutoff: float) -> None:
+    """Distances are exact up to the cutoff, and bounds above it, after any selection."""
+    robot, rng = load_robot("husky_ur5e"), np.random.default_rng(5)
+    shapes = robot.collision.geometryObjects
+    groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for pair in robot.collision.collisionPairs:
+        groups.setdefault((robot.link_of(pair.first), robot.link_of(pair.second)), []).append(
+            (pair.first, pair.second)
+        )
+    distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
+    links, data = LinkDistances(distances, groups), robot.model.createData()
+    assert links.links == list(groups)
+    for _ in range(4):
+        z = rng.uniform(-2.0, 2.0, len(robot.lower))
+        distances.set_configuration(z)
+        pin.forwardKinematics(robot.model, data, robot.coordinates.q(z))
+        placed = [
+            (shape.geometry, data.oMi[shape.parentJoint] * shape.placement) for shape in shapes
+        ]
+        np.testing.assert_allclose(
+            distances.compute_lowest_points(),
+            [compute_world_box(*one)[0][2] for one in placed],
+            atol=1e-12,
+        )
+        bounds = links.compute_lower_bounds()
+        for k, name in enumerate(links.links):
+            exact = min(
+                compute_shape_distance(*placed[one], *placed[other]) for one, other in groups[name]
+            )
+            assert bounds[k] <= exact + 1e-6
+            found = links.compute_distance(k, cutoff)
+            assert found == pytest.approx(exact, abs=1e-6) if exact <= cutoff else found > cutoff
+        links.select([k % 3 > 0 for k in range(len(links.links))])
+        if not links.links:
+            break
+    links.select([False] * len(links.links))
+    assert links.links == []
+    assert links.compute_lower_bounds().shape == (0,)

@@ -1,0 +1,516 @@
+"""Tests close pairs of shapes: exemptions, their joint ranges, and warnings."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.drawers import changed, drawer_scene, with_boxes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.validation.validate import validate
+from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
+from vkc_pin.world.scene import clearance_exemptions as neighbours
+from vkc_pin.world.scene.clearance_exemptions import (
+    ClearanceExemption,
+    find_clearance_exemptions,
+    find_close_pairs,
+)
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene, load_scene
+
+SAFE = 0.02
+# y of the side of the drawer's front, which reaches from x = 1.885 to 1.903 when it is shut
+TRAY = 0.295
+HINGE = {"hinge": 1.2}
+
+
+def beside(gap: float, begin: float = 1.7) -> Scene:
+    """Return the drawer's room with a panel beside the drawer's front, from x = `begin` on."""
+    depth = 2.3 - begin
+    return with_boxes(
+        drawer_scene(), side=((depth, 0.1, 0.9), (begin + depth / 2, TRAY + gap + 0.05, 0.45))
+    )
+
+
+def in_wall(depth: float = 0.05, **fields: Any) -> Scene:
+    """Return a room with a door whose leaf overlaps the wall at its hinges, at y = 0."""
+    walls = [
+        {
+            "name": "wall",
+            "type": "box",
+            "size": [0.08, 1.2, 2.4],
+            "position": [2.55, 0.6 - depth, 1.2],
+        },
+        {"name": "other", "type": "box", "size": [0.08, 1.2, 2.4], "position": [2.55, -1.56, 1.2]},
+    ]
+    document = {
+        "name": "tight",
+        "robot": "husky_ur5e",
+        "start": {"base": [0.0, 0.0, 0.0]},
+        "objects": [{"name": "door", "type": "door", "position": [2.55, 0.0, 0.0]}],
+        "obstacles": walls,
+    }
+    return Scene.from_document({**document, **fields})
+
+
+@given(gap=st.floats(0.001, 0.018), begin=st.floats(1.4, 1.8))
+@settings(max_examples=20, deadline=None)
+def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(
+    gap: float, begin: float
+) -> None:
+    (close,) = find_close_pairs(beside(gap, begin), SAFE)
+    assert close[:2] == ("drawer.tray", "side")
+    assert close.distance == pytest.approx(gap, abs=1e-6)
+    (one,) = find_clearance_exemptions(beside(gap, begin), SAFE)
+    assert (one.margin, one.distance) == (0.0, close.distance)
+    lower, upper = one.ranges["drawer.slide"]
+    assert lower == -np.inf
+    # The front's back face leaves the panel's end; then both are √(gap² + way²) apart. What is
+    # behind the front is further away.
+    leaves = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
+    assert upper == (
+        np.inf
+        if leaves > drawer_scene().objects["drawer"].object.upper[0]
+        else pytest.approx(leaves, abs=2e-4)
+    )
+
+
+def test_link_distance_is_that_of_the_closest_shapes() -> None:
+    scene = beside(0.012).with_state("drawer", {"slide": 0.2})
+    shapes = [
+        (f"drawer.{get_link_name(shape.name)}", shape)
+        for shape in make_world_shapes(scene.objects["drawer"])
+    ]
+    moving = [shape for label, shape in shapes if label == "drawer.tray"]
+    least: dict[str, float] = {}
+    for label, other in zip(scene.obstacle_labels, scene.obstacles, strict=True):
+        for shape in moving if label != FLOOR else ():
+            distance = compute_shape_distance(
+                shape.geometry, shape.placement, other.geometry, other.placement
+            )
+            least[label] = min(least.get(label, np.inf), distance)
+    found = {pair.second: pair.distance for pair in find_close_pairs(scene, 0.6)}
+    assert len(moving) > 3
+    assert found == pytest.approx(
+        {label: distance for label, distance in least.items() if distance < 0.6}, abs=1e-9
+    )
+    assert {"side", "wall_east"} <= set(found)
+
+
+def test_cache_depends_on_obstacles_and_states() -> None:
+    scene = beside(0.004, 1.4)
+    (one,) = find_clearance_exemptions(scene, SAFE)
+    kept = [k for k, label in enumerate(scene.obstacle_labels) if label != "side"]
+    parts = {
+        name: tuple(getattr(scene, name)[k] for k in kept)
+        for name in ("obstacles", "obstacle_labels")
+    }
+    assert find_clearance_exemptions(dataclasses.replace(scene, **parts), SAFE) == ()
+    assert find_clearance_exemptions(scene.with_start(base=[0.0, 0.0, 0.0]), SAFE) == (one,)
+    ahead = with_boxes(
+        drawer_scene(), ahead=((0.1, 0.5, 0.2), (1.43, 0.0, 0.755))
+    )  # 0.37 m before the front, which is 0.59 m wide
+    assert find_clearance_exemptions(ahead, SAFE) == ()
+    met = find_clearance_exemptions(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
+    assert {(one.first, one.second) for one in met} == {("drawer.tray", "ahead")}
+    assert -np.inf in {one.margin for one in met}
+    assert len({one.shapes for one in met}) == len(
+        met
+    )  # each shape of the tray that is close has its own
+
+
+def test_two_drawers_side_by_side_are_neighbours_until_either_is_past_the_other() -> None:
+    gap, thick = 0.015, 0.018  # between the fronts, and of each
+    drawer = {"type": "drawer", "position": [1.93, 0.0, 0.0]}
+    at = [[1.93, y, 0.0] for y in (0.0, 2 * TRAY + gap)]
+    pair = [
+        {**drawer, "name": name, "position": place}
+        for name, place in zip(("near", "next"), at, strict=True)
+    ]
+    scene = changed(drawer_scene(), objects=pair, obstacles=[])
+    (one,) = find_clearance_exemptions(scene, SAFE)
+    assert one.is_between("near.tray", "next.tray")
+    leaves = thick + np.sqrt(SAFE**2 - gap**2)
+    assert {name: ends[1] for name, ends in one.ranges.items()} == {
+        f"{name}.slide": pytest.approx(leaves, abs=2e-4) for name in ("near", "next")
+    }
+    out = np.array([[0.0, 0.0], [0.02, 0.03], [0.05, 0.0], [0.0, 0.05]])
+    assert one.is_active(["near.slide", "next.slide"], out).tolist() == [True, True, False, False]
+
+
+def test_packaged_scenes_have_no_close_pairs() -> None:
+    for name in ("door", "drawer", "fetch", "household", "corridor_door", "aisle_drawer"):
+        scene = load_scene(name)
+        assert find_clearance_exemptions(scene, SAFE) == ()
+        assert find_close_pairs(scene, SAFE) == []
+
+
+def test_warning_names_overlapping_links() -> None:
+    with pytest.warns(
+        UserWarning, match=r"tight: .*door\.panel – wall overlap by 50\.0 mm.*`allow:`"
+    ) as caught:
+        scene = in_wall()
+    assert len(caught) == 1
+    (one,) = find_clearance_exemptions(scene, SAFE)
+    assert one.is_between("wall", "door.panel")
+    assert one.margin == -np.inf
+    assert one.ranges == {"door.hinge": (-np.inf, np.inf)}  # its hinge is in the wall for ever
+
+
+def test_open_door_keeps_the_exemption_of_its_wall() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = in_wall(0.003)
+    shut = find_clearance_exemptions(scene, SAFE)
+    (ajar,) = {
+        one.ranges["door.hinge"]
+        for one in find_clearance_exemptions(scene.with_state("door", {"hinge": 1.0}), SAFE)
+    }
+    assert {one.ranges["door.hinge"] for one in shut} == {ajar}
+
+
+def test_open_drawer_keeps_the_exemption_of_its_neighbour() -> None:
+    (one,) = find_clearance_exemptions(beside(0.004), SAFE)
+    assert find_close_pairs(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE) == []
+    (other,) = find_clearance_exemptions(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE)
+    assert (other.first, other.second, other.margin, other.ranges) == (
+        one.first,
+        one.second,
+        one.margin,
+        one.ranges,
+    )
+
+
+def test_held_and_resting_objects_have_no_exemptions() -> None:
+    scene = load_scene("init_1")
+    assert find_close_pairs(scene, 0.3) == []
+    with pytest.warns(UserWarning, match="overlap by 10"):
+        sunk = changed(
+            scene, objects=[{**scene.document["objects"][0], "position": [2.5, 1.0, 0.76]}]
+        )
+    (close,) = find_close_pairs(sunk, SAFE)
+    assert close[:2] == ("stick.stick", "table_top")
+    held = sunk.with_held({"stick": "grip"})
+    assert find_close_pairs(held, SAFE) == []
+    assert (
+        find_clearance_exemptions(sunk, SAFE) == ()
+    )  # it may leave when it is lifted; that is not told by joints
+
+
+def test_exemption_is_active_where_every_joint_is_in_range() -> None:
+    one = ClearanceExemption("a.b", "c", 0.0, 0.01, {"a.x": (0.0, 1.0), "a.y": (-np.inf, 0.5)})
+    states = np.array([[9.0, 0.5, 0.0], [9.0, 1.5, 0.0], [9.0, 1.0, 0.6], [9.0, 0.0, -7.0]])
+    assert one.is_active(["q", "a.x", "a.y"], states).tolist() == [True, False, False, True]
+    assert ClearanceExemption("a", "b", 0.0, 0.0).is_active([], np.zeros((2, 0))).all()
+
+
+@pytest.mark.parametrize(
+    ("allow", "margin"),
+    [
+        ([["door.panel", "wall"]], -np.inf),
+        ([["wall", "door"]], -np.inf),
+        ([{"pair": ["door", "wall"], "margin": 0.004}], 0.004),
+        ([{"pair": ["door", "wall"], "margin": 0.004}, ["door.panel", "wall"]], -np.inf),
+        (["home.srdf"], -np.inf),
+        ([{"srdf": "home.srdf"}], -np.inf),
+    ],
+)
+def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: float) -> None:
+    (tmp_path / "home.srdf").write_text(
+        '<robot name="home"><disable_collisions link1="door.panel" link2="wall" reason="as built"/></robot>'
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # what is allowed is not told of
+        scene = Scene.from_document({**in_wall(-0.004).document, "allow": allow}, tmp_path)
+    assert scene.allowed[frozenset(("door.panel", "wall"))] == margin
+    assert find_close_pairs(scene, SAFE) == []
+    assert all(isinstance(label, str) for pair in scene.allowed for label in pair)
+    again = Scene.from_document(scene.document, tmp_path)
+    assert dict(again.allowed) == dict(scene.allowed)
+    assert dict(scene.with_state("door", {"hinge": 0.4}).allowed) == dict(scene.allowed)
+
+
+@pytest.mark.parametrize(
+    ("allow", "field", "said"),
+    [
+        ([["door.panle", "wall"]], "allow[0][0]", "did you mean 'door.panel'"),
+        ([{"pair": ["door", "wal"]}], "allow[0].pair[1]", "did you mean 'wall'"),
+        ([["door"]], "allow[0]", "2 values"),
+        ([{"margin": 0.1}], "allow[0]", "neither a pair nor an SRDF file"),
+        ([{"srdf": "home.srdf", "margin": 0.1}], "allow[0]", "neither a pair nor an SRDF file"),
+        (["nowhere.srdf"], "allow[0]", "there is no such file"),
+        ([{"pair": ["door", "wall"], "margin": "thin"}], "allow[0].margin", "a number"),
+        ([7], "allow[0]", ""),
+    ],
+)
+def test_errors_name_invalid_allowed_pairs(allow: list[Any], field: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Scene.from_document({**in_wall(-0.03).document, "allow": allow})
+    assert caught.value.field == field
+    assert said in str(caught.value)
+
+
+def test_a_file_that_is_missing_is_named_with_the_nearest_one(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    for name in ("door.yaml", "door.yml", "oven.yaml"):
+        (tmp_path / "mine" / name).touch()
+    thing = {"name": "door", "type": "mine/dor.yaml", "position": [2.0, 0.0, 0.0]}
+    for missing, said in (
+        ("mine/dor.yaml", ", perhaps mine/door.yaml, got"),
+        ("none/dor.yaml", rf"a file in {tmp_path}, got"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Scene.from_document(
+                {**in_wall(-0.03).document, "objects": [{**thing, "type": missing}], "allow": []},
+                tmp_path,
+            )
+
+
+def test_an_srdf_of_other_links_is_refused_by_line(tmp_path: Path) -> None:
+    (tmp_path / "home.srdf").write_text(
+        '<robot name="home">\n<disable_collisions link1="doro" link2="wall"/>\n</robot>'
+    )
+    with pytest.raises(UnknownNameError, match=r"home\.srdf:2: .*did you mean 'door'"):
+        Scene.from_document({**in_wall(-0.03).document, "allow": ["home.srdf"]}, tmp_path)
+
+
+def test_plans_open_and_close_overlapping_doors(tmp_path: Path) -> None:
+    """Every success is judged by the oracle, which has its own idea of neighbours."""
+    plan = vkc.plan(beside(0.004), [vkc.Actuate("drawer", {"slide": 0.3})])
+    assert plan.success, plan.report()
+    assert 0.003 < plan.validation.clearance < 0.0045
+    with pytest.warns(UserWarning, match="overlap by 50"):
+        scene = in_wall()
+    both = vkc.plan(scene, [vkc.Actuate("door", HINGE), vkc.Actuate("door", {"hinge": 0.0})])
+    assert both.success, both.report()
+    assert both.validation.clearance > 0.015  # of what must be apart
+    both.save(tmp_path / "both.npz")
+    with pytest.warns(UserWarning, match="overlap by 50"):
+        assert vkc.Plan.load(tmp_path / "both.npz").success
+
+
+def test_cup_may_leave_but_not_enter_an_overlap() -> None:
+    cup, table = {"name": "cup", "type": "cup", "position": [1.5, 0.0, 0.748]}, [0.8, 1.2, 0.05]
+    document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}, "objects": [cup]}
+    tables = [{"name": "table", "type": "box", "size": table, "position": [1.8, 0.0, 0.725]}]
+    with pytest.warns(UserWarning, match=r"cup\.cup – table overlap by 2\.0 mm"):
+        scene = Scene.from_document({**document, "obstacles": tables})
+    plan = vkc.plan(scene, [vkc.Place("cup", (1.5, 0.4, 0.751))])
+    assert plan.success, plan.report()
+    deep = validate(scene, [vkc.Place("cup", (1.5, 0.4, 0.749))], plan.trajectory)
+    assert {violation.constraint for violation in deep.violations} == {"goal"}
+    into = vkc.plan(scene, [vkc.Place("cup", (1.5, 0.4, 0.747))])
+    assert into.status == "infeasible"
+    assert "cup.cup – table overlap by" in into.validation.notes[0]
+
+
+def test_left_overlap_is_not_exempt_again() -> None:
+    """A leaf that swings by 1.2 rad may not swing into a post that it was never near."""
+    post = {"name": "post", "type": "box", "size": [0.08, 0.1, 0.5], "position": [3.2, -0.3, 0.25]}
+    document = in_wall(-0.06).document
+    blocked = Scene.from_document({**document, "obstacles": [*document["obstacles"], post]})
+    plan = vkc.plan(blocked, [vkc.Actuate("door", HINGE)])
+    assert plan.status == "infeasible"
+    (note,) = plan.validation.notes
+    assert "proven: between 0 and 1.2" in note
+    assert "door.panel – post overlap by" in note
+    allowed = Scene.from_document({**blocked.document, "allow": [["door", "post"]]})
+    assert vkc.plan(allowed, [vkc.Actuate("door", HINGE)]).success
+
+
+def test_a_leaf_whose_edge_swings_into_the_wall_is_proven_to() -> None:
+    """3 mm are too few for a leaf 40 mm thick that turns about its edge, unless the scene allows it."""
+    scene = in_wall(-0.003)
+    plan = vkc.plan(scene, [vkc.Actuate("door", HINGE)])
+    assert plan.status == "infeasible"
+    (note,) = plan.validation.notes
+    overlap = float(note.rpartition("overlap by ")[2].removesuffix(" mm"))
+    assert "door.panel – wall" in note
+    short = Scene.from_document(
+        {**scene.document, "allow": [{"pair": ["door", "wall"], "margin": -1e-3 * (overlap - 2.0)}]}
+    )
+    assert vkc.plan(short, [vkc.Actuate("door", HINGE)]).status == "infeasible"
+    enough = Scene.from_document(
+        {**scene.document, "allow": [{"pair": ["door", "wall"], "margin": -1e-3 * (overlap + 0.2)}]}
+    )
+    assert vkc.plan(enough, [vkc.Actuate("door", HINGE)]).success
+
+
+def test_robot_may_overlap_allowed_obstacles() -> None:
+    mat = {"name": "mat", "type": "box", "size": [1.2, 1.2, 0.2], "position": [0.0, 0.0, 0.1]}
+    document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}, "obstacles": [mat]}
+    refused = vkc.plan(Scene.from_document(document), [vkc.GoTo(2.0, 0.0)])
+    assert refused.status == "infeasible"
+    touching = sorted({v.subject.split(" – ")[0] for v in refused.validation.violations})
+    assert touching
+    plan = vkc.plan(
+        Scene.from_document({**document, "allow": [[link, "mat"] for link in touching]}),
+        [vkc.GoTo(2.0, 0.0)],
+    )
+    assert plan.success, plan.report()
+
+
+def test_only_nearby_obstacles_are_measured(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    boxes = [
+        {
+            "name": f"b{k}",
+            "type": "box",
+            "size": [0.02, 0.02, 0.02],
+            "position": [*rng.uniform(-4, 1.5, 2).tolist(), 1.0],
+        }
+        for k in range(9_990)
+    ]
+    document = in_wall(-0.004).document
+    asked = []
+    measured = neighbours.compute_shape_distance
+    monkeypatch.setattr(
+        neighbours, "compute_shape_distance", lambda *given: asked.append(given) or measured(*given)
+    )
+    scene = Scene.from_document({**document, "obstacles": [*document["obstacles"], *boxes]})
+    assert [pair[:2] for pair in find_close_pairs(scene, SAFE)] == [("door.panel", "wall")]
+    assert 1 <= len(asked) < 10
+
+
+def test_unreached_links_are_never_near() -> None:
+    """In a home, a refrigerator's door is near those links only that it reaches."""
+    home = load_scene("household")
+    standing = neighbours.PlacedShapes(home, home.objects)
+    label, values = "refrigerator.door", np.linspace(0.0, 2.0, 9)
+    reached = standing.find_links_near_sweep(label, 0, values)
+    others = {one for one in standing.labels if not one.startswith("refrigerator.")}
+    met = {
+        one
+        for one in others
+        if standing.compute_distances(label, 0, values, standing.find_shapes([one]), 0.0).min()
+        < 0.0
+    }
+    assert met <= reached
+    assert len(reached & others) < len(others) / 5
+
+
+LEAF = (
+    '<robot name="d"><link name="frame"/><link name="leaf">{leaf}'
+    '<collision><origin xyz="-0.07 -0.7 1"/><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>'
+    '<joint name="hinge" type="revolute"><parent link="frame"/><child link="leaf"/><axis xyz="0 0 1"/>'
+    '<limit lower="0" upper="1.5" velocity="1" effort="1"/></joint></robot>'
+)
+
+
+def box(position: str, size: str) -> str:
+    return f'<collision><origin xyz="{position}"/><geometry><box size="{size}"/></geometry></collision>'
+
+
+def hinged_at_post(folder: Path, *, block: bool) -> Scene:
+    """Return a room with a leaf 1 mm inside its post; the same obstacle may have a block."""
+    post, blocking = box("0.02 0.049 1", "0.1 0.1 2"), box("0.3 -0.25 0.3", "0.2 0.2 0.6")
+    wall = f'<robot name="w"><link name="w">{post}{blocking if block else ""}</link></robot>'
+    (folder / "wall.urdf").write_text(wall, encoding="utf-8")
+    attachment = {
+        "name": "h",
+        "link": "leaf",
+        "position": [-0.07, -0.7, 1.0],
+        "approach": [1, 0, 0],
+        "closing": [0, 1, 0],
+    }
+    door = {"urdf": LEAF.format(leaf=box("0.02 -0.4 1", "0.04 0.8 2")), "attachments": [attachment]}
+    document = {
+        "name": "hinged",
+        "robot": "husky_ur5e",
+        "start": {"base": [-1.5, 0, 0]},
+        "arena": {"x": [-4, 4], "y": [-4, 4]},
+        "obstacles": [
+            {"name": "wall", "type": "urdf", "file": "wall.urdf", "position": [1.5, 0.4, 0]}
+        ],
+        "objects": [{"name": "door", "position": [1.5, 0.4, 0], "type": door}],
+    }
+    with pytest.warns(UserWarning, match=r"door\.leaf – wall overlap by 1\.0 mm"):
+        return Scene.from_document(document, folder)
+
+
+def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
+    """The leaf may turn in its post, but not through other shapes of the same obstacle."""
+    for name in ("free", "blocked"):
+        (tmp_path / name).mkdir()
+    steps = [vkc.Actuate("door", {"hinge": 1.2})]
+    free = hinged_at_post(tmp_path / "free", block=False)
+    opened = vkc.plan(free, steps)
+    assert opened.success, opened.report()
+    (used,) = opened.validation.exemptions
+    assert used.subject == "door.leaf – wall"
+    assert -0.045 < used.distance < -0.03  # the corner of the leaf, 40 mm thick, turns in the post
+    assert "1.0 mm inside each other" in used.reason
+    assert f"exempt      {used}" in opened.report()
+    opened.save(tmp_path / "opened.npz")
+    assert (
+        vkc.Plan.load(tmp_path / "opened.npz").validation.exemptions == opened.validation.exemptions
+    )
+
+    blocked = hinged_at_post(tmp_path / "blocked", block=True)
+    (one,) = find_clearance_exemptions(blocked, SAFE)
+    assert one.shapes == ("door.leaf_0", "wall_0")
+    report = validate(blocked, steps, opened.trajectory)
+    (hit,) = (found for found in report.violations if found.constraint == "penetration")
+    assert hit.subject == "door.leaf – wall"
+    assert hit.amount == pytest.approx(0.161, abs=0.002)
+    refused = vkc.plan(blocked, steps)
+    assert refused.status == "infeasible"
+    assert any("door.leaf – wall overlap by 16" in note for note in refused.validation.notes), (
+        refused.report()
+    )
+
+
+def test_overlap_of_two_joints_is_bounded_by_each_alone() -> None:
+    """A lever on a leaf, 5 mm inside a panel: only overlaps by one joint alone are exempt."""
+    lever = (
+        '<link name="lever">{}</link><joint name="turn" type="revolute"><parent link="leaf"/><child link="lever"/>'
+        '<origin xyz="0.055 -0.4 1"/><axis xyz="1 0 0"/><limit lower="0" upper="0.5" velocity="1" effort="1"/></joint></robot>'
+    ).format(box("0.025 0.1 0", "0.05 0.3 0.03"))
+    urdf = LEAF.format(leaf=box("0.02 -0.4 1", "0.04 0.8 2")).replace("</robot>", lever)
+    attachment = {
+        "name": "h",
+        "link": "leaf",
+        "position": [-0.07, -0.7, 1.0],
+        "approach": [1, 0, 0],
+        "closing": [0, 1, 0],
+    }
+    document = {
+        "robot": "husky_ur5e",
+        "start": {"base": [-1.5, 0, 0]},
+        "objects": [
+            {
+                "name": "door",
+                "position": [1.5, 0.4, 0],
+                "type": {"urdf": urdf, "attachments": [attachment]},
+            }
+        ],
+        "obstacles": [
+            {"name": "panel", "type": "box", "size": [0.06, 0.5, 0.5], "position": [1.63, 0.3, 1.0]}
+        ],
+    }
+    with pytest.warns(UserWarning, match=r"door\.lever – panel overlap by 5"):
+        scene = Scene.from_document(document)
+    (one,) = (one for one in find_clearance_exemptions(scene, SAFE) if one.first == "door.lever")
+    assert set(one.ranges) == {"door.hinge", "door.turn"}
+    standing, least = neighbours.PlacedShapes(scene, scene.objects), 0.0
+    for index, upper in ((0, 1.5), (1, 0.5)):
+        (alone,) = standing.compute_distances(
+            "door.lever", index, np.linspace(0.0, upper, 2001), standing.find_shapes(["panel"]), 0.1
+        ).T
+        inside = (
+            alone[0][: int(np.argmax(alone[0] >= SAFE))] if (alone[0] >= SAFE).any() else alone[0]
+        )
+        least = min(least, float(inside.min()))
+    assert one.margin == pytest.approx(least, abs=1e-4)
+    assert one.margin < -0.004

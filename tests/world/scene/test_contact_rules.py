@@ -1,0 +1,125 @@
+"""Tests each rule for shapes that may be close to each other."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.grippers import between_cheeks, write_gripper
+from helpers.judging import with_object
+from helpers.small_problems import door_scene
+
+from vkc_pin.options import Options
+from vkc_pin.world.models.articulated_object import Attachment
+from vkc_pin.world.scene.contact_rules import (
+    CONTACT_WINDOW,
+    compute_grasp_opening,
+    compute_hand_clearance,
+    compute_hand_frame,
+    compute_start_opening,
+    find_grasped_link,
+    find_gripper_hold,
+    find_touch_links,
+    is_rigid_grasp,
+)
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+
+HANDLE, FREE = Hold("door", "handle"), Hold("door", "handle_free")
+THROUGH = Hold("door", "handle", Hold("stick", "grip"), "tip")
+LEVER, PANEL = "door.lever", "door.panel"
+
+
+def door(attachment: str = "handle", **fields: object) -> Scene:
+    """Return the door's scene, with something about an attachment changed."""
+    scene = door_scene()
+    given = scene.objects["door"].object.attachments
+    changed: Attachment = dataclasses.replace(given[attachment], **fields)  # type: ignore[arg-type]
+    return with_object(scene, attachments={**given, attachment: changed})
+
+
+def test_grasping_and_grasped_links() -> None:
+    scene = door_scene()
+    assert CONTACT_WINDOW == 1.0  # [s], as the pages say
+    assert find_grasped_link(scene, HANDLE) == LEVER
+    assert tuple(find_touch_links(scene, HANDLE)) == scene.robot.touch_links
+    assert find_touch_links(scene, THROUGH) == ("stick.tip",)
+
+
+@pytest.mark.parametrize(
+    ("clearance", "expected"),
+    [(None, 0.005), (0.012, 0.012), (0.0, 0.0), (0.5, 0.02)],  # no more than everything keeps
+)
+def test_a_hand_keeps_the_attachments_clearance(clearance: float | None, expected: float) -> None:
+    scene = door(clearance=clearance)
+    for link in (LEVER, PANEL):
+        assert compute_hand_clearance(scene, HANDLE, link, Options()) == expected
+    assert compute_hand_clearance(scene, HANDLE, LEVER, Options(dist_safe=0.001)) == min(
+        expected, 0.001
+    )
+
+
+def test_pushing_or_indirect_hold_needs_no_clearance_from_its_link() -> None:
+    options = Options()
+    pushed = door(contact="push")
+    assert compute_hand_clearance(pushed, HANDLE, LEVER, options) == 0.0
+    assert compute_hand_clearance(pushed, HANDLE, PANEL, options) == 0.005
+    assert compute_hand_clearance(door(), THROUGH, LEVER, options) == 0.0
+    assert compute_hand_clearance(door(), THROUGH, PANEL, options) == 0.005
+    assert compute_hand_clearance(door(), HANDLE, LEVER, options) == 0.005
+
+
+@pytest.mark.parametrize(
+    ("attachment", "contact", "firm", "as_one"),
+    [
+        ("handle", "grasp", False, True),  # it leaves no freedom
+        ("handle", "grasp", True, True),
+        ("handle_free", "grasp", False, False),
+        ("handle_free", "grasp", True, True),  # clamped
+        ("handle", "push", False, False),
+        ("handle_free", "push", True, False),
+    ],
+)
+def test_rigid_grasps(attachment: str, contact: str, firm: bool, as_one: bool) -> None:
+    scene = door(attachment, contact=contact, firm=firm)
+    assert bool(scene.objects["door"].object.attachments[attachment].freedoms) == (
+        attachment == "handle_free"
+    )
+    assert is_rigid_grasp(scene, Hold("door", attachment)) == as_one
+
+
+def test_hold_of_the_gripper_itself() -> None:
+    stick = Hold("stick", "grip")
+    assert find_gripper_hold([]) is None
+    assert find_gripper_hold([THROUGH]) is None
+    assert find_gripper_hold([THROUGH, stick]) is stick
+    assert find_gripper_hold([stick, THROUGH]) is stick
+
+
+def test_hand_frame_of_a_push_is_the_foremost_point() -> None:
+    robot = door_scene().robot
+    grip = door_scene().objects["door"].object.attachments["handle"]
+    assert compute_hand_frame(robot, grip) == pin.SE3.Identity()
+    front = compute_hand_frame(robot, dataclasses.replace(grip, contact="push"))
+    np.testing.assert_array_equal(front.translation, robot.front.translation)
+    assert front.translation[2] > 0.0
+
+
+def test_gripper_openings(tmp_path: Path) -> None:
+    """For what is held, and at the start; what has no gripper rests."""
+    scene = between_cheeks(write_gripper(tmp_path / "mine"), opening=0.04, start=0.03)
+    hold = Hold("drawer", "grip")
+    assert compute_grasp_opening(scene, hold) == pytest.approx(0.04)
+    assert compute_start_opening(scene) == pytest.approx(0.03)
+    assert compute_start_opening(scene.with_held({"drawer": "grip"})) == pytest.approx(0.04)
+    assert compute_grasp_opening(door_scene(), HANDLE) is None
+    assert compute_start_opening(door_scene()) is None
+    grip = scene.objects["drawer"].object.attachments["grip"]
+    pushed = dataclasses.replace(grip, contact="push")
+    np.testing.assert_array_equal(
+        compute_hand_frame(scene.robot, pushed).translation,
+        scene.robot.opened(0.04).front.translation,
+    )

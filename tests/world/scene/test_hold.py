@@ -1,0 +1,280 @@
+"""Tests holds: their dependencies, and invalid descriptions."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.drawers import drawer_scene
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.models.object_file import load_object
+from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
+from vkc_pin.world.scene.scene import Scene
+
+STICK = Hold("stick", "grip")
+BALL = Hold("ball", "pull", STICK, "tip")
+FLY = Hold("fly", "leg", BALL, "ball")
+
+
+def test_grasping_frames_of_holds() -> None:
+    assert make_holds({}, {}) == ()
+    assert make_holds({"door": "handle", "drawer": "knob"}, {}) == (
+        Hold("door", "handle"),
+        Hold("drawer", "knob"),
+    )
+    assert (STICK.by, STICK.link, STICK.frame) == (None, None, None)
+    assert (BALL.by, BALL.link, BALL.frame) == (STICK, "tip", "stick.tip")
+    assert [str(hold) for hold in (STICK, BALL, FLY)] == [
+        "stick.grip",
+        "ball.pull by stick.tip",
+        "fly.leg by ball.ball",
+    ]
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(["stick", "ball", "fly", "door"])))
+def test_holds_are_ordered_by_dependency(order: tuple[str, ...]) -> None:
+    attachments = {"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}
+    found = make_holds(
+        {name: attachments[name] for name in order}, {"fly": "ball.ball", "ball": "stick.tip"}
+    )
+    assert sorted(found, key=str) == sorted([STICK, BALL, FLY, Hold("door", "handle")], key=str)
+    assert found.index(STICK) < found.index(BALL) < found.index(FLY)
+
+
+def test_equal_holds_are_one_key() -> None:
+    again = Hold("ball", "pull", Hold("stick", "grip"), "tip")
+    assert again == BALL
+    assert hash(again) == hash(BALL)
+    assert Hold("ball", "pull") != BALL
+    assert Hold("ball", "pull", STICK, "stick") != BALL
+    assert Hold("ball", "pull", Hold("stick", "end"), "tip") != BALL
+
+
+@pytest.mark.parametrize(
+    ("held", "by"),
+    [
+        ({}, {}),
+        ({"stick": "grip"}, {}),
+        (
+            {"fly": "leg", "stick": "grip", "ball": "pull"},
+            {"fly": "ball.ball", "ball": "stick.tip"},
+        ),
+        (
+            {"ball": "pull", "fly": "leg", "stick": "grip"},
+            {"fly": "stick.tip", "ball": "stick.tip"},
+        ),
+    ],
+)
+def test_mappings_round_trip(held: dict[str, str], by: dict[str, str]) -> None:
+    found = make_holds(held, by)
+    assert {hold.object: hold.attachment for hold in found} == held
+    assert {hold.object: hold.frame for hold in found if hold.by} == by
+    assert (
+        make_holds({hold.object: hold.attachment for hold in found}, by)
+        == check_hold_order(iter(found))
+        == found
+    )
+
+
+def test_values_do_not_make_another_hold() -> None:
+    (again,) = make_holds({"stick": "grip"}, at={"stick": [0.1, 2]})
+    assert (again, hash(again), again.at, STICK.at) == (STICK, hash(STICK), (0.1, 2.0), ())
+
+
+def test_a_hold_comes_after_the_one_it_depends_on() -> None:
+    for holds in ((BALL,), (BALL, STICK), (STICK, FLY), (Hold("stick", "end"), BALL)):
+        with pytest.raises(InputError, match="not held before"):
+            check_hold_order(holds)
+
+
+@pytest.mark.parametrize(
+    ("by", "got"),
+    [
+        ({"ball": "ball.ball"}, "ball"),
+        ({"ball": "stick.tip", "stick": "ball.ball"}, "ball, stick"),
+        ({"ball": "fly.leg", "fly": "stick.tip", "stick": "ball.ball"}, "ball, fly, stick"),
+    ],
+)
+def test_cyclic_holds_are_rejected(by: dict[str, str], got: str) -> None:
+    with pytest.raises(InputError, match="in a cycle") as caught:
+        make_holds({"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}, by)
+    assert (caught.value.field, caught.value.got) == ("by", got)
+
+
+@pytest.mark.parametrize("frame", ["tip", "stick.", "stick", "", None, 3])
+def test_invalid_link_labels_are_rejected(frame: object) -> None:
+    with pytest.raises(InputError, match="not a link of an object") as caught:
+        make_holds({"stick": "grip", "ball": "pull"}, {"ball": frame})  # type: ignore[dict-item]
+    assert caught.value.field == "by"
+
+
+def test_only_held_objects_can_hold() -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        make_holds({"stick": "grip", "ball": "pull"}, {"ball": "stik.tip"})
+    assert (caught.value.field, caught.value.nearest) == ("by", "stick")
+
+
+def described(path: Path, name: str, old: str, new: str) -> str:
+    """Write a modified copy of an object's description; return its path."""
+    source = Path(str(folder("scenes"))) / "objects"
+    shutil.copy(source / f"{name}.urdf", path)
+    text = (source / f"{name}.yaml").read_text()
+    assert old in text
+    (path / f"{name}.yaml").write_text(text.replace(old, new))
+    return str(path / f"{name}.yaml")
+
+
+def test_approach_from_inside_is_reversed(
+    tmp_path: Path,
+) -> None:
+    right = drawer_scene()
+    item = {
+        **right.document["objects"][0],
+        "type": described(tmp_path, "drawer", "approach: [1, 0, 0]", "approach: [-1, 0, 0]"),
+    }
+    with pytest.warns(
+        UserWarning, match=r"the hand would approach drawer\.handle through the object"
+    ) as caught:
+        scene = Scene.from_document({**right.document, "objects": [item]}, right.folder)
+    assert sorted(str(one.message).split()[5] for one in caught) == [
+        "drawer.handle",
+        "drawer.handle_free",
+    ]
+    placed = scene.objects["drawer"]
+    assert placed.reversed == ("handle", "handle_free")
+    for name in placed.reversed:
+        mine, given = (one.objects["drawer"].object.attachment(name) for one in (scene, right))
+        np.testing.assert_allclose(
+            mine.tool(np.zeros(len(mine.freedoms))),
+            given.tool(np.zeros(len(given.freedoms))),
+            atol=1e-12,
+        )
+    plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})])  # judged by the oracle as well
+    assert plan.success, plan.report()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = Scene.from_document(scene.document, scene.folder)
+    assert again.objects["drawer"].reversed == placed.reversed
+    np.testing.assert_array_equal(
+        again.objects["drawer"].object.attachment().placement, placed.object.attachment().placement
+    )
+
+
+def test_approach_that_is_no_better_reversed_is_kept() -> None:
+    for name in (
+        "drawer",
+        "door",
+        "household",
+        "fetch",
+        "tray",
+        "init_1",
+        "aisle_drawer",
+        "corridor_door",
+    ):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            scene = vkc.load_scene(name)
+        assert all(placed.reversed == () for placed in scene.objects.values())
+    walls = [
+        {"name": f"w{k}", "type": "box", "size": [3, 3, 0.1], "position": [0, 0, 0.5 + k]}
+        for k in range(2)
+    ]
+    around = {
+        **drawer_scene().document,
+        "obstacles": walls,
+    }  # what others stand there is no matter of the object
+    assert Scene.from_document(around, drawer_scene().folder).objects["drawer"].reversed == ()
+
+
+def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
+    free = "\n    closing: [1, 0, 0]\n    joint: spherical\n    limits: [-1.5, 1.5]"
+    said = described(
+        tmp_path,
+        "ball",
+        f"approach: [0, 0, -1]{free}",
+        "approach: [0, 0, 1]\n    closing: [1, 0, 0]",
+    )
+    document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}}
+    ball = {"name": "ball", "type": said, "position": [1.2, 0.0, 0.036]}
+    with pytest.warns(UserWarning, match=r"ball\.grip through the object or the floor"):
+        scene = Scene.from_document({**document, "objects": [ball]})
+    assert scene.objects["ball"].reversed == ("grip",)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # high above the floor, from below is as good as any
+        high = Scene.from_document({**document, "objects": [{**ball, "position": [1.2, 0.0, 1.0]}]})
+        flat = Scene.from_document({**document, "objects": [ball], "floor": False})
+    assert high.objects["ball"].reversed == flat.objects["ball"].reversed == ()
+
+
+def test_approach_by_a_reversed_stick_is_reversed(tmp_path: Path) -> None:
+    fixed = described(
+        tmp_path,
+        "ball",
+        "joint: spherical\n    standoff: 0.035",
+        "joint: fixed\n    standoff: 0.035",
+    )
+    document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}}
+    stick = {"name": "stick", "type": "stick", "position": [2.0, 0.0, 0.5]}
+    ball = {"name": "ball", "type": fixed, "position": [1.2, 0.0, 0.036]}
+    scene = Scene.from_document({**document, "objects": [stick, ball]})
+    hold = Hold("ball", "pull", STICK, "tip")
+    assert scene.with_approaches([hold]) is scene
+    backwards = scene.with_approaches([]).objects["ball"].with_reversed("pull")
+    from_below = Scene.from_document(
+        {**document, "objects": [stick, {**ball, "reversed": ["pull"]}]}
+    )
+    np.testing.assert_array_equal(
+        from_below.objects["ball"].object.attachment("pull").placement,
+        backwards.object.attachment("pull").placement,
+    )
+    up = described(
+        tmp_path,
+        "ball",
+        "joint: spherical\n    standoff: 0.035",
+        "joint: fixed\n    standoff: 0.035",
+    )
+    text = Path(up).read_text()
+    first, _, last = text.rpartition("approach: [0, 0, -1]")
+    Path(up).write_text(f"{first}approach: [0, 0, 1]{last}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a hand would come from below as well
+        wrong = Scene.from_document({**document, "objects": [stick, {**ball, "type": up}]})
+    if not wrong.objects["ball"].reversed:
+        with pytest.warns(UserWarning, match=r"stick\.tip would come to ball\.pull"):
+            wrong = wrong.with_approaches([hold])
+    assert wrong.objects["ball"].reversed == ("pull",)
+
+
+@pytest.mark.parametrize("name", ["drawer", "door", "ball", "cup", "stick", "cabinet", "tray"])
+def test_reversing_twice_restores_the_approach(name: str) -> None:
+    placed = next(iter(drawer_scene().objects.values()))
+    placed = vkc.PlacedObject(
+        name, load_object(name), placed.placement, np.zeros(load_object(name).coordinates.size)
+    )
+    for attachment, given in placed.object.attachments.items():
+        values = [
+            0.3 * (freedom.lower + freedom.upper) + 0.1 * freedom.upper
+            for freedom in given.freedoms
+        ]
+        turned = placed.with_reversed(attachment)
+        there, here = turned.object.attachment(attachment).tool(values), given.tool(values)
+        np.testing.assert_allclose(
+            there.rotation[:, 0], here.rotation[:, 0], atol=1e-12
+        )  # fingers close along the same line
+        np.testing.assert_allclose(there.rotation[:, 2], -here.rotation[:, 2], atol=1e-12)
+        centre = [one.translation + given.standoff * one.rotation[:, 2] for one in (there, here)]
+        np.testing.assert_allclose(*centre, atol=1e-12)
+        back = turned.with_reversed(attachment)
+        assert back.reversed == ()
+        np.testing.assert_allclose(
+            back.object.attachment(attachment).tool(values), here, atol=1e-12
+        )
+    with pytest.raises(UnknownNameError, match="there is no attachment"):
+        placed.with_reversed("nowhere")

@@ -1,0 +1,96 @@
+"""Tests the shapes of obstacles: placement, size and visual shapes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pydantic
+import pytest
+import trimesh
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.models.shapes import compute_world_box, triangulate
+from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
+from vkc_pin.world.scene.scene_schema import ObstacleSchema
+
+POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([1.0, -2.0, 0.5]))
+URDF = """<robot name="r"><link name="a"><collision><origin xyz="0 0 1"/><geometry><sphere radius="0.1"/></geometry></collision>
+</link><link name="b"><collision><geometry><box size="1 2 3"/></geometry></collision></link>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.5 0 0" rpy="0 0 0.4"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+
+
+def described(
+    folder: Path, **fields: Any
+) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
+    item = pydantic.TypeAdapter(ObstacleSchema).validate_python(
+        {"name": "thing", "position": [0, 0, 0], **fields}
+    )
+    return make_obstacle_shapes(item, POSE, folder)
+
+
+def volume(shape: pin.GeometryObject) -> float:
+    return float(trimesh.Trimesh(*triangulate(shape.geometry)).volume)
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"type": "box", "size": [0.2, 0.3, 0.4]}, 0.024),
+        ({"type": "sphere", "radius": 0.2}, 4 / 3 * np.pi * 0.008),
+        ({"type": "cylinder", "radius": 0.2, "length": 0.5}, np.pi * 0.04 * 0.5),
+        (
+            {"type": "capsule", "radius": 0.2, "length": 0.5},
+            np.pi * 0.04 * 0.5 + 4 / 3 * np.pi * 0.008,
+        ),
+        ({"type": "mesh", "file": "wedge.obj", "scale": [2.0, 1.0, 3.0]}, 6.0 / 6.0),
+    ],
+)
+def test_every_kind_has_its_volume_and_place(
+    fields: dict[str, Any], expected: float, tmp_path: Path
+) -> None:
+    """Round shapes are drawn with so many corners that a few percent of the volume are missing."""
+    (tmp_path / "wedge.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    )
+    (drawn,), (solid,) = described(tmp_path, colour=[0.1, 0.2, 0.3, 0.4], **fields)
+    assert 0.95 * expected <= volume(solid) <= expected * (1 + 1e-9)
+    for shape in (drawn, solid):
+        assert shape.name == "thing"
+        assert shape.parentJoint == 0
+        assert shape.placement.isApprox(POSE)
+        np.testing.assert_allclose(shape.meshColor, [0.1, 0.2, 0.3, 0.4])
+    assert drawn.meshPath == (str(tmp_path / "wedge.obj") if fields["type"] == "mesh" else "")
+    assert solid.meshPath == ""
+
+
+def test_a_urdf_stands_with_its_joints_at_zero(tmp_path: Path) -> None:
+    (tmp_path / "r.urdf").write_text(URDF)
+    _, solid = described(tmp_path, type="urdf", file="r.urdf", colour=[1, 0, 0, 1])
+    assert [shape.name for shape in solid] == ["thing_0", "thing_1"]
+    assert all(shape.parentJoint == 0 for shape in solid)
+    where = [
+        pin.SE3(np.eye(3), np.array([0, 0, 1.0])),
+        pin.SE3(pin.rpy.rpyToMatrix(0, 0, 0.4), np.array([0.5, 0, 0])),
+    ]
+    for shape, local in zip(solid, where, strict=True):
+        assert shape.placement.isApprox(POSE * local, 1e-12)
+        np.testing.assert_array_equal(shape.meshColor, [1, 0, 0, 1])
+
+
+@pytest.mark.parametrize("kind", ["urdf", "mesh"])
+def test_missing_file_is_reported(kind: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        described(tmp_path, type=kind, file="none.obj")
+    assert caught.value.file == tmp_path / "none.obj"
+
+
+def test_the_floor_lies_under_the_whole_arena_and_a_border() -> None:
+    floor = make_floor_shape((-1.0, 4.0, 0.0, 2.5))
+    low, high = compute_world_box(floor.geometry, floor.placement)
+    np.testing.assert_allclose(low, [-3.0, -2.0, -0.1])
+    np.testing.assert_allclose(high, [6.0, 4.5, 0.0], atol=1e-12)
+    assert floor.name == FLOOR

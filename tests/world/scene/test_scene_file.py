@@ -1,0 +1,544 @@
+"""Tests scene files and their errors."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.rooms import TINY, load
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.scene import Scene, load_scene
+
+
+@pytest.fixture(scope="module")
+def door() -> Scene:
+    return load_scene("door")
+
+
+def test_every_kind_of_obstacle(tmp_path: Path) -> None:
+    (tmp_path / "wedge.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+    )
+    box = '<geometry><box size="0.1 0.2 0.3"/></geometry>'
+    shape = f"<visual>{box}</visual><collision>{box}</collision>"
+    links = f'<link name="a">{shape}</link><link name="b">{shape}</link>'
+    lid = '<joint name="lid" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>'
+    limit = '<limit lower="0" upper="1" velocity="1" effort="1"/>'
+    (tmp_path / "chest.urdf").write_text(f'<robot name="chest">{links}{lid}{limit}</joint></robot>')
+    extra = """\
+  - {name: ball, type: sphere, radius: 0.2, position: [0, 2, 0.2], colour: red}
+  - {name: pole, type: capsule, radius: 0.05, length: 1, position: [-3, 0, 1], rpy: [0, 1.5707963267948966, 0]}
+  - {name: rock, type: mesh, file: wedge.obj, scale: 0.3, position: [1, 2, 0]}
+  - {name: chest, type: urdf, file: chest.urdf, position: [-1, 2, 0], yaw: 1.5707963267948966}
+"""
+    scene = load(tmp_path, TINY + extra)
+    shapes = {s.name: s for s in scene.obstacles}
+    kinds = {name: type(s.geometry).__name__ for name, s in shapes.items()}
+    assert kinds["crate"] == "Box"
+    assert kinds["post"] == "Cylinder"
+    assert kinds["ball"] == "Sphere"
+    assert kinds["pole"] == "Capsule"
+    assert "Convex" in kinds["rock"]
+    assert isinstance(shapes[FLOOR].geometry, coal.Box)
+    np.testing.assert_allclose(np.max(shapes["rock"].geometry.points(), axis=0), [0.3, 0.3, 0.3])
+    np.testing.assert_allclose(shapes["crate"].meshColor, [1.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(2.0 * shapes["crate"].geometry.halfSide, [0.5, 0.4, 0.3])
+    np.testing.assert_allclose(
+        shapes["crate"].placement.rotation, pin.utils.rotate("z", 0.2), atol=1e-12
+    )
+    np.testing.assert_allclose(shapes["pole"].placement.rotation[:, 2], [1.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(shapes["chest_0"].placement.translation, [-1.0, 2.0, 0.0])
+    np.testing.assert_allclose(shapes["chest_1"].placement.translation, [-1.0, 2.0, 1.0])
+    assert scene.obstacle_labels == (
+        "crate",
+        "post",
+        "ball",
+        "pole",
+        "rock",
+        "chest",
+        "chest",
+        FLOOR,
+    )
+    assert scene.obstacle_names == ("crate", "post", "ball", "pole", "rock", "chest")
+    drawn = {s.name: s for s in scene.obstacle_visual}
+    assert drawn.keys() == shapes.keys() - {FLOOR}
+    assert Path(drawn["rock"].meshPath).name == "wedge.obj"
+    for s in scene.obstacles:
+        assert s.parentJoint == 0
+        assert s.placement.homogeneous[3, 3] == 1.0
+    again = Scene.from_document(json.loads(json.dumps(scene.document)), tmp_path)
+    assert [s.name for s in again.obstacles] == [s.name for s in scene.obstacles]
+
+
+def test_thousands_of_obstacles(tmp_path: Path) -> None:
+    """They are loaded in time that grows as they do: a minute would be a square of it."""
+    entry = "  - {{name: b{}, type: sphere, radius: 0.01, position: [9, 9, 9]}}\n"
+    began = time.perf_counter()
+    scene = load(tmp_path, TINY + "".join(map(entry.format, range(3000))))
+    assert time.perf_counter() - began < 30.0
+    assert (
+        len(scene.obstacles) == len(scene.obstacle_labels) == len(scene.obstacle_visual) + 1 > 3000
+    )
+    with pytest.raises(InputError, match="too many") as caught:
+        load(tmp_path, TINY + "".join(map(entry.format, range(10_001))))
+    assert caught.value.field == "obstacles"
+    assert len(str(caught.value)) < 300
+
+
+def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
+    half = np.sqrt(0.5)
+    extra = f"""\
+  - {{name: turned, type: box, size: [1, 2, 3], position: [0, 3, 2], yaw: {np.pi / 2}}}
+  - {{name: same, type: box, size: [1, 2, 3], position: [0, -3, 2], quaternion: [0, 0, 0.7071, 0.7071]}}
+"""
+    scene = load(tmp_path, TINY + extra)
+    drawer = {
+        "name": "drawer",
+        "type": "drawer",
+        "position": [2, 0, 0],
+        "quaternion": [0, 0, -half, half],
+    }
+    scene = Scene.from_document({**scene.document, "objects": [drawer]}, tmp_path)
+    turns = {shape.name: shape.placement.rotation for shape in scene.obstacles}
+    np.testing.assert_allclose(turns["turned"], turns["same"], atol=1e-12)
+    np.testing.assert_allclose(
+        pin.rpy.matrixToRpy(scene.objects["drawer"].placement.rotation),
+        [0, 0, -np.pi / 2],
+        atol=1e-12,
+    )
+    same(scene, Scene.from_document(scene.document, tmp_path))
+    moved = scene.with_placement("drawer", pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.ones(3)))
+    again = Scene.from_document(moved.document, tmp_path).objects["drawer"].placement
+    np.testing.assert_allclose(
+        again.homogeneous, moved.objects["drawer"].placement.homogeneous, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("orientation", "said"),
+    [
+        ("quaternion: [0, 0, 1, 1]", "not a rotation .*length 1, not 1.414"),
+        ("quaternion: [0, 0, 1]", "4 values"),
+        (
+            "quaternion: [0, 0, 0, 1], yaw: 0",
+            "more than one orientation .*one of rpy, yaw and quaternion",
+        ),
+        ("quaternion: [0, 0, 0, 1], rpy: [0, 0, 0]", "more than one orientation"),
+    ],
+)
+def test_wrong_quaternions_are_located(tmp_path: Path, orientation: str, said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        load(
+            tmp_path,
+            TINY
+            + f"  - {{name: box, type: box, size: [1, 2, 3], position: [0, 3, 2], {orientation}}}\n",
+        )
+    assert caught.value.line == len(TINY.splitlines()) + 1
+
+
+def test_a_scene_without_a_floor(tmp_path: Path) -> None:
+    assert FLOOR not in load(tmp_path, TINY + "floor: false\n").obstacle_labels
+
+
+def same(a: Scene, b: Scene) -> None:
+    """Assert that two scenes are equal in everything a planner looks at."""
+    assert (a.name, a.arena, a.floor, dict(a.held), a.start_region) == (
+        b.name,
+        b.arena,
+        b.floor,
+        dict(b.held),
+        b.start_region,
+    )
+    np.testing.assert_array_equal(a.start, b.start)
+    assert a.obstacle_labels == b.obstacle_labels
+    for x, y in zip(a.obstacles, b.obstacles, strict=True):
+        assert x.name == y.name
+        assert type(x.geometry) is type(y.geometry)
+        assert x.geometry.computeVolume() == y.geometry.computeVolume()
+        np.testing.assert_array_equal(x.placement.homogeneous, y.placement.homogeneous)
+        np.testing.assert_array_equal(x.meshColor, y.meshColor)
+    assert a.objects.keys() == b.objects.keys()
+    for name, placed in a.objects.items():
+        np.testing.assert_array_equal(placed.state, b.objects[name].state)
+        np.testing.assert_array_equal(
+            placed.placement.homogeneous, b.objects[name].placement.homogeneous
+        )
+    assert a.document == b.document
+
+
+def test_the_document_rebuilds_the_scene(door: Scene) -> None:
+    changed = door.with_start(base=[0.1, 0.2, -1.0], arm=door.robot.home + 0.1).with_state(
+        "door", {"hinge": 0.25, "knob": 0.1}
+    )
+    for scene in (door, changed):
+        same(scene, Scene.from_document(json.loads(json.dumps(scene.document)), scene.folder))
+    np.testing.assert_array_equal(changed.start[:3], [0.1, 0.2, -1.0])
+    np.testing.assert_array_equal(changed.start[3:], door.robot.home + 0.1)
+    np.testing.assert_array_equal(changed.objects["door"].state, [0.25, 0.1])
+    np.testing.assert_array_equal(door.objects["door"].state, [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "field", "nearest"),
+    [
+        ("robot: husky_ur5e", "robot: husky_ur5", 1, "robot", "husky_ur5e"),
+        ("robot: husky_ur5e", "robot:\n  name: husky\n  base: omni", 2, "robot.name", "husky_ur5e"),
+        ("robot: husky_ur5e", "robot: {name: husky_ur5e, base: omnni}", 1, "robot.base", "omni"),
+        ("  arm: home", "  arn: home", 4, "start.arn", "arm"),
+        ("start_region:", "start_regon:", 5, "start_regon", "start_region"),
+        ("  arm: home", "  arm: home\n  held: {frnt: handle}", 5, "start.held.frnt", "front"),
+        ("  arm: home", "  arm: home\n  held: {front: handel}", 5, "start.held.front", "handle"),
+        ("type: door", "type: doors", 9, "objects[0].type", "door"),
+        ("state: {hinge: 0.3}", "state: {hing: 0.3}", 11, "objects[0].state.hing", "hinge"),
+        ("    state:", "    states:", 11, "objects[0].states", "state"),
+        ("type: box", "type: bax", 13, "obstacles[0].type", "box"),
+        ("    type: cylinder", "    type: cilinder", 15, "obstacles[1].type", "cylinder"),
+        ("    radius: 0.1", "    radus: 0.1", 16, "obstacles[1].radus", "radius"),
+    ],
+)
+def test_unknown_names_are_located_with_a_suggestion(
+    tmp_path: Path, old: str, new: str, line: int, field: str, nearest: str
+) -> None:
+    assert old in TINY
+    with pytest.raises(UnknownNameError) as caught:
+        load(tmp_path, TINY.replace(old, new))
+    error = caught.value
+    assert (error.file, error.line, error.field, error.nearest) == (
+        tmp_path / "room.yaml",
+        line,
+        field,
+        nearest,
+    ), str(error)
+    assert f"room.yaml:{line}: {field}: " in str(error)
+    assert f"did you mean '{nearest}'?" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "field", "details"),
+    [
+        (
+            "base: [0.0, 0.0, 0.5]",
+            "base: [0.0, 0.0]",
+            3,
+            "start.base",
+            "expected 3 values, got [0.0, 0.0]",
+        ),
+        (
+            "base: [0.0, 0.0, 0.5]",
+            "base: [0.0, .nan, 0.5]",
+            3,
+            "start.base[1]",
+            "expected a finite number, got nan",
+        ),
+        (
+            "base: [0.0, 0.0, 0.5]",
+            "base: [0.0, .inf, 0.5]",
+            3,
+            "start.base[1]",
+            "expected a finite number, got inf",
+        ),
+        (
+            "base: [0.0, 0.0, 0.5]",
+            "base: [0.0, north, 0.5]",
+            3,
+            "start.base[1]",
+            "expected a number, got 'north'",
+        ),
+        (
+            "base: [0.0, 0.0, 0.5]",
+            "base: [0.0, yes, 0.5]",
+            3,
+            "start.base[1]",
+            "expected a number, got True",
+        ),
+        (
+            "base: [0.0, 0.0, 0.5]",
+            "base: [9.0, 0.0, 0.5]",
+            3,
+            "start.base[0]",
+            "expected x from -4 to 4, got 9.0",
+        ),
+        ("  base: [0.0, 0.0, 0.5]\n", "", 2, "start.base", "missing"),
+        ("arm: home", "arm: [0, 0, 0]", 4, "start.arm", "wrong number of arm joints"),
+        ("arm: home", "arm: rest", 4, "start.arm", "expected home, or a list of joint values"),
+        (
+            "x: [-1, 1], y",
+            "x: [1, -1], y",
+            5,
+            "start_region.x",
+            "expected [lowest, highest], got [1, -1]",
+        ),
+        ("x: [-1, 1], y", "x: [-9, 1], y", 5, "start_region.x", "expected x from -4 to 4"),
+        ("yaw: any", "yaw: north", 5, "start_region.yaw", "expected any, or [lowest, highest]"),
+        (
+            "state: {hinge: 0.3}",
+            "state: {hinge: 3}",
+            11,
+            "objects[0].state.hinge",
+            "expected -1.57 to 1.57, got 3",
+        ),
+        (
+            "state: {hinge: 0.3}",
+            "state: {hinge: .nan}",
+            11,
+            "objects[0].state.hinge",
+            "expected a finite number, got nan",
+        ),
+        ("type: door", "type: my/door.yaml", 9, "objects[0].type", "got my/door.yaml"),
+        (
+            "size: [0.5, 0.4, 0.3]",
+            "size: [0.5, -0.4, 0.3]",
+            13,
+            "obstacles[0].size[1]",
+            "expected a number > 0, got -0.4",
+        ),
+        (
+            "size: [0.5, 0.4, 0.3]",
+            "size: 0.5",
+            13,
+            "obstacles[0].size",
+            "expected a list of 3 values, got 0.5",
+        ),
+        (
+            "size: [0.5, 0.4, 0.3]",
+            "size: [1, 2, 3, 4]",
+            13,
+            "obstacles[0].size",
+            "wrong number of values",
+        ),
+        (
+            "yaw: 0.2, ",
+            "yaw: 0.2, rpy: [0, 0, 0], ",
+            13,
+            "obstacles[0]",
+            "expected one of rpy, yaw and quaternion",
+        ),
+        ("colour: [1, 0, 0]", "colour: rd", 13, "obstacles[0].colour", "unknown colour 'rd'"),
+        (
+            "colour: [1, 0, 0]",
+            "colour: [255, 0, 0]",
+            13,
+            "obstacles[0].colour[0]",
+            "expected a number <= 1, got 255",
+        ),
+        (
+            "    radius: 0.1",
+            "    radius: 0",
+            16,
+            "obstacles[1].radius",
+            "expected a number > 0, got 0",
+        ),
+        ("    type: cylinder\n", "", 14, "obstacles[1].type", "missing"),
+        ("    length: 1.0\n", "", 14, "obstacles[1].length", "missing"),
+        (
+            "name: post",
+            "name: crate",
+            14,
+            "obstacles[1].name",
+            "got crate, as obstacles[0] in line 13",
+        ),
+        (
+            "name: front",
+            "name: crate",
+            8,
+            "objects[0].name",
+            "got crate, as obstacles[0] in line 13",
+        ),
+        ("name: front", "name: floor", 8, "objects[0].name", "got floor, as the floor"),
+        ("name: front", "name: a.b", 8, "objects[0].name", "not a name"),
+        (
+            "type: box, size: [0.5, 0.4, 0.3]",
+            "type: mesh, file: none.obj",
+            13,
+            "obstacles[0].file",
+            "got none.obj",
+        ),
+        (
+            "type: box, size: [0.5, 0.4, 0.3]",
+            "type: urdf, file: none.urdf",
+            13,
+            "obstacles[0].file",
+            "got none.urdf",
+        ),
+        ("robot: husky_ur5e\n", "", 1, "robot", "missing"),
+        ("start:\n", "robot: x\nstart:\n", 2, "robot", "lines 1 and 2"),
+        ("  arm: home", "  arm: [home", 5, None, "not valid YAML"),
+        ("  arm: home", "\tarm: home", 4, None, "not valid YAML"),
+        (TINY, "", None, "", "expected fields (name: value), got None"),
+        (TINY, "- 1\n", 1, "", "expected fields (name: value), got [1]"),
+    ],
+)
+def test_bad_input_is_located(
+    tmp_path: Path, old: str, new: str, line: int | None, field: str | None, details: str
+) -> None:
+    assert old in TINY
+    with pytest.raises(InputError) as caught:
+        load(tmp_path, TINY.replace(old, new))
+    error = caught.value
+    assert (error.file, error.line, error.field) == (tmp_path / "room.yaml", line, field), str(
+        error
+    )
+    assert details in str(error)
+
+
+def test_the_first_error_in_the_file_is_reported(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        load(
+            tmp_path,
+            TINY.replace("radius: 0.1", "radius: -1")
+            .replace("arm: home", "arm: 3")
+            .replace("size: [0.5", "size: [0"),
+        )
+    assert caught.value.line == 4
+
+
+def test_errors_in_files_that_a_scene_names_point_into_these(tmp_path: Path) -> None:
+    (tmp_path / "bad.yaml").write_text("urdf: none.urdf\nattachment: []\n")
+    with pytest.raises(UnknownNameError) as caught:
+        load(tmp_path, TINY.replace("type: door", "type: bad.yaml"))
+    assert (caught.value.file, caught.value.line, caught.value.nearest) == (
+        tmp_path / "bad.yaml",
+        2,
+        "attachments",
+    )
+    (tmp_path / "bad.urdf").write_text("<robot>")
+    with pytest.raises(InputError) as broken:
+        load(
+            tmp_path, TINY.replace("type: box, size: [0.5, 0.4, 0.3]", "type: urdf, file: bad.urdf")
+        )
+    assert broken.value.file == tmp_path / "bad.urdf"
+
+
+DESCRIBED = """\
+robot: husky_ur5e
+start: {base: [0, 0, 0]}
+objects:
+  - name: trap
+    position: [2, 0, 0]
+    state: {hinge: 0.3}
+    type:
+      joints:
+        hinge: {acceleration: 3}
+      attachments:
+        - {name: ring, link: leaf, position: [-0.4, 0, 0], approach: [0, 0, -1], closing: [1, 0, 0]}
+      urdf: |
+        <robot name="trap_door">
+          <link name="frame"/>
+          <link name="leaf">
+            <collision><origin xyz="-0.25 0 0"/><geometry><box size="0.5 0.5 0.02"/></geometry></collision>
+          </link>
+          <joint name="hinge" type="revolute">
+            <parent link="frame"/><child link="leaf"/><axis xyz="0 1 0"/>
+            <limit lower="0" upper="1.5" velocity="1" effort="1"/>
+          </joint>
+        </robot>
+"""
+
+
+def test_objects_that_a_scene_describes_itself(tmp_path: Path) -> None:
+    file = tmp_path / "room.yaml"
+    file.write_text(DESCRIBED)
+    scene = load_scene(file)
+    placed = scene.objects["trap"]
+    assert (placed.object.name, placed.object.urdf, placed.object.acceleration[0]) == (
+        "trap_door",
+        None,
+        3.0,
+    )
+    assert placed.state[0] == 0.3
+    elsewhere = Scene.from_document(json.loads(json.dumps(scene.document)), "/")
+    assert elsewhere.document == scene.document
+    assert elsewhere.objects["trap"].object.model == placed.object.model
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "field"),
+    [
+        ("link: leaf,", "link: leav,", 11, "attachments[0].link"),
+        ("acceleration: 3", "acceleration: -3", 9, "joints.hinge.acceleration"),
+        ("      joints:", "      jonts:", 8, "jonts"),
+        ('size="0.5 0.5 0.02"', 'size="0.5 0.5"', 4, "leaf_0: box size"),
+        ('<child link="leaf"/>', '<child link="leav"/>', 7, "hinge: child"),
+    ],
+)
+def test_errors_in_inline_descriptions_are_located(
+    tmp_path: Path, old: str, new: str, line: int, field: str
+) -> None:
+    """In the scene's file, or in the text of the URDF in it."""
+    assert old in DESCRIBED
+    (tmp_path / "room.yaml").write_text(DESCRIBED.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        load_scene(tmp_path / "room.yaml")
+    assert str(caught.value.file) == str(tmp_path / "room.yaml") + (
+        ": urdf" if "link=" in old or "size" in old else ""
+    )
+    assert (caught.value.line, caught.value.field) == (line, field)
+
+
+def test_objects_of_no_kind(tmp_path: Path) -> None:
+    plain = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}
+    for kind, field, said in (
+        (5, "objects[0].type", "the name or file"),
+        ({}, "objects[0].type", "urdf: missing"),
+    ):
+        with pytest.raises(InputError, match=said) as caught:
+            Scene.from_document(
+                {**plain, "objects": [{"name": "it", "type": kind, "position": [0, 0, 0]}]}
+            )
+        assert caught.value.field == field
+
+
+def test_unknown_scenes_and_missing_files(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        load_scene("dor")
+    assert caught.value.nearest == "door"
+    with pytest.raises(InputError) as missing:
+        load_scene(tmp_path / "none.yaml")
+    assert missing.value.file == tmp_path / "none.yaml"
+
+
+def test_bad_documents_are_refused_without_a_file() -> None:
+    with pytest.raises(InputError) as caught:
+        Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, "x"]}})
+    assert (caught.value.file, caught.value.line, caught.value.field) == (
+        None,
+        None,
+        "start.base[2]",
+    )
+
+
+def test_the_packaged_scenes_all_load() -> None:
+    files = sorted(folder("scenes").glob("*.yaml"))
+    assert {file.stem for file in files} >= {"door", "drawer"}
+    for file in files:
+        assert load_scene(file).name == file.stem
+
+
+def test_a_start_may_have_a_height(tmp_path: Path) -> None:
+    """The height is constant and part of the document; scenes of one robot may differ."""
+    low, high = (
+        load(tmp_path, TINY),
+        load(tmp_path, TINY.replace("arm: home", "arm: home\n  z: 0.4")),
+    )
+    assert (low.robot.height, high.robot.height) == (0.0, 0.4)
+    assert "z" not in low.document["start"]
+    again = Scene.from_document(high.with_start(base=[1.0, 0.0, 0.0]).document, tmp_path)
+    assert again.document["start"]["z"] == again.robot.height == 0.4
+    at = [
+        scene.robot.model.frames[scene.robot.model.getFrameId("tool")].placement.translation
+        for scene in (low, high)
+    ]
+    np.testing.assert_array_equal(*at)  # above the wrist
+    rise = [scene.robot.model.jointPlacements[2].translation for scene in (high, low)]
+    np.testing.assert_allclose(rise[0] - rise[1], [0.0, 0.0, 0.4], atol=1e-12)
+    with pytest.raises(InputError, match=r"start\.z") as caught:
+        load(tmp_path, TINY.replace("arm: home", "z: high"))
+    assert caught.value.line == 4

@@ -1,0 +1,92 @@
+"""Tests which objects rest on which links."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.carrying import lifted
+from helpers.riding import TOP, cup, folder, plates, scene_of
+
+from vkc_pin.world.models.shapes import get_link_name
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import (
+    RESTING_DISTANCE,
+    compute_tilt,
+    find_supported_objects,
+    find_supports,
+)
+
+
+def on(scene: Scene, name: str = "cup") -> set[str]:
+    shapes = [
+        (f"{other}.{get_link_name(shape.name)}", shape)
+        for other, placed in scene.objects.items()
+        if other != name
+        for shape in make_world_shapes(placed)
+    ]
+    shapes += zip(scene.obstacle_labels, scene.obstacles, strict=True)
+    return find_supports(scene.objects[name], shapes)
+
+
+@pytest.mark.parametrize(
+    ("gap", "stands"),
+    [(-2e-3, True), (0.0, True), (1e-3, True), (2.4e-3, True), (2.6e-3, False), (0.1, False)],
+)
+def test_a_cup_on_a_plate_or_above_it(gap: float, stands: bool) -> None:
+    assert on(plates(gap=gap)) == ({"plate.plate"} if stands else set())
+
+
+@pytest.mark.parametrize("apart", [-1e-3, 0.0, 1e-3])
+def test_adjacent_shape_is_no_support(apart: float) -> None:
+    assert on(plates(cups=1, wall=apart)) == {"plate.plate"}
+
+
+def test_the_floor_and_two_tables() -> None:
+    size = [0.2, 0.5, 0.5]
+    tables = [
+        {"name": f"table_{k}", "type": "box", "size": size, "position": [0.2 * k, 0.0, 0.25]}
+        for k in range(3)
+    ]
+    assert on(scene_of([cup(at=(0.1, 0.0, 0.5))], tables)) == {"table_0", "table_1"}
+    assert on(scene_of([cup(at=(0.1, 0.0, 0.0))])) == {"floor"}
+
+
+def test_stacked_objects_are_supported() -> None:
+    scene = plates(cups=1)
+    upper = cup("upper", at=(0.8, 0.06, TOP + 0.1))
+    stacked = Scene.from_document(
+        {**scene.document, "objects": [*scene.document["objects"], upper]}, folder()
+    )
+    assert on(stacked, "upper") == {"cup.cup"}
+    assert find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["cup", "upper"]) == {
+        "cup": "plate.plate",
+        "upper": "plate.plate",
+    }
+    assert find_supported_objects(stacked.objects, {"cup": {"cup"}}, ["cup", "upper"]) == {
+        "upper": "cup.cup"
+    }
+    assert find_supported_objects(stacked.objects, {"plate": {"post"}}, ["cup", "upper"]) == {}
+    assert (
+        find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}
+    )  # what is between is held by somebody
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.1, 1.5, 3.0])
+def test_tilt_ignores_the_heading(angle: float) -> None:
+    rng = np.random.default_rng(3)
+    before = pin.SE3.Random()
+    first, last = (pin.utils.rotate("z", rng.uniform()) for _ in range(2))
+    leaning = pin.SE3(first @ pin.utils.rotate("x", angle) @ last, rng.normal(size=3))
+    assert compute_tilt(before, leaning * before) == pytest.approx(angle, abs=1e-9)
+
+
+def test_resting_distance_exceeds_rounding() -> None:
+    assert 1e-3 < RESTING_DISTANCE < 0.02
+    thin = [
+        {"name": "sheet", "type": "box", "size": [0.3, 0.3, 0.002], "position": [0.0, 0.0, 0.499]}
+    ]
+    for at, stands in ((0.5, True), (0.502, True), (0.51, False)):
+        assert on(scene_of([cup(at=(0.0, 0.0, at))], thin)) == ({"sheet"} if stands else set())
+    assert lifted(pin.SE3.Identity()).translation[2] > RESTING_DISTANCE

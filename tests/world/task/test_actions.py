@@ -1,0 +1,129 @@
+"""Tests the grouping of steps into actions, and the check of steps before planning."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.litter import AT, BIN, littered
+
+import vkc_pin as vkc
+from vkc_pin.world.task.actions import compile_each_step, generate_alternatives, group_into_actions
+from vkc_pin.world.task.compiler import compile_task
+
+A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
+
+
+TABLE = (-3.0, 1.3, 1.051)  # on the bar table
+
+
+OPEN, SHUT = A("refrigerator", {"hinge": 1.57}), A("refrigerator", {"hinge": 0.0})
+CUP = (G("cold_cup"), P("cold_cup", TABLE))
+
+
+def test_steps_with_one_object_form_one_action() -> None:
+    steps = [
+        G("refrigerator"),
+        OPEN,
+        G("cold_cup"),
+        P("cold_cup", TABLE),
+        SHUT,
+        G("broom"),
+        G("litter", "pull", by="broom.bristles"),
+        P("litter", (1.1, -2.9, 0.036)),
+        vkc.Release(),
+        vkc.GoTo(0, 0),
+    ]
+    assert group_into_actions(steps) == [
+        tuple(steps[0:2]),
+        tuple(steps[2:4]),
+        (SHUT,),
+        (steps[5],),
+        tuple(steps[6:9]),
+        (steps[9],),
+    ]
+
+
+def test_grouping_keeps_all_steps() -> None:
+    steps = [
+        vkc.Release(),
+        vkc.Release(),
+        G("cup"),
+        vkc.GoTo(1, 0),
+        G("door"),
+        OPEN,
+        OPEN,
+        vkc.Release(),
+    ]
+    actions = group_into_actions(steps)
+    assert [step for action in actions for step in action] == steps
+    assert len(actions) == 6  # a grasp of one thing is no part of what is done with another
+
+
+def test_steps_are_compiled_in_the_scene_that_the_previous_steps_leave() -> None:
+    """Each step is compiled in the scene that the steps before leave."""
+    scene, options = vkc.load_scene("household"), vkc.Options()
+    steps = [OPEN, *CUP, SHUT]
+    tasks = compile_each_step(scene, steps, options)
+    assert [task.steps for task in tasks] == [(step,) for step in steps]
+    assert [[phase.name for phase in task.phases] for task in tasks] == [
+        ["reach refrigerator.handle", "move refrigerator.hinge"],
+        ["reach cold_cup.side"],
+        ["place cold_cup"],
+        ["reach refrigerator.handle", "move refrigerator.hinge"],
+    ]
+    assert tasks[-1].state["refrigerator.hinge"] == pytest.approx(1.57), "it is open by then"
+    assert tasks[-1].phases[-1].values == {"refrigerator.hinge": 0.0}
+    assert [hold.object for hold in tasks[1].after] == ["cold_cup"]
+    assert scene.objects["refrigerator"].state[0] == 0.0
+    again = compile_each_step(scene, [*steps, G("cold_cup")], options)[-1]
+    (grasp,) = again.phases
+    np.testing.assert_allclose(grasp.resting["cold_cup"].translation, TABLE, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("steps", "field", "problem"),
+    [
+        ([OPEN, G("cold_cup"), SHUT], "steps[2].object", "one hand"),
+        ([OPEN, *CUP, vkc.Release()], "steps[3]", "hand is empty"),
+        ([OPEN, G("no_cup")], "steps[1].object", "no object"),
+    ],
+)
+def test_error_names_the_first_infeasible_step(
+    steps: list[vkc.Step], field: str, problem: str
+) -> None:
+    with pytest.raises(vkc.InputError, match=problem) as caught:
+        compile_each_step(vkc.load_scene("household"), steps, vkc.Options())
+    assert str(caught.value.field).startswith(field)
+
+
+@pytest.mark.parametrize("stands", [True, False])
+def test_free_object_is_regrasped_only_if_it_rests_on_a_support(stands: bool) -> None:
+    """In the air, it would fall."""
+    x, y, z = littered().with_held({"litter": "grip"}).objects["litter"].placement.translation
+    table = {
+        "name": "table",
+        "type": "box",
+        "size": [0.2, 0.2, 0.02],
+        "position": [x, y, z - AT[2] - 0.01],
+    }
+    scene = littered(*[table] * stands).with_held({"litter": "grip"})
+    place = vkc.Place("litter", BIN)
+    task = compile_task(scene, [place], vkc.Options())
+    again = (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
+    assert (
+        list(generate_alternatives(scene, task, anew=True))
+        == [("litter.grip, grasped again", again)] * stands
+    )
+    assert not list(generate_alternatives(scene, task)), "only where phases may be more"
+
+
+def test_released_object_can_be_regrasped_if_nothing_has_moved() -> None:
+    """Otherwise only the motion decides where it rests, and the plan cannot grasp it again."""
+    scene = littered().with_held({"litter": "grip"})
+    compile_task(scene, [vkc.Release("litter"), vkc.Place("litter", BIN)], vkc.Options())
+    with pytest.raises(vkc.InputError, match="known only after planning"):
+        compile_task(
+            scene,
+            [vkc.GoTo(0.0, 1.0), vkc.Release("litter"), vkc.Place("litter", BIN)],
+            vkc.Options(),
+        )

@@ -1,0 +1,239 @@
+"""Tests which joints a hand can push, and in which direction."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.small_problems import cabinet, door_scene, full_scene, with_attachment, with_objects
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError
+from vkc_pin.options import Options
+from vkc_pin.world.models.articulated_object import Attachment, Freedom
+from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.actuation import compute_advance
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import Task
+
+STEP = 1e-6  # [rad] or [m]
+
+
+def moved(placed: PlacedObject, attachment: Attachment, joint: str, values: list[float]) -> float:
+    """Return the advance of the contact into its face per unit of a joint, numerically."""
+    touched = attachment.placement
+    for freedom, value in zip(attachment.freedoms, values, strict=True):
+        touched = touched * freedom.motion(value)
+    now = float(placed.state[placed.object.coordinates.index(joint)])
+    ahead, behind, here = (
+        placed.with_state({joint: v}).link_placement(attachment.link)
+        for v in (now + STEP, now - STEP, now)
+    )
+    shift = (ahead.act(touched.translation) - behind.act(touched.translation)) / (2 * STEP)
+    return float((here * attachment.placement).rotation[:, 2] @ shift)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3),
+    st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3),
+    st.lists(st.floats(0.0, 1.0), min_size=3, max_size=3),
+    st.tuples(st.floats(-0.9, 1.9), st.floats(0.01, 0.29)),
+)
+def test_advance_matches_finite_differences(
+    rpy: list[float], at: list[float], where: list[float], state: tuple[float, float]
+) -> None:
+    """Advances of all points of a region lie between the extremes, which two points attain.
+
+    The face is on a tray that slides on a rotating arm.
+    """
+    arm = full_scene().objects["cabinet"].with_state({"swing": state[0], "slide": state[1]})
+    slides = [
+        Freedom(f"_{k}", "prismatic", axis, -0.1, 0.2) for k, axis in enumerate(np.eye(3)[:2])
+    ]
+    tilt = Freedom("_tilt", "revolute", np.array([1.0, 0.0, 0.0]), -0.5, 0.5)
+    placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(at))
+    face = Attachment(
+        name="face",
+        link="tray",
+        placement=placement,
+        freedoms=(*slides, tilt),
+        standoff=0.01,
+        contact="push",
+    )
+    for joint in ("swing", "slide"):
+        least, most = compute_advance(arm, face, joint)
+        corners = [moved(arm, face, joint, [x, y, 0.3]) for x in (-0.1, 0.2) for y in (-0.1, 0.2)]
+        np.testing.assert_allclose([least, most], [min(corners), max(corners)], rtol=0.0, atol=1e-8)
+        inside = [
+            own.lower + share * (own.upper - own.lower)
+            for own, share in zip(face.freedoms, where, strict=True)
+        ]
+        assert least - 1e-8 <= moved(arm, face, joint, inside) <= most + 1e-8
+
+
+def test_advance_covers_the_whole_rim() -> None:
+    """The rim of a wheel beside the hinge has a longer lever arm at one side."""
+    arm = full_scene().objects["cabinet"]
+    around = Freedom(
+        "_around", "revolute", np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, np.array([-0.1, 0.0, 0.0])
+    )
+    rim = Attachment(
+        name="rim", link="tray", placement=pin.SE3.Identity(), freedoms=(around,), contact="push"
+    )
+    least, most = compute_advance(arm, rim, "swing")
+    every = [moved(arm, rim, "swing", [value]) for value in np.linspace(-np.pi, np.pi, 200)]
+    assert most - least > 0.1
+    assert abs(least - min(every)) < 0.1 * (most - least)
+    assert abs(most - max(every)) < 0.1 * (most - least)
+
+
+def compiled(scene: Scene, joints: dict[str, float], attachment: str, name: str = "door") -> Task:
+    return compile_task(scene, [vkc.Actuate(name, joints, attachment)], Options())
+
+
+def at(hinge: float) -> Scene:
+    return door_scene().with_state("door", {"hinge": hinge})
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "face", "way"),
+    [(-1.2, 0.0, "push", 1), (1.2, 0.0, "push_back", -1), (0.3, 0.9, "push", 1)],
+)
+def test_a_door_is_pushed_shut_or_further_open(
+    begin: float, end: float, face: str, way: int
+) -> None:
+    reach, move = compiled(at(begin), {"hinge": end}, face).phases
+    assert (reach.pushed, move.pushed, move.name) == ({}, {"door.hinge": way}, "move door.hinge")
+
+
+def test_push_goal_is_clipped_to_the_limit() -> None:
+    """A door that is as far open as it goes is not pulled further."""
+    (_, move) = compiled(at(1.57), {"hinge": 2.0}, "push_back").phases
+    assert move.pushed == {"door.hinge": -1}
+
+
+def test_push_direction_depends_on_the_state_after_previous_steps() -> None:
+    """A face on a sliding tray: pulled out, it is on the other side of the arm's axis."""
+    scene, slides = full_scene(), (0.0, 0.3)
+    normal, along = (
+        np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0),
+        np.array([0.0, -1.0, 0.0]),
+    )  # the tray slides along its -y axis
+
+    def face(shift: float) -> Attachment:
+        placement = pin.SE3(
+            pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), normal).matrix(), shift * along
+        )
+        return Attachment(name="face", link="tray", placement=placement, contact="push")
+
+    def yields(value: float, shift: float) -> float:
+        return compute_advance(
+            scene.objects["cabinet"].with_state({"slide": value}), face(shift), "swing"
+        )[0]
+
+    root = yields(0.0, 0.0) / (
+        yields(0.0, 0.0) - yields(0.0, 1.0)
+    )  # the lever is linear along the axis
+    middle = face(root - sum(slides) / 2.0)
+    signs = [
+        np.sign(
+            compute_advance(scene.objects["cabinet"].with_state({"slide": value}), middle, "swing")[
+                0
+            ]
+        )
+        for value in slides
+    ]
+    assert signs[0] == -signs[1] != 0.0
+    there = with_objects(
+        scene,
+        {"cabinet": with_attachment(scene.objects["cabinet"].with_state({"slide": 0.0}), middle)},
+    )
+    swing_by = 0.3 + 0.2 * signs[1]
+    steps = [
+        vkc.Actuate("cabinet", {"slide": 0.3}, "face"),
+        vkc.Actuate("cabinet", {"swing": swing_by}, "face"),
+    ]
+    assert compile_task(there, steps, Options()).phases[-1].pushed == {"cabinet.swing": signs[1]}
+    with pytest.raises(InputError, match="cannot pull"):
+        compile_task(there, steps[1:], Options())
+
+
+def test_grasp_has_no_push_directions() -> None:
+    assert [phase.pushed for phase in compiled(at(0.0), {"hinge": 1.0}, "handle").phases] == [
+        {},
+        {},
+        {},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "face", "way"), [(-0.5, -1.0, "push", "up"), (0.5, 1.0, "push_back", "down")]
+)
+def test_push_cannot_pull(begin: float, end: float, face: str, way: str) -> None:
+    said = f"pushing 'door' at '{face}' moves 'hinge' {way} only: a hand that pushes cannot pull"
+    with pytest.raises(InputError, match=said) as caught:
+        compiled(at(begin), {"hinge": end}, face)
+    assert caught.value.field == "steps[0].joints"
+    other = "or an attachment that can be grasped: handle, handle_free"
+    assert caught.value.expected == f"{'≥' if way == 'up' else '≤'} {begin:g}, {other}"
+
+
+def test_a_latched_door_cannot_be_pushed_open() -> None:
+    with pytest.raises(InputError, match="latched"):
+        compiled(at(0.0), {"hinge": 1.0}, "push")
+
+
+def test_drawer_front_cannot_be_pulled() -> None:
+    scene = vkc.load_scene("drawer")
+    with pytest.raises(InputError, match="moves 'slide' down only"):
+        compiled(scene, {"slide": 0.3}, "push", "drawer")
+    (_, move) = compiled(
+        scene.with_state("drawer", {"slide": 0.3}), {"slide": 0.0}, "push", "drawer"
+    ).phases
+    assert move.pushed == {"drawer.slide": -1}
+
+
+@pytest.mark.parametrize(
+    ("link", "position", "approach", "joint"),
+    [
+        ("tray", [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], "slide"),  # across the way it slides
+        ("arm", [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], "swing"),  # at the axis itself
+        ("arm", [0.0, 6e-4, 0.0], [1.0, 0.0, 0.0], "swing"),  # half a millimetre beside it
+    ],
+)
+def test_push_along_the_joint_axis_is_rejected(
+    link: str, position: list[float], approach: list[float], joint: str
+) -> None:
+    z = np.array(approach)
+    placement = pin.SE3(
+        pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), z).matrix(), np.array(position)
+    )
+    face = Attachment(name="face", link=link, placement=placement, contact="push")
+    scene = with_objects(
+        door_scene(), {"cabinet": with_attachment(full_scene().objects["cabinet"], face)}
+    )
+    with pytest.raises(
+        InputError, match=f"does not move '{joint}' in a single direction"
+    ) as caught:
+        compiled(scene, {joint: 0.2}, "face", "cabinet")
+    assert "one side of the joint's axis" in str(caught.value)
+    assert cabinet().attachments["grip"].contact == "grasp"
+
+
+def test_face_on_both_sides_of_the_hinge_is_rejected() -> None:
+    placed = at(-1.0).objects["door"]
+    wide = (
+        dataclasses.replace(placed.object.attachments["push"].freedoms[0], lower=-0.7),
+        *placed.object.attachments["push"].freedoms[1:],
+    )
+    both = dataclasses.replace(placed.object.attachments["push"], name="both", freedoms=wide)
+    with pytest.raises(InputError, match="does not move 'hinge' in a single direction"):
+        compiled(
+            with_objects(at(-1.0), {"door": with_attachment(placed, both)}), {"hinge": 0.0}, "both"
+        )

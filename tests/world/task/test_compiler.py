@@ -1,0 +1,422 @@
+"""Tests the compilation of steps to phases: holds, moving joints and goals."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.small_problems import (
+    CABINET_STATE,
+    door_scene,
+    full_scene,
+    with_attachment,
+    with_objects,
+)
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.actuation import find_shared_coordinate
+from vkc_pin.world.task.compiler import LATCH_MARGIN, compile_task
+from vkc_pin.world.task.lookup import find_path_joints
+from vkc_pin.world.task.phases import Task
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Release, Step
+
+OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
+OPEN = Actuate("door", {"hinge": 1.2})
+TURNED = 0.5 + LATCH_MARGIN  # the latch's threshold and a bit
+SHUT = {"door.hinge": 0.0, "door.knob": 0.0}
+HINGE, KNOB = (-1.57, 1.57), (0.0, 0.8)
+HANDLE = Hold("door", "handle")
+
+
+def phases(steps: Sequence[Step], scene: Scene | None = None) -> Task:
+    return compile_task(scene or door_scene(), steps, OPTIONS)
+
+
+def with_link(scene: Scene, name: str, link: str) -> Scene:
+    """Return the scene with one more attachment of the door, at the origin of `link`."""
+    placed = scene.objects["door"]
+    attachment = dataclasses.replace(
+        placed.object.attachment(), name=name, link=link, placement=pin.SE3.Identity()
+    )
+    thing = dataclasses.replace(
+        placed.object, attachments={**placed.object.attachments, name: attachment}
+    )
+    return dataclasses.replace(
+        scene, objects={**scene.objects, "door": dataclasses.replace(placed, object=thing)}
+    )
+
+
+def with_link_of(scene: Scene, owner: str, link: str) -> Scene:
+    """Return the scene with one more attachment, named after its link and like the first."""
+    placed = scene.objects[owner]
+    return with_objects(
+        scene,
+        {
+            owner: with_attachment(
+                placed, dataclasses.replace(placed.object.attachment(), name=link, link=link)
+            )
+        },
+    )
+
+
+def test_opening_a_door_has_three_phases() -> None:
+    task = phases([OPEN])
+    assert [phase.name for phase in task.phases] == [
+        "reach door.handle",
+        "turn door.knob",
+        "move door.hinge, door.knob",
+    ]
+    assert [phase.segments for phase in task.phases] == [10, 3, 7]
+    assert task.segments == 20
+    assert task.holds == task.after == (HANDLE,)
+    assert task.state == SHUT
+    reach, turn, move = task.phases
+    assert (reach.held, reach.grasps, reach.ranges, reach.values) == ((), (HANDLE,), {}, {})
+    assert (turn.held, turn.grasps, turn.released) == ((HANDLE,), (), ())
+    assert turn.ranges == {"door.knob": KNOB}
+    assert turn.values == {"door.knob": TURNED}
+    assert move.held == (HANDLE,)
+    assert move.ranges == {"door.hinge": HINGE, "door.knob": (TURNED, KNOB[1])}
+    assert move.values == {"door.hinge": 1.2, "door.knob": TURNED}
+    assert [phase.initial_values for phase in task.phases] == [
+        SHUT,
+        SHUT,
+        {**SHUT, "door.knob": TURNED},
+    ]
+    assert all(phase.base is None and phase.frames == () for phase in task.phases)
+
+
+def test_turned_knob_needs_no_turn_phase() -> None:
+    task = phases([OPEN], door_scene().with_state("door", {"knob": 0.6}))
+    assert [phase.name for phase in task.phases] == [
+        "reach door.handle",
+        "move door.hinge, door.knob",
+    ]
+    assert task.phases[1].ranges["door.knob"] == (TURNED, KNOB[1])
+    assert task.phases[1].initial_values == {"door.hinge": 0.0, "door.knob": 0.6}
+
+
+def test_open_door_needs_no_turn_phase() -> None:
+    """Out of the latch's reach nothing needs turning; within it, it does."""
+    task = phases([OPEN], door_scene().with_state("door", {"hinge": 0.3}))
+    assert [phase.name for phase in task.phases] == ["reach door.handle", "move door.hinge"]
+    task = phases([OPEN], door_scene().with_state("door", {"hinge": 0.03}))
+    assert [phase.name for phase in task.phases] == [
+        "reach door.handle",
+        "turn door.knob",
+        "move door.hinge, door.knob",
+    ]
+
+
+def test_joint_at_its_goal_does_not_release_the_latch() -> None:
+    assert len(phases([Actuate("door", {"hinge": 0.0})]).phases) == 2
+
+
+def test_the_knob_alone() -> None:
+    task = phases([Actuate("door", {"knob": 0.3})])
+    assert [phase.name for phase in task.phases] == ["reach door.handle", "move door.knob"]
+    assert task.phases[1].ranges == {"door.knob": KNOB}
+    assert task.phases[1].values == {"door.knob": 0.3}
+
+
+def test_hinge_and_knob_together() -> None:
+    """The latch is released first; the knob reaches its goal once the door is open."""
+    far = phases([Actuate("door", {"hinge": 1.2, "knob": 0.7})])
+    assert [phase.name for phase in far.phases] == [
+        "reach door.handle",
+        "turn door.knob",
+        "move door.hinge, door.knob",
+    ]
+    assert far.phases[2].values == {"door.hinge": 1.2, "door.knob": 0.7}
+    assert far.phases[2].ranges["door.knob"] == (TURNED, KNOB[1])
+    back = phases([Actuate("door", {"hinge": 1.2, "knob": 0.0})])
+    assert [phase.name for phase in back.phases][2:] == [
+        "move door.hinge, door.knob",
+        "turn door.knob",
+    ]
+    assert back.phases[2].values == {"door.hinge": 1.2, "door.knob": TURNED}
+    assert back.phases[3].values == {"door.knob": 0.0}
+    assert back.phases[3].ranges == {"door.knob": KNOB}
+    assert back.phases[3].initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
+
+
+def test_held_object_is_not_grasped_again() -> None:
+    task = phases([OPEN], door_scene().with_held({"door": "handle"}))
+    assert [phase.name for phase in task.phases] == ["turn door.knob", "move door.hinge, door.knob"]
+    assert task.phases[0].held == task.holds == (HANDLE,)
+    assert task.phases[0].released == ()
+    assert task.state == SHUT
+
+
+def test_object_of_two_steps_is_grasped_once() -> None:
+    task = phases([Grasp("door"), OPEN, Actuate("door", {"hinge": 0.5})])
+    assert [phase.name for phase in task.phases][2:] == [
+        "move door.hinge, door.knob",
+        "move door.hinge",
+    ]
+    assert task.phases[3].initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
+
+
+def test_truncated_task_equals_task_of_the_first_steps() -> None:
+    back, drawer = Actuate("door", {"knob": 0.0}), Actuate("drawer", {"slide": 0.2})
+    steps = [GoTo(0.3, 0.2), OPEN, back, drawer, Release()]
+    whole = phases(steps, full_scene())
+    for count in range(1, len(steps) + 1):
+        part, alone = whole.truncate(count), phases(steps[:count], full_scene())
+        assert part == alone
+        assert [list(phase.initial_values) for phase in part.phases] == [
+            list(phase.initial_values) for phase in alone.phases
+        ]
+        assert list(part.state) == list(alone.state)
+
+
+def test_grasp_only() -> None:
+    task = phases([Grasp("door", "handle_free")])
+    (phase,) = task.phases
+    assert (phase.name, phase.held, phase.grasps) == (
+        "reach door.handle_free",
+        (),
+        (Hold("door", "handle_free"),),
+    )
+    assert task.holds == (Hold("door", "handle_free"),)
+
+
+def test_previous_attachment_is_preferred() -> None:
+    task = phases([Grasp("door", "handle_free"), GoTo(0.0, 0.0), OPEN])
+    assert task.holds == (Hold("door", "handle_free"),)
+    assert task.phases[2].grasps == (Hold("door", "handle_free"),)
+
+
+def test_reach() -> None:
+    pose = pin.SE3(np.eye(3), np.array([1.0, 0.0, 1.0]))
+    (phase,) = phases([Reach(pose)]).phases
+    assert (phase.name, phase.held, phase.segments) == ("reach with tool", (), 10)
+    (goal,) = phase.frames
+    assert (goal.frame, goal.kind, goal.hold, goal.touches) == ("tool", "pose", None, False)
+    assert goal.placement == pose
+    (phase,) = phases([Reach(pose, "forearm_link")]).phases
+    assert phase.frames[0].frame == "forearm_link"
+
+
+def test_go_to_releases_fixed_objects() -> None:
+    task = phases([OPEN, GoTo(1.0, 2.0, 0.3)])
+    last = task.phases[-1]
+    assert (last.name, last.held, last.released) == ("go to", (), (HANDLE,))
+    assert last.base == (1.0, 2.0, 0.3)
+    assert last.initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
+    assert phases([GoTo(1.0, 2.0)]).phases[0].base == (1.0, 2.0, None)
+    held = door_scene().with_held({"door": "handle"})
+    assert phases([GoTo(1.0, 2.0)], held).phases[0].released == (HANDLE,)
+
+
+def test_one_object_after_another() -> None:
+    """The second stands still until it is grasped, the first stays as it was left."""
+    task = phases([OPEN, Actuate("drawer", {"slide": 0.2})], full_scene())
+    names = [
+        "reach door.handle",
+        "turn door.knob",
+        "move door.hinge, door.knob",
+        "reach drawer.handle",
+        "move drawer.slide",
+    ]
+    assert [phase.name for phase in task.phases] == names
+    drawer = Hold("drawer", "handle")
+    assert task.holds == (HANDLE, drawer)
+    assert task.state == {**SHUT, "drawer.slide": 0.0}
+    assert all(phase.initial_values["drawer.slide"] == 0.0 for phase in task.phases)
+    assert (task.phases[3].released, task.phases[3].held) == ((HANDLE,), ())
+    assert task.phases[4].initial_values["door.hinge"] == 1.2
+    assert task.phases[4].held == task.after == (drawer,)
+
+
+def test_task_has_only_joints_that_its_grasps_can_move() -> None:
+    task = phases([Actuate("cabinet", {"slide": 0.2})], full_scene())
+    assert task.state == {f"cabinet.{joint}": CABINET_STATE[joint] for joint in ("swing", "slide")}
+    placed = full_scene().objects["cabinet"]
+    assert find_path_joints(placed, placed.object.attachment()) == ["swing", "slide"]
+
+
+def test_goal_beyond_a_limit_ends_at_the_limit() -> None:
+    """Planning then says by how much it fails; later steps start from the limit."""
+    task = phases([Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)])
+    assert task.phases[2].values["door.hinge"] == 2.0
+    assert task.phases[3].initial_values["door.hinge"] == HINGE[1]
+
+
+@pytest.mark.parametrize(
+    ("step", "field", "nearest"),
+    [
+        (Actuate("dor", {"hinge": 1.0}), "steps[1].object", "door"),
+        (Grasp("dor"), "steps[1].object", "door"),
+        (Actuate("door", {"hing": 1.0}), "steps[1].joints", "hinge"),
+        (Actuate("door", {"hinge": 1.0}, "handel"), "steps[1].attachment", "handle"),
+        (Grasp("door", "handel"), "steps[1].attachment", "handle"),
+        (Reach([0.0] * 6, "tol"), "steps[1].frame", "tool"),
+    ],
+)
+def test_unknown_names_are_rejected(step: Step, field: str, nearest: str | None) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        phases([GoTo(0.0, 0.0), step])
+    assert (caught.value.field, caught.value.nearest) == (field, nearest)
+
+
+def test_a_joint_that_does_not_move_with_the_hand() -> None:
+    with pytest.raises(InputError, match="does not move") as caught:
+        phases([Actuate("door", {"knob": 0.3}, "plate")], with_link(door_scene(), "plate", "panel"))
+    assert caught.value.field == "steps[0].joints"
+    assert caught.value.expected == "one of hinge"
+    with pytest.raises(InputError, match="does not move"):
+        phases([Actuate("door", {"hinge": 0.3}, "post")], with_link(door_scene(), "post", "frame"))
+
+
+def test_a_latch_that_the_hand_cannot_release() -> None:
+    plate = with_link(door_scene(), "plate", "panel")
+    with pytest.raises(InputError, match="is latched") as caught:
+        phases([Actuate("door", {"hinge": 1.2}, "plate")], plate)
+    assert caught.value.field == "steps[0].attachment"
+    for state in ({"knob": 0.6}, {"hinge": 0.2}):
+        task = phases([Actuate("door", {"hinge": 1.2}, "plate")], plate.with_state("door", state))
+        assert [phase.name for phase in task.phases] == ["reach door.plate", "move door.hinge"]
+        assert set(task.state) == {"door.hinge"}
+
+
+@pytest.mark.parametrize("steps", [[], (), [Grasp("door")]])
+def test_nothing_to_do(steps: list[Step]) -> None:
+    with pytest.raises(InputError, match="nothing to do") as caught:
+        phases(steps, door_scene().with_held({"door": "handle"}))
+    assert caught.value.field == "steps"
+
+
+@pytest.mark.parametrize(
+    ("steps", "field"),
+    [(OPEN, "steps"), (["open"], "steps[0]"), ([GoTo(0.0, 0.0), None], "steps[1]")],
+)
+def test_invalid_steps_are_rejected(steps: Any, field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        phases(steps)
+    assert caught.value.field == field
+
+
+def test_default_attachment_is_the_first_that_moves_the_joints() -> None:
+    """The first of all moves only some of them."""
+    placed = full_scene().objects["cabinet"]
+    named = {
+        name: dataclasses.replace(placed.object.attachment(), name=name, link=name)
+        for name in ("case", "arm", "lid")
+    }
+    thing = dataclasses.replace(placed.object, attachments={**named, **placed.object.attachments})
+    scene = with_objects(full_scene(), {"cabinet": dataclasses.replace(placed, object=thing)})
+    for joints, taken in (
+        ({"swing": 0.5}, "arm"),
+        ({"lid_hinge": 0.2}, "lid"),
+        ({"swing": 0.5, "slide": 0.2}, "grip"),
+    ):
+        task = phases([Actuate("cabinet", joints)], scene)
+        assert task.holds == (Hold("cabinet", taken),)
+        assert task == dataclasses.replace(
+            phases([Actuate("cabinet", joints, taken)], scene), steps=task.steps
+        )
+    assert phases([Grasp("cabinet")], scene).holds == (Hold("cabinet", "case"),)
+    with pytest.raises(
+        InputError, match="no attachment of 'cabinet' can bring 'swing' and 'lid_hinge' there"
+    ) as caught:
+        phases([Actuate("cabinet", {"swing": 0.5, "lid_hinge": 0.2})], scene)
+    assert caught.value.field == "steps[0].joints"
+    assert (
+        "case moves nothing; arm moves swing; lid moves lid_hinge; grip moves swing, slide"
+        in str(caught.value.expected)
+    )
+
+
+def test_present_attachment_is_preferred() -> None:
+    task = phases(
+        [
+            Actuate("door", {"hinge": 1.2}, "handle_free"),
+            GoTo(0.0, 0.0),
+            Actuate("door", {"hinge": 0.5}),
+        ]
+    )
+    assert task.holds == (Hold("door", "handle_free"),)
+    task = phases([OPEN], door_scene().with_held({"door": "handle_free"}))
+    assert task.holds == (Hold("door", "handle_free"),)
+
+
+def test_attachment_that_cannot_release_the_latch_is_skipped() -> None:
+    """The plate moves the hinge, and no knob: while the latch is shut, it will not do."""
+    scene = with_link(door_scene(), "plate", "panel")
+    attachments = scene.objects["door"].object.attachments
+    thing = dataclasses.replace(
+        scene.objects["door"].object, attachments={"plate": attachments["plate"], **attachments}
+    )
+    scene = with_objects(scene, {"door": dataclasses.replace(scene.objects["door"], object=thing)})
+    assert phases([OPEN], scene).holds == (HANDLE,)
+    assert phases([OPEN], scene.with_state("door", {"hinge": 0.2})).holds == (
+        Hold("door", "plate"),
+    )
+
+
+def test_object_grasped_at_two_attachments_in_turn() -> None:
+    """Holds of different joints share a chain; of the same joint they cannot."""
+    lid = with_link_of(full_scene(), "cabinet", "lid")
+    task = phases([Actuate("cabinet", {"swing": 0.5}), Actuate("cabinet", {"lid_hinge": 0.2})], lid)
+    grip, other = Hold("cabinet", "grip"), Hold("cabinet", "lid")
+    assert task.holds == (grip, other)
+    assert [phase.name for phase in task.phases] == [
+        "reach cabinet.grip",
+        "move cabinet.swing",
+        "reach cabinet.lid",
+        "move cabinet.lid_hinge",
+    ]
+    assert [phase.held for phase in task.phases] == [(), (grip,), (), (other,)]
+    assert task.phases[2].released == (grip,)
+    assert task.phases[3].initial_values == {
+        "cabinet.swing": 0.5,
+        "cabinet.slide": 0.1,
+        "cabinet.lid_hinge": -0.4,
+    }
+    assert find_shared_coordinate(lid, task.holds) is None
+    both = phases([OPEN, Actuate("door", {"hinge": 0.5}, "handle_free")])
+    assert both.holds == (HANDLE, Hold("door", "handle_free"))
+    assert find_shared_coordinate(door_scene(), both.holds) == "door.hinge"
+
+
+def test_unused_initial_hold_is_dropped_if_another_moves_the_same_joints() -> None:
+    """With the joints that the new one does not move, which then are none of the task."""
+    scene = (
+        with_link(door_scene(), "plate", "panel")
+        .with_state("door", {"hinge": 0.4, "knob": 0.6})
+        .with_held({"door": "handle"})
+    )
+    for steps in (
+        [Actuate("door", {"hinge": 0.9}, "plate")],
+        [GoTo(0.0, 0.0), Actuate("door", {"hinge": 0.9}, "plate")],
+    ):
+        task = phases(steps, scene)
+        assert task.holds == (Hold("door", "plate"),)
+        assert task.state == {"door.hinge": 0.4}
+        assert all(phase.initial_values == {"door.hinge": 0.4} for phase in task.phases)
+        assert task.phases[0].released == (HANDLE,)
+
+
+def test_an_object_without_attachments() -> None:
+    placed = door_scene().objects["door"]
+    bare = dataclasses.replace(placed, object=dataclasses.replace(placed.object, attachments={}))
+    with pytest.raises(InputError, match="no attachment"):
+        phases([Grasp("door")], dataclasses.replace(door_scene(), objects={"door": bare}))
+
+
+def test_phase_keys_differ_by_kind_and_subject() -> None:
+    """However they are called."""
+    assert [phase.key for phase in phases([OPEN, GoTo(0.0, 0.0)]).phases] == [
+        ("grasp", ("door", "handle", "")),
+        ("turn", ("door.knob",)),
+        ("move", ("door.hinge", "door.knob")),
+        ("go", ()),
+    ]

@@ -1,0 +1,460 @@
+"""Tests the compilation of steps in which objects are carried, placed or used as tools."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.carrying import BALL, STICK, room, with_object
+from helpers.small_problems import full_scene, with_objects
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import Phase, Task
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+
+OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
+GRIP = Hold("stick", "grip")
+END = Hold("stick", "end")
+PULLED = Hold("ball", "grip", GRIP, "tip")
+HANDLE = Hold("door", "handle")
+POINT = (0.4, 0.2, 0.9)
+POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array(POINT))
+
+
+@cache
+def scene() -> Scene:
+    """Return the door's room with drawer and cabinet, and stick and ball in it too."""
+    return with_objects(full_scene(), room(objects=("stick", "ball")).objects)
+
+
+def phases(*steps: Step, of: Scene | None = None) -> Task:
+    return compile_task(of or scene(), steps, OPTIONS)
+
+
+def names(task: Task) -> list[str]:
+    return [phase.name for phase in task.phases]
+
+
+def held(task: Task) -> list[tuple[Hold, ...]]:
+    return [phase.held for phase in task.phases]
+
+
+# --- touching
+# ------------------------------------------------------------------------------------------
+
+
+def test_touch_with_a_stick_grasps_it_first() -> None:
+    task = phases(Touch("stick.tip", POINT))
+    reach, touch = task.phases
+    assert names(task) == ["reach stick.grip", "touch with stick.tip"]
+    assert (task.segments, task.holds, task.after) == (20, (GRIP,), (GRIP,))
+    assert (reach.held, reach.grasps, reach.released, reach.frames) == ((), (GRIP,), (), ())
+    assert (touch.held, touch.grasps, touch.released) == ((GRIP,), (), ())
+    (goal,) = touch.frames
+    assert (goal.frame, goal.kind, goal.hold, goal.touches) == ("tip", "point", GRIP, True)
+    np.testing.assert_array_equal(goal.placement.translation, POINT)
+    assert str(goal) == "stick.tip"
+    assert task.state == {}  # a stick has no joints
+
+
+def test_touching_a_pose() -> None:
+    (goal,) = phases(Touch("stick.tip", POSE)).phases[1].frames
+    assert (goal.kind, goal.placement) == ("pose", POSE)
+
+
+def test_touching_with_the_robot_itself() -> None:
+    task = phases(Touch("forearm_link", POINT), Touch("tool", POSE))
+    assert names(task) == ["touch with forearm_link", "touch with tool"]
+    goals = [goal for phase in task.phases for goal in phase.frames]
+    assert [(goal.frame, goal.kind, goal.hold, goal.touches) for goal in goals] == [
+        ("forearm_link", "point", None, True),
+        ("tool", "pose", None, True),
+    ]
+    assert held(task) == [(), ()]
+
+
+def test_resting_placements_before_and_after_a_grasp() -> None:
+    task = phases(Touch("stick.tip", POINT))
+    for phase, standing in zip(task.phases, [{"stick", "ball"}, {"ball"}], strict=True):
+        assert set(phase.resting) == standing
+    assert task.phases[0].resting["stick"] == STICK
+    assert task.phases[1].resting["ball"] == BALL
+    assert task.phases[1].lifted == {GRIP: STICK}
+    assert task.phases[0].lifted == {}
+    assert all(not phase.lowered and not phase.released_by for phase in task.phases)
+
+
+def test_held_stick_touches_without_a_grasp() -> None:
+    for attachment, hold in (("grip", GRIP), ("end", END)):
+        task = phases(Touch("stick.tip", POINT), of=scene().with_held({"stick": attachment}))
+        assert (names(task), held(task), task.holds) == (
+            ["touch with stick.tip"],
+            [(hold,)],
+            (hold,),
+        )
+        assert task.phases[0].released == ()
+        assert "stick" not in task.phases[0].resting
+        assert task.phases[0].lifted == {}
+    taken = phases(Grasp("stick", "end"), Touch("stick.tip", POINT))
+    assert names(taken) == ["reach stick.end", "touch with stick.tip"]
+    assert taken.holds == (END,)
+
+
+# --- putting down, letting go
+# -----------------------------------------------------------------------------------------
+
+
+def test_place_grasps_carries_and_releases() -> None:
+    task = phases(Place("stick", POSE), GoTo(0.0, 0.0))
+    assert names(task) == ["reach stick.grip", "place stick", "go to"]
+    reach, place, leave = task.phases
+    (goal,) = place.frames
+    assert (goal.frame, goal.kind, goal.hold, goal.touches, goal.placement) == (
+        "stick",
+        "pose",
+        GRIP,
+        False,
+        POSE,
+    )
+    assert (place.held, place.lifted, place.lowered) == ((GRIP,), {GRIP: STICK}, {GRIP: POSE})
+    assert (leave.held, leave.released) == ((), (GRIP,))
+    assert leave.resting["stick"] == POSE
+    assert leave.released_by == {}
+    assert task.after == ()
+    assert reach.released == place.released == ()
+
+
+def test_place_at_a_point_keeps_the_object_upright() -> None:
+    lying = with_object(scene(), "stick", POSE)
+    task = phases(Place("stick", (0.0, 1.0, 0.5)), GoTo(0.0, 0.0), of=lying)
+    (goal,) = task.phases[1].frames
+    assert goal.kind == "upright"
+    np.testing.assert_array_equal(goal.placement.translation, [0.0, 1.0, 0.5])
+    np.testing.assert_array_equal(goal.placement.rotation, POSE.rotation)
+    assert task.phases[1].released_by == {}
+    assert task.phases[2].released_by == {"stick": (GRIP, 1)}  # as the phase before left it
+    assert "stick" in task.phases[2].resting
+
+
+def test_placing_at_another_attachment() -> None:
+    assert phases(Place("stick", POSE, "end")).holds == (END,)
+    with pytest.raises(InputError, match="held elsewhere") as caught:
+        phases(Grasp("stick"), Place("stick", POSE, "end"))
+    assert (caught.value.field, caught.value.expected, caught.value.got) == (
+        "steps[1].attachment",
+        "grip",
+        "end",
+    )
+
+
+def test_releasing() -> None:
+    task = phases(Touch("stick.tip", POINT), Release(), GoTo(0.0, 0.0))
+    assert names(task) == ["reach stick.grip", "touch with stick.tip", "go to"]
+    assert (task.phases[2].held, task.phases[2].released) == ((), (GRIP,))
+    assert task.phases[2].released_by == {"stick": (GRIP, 1)}
+    assert task.after == ()
+    assert phases(Touch("stick.tip", POINT), Release("stick")).after == ()
+    assert phases(Grasp("door"), Release(), GoTo(0.0, 0.0)).phases[1].released == (HANDLE,)
+
+
+def test_releasing_what_is_held_at_the_start() -> None:
+    task = phases(Release(), of=scene().with_held({"stick": "grip"}))
+    assert (names(task), held(task), task.after) == (["stand still"], [(GRIP,)], ())
+    later = phases(Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"}))
+    assert later.phases[1].released == (GRIP,)
+    assert not later.phases[1].released_by, (
+        "where it stands is known: it is let go of before anything has moved"
+    )
+    moved = phases(
+        GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"})
+    )
+    assert moved.phases[1].released_by == {"stick": (GRIP, 0)}
+
+
+def test_invalid_releases_are_rejected() -> None:
+    with pytest.raises(InputError, match="hand is empty") as caught:
+        phases(GoTo(0.0, 0.0), Release())
+    assert caught.value.field == "steps[1]"
+    with pytest.raises(UnknownNameError) as unknown:
+        phases(Grasp("stick"), Release("stik"))
+    assert (unknown.value.field, unknown.value.nearest) == ("steps[1].object", "stick")
+    with pytest.raises(InputError, match="hand is empty"):
+        phases(Place("stick", POSE), Release())
+
+
+# --- holding through what is held
+# -------------------------------------------------------------------------------------
+
+
+def test_a_ball_is_fetched_with_the_stick() -> None:
+    task = phases(
+        Grasp("stick"),
+        Grasp("ball", by="stick.tip"),
+        GoTo(0.0, 0.0),
+        Place("ball", POINT),
+        Place("stick", POSE),
+    )
+    assert names(task) == [
+        "reach stick.grip",
+        "reach ball.grip by stick.tip",
+        "go to",
+        "place ball",
+        "place stick",
+    ]
+    assert held(task) == [(), (GRIP,), (GRIP, PULLED), (GRIP, PULLED), (GRIP,)]
+    assert task.holds == (GRIP, PULLED)
+    assert [phase.grasps for phase in task.phases] == [(GRIP,), (PULLED,), (), (), ()]
+    assert [phase.released for phase in task.phases] == [(), (), (), (), (PULLED,)]
+    assert task.phases[2].lifted == {PULLED: BALL}
+    assert task.phases[3].frames[0].hold == PULLED
+    assert task.phases[4].released_by == {"ball": (PULLED, 3)}
+    assert task.after == ()
+
+
+def test_releasing_the_stick_releases_the_ball_on_it() -> None:
+    fetch = [Grasp("stick"), Grasp("ball", "pull", by="stick.tip")]
+    for step in (Release(), Release("stick"), Place("stick", POSE)):
+        task = phases(*fetch, step, GoTo(0.0, 0.0))
+        assert (task.phases[-1].held, task.after) == ((), ())
+        assert {hold.object for hold in task.phases[-1].released} == {"stick", "ball"}
+        assert "ball" in task.phases[-1].released_by
+        assert ("stick" in task.phases[-1].released_by) == isinstance(step, Release)
+    task = phases(*fetch, Release("ball"), GoTo(0.0, 0.0))
+    assert (task.phases[-1].held, task.after) == ((GRIP,), (GRIP,))
+
+
+def test_held_through_something_at_the_start() -> None:
+    start = scene().with_held({"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"})
+    task = phases(GoTo(0.0, 0.0), of=start)
+    assert task.holds == task.phases[0].held == (GRIP, Hold("ball", "pull", GRIP, "tip"))
+
+
+@pytest.mark.parametrize(
+    ("by", "match", "error"),
+    [
+        ("tip", "not a link of an object", InputError),
+        ("stik.tip", "stik", UnknownNameError),
+        ("stick.top", "top", UnknownNameError),
+        ("door.lever", "does not carry", InputError),
+        ("ball.ball", "does not carry", InputError),
+    ],
+)
+def test_invalid_holders_are_rejected(by: str, match: str, error: type[InputError]) -> None:
+    with pytest.raises(error, match=match) as caught:
+        phases(Grasp("stick"), Grasp("ball", by=by))
+    assert caught.value.field == "steps[1].by"
+
+
+def test_only_carried_objects_can_hold_others() -> None:
+    with pytest.raises(InputError, match="does not carry") as caught:
+        phases(Grasp("ball", by="stick.tip"))
+    assert (caught.value.field, caught.value.got) == ("steps[0].by", "'stick.tip'")
+    with pytest.raises(InputError, match="does not carry"):
+        phases(Place("stick", POSE), Grasp("ball", by="stick.tip"))
+    with pytest.raises(InputError, match="does not carry"):  # a door in the hand is not carried
+        phases(Grasp("door"), Grasp("ball", by="door.lever"))
+    with pytest.raises(InputError, match="held already"):
+        phases(Grasp("stick"), Grasp("stick", by="stick.tip"))
+
+
+# --- one hand
+# ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        Grasp("ball"),
+        Grasp("door"),
+        Actuate("drawer", {"slide": 0.2}),
+        Touch("ball.ball", POINT),
+        Place("ball", POINT),
+    ],
+    ids=lambda step: f"{type(step).__name__} {getattr(step, 'object', 'ball')}",
+)
+@pytest.mark.parametrize(
+    "first", [Grasp("stick"), Touch("stick.tip", POINT)], ids=["taken", "used"]
+)
+def test_hand_holds_one_object_only(first: Step, second: Step) -> None:
+    with pytest.raises(InputError, match="one hand") as caught:
+        phases(GoTo(0.0, 0.0), first, second)
+    assert str(caught.value.field).startswith("steps[2]")
+    assert "stick.grip" in str(caught.value)
+    with pytest.raises(InputError, match="one hand") as caught:
+        phases(second, of=scene().with_held({"stick": "end"}))
+    assert str(caught.value.field).startswith("steps[0]")
+    compile_task(scene(), [GoTo(0.0, 0.0), first, Release(), second], OPTIONS)
+
+
+def test_held_object_cannot_be_grasped_twice() -> None:
+    assert names(phases(Grasp("stick"), Grasp("stick"), Touch("stick.tip", POINT))) == [
+        "reach stick.grip",
+        "touch with stick.tip",
+    ]
+    with pytest.raises(InputError, match="held already") as caught:
+        phases(Grasp("stick"), Grasp("stick", "end"))
+    assert caught.value.field == "steps[1]"
+
+
+def test_free_objects_are_carried_along_and_doors_released() -> None:
+    for step in (
+        Reach(POSE),
+        Reach(POSE, "forearm_link"),
+        GoTo(0.0, 0.0),
+        Touch("forearm_link", POINT),
+    ):
+        carried = phases(Grasp("stick"), step)
+        assert held(carried) == [(), (GRIP,)]
+        assert (carried.phases[1].released, carried.after) == ((), (GRIP,))
+        shut = phases(Grasp("door"), step)
+        assert held(shut) == [(), ()]
+        assert (shut.phases[1].released, shut.after) == ((HANDLE,), ())
+    drawer = Actuate("drawer", {"slide": 0.2})
+    after = phases(
+        Actuate("door", {"knob": 0.1}), Grasp("stick"), GoTo(0.0, 0.0), Place("stick", POSE), drawer
+    )
+    assert [len(phase.held) for phase in after.phases] == [0, 1, 0, 1, 1, 0, 1]
+    assert after.phases[2].released == (HANDLE,)
+    assert after.phases[5].released == (GRIP,)
+
+
+# --- again
+# ------------------------------------------------------------------------------------------
+
+
+def test_placed_object_can_be_grasped_again() -> None:
+    task = phases(Place("stick", POSE), GoTo(0.0, 0.0), Touch("stick.tip", POINT))
+    assert names(task) == [
+        "reach stick.grip",
+        "place stick",
+        "go to",
+        "reach stick.grip",
+        "touch with stick.tip",
+    ]
+    assert task.holds == (GRIP,)
+    again, touch = task.phases[3:]
+    assert again.grasps == (GRIP,)
+    assert again.resting["stick"] == POSE
+    assert touch.lifted == {GRIP: POSE}
+    elsewhere = phases(Place("stick", POSE), Grasp("stick", "end"))
+    assert elsewhere.holds == (GRIP, END)
+    assert elsewhere.phases[2].released == (GRIP,)
+
+
+def test_previous_attachment_is_preferred() -> None:
+    task = phases(Place("stick", POSE, "end"), Touch("stick.tip", POINT))
+    assert task.holds == (END,)
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        [Grasp("stick"), Release()],
+        [Touch("stick.tip", POINT), Release("stick")],
+        [Place("stick", POINT)],
+    ],
+    ids=["taken and let go", "used and let go", "placed at a point"],
+)
+def test_object_of_uncertain_placement_cannot_be_grasped(before: Sequence[Step]) -> None:
+    for again in (Grasp("stick"), Touch("stick.tip", POSE), Place("stick", POSE)):
+        with pytest.raises(InputError, match="known only after planning") as caught:
+            phases(*before, again)
+        assert str(caught.value.field).startswith(f"steps[{len(before)}]")
+    other = phases(*before, Grasp("ball"))
+    assert other.phases[-1].grasps == (Hold("ball", "grip"),)
+
+
+# --- what is wrong
+# ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("step", "field", "nearest"),
+    [
+        (Touch("stick.top", POINT), "steps[0].frame", "tip"),
+        (Touch("stik.tip", POINT), "steps[0].frame", None),
+        (Touch("tol", POINT), "steps[0].frame", "tool"),
+        (Place("stik", POINT), "steps[0].object", "stick"),
+        (Place("stick", POINT, "gripp"), "steps[0].attachment", "grip"),
+        (Grasp("stick", "gripp"), "steps[0].attachment", "grip"),
+    ],
+)
+def test_unknown_names_are_rejected(step: Step, field: str, nearest: str | None) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        phases(step)
+    assert caught.value.field == field
+    if nearest:
+        assert caught.value.nearest == nearest
+
+
+@pytest.mark.parametrize(
+    ("step", "field"),
+    [
+        (Touch("door.lever", POINT), "steps[0].frame"),
+        (Place("door", POSE), "steps[0].object"),
+        (Actuate("stick", {"tip_joint": 0.0}), "steps[0].joints"),
+    ],
+)
+def test_fixed_objects_are_not_carried_and_free_objects_not_actuated(
+    step: Step, field: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        phases(step)
+    assert caught.value.field == field
+
+
+def test_joints_of_free_objects_are_not_actuated() -> None:
+    free = full_scene().objects["cabinet"]
+    loose = dataclasses.replace(free, object=dataclasses.replace(free.object, free=True))
+    with pytest.raises(InputError, match="is a free object") as caught:
+        phases(Actuate("cabinet", {"swing": 0.5}), of=with_objects(scene(), {"cabinet": loose}))
+    assert caught.value.field == "steps[0].object"
+
+
+def test_every_phase_has_all_placements() -> None:
+    """A free object is either in the hand or stands somewhere, never both."""
+    task = phases(
+        Touch("stick.tip", POINT),
+        Grasp("ball", by="stick.tip"),
+        Place("ball", POSE),
+        Place("stick", POSE),
+        Grasp("ball"),
+        Release(),
+        Actuate("drawer", {"slide": 0.1}),
+    )
+
+    def where(phase: Phase) -> tuple[set[str], set[str]]:
+        return {hold.object for hold in phase.held}, set(phase.resting)
+
+    for phase in task.phases:
+        carried, standing = where(phase)
+        assert not carried & standing
+        assert (carried | standing) >= {"stick", "ball"}
+        assert set(phase.released_by) <= standing
+    for before, after in zip(task.phases[:-1], task.phases[1:], strict=True):
+        assert set(after.held) == ({*before.held, *before.grasps} - set(after.released))
+        assert set(after.lifted) == {
+            hold
+            for hold in before.grasps
+            if hold in after.held and hold.object in ("stick", "ball")
+        }
+
+
+def test_a_door_is_not_held_through_a_stick() -> None:
+    with pytest.raises(InputError, match="is fixed in the world") as caught:
+        phases(Grasp("stick"), Grasp("door", by="stick.tip"))
+    assert caught.value.field == "steps[1].by"
+
+
+def test_error_names_the_missing_object() -> None:
+    with pytest.raises(InputError, match="stick") as caught:
+        phases(Touch("stik.tip", POINT))
+    assert caught.value.field == "steps[0].frame"

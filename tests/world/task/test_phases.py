@@ -1,0 +1,109 @@
+"""Tests names and keys of phases, and the truncation of tasks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.carrying import room, stand
+from helpers.small_problems import SHORT, full_scene
+
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import FrameGoal, Phase, Task, summarize_phases
+from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+
+POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
+FURNITURE: list[Step] = [
+    GoTo(0.5, 0.0),
+    Actuate("drawer", {"slide": 0.2}),
+    Reach(POSE),
+    Actuate("door", {"hinge": 1.0}),
+]
+CARRYING: list[Step] = [
+    Grasp("stick", "grip"),
+    Touch("stick.tip", (0.8, 0.9, 0.7)),
+    Grasp("ball", "pull", by="stick.tip"),
+    Place("ball", POSE),
+    Release("stick"),
+    GoTo(0.0, 0.0),
+]
+
+
+def scene_for(steps: list[Step]) -> Scene:
+    return full_scene() if steps is FURNITURE else room(stand(), objects=("stick", "ball"))
+
+
+def told(task: Task) -> list[tuple[object, ...]]:
+    """Return all that is said about the phases but placements, which have no equality."""
+    return [
+        (
+            p.key,
+            p.name,
+            p.segments,
+            p.held,
+            dict(p.ranges),
+            dict(p.values),
+            p.base,
+            p.grasps,
+            p.released,
+            dict(p.initial_values),
+            set(p.released_by),
+        )
+        for p in task.phases
+    ]
+
+
+@pytest.mark.parametrize("steps", [FURNITURE, CARRYING], ids=["furniture", "carrying"])
+def test_truncated_task_is_that_of_the_first_steps(steps: list[Step]) -> None:
+    scene = scene_for(steps)
+    whole = compile_task(scene, steps, SHORT)
+    for count in range(1, len(steps) + 1):
+        part, alone = whole.truncate(count), compile_task(scene, steps[:count], SHORT)
+        assert told(part) == told(alone)
+        assert (part.steps, part.holds, part.after, part.segments) == (
+            alone.steps,
+            alone.holds,
+            alone.after,
+            alone.segments,
+        )
+        assert dict(part.state) == dict(alone.state)
+        assert part.boundaries == alone.boundaries
+    assert whole.segments == sum(phase.segments for phase in whole.phases)
+    assert told(whole.truncate(len(steps))) == told(whole)
+
+
+def test_phase_names() -> None:
+    names = [phase.name for phase in compile_task(scene_for(CARRYING), CARRYING, SHORT).phases]
+    assert names == [
+        "reach stick.grip",
+        "touch with stick.tip",
+        "reach ball.pull by stick.tip",
+        "place ball",
+        "go to",
+    ]
+    assert Phase("turn", ("door.knob",), 3).name == "turn door.knob"
+    assert Phase("move", ("door.hinge", "door.knob"), 3).name == "move door.hinge, door.knob"
+    assert Phase("stand", (), 1).name == "stand still"
+    held = Hold("door", "handle")
+    assert str(FrameGoal("panel", POSE, hold=held)) == "door.panel"
+    assert str(FrameGoal("tool", POSE)) == "tool"
+
+
+def test_equal_keys_mean_equal_phases() -> None:
+    """However long they take and whatever is held."""
+    one, other = Phase("go", (), 3), Phase("go", (), 9, held=(Hold("cup", "side"),))
+    assert one.key == other.key
+    assert Phase("turn", ("door.knob",), 3).key != Phase("move", ("door.knob",), 3).key
+
+
+def test_summary_lists_held_objects() -> None:
+    found = summarize_phases(compile_task(scene_for(CARRYING), CARRYING, SHORT))
+    assert found[:4] == [
+        ("reach stick.grip", ()),
+        ("touch with stick.tip", ("stick",)),
+        ("reach ball.pull by stick.tip", ("stick",)),
+        ("place ball", ("stick", "ball")),
+    ]
+    assert found[-1] == ("go to", ())

@@ -1,0 +1,257 @@
+"""Tests the arguments of steps, their conversion to data, and their errors."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.scene.poses import as_placement, as_target
+from vkc_pin.world.task.steps import (
+    STEPS,
+    Actuate,
+    GoTo,
+    Grasp,
+    Place,
+    Reach,
+    Release,
+    Step,
+    Touch,
+    step_from_dict,
+    step_to_dict,
+)
+
+TURN = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([1.0, 2.0, 3.0]))
+
+
+@pytest.mark.parametrize(
+    "pose", [TURN, TURN.homogeneous, TURN.homogeneous.tolist(), [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]]
+)
+def test_poses(pose: Any) -> None:
+    np.testing.assert_allclose(as_placement(pose).homogeneous, TURN.homogeneous, atol=1e-15)
+    np.testing.assert_allclose(Reach(pose).pose.homogeneous, TURN.homogeneous, atol=1e-15)
+
+
+def test_a_pose_is_copied() -> None:
+    pose = pin.SE3(TURN)
+    step = Reach(pose)
+    pose.translation[:] = 0.0
+    assert step.pose == TURN
+
+
+def spoiled(row: int, column: int, value: float) -> np.ndarray:
+    matrix = TURN.homogeneous.copy()
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("pose", "problem"),
+    [
+        ("here", "not a pose"),
+        (None, "not a pose"),
+        ({"x": 1.0}, "not a pose"),
+        ([1.0, 2.0, 3.0], "not a pose"),
+        ([[1.0], [1.0, 2.0]], "not a pose"),
+        (np.eye(3), "not a pose"),
+        ([1.0, 2.0, 3.0, 0.0, 0.0, np.nan], "not finite"),
+        (spoiled(0, 3, np.inf), "not finite"),
+        (pin.SE3(np.eye(3), np.array([np.nan, 0.0, 0.0])), "not finite"),
+        (spoiled(0, 0, 0.5), "not a rotation"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "not a rotation"),
+        (pin.SE3(2.0 * np.eye(3), np.zeros(3)), "not a rotation"),
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "not a rotation"),
+        (spoiled(3, 3, 0.0), "last row"),
+        (pin.SE3(np.eye(3), np.ones(3)).homogeneous.T, "last row"),
+    ],
+)
+def test_invalid_poses_are_rejected(pose: Any, problem: str) -> None:
+    with pytest.raises(InputError, match=problem) as caught:
+        Reach(pose)
+    assert caught.value.field == "Reach.pose"
+    with pytest.raises(InputError) as caught:
+        as_placement(pose, name="target")
+    assert caught.value.field == "target"
+
+
+@pytest.mark.parametrize(
+    ("joints", "field"),
+    [
+        ({}, "Actuate.joints"),
+        (None, "Actuate.joints"),
+        (1.2, "Actuate.joints"),
+        ("hinge", "Actuate.joints"),
+        ([("hinge", 1.2)], "Actuate.joints"),
+        ({"hinge": "wide"}, "Actuate.joints['hinge']"),
+        ({"hinge": None}, "Actuate.joints['hinge']"),
+        ({"knob": 0.1, "hinge": np.nan}, "Actuate.joints['hinge']"),
+        ({"hinge": np.inf}, "Actuate.joints['hinge']"),
+    ],
+)
+def test_invalid_joints_are_rejected(joints: Any, field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Actuate("door", joints)
+    assert caught.value.field == field
+
+
+@pytest.mark.parametrize(
+    "point", [(1.0, -2.0, 3.0), [1, -2, 3], np.array([1.0, -2.0, 3.0]), np.array([1, -2, 3])]
+)
+def test_points(point: Any) -> None:
+    for target in (
+        as_target(point, name="p"),
+        Touch("stick.tip", point).target,
+        Place("stick", point).pose,
+    ):
+        assert target == (1.0, -2.0, 3.0)
+        assert [type(value) for value in target] == [float] * 3
+
+
+@pytest.mark.parametrize("pose", [TURN, TURN.homogeneous, [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]])
+def test_targets_that_are_poses(pose: Any) -> None:
+    for target in (
+        as_target(pose, name="p"),
+        Touch("stick.tip", pose).target,
+        Place("stick", pose).pose,
+    ):
+        assert isinstance(target, pin.SE3)
+        np.testing.assert_allclose(target.homogeneous, TURN.homogeneous, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("target", "problem"),
+    [
+        ("here", "not a pose"),
+        (None, "not a pose"),
+        (1.0, "not a pose"),
+        ([1.0, 2.0], "not a pose"),
+        ([1.0, 2.0, 3.0, 4.0], "not a pose"),
+        ([[1.0], [1.0, 2.0]], "not a pose"),
+        (np.zeros((3, 1)), "not a pose"),
+        ([0.0, np.nan, 0.0], "not finite"),
+        ([0.0, 0.0, -np.inf], "not finite"),
+        ([1.0, 2.0, 3.0, 0.0, np.inf, 0.0], "not finite"),
+        (spoiled(0, 0, 0.5), "not a rotation"),
+    ],
+)
+def test_invalid_targets_are_rejected(target: Any, problem: str) -> None:
+    for make, field in (
+        (lambda: Touch("stick.tip", target), "Touch.target"),
+        (lambda: Place("stick", target), "Place.pose"),
+    ):
+        with pytest.raises(InputError, match=problem) as caught:
+            make()
+        assert caught.value.field == field
+
+
+def test_a_point_is_copied() -> None:
+    point = np.ones(3)
+    step = Touch("stick.tip", point)
+    point[:] = 0.0
+    assert step.target == (1.0, 1.0, 1.0)
+
+
+def test_actuate_needs_joints() -> None:
+    with pytest.raises(InputError):
+        Actuate("door")
+
+
+@pytest.mark.parametrize("field", ["x", "y", "yaw"])
+@pytest.mark.parametrize("value", ["there", np.nan, -np.inf, [1.0, 2.0], {}])
+def test_invalid_base_goals_are_rejected(field: str, value: Any) -> None:
+    with pytest.raises(InputError) as caught:
+        GoTo(**{"x": 0.0, "y": 0.0, "yaw": 0.0, field: value})
+    assert caught.value.field == f"GoTo.{field}"
+
+
+def test_only_the_heading_is_optional() -> None:
+    assert GoTo(1.0, 2.0).yaw is None
+    with pytest.raises(InputError, match=r"GoTo\.x"):
+        GoTo(None, 2.0)  # type: ignore[arg-type]
+
+
+def test_numbers_become_plain() -> None:
+    step = GoTo(np.float32(1.0), np.int64(2), np.float64(3.0))  # type: ignore[arg-type]
+    assert [type(value) for value in vars(step).values()] == [float] * 3
+    assert {
+        type(value) for value in Actuate("door", {"hinge": np.float32(1.0)}).joints.values()
+    } == {float}
+    json.dumps([step_to_dict(step)])
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        Reach(TURN, "wrist_3_link"),
+        Reach(TURN),
+        Grasp("door"),
+        Grasp("door", "handle_free"),
+        Grasp("ball", by="stick.tip"),
+        Grasp("ball", "pull", "stick.tip"),
+        Touch("stick.tip", (1.0, 2.0, -3.0)),
+        Touch("tool", TURN),
+        Place("stick", [1.0, 2.0, 3.0]),
+        Place("stick", TURN, "end"),
+        Release(),
+        Release("stick"),
+        Actuate("door", {"hinge": 1.2, "knob": 0.1}, "handle"),
+        GoTo(1.0, -2.0),
+        GoTo(1.0, -2.0, 0.3),
+    ],
+)
+def test_round_trip(step: Step) -> None:
+    again = step_from_dict(json.loads(json.dumps(step_to_dict(step))))
+    assert type(again) is type(step)
+    assert step_to_dict(again) == step_to_dict(step)
+    assert again == step
+
+
+def test_every_kind_of_step_is_known_and_exported() -> None:
+    assert set(STEPS) == {Reach, Grasp, Actuate, GoTo, Touch, Place, Release}
+    assert {kind.__name__ for kind in STEPS} <= set(vkc.__all__)
+
+
+def test_steps_of_earlier_plans() -> None:
+    """Saved when a grasp could not yet go through anything."""
+    assert step_from_dict({"step": "Grasp", "object": "door", "attachment": None}) == Grasp("door")
+
+
+@pytest.mark.parametrize(
+    ("data", "field", "nearest"),
+    [
+        ({"step": "Actuat", "object": "door"}, "step", "Actuate"),
+        ({"object": "door"}, "step", None),
+        ({"step": "Grasp", "objects": "door"}, "Grasp.objects", "object"),
+        ({"step": "GoTo", "x": 0.0, "y": 0.0, "jaw": 0.0}, "GoTo.jaw", "yaw"),
+        ({"step": "Tuch", "frame": "tool", "target": [0.0, 0.0, 0.0]}, "step", "Touch"),
+        ({"step": "Touch", "frame": "tool", "targt": [0.0, 0.0, 0.0]}, "Touch.targt", "target"),
+        ({"step": "Place", "object": "stick", "pos": [0.0, 0.0, 0.0]}, "Place.pos", "pose"),
+        ({"step": "Release", "objects": "stick"}, "Release.objects", "object"),
+    ],
+)
+def test_data_with_unknown_names_are_rejected(
+    data: dict[str, Any], field: str, nearest: str | None
+) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        step_from_dict(data)
+    assert (caught.value.field, caught.value.nearest) == (field, nearest)
+
+
+@pytest.mark.parametrize(
+    ("data", "field"),
+    [
+        ({"step": "Reach"}, "Reach.pose"),
+        ({"step": "GoTo", "x": 1.0}, "GoTo.y"),
+        ({"step": "Touch", "frame": "tool"}, "Touch.target"),
+        ({"step": "Place", "pose": [0.0, 0.0, 0.0]}, "Place.object"),
+    ],
+)
+def test_incomplete_data_are_rejected(data: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        step_from_dict(data)
+    assert caught.value.field == field

@@ -1,0 +1,111 @@
+"""Tests which objects are supported by moving links in the phases of a task."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.riding import TOP, cup, folder, plates, trays
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError
+from vkc_pin.options import Options
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import Task
+
+THERE = pin.SE3(np.eye(3), np.array([-0.5, -1.5, 0.7]))
+
+
+def compiled(scene: Scene, *steps: vkc.Step) -> Task:
+    return compile_task(scene, steps, Options())
+
+
+def rides(task: Task) -> list[list[tuple[str, str]]]:
+    return [[(ride.object, ride.support) for ride in phase.supported] for phase in task.phases]
+
+
+def test_cup_on_the_plate_moves_with_it() -> None:
+    task = compiled(
+        plates(cups=2), vkc.Actuate("plate", {"slide": 0.4}), vkc.Grasp("cup"), vkc.GoTo(0.0, 0.0)
+    )
+    assert rides(task) == [[], [("cup", "plate.plate"), ("cup_1", "plate.plate")], [], []]
+    for name, y in (("cup", 0.05), ("cup_1", -0.07)):
+        np.testing.assert_allclose(
+            task.phases[1].resting[name].translation, [0.8, y, TOP], rtol=0.0, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            task.phases[2].resting[name].translation, [0.4, y, TOP], rtol=0.0, atol=1e-12
+        )
+    assert [hold.object for hold in task.phases[3].held] == ["cup"]
+
+
+def test_object_above_the_plate_or_on_the_post_does_not_move() -> None:
+    assert rides(compiled(plates(gap=0.05), vkc.Actuate("plate", {"slide": 0.4}))) == [[], []]
+
+
+def test_tilting_support_is_rejected() -> None:
+    assert rides(compiled(plates("turntable"), vkc.Actuate("plate", {"turn": 0.5})))[1] == [
+        ("cup", "plate.plate")
+    ]
+    assert rides(compiled(plates("flap"), vkc.Actuate("plate", {"tip": 0.09})))[1] == [
+        ("cup", "plate.plate")
+    ]
+    with pytest.raises(
+        InputError, match=r"'cup' rests on 'plate\.plate', which would tilt too much"
+    ) as caught:
+        compiled(plates("flap"), vkc.Actuate("plate", {"tip": 0.5}))
+    assert caught.value.field == "steps[0]"
+    assert "0.50 rad" in str(caught.value)
+
+
+def test_object_on_moving_and_fixed_links_is_rejected() -> None:
+    scene = plates(cups=0)
+    shelf = {
+        "name": "shelf",
+        "type": "box",
+        "size": [0.2, 0.4, 0.02],
+        "position": [1.1, 0.0, TOP - 0.01],
+    }
+    document = {
+        **scene.document,
+        "objects": [*scene.document["objects"], cup(at=(1.0, 0.0, TOP))],
+        "obstacles": [shelf],
+    }
+    between = Scene.from_document(document, folder())
+    with pytest.raises(
+        InputError, match=r"rests both on a moving and on a fixed link: 'plate\.plate' and 'shelf'"
+    ):
+        compiled(between, vkc.Actuate("plate", {"slide": 0.4}))
+    assert rides(compiled(between, vkc.GoTo(0.0, 0.0))) == [[]]
+
+
+def test_cup_placed_on_the_plate_moves_with_it() -> None:
+    scene = plates().with_placement("cup", pin.SE3(np.eye(3), np.array([0.0, 1.0, 0.0])))
+    steps = vkc.Place("cup", [0.8, 0.05, TOP]), vkc.Actuate("plate", {"slide": 0.4})
+    task = compiled(scene, *steps)
+    assert rides(task)[-1] == [("cup", "plate.plate")]
+    assert "cup" in task.phases[-2].released_by  # at a heading that the motion decides
+    assert "cup" not in task.phases[-1].released_by
+
+
+def test_cup_on_the_held_tray_moves_with_it() -> None:
+    task = compiled(trays(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
+    assert rides(task) == [[], [("cup", "tray.tray")], []]
+    left = task.phases[2].resting["cup"].translation
+    np.testing.assert_allclose(
+        left, THERE.translation + np.array([0.02, 0.05, 0.02]), rtol=0.0, atol=1e-12
+    )
+
+
+def test_supported_object_cannot_be_grasped() -> None:
+    with pytest.raises(InputError, match="'cup' rests on an object that the robot carries"):
+        compiled(trays(), vkc.Grasp("tray"), vkc.Grasp("cup", by="tray.tray"))
+
+
+def test_supported_object_of_uncertain_placement_cannot_be_grasped() -> None:
+    with pytest.raises(
+        InputError, match="the placement of 'cup' at this step is known only after planning"
+    ):
+        compiled(trays(), vkc.Place("tray", [-0.5, -1.5, 0.7]), vkc.Grasp("cup"))
+    compiled(trays(), vkc.Place("tray", THERE), vkc.Grasp("cup"))

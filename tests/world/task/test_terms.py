@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers.carrying import room, table
+from helpers.drives import hall
+
+import vkc_pin as vkc
+from vkc_pin.world.task.terms import check_terms_active, term_from_dict, term_to_dict, trace_terms
+
+PERSON = np.array([1.0, 2.0, 1.0])
+SHORT = vkc.Options(reach_waypoints=3)
+
+
+def tilt(**fields: Any) -> vkc.Constraint:
+    return vkc.Constraint(
+        "upright", lambda s: s.rotation("stick.stick")[2, 2], **{"lower": 0.98, **fields}
+    )
+
+
+def three() -> list[vkc.Constraint | vkc.Cost]:
+    slow = vkc.Constraint(
+        "slow",
+        lambda s: (
+            ca.norm_2(s.velocity("tool")) - 0.2 - 0.5 * ca.norm_2(PERSON - s.position("tool"))
+        ),
+        upper=0.0,
+    )
+    within = vkc.Constraint(
+        "within",
+        lambda s: s.position("tool"),
+        lower=[-1, -2, 0],
+        upper=[1, 2, np.inf],
+        tolerance=1e-2,
+    )
+    return [
+        slow,
+        within,
+        vkc.Cost(
+            "elbow", lambda s: (s.coordinate("elbow_joint") - 1.5) ** 2, weight=0.1, holding="stick"
+        ),
+    ]
+
+
+def test_terms_become_data_and_back() -> None:
+    found = trace_terms(room(table()), three())
+    assert [term.name for term in found] == ["slow", "within", "elbow"]
+    assert [term.formula.uses_time_step for term in found] == [True, False, False]
+    for term in found:
+        again = term_from_dict(json.loads(json.dumps(term_to_dict(term))))
+        assert again == term
+        assert hash(again) == hash(term)
+    assert trace_terms(room(table()), found) == found
+    assert trace_terms(room(table()), []) == ()
+
+
+def test_bounds() -> None:
+    unbounded = np.inf
+    slow, within, _ = trace_terms(room(table()), three())
+    assert isinstance(slow, vkc.Constraint)
+    assert isinstance(within, vkc.Constraint)
+    np.testing.assert_array_equal(slow.compute_bounds(1), [[-unbounded], [0.0]])
+    np.testing.assert_array_equal(within.compute_bounds(3), [[-1, -2, 0], [1, 2, unbounded]])
+    np.testing.assert_array_equal(tilt(upper=1).compute_bounds(2), [[0.98, 0.98], [1.0, 1.0]])
+
+
+def test_when_terms_are_active() -> None:
+    always, placing, carrying = tilt(), tilt(during="place stick"), tilt(holding="stick")
+    assert placing.during == ("place stick",)
+    assert [term.is_active("place stick", ()) for term in (always, placing, carrying)] == [
+        True,
+        True,
+        False,
+    ]
+    assert [term.is_active("go to", ("stick",)) for term in (always, placing, carrying)] == [
+        True,
+        False,
+        True,
+    ]
+    both = tilt(during=["place stick", "go to"], holding="stick")
+    assert [
+        both.is_active(*when) for when in (("go to", ()), ("go to", ["stick"]), ("move", ["stick"]))
+    ] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"lower": None}, r"terms\['upright'\]\.lower, upper: no bound"),
+        ({"lower": -np.inf}, r"terms\['upright'\]\.lower, upper: no bound"),
+        ({"lower": -np.inf, "upper": np.inf}, "no bound"),
+        ({"lower": [0.0, -np.inf]}, "no bound"),
+        ({"lower": np.inf}, r"\.lower: no such bound"),
+        ({"upper": np.nan}, r"\.upper: no such bound"),
+        ({"lower": [[0.0]]}, r"\.lower: no such bound"),
+        ({"lower": []}, r"\.lower: no such bound"),
+        ({"lower": "low"}, r"\.lower: not a number"),
+        ({"upper": 0.9}, "lower is more than upper"),
+        ({"lower": [0, 3], "upper": [1, 2]}, "lower is more than upper"),
+        ({"lower": [0, 0], "upper": [1, 2, 3]}, "wrong number of bounds"),
+        ({"tolerance": 0.0}, r"\.tolerance: out of range"),
+        ({"tolerance": True}, r"\.tolerance: out of range"),
+        ({"during": []}, r"\.during: not phases"),
+        ({"during": [3]}, r"\.during: not phases"),
+        ({"holding": 3}, r"\.holding: not an object"),
+    ],
+)
+def test_errors_name_the_invalid_field(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(vkc.InputError, match=message):
+        tilt(**fields)
+
+
+def test_names_expressions_and_weights_are_checked() -> None:
+    with pytest.raises(vkc.InputError, match=r"Cost\.name: not a name"):
+        vkc.Cost("", lambda s: s.coordinate("base_x"))
+    with pytest.raises(vkc.InputError, match=r"terms\['far'\]\.expression: not a function"):
+        vkc.Constraint("far", 3.0, lower=0.0)  # type: ignore[arg-type]
+    for weight in (0.0, -1.0, np.nan, np.inf, "much"):
+        with pytest.raises(vkc.InputError, match=r"terms\['far'\]\.weight: out of range"):
+            vkc.Cost("far", lambda s: s.coordinate("base_x"), weight=weight)  # type: ignore[arg-type]
+    with pytest.raises(TypeError):
+        vkc.Cost("far", lambda s: s.coordinate("base_x"), 0.1)  # type: ignore[misc]
+
+
+def own(s: vkc.State) -> Any:
+    raise ZeroDivisionError("mine")
+
+
+@pytest.mark.parametrize(
+    ("expression", "message"),
+    [
+        (lambda s: 3.0, "it does not depend on the state"),
+        (lambda s: ca.SX(3.0), "it does not depend on the state"),
+        (lambda s: 0 * s.coordinate("base_x"), "it does not depend on the state"),
+        (lambda s: None, "no CasADi expression"),
+        (lambda s: [s.coordinate("base_x")], "no CasADi expression"),
+        (lambda s: s.rotation("tool"), "wrong shape"),
+        (lambda s: ca.SX(0, 1), "wrong shape"),
+        (lambda s: s.coordinate("base_x") >= 1.0, "a comparison"),
+        (lambda s: s.coordinate("base_x") + ca.SX.sym("mine"), "it has symbols of its own"),
+        (
+            lambda s: s.coordinate("base_x") if s.coordinate("base_y") > 0 else 0.0,
+            "it cannot be evaluated",
+        ),
+        (own, "it cannot be evaluated.*mine"),
+        (lambda s: s.position("tool")[7], "it cannot be evaluated"),
+    ],
+)
+def test_errors_name_the_invalid_expression(
+    expression: Callable[[vkc.State], Any], message: str
+) -> None:
+    with pytest.raises(vkc.InputError, match=rf"(?s)^terms\['mine'\]\.expression: {message}"):
+        trace_terms(hall(), [vkc.Constraint("mine", expression, lower=0.0)])
+
+
+def test_costs_are_numbers_and_bounds_fit_expressions() -> None:
+    with pytest.raises(vkc.InputError, match=r"wrong shape.*a number, got shape"):
+        trace_terms(hall(), [vkc.Cost("far", lambda s: s.position("tool"))])
+    with pytest.raises(vkc.InputError, match=r"wrong number of bounds.*one number, or 3"):
+        trace_terms(hall(), [vkc.Constraint("far", lambda s: s.position("tool"), lower=[0.0, 0.0])])
+    with pytest.raises(vkc.InputError, match="wrong number of bounds"):
+        trace_terms(
+            hall(), [vkc.Constraint("far", lambda s: s.coordinate("base_x"), lower=[0.0, 0.0])]
+        )
+
+
+def test_unknown_names_are_named() -> None:
+    scene = room(table())
+    for expression, nearest in (
+        (lambda s: s.position("stick.tipp"), "stick.tip"),
+        (lambda s: s.velocity("tol"), "tool"),
+        (lambda s: s.coordinate("elbow_jiont"), "elbow_joint"),
+    ):
+        with pytest.raises(vkc.UnknownNameError) as caught:
+            trace_terms(scene, [vkc.Cost("mine", expression)])
+        assert (caught.value.nearest, caught.value.field) == (nearest, "terms['mine'].expression")
+    with pytest.raises(vkc.UnknownNameError) as caught:
+        trace_terms(scene, [tilt(holding="stik")])
+    assert (caught.value.nearest, caught.value.field) == ("stick", "terms['upright'].holding")
+    with pytest.raises(vkc.UnknownNameError, match="there is no frame 'stick"):  # traced elsewhere
+        trace_terms(hall(), trace_terms(scene, [tilt()]))
+
+
+def test_lists_of_terms_are_checked() -> None:
+    for terms in (tilt(), 3, "upright"):
+        with pytest.raises(vkc.InputError, match=r"^terms(\[0\])?: not a list"):
+            trace_terms(room(table()), terms)  # type: ignore[arg-type]
+    with pytest.raises(vkc.InputError, match=r"terms\[1\]: wrong kind of entry"):
+        trace_terms(room(table()), [tilt(), lambda s: 0])  # type: ignore[list-item]
+    with pytest.raises(vkc.InputError, match="two terms share a name"):
+        trace_terms(room(table()), [tilt(), tilt(lower=0.5)])
+
+
+def test_unknown_phases_are_rejected() -> None:
+    phases = [("reach stick.grip", ()), ("place stick", ("stick",))]
+    check_terms_active([tilt(), tilt(during="place stick"), tilt(holding="stick")], phases)
+    with pytest.raises(vkc.UnknownNameError, match="there is no phase 'place stik'") as caught:
+        check_terms_active([tilt(during=["place stick", "place stik"])], phases)
+    assert (caught.value.nearest, caught.value.choices) == (
+        "place stick",
+        ("reach stick.grip", "place stick"),
+    )
+    for wrong in (tilt(holding="ball"), tilt(holding="stick", during="reach stick.grip")):
+        with pytest.raises(vkc.InputError, match="never held in these phases"):
+            check_terms_active([wrong], phases)
+
+
+@pytest.mark.parametrize("function", [vkc.plan, vkc.build])
+def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -> None:
+    steps = [vkc.Place("stick", (0.8, 0.5, 0.56)), vkc.GoTo(0.0, 0.0)]
+    for terms, message in (
+        (
+            [tilt(during="plaice stick")],
+            "there is no phase 'plaice stick'; did you mean 'place stick'",
+        ),
+        ([vkc.Cost("far", lambda s: s.position("too")[0])], "there is no frame 'too'"),
+        ([tilt(lower=[0, 0])], "wrong number of bounds"),
+        (tilt(), "terms: not a list"),
+    ):
+        with pytest.raises(vkc.InputError, match=message):
+            function(room(table()), steps, options=SHORT, terms=terms)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"code": None},
+        {"code": "rm"},
+        {"code": [["open", [0], 0, 0.0]]},
+        {"code": [["sin", [9], 0, 0.0]]},
+        {"code": [["input", [99], 0, 0.0]]},
+        {"code": [["input", [], 0, 0.0]]},
+        {"rows": "many"},
+        {"rows": -1},
+        {"frames": None},
+        {"frames": []},
+    ],
+)
+def test_saved_expressions_that_are_damaged_are_refused(wrong: dict[str, Any]) -> None:
+    (term,) = trace_terms(room(table()), [tilt()])
+    data = term_to_dict(term)
+    with pytest.raises(vkc.InputError, match="not a saved term"):
+        term_from_dict({**data, "expression": {**data["expression"], **wrong}})
+
+
+def test_saved_terms_that_are_damaged_are_refused() -> None:
+    (term,) = trace_terms(room(table()), [tilt()])
+    data = term_to_dict(term)
+    for broken in (
+        {**data, "term": "Wish"},
+        {**data, "colour": 3},
+        {},
+        {k: v for k, v in data.items() if k != "name"},
+    ):
+        with pytest.raises(vkc.InputError, match="not a saved term"):
+            term_from_dict(broken)
+    with pytest.raises(vkc.InputError, match="lower is more than upper"):
+        term_from_dict({**data, "upper": 0.5})
+
+
+def test_a_term_is_frozen() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        tilt().lower = 0.5  # type: ignore[misc]

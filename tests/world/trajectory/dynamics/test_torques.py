@@ -1,0 +1,143 @@
+"""Torques of the arm: against energies, and against the oracle's virtual work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.closers import changed, closer
+from oracle import motors
+from oracle.plan import read_plan
+from oracle.stage import World as Judged
+
+import vkc_pin as vkc
+from vkc_pin.validation.dynamics.torques import MotorLoads
+from vkc_pin.validation.samples import Samples
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
+from vkc_pin.world.trajectory.world_model import World
+
+
+def swung(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
+    """Return a scene with the stick in the hand, and a motion of arm and base in it."""
+    scene = changed(vkc.load_scene("init_1"), "stick", mass=mass).with_held({"stick": "grip"})
+    names = (*scene.robot.coordinates.names, "stick.grip_slide", "stick.grip_turn")
+    times, rng = np.linspace(0.0, 1.5, 6), np.random.default_rng(3)
+    size = len(scene.start)
+    positions = np.tile([*scene.start, *scene.holds[0].at], (6, 1))
+    scale = np.array([base] * 3 + [0.5] * (size - 3))
+    positions[:, :size] += scale * np.cumsum(rng.uniform(-1.0, 1.0, (6, size)), axis=0)
+    rates = np.zeros_like(positions)
+    rates[1:-1, :size] = scale * rng.uniform(-1.0, 1.0, (4, size))
+    phase = PhaseSpan("swing", 0, 5, scene.holds)
+    return scene, Trajectory(
+        names, times, positions, (phase,), size, Curve(times, positions, rates)
+    )
+
+
+def energy(world: World, motion: Trajectory, moment: float) -> float:
+    """Return what robot and stick have, of where their bodies are a moment before and after [J]."""
+    h = 1e-5
+    rows = world.coordinates.q(
+        world.compute_positions(motion, np.array([moment - h, moment, moment + h]))
+    )
+    found, places = 0.0, []
+    for q in rows:
+        data = world.model.createData()
+        pin.forwardKinematics(world.model, data, q)
+        places.append([data.oMi[j].copy() for j in range(world.model.njoints)])
+    for j in range(2, world.model.njoints):
+        inertia = world.model.inertias[j]
+        speed = (places[2][j] * inertia.lever - places[0][j] * inertia.lever) / (2.0 * h)
+        spin = pin.log3(places[0][j].rotation.T @ places[2][j].rotation) / (2.0 * h)
+        found += (
+            0.5 * inertia.mass * speed @ speed + 0.5 * spin @ np.asarray(inertia.inertia) @ spin
+        )
+        found += 9.81 * inertia.mass * (places[1][j] * inertia.lever)[2]
+    return found
+
+
+@pytest.mark.parametrize("mass", [0.0, 4.0])
+def test_motors_give_the_energy_that_arm_and_payload_gain(mass: float) -> None:
+    scene, motion = swung(mass)
+    world = World(scene)
+    for moment in (0.35, 0.8, 1.3):
+        torques, rates = Torques(scene, motion).along(np.array([moment])), motion.velocity(moment)
+        power = float(torques[0] @ rates[: motion.robot_size])
+        gained = (
+            energy(world, motion, moment + 1e-3) - energy(world, motion, moment - 1e-3)
+        ) / 2e-3
+        assert power == pytest.approx(gained, rel=2e-3, abs=2e-2)
+
+
+def test_a_payload_at_rest_weighs_by_its_lever() -> None:
+    torques = []
+    for mass in (0.0, 3.0):
+        scene, motion = swung(mass)
+        still = np.zeros_like(motion.positions[:1])
+        torques.append(
+            Torques(scene, motion).at(np.zeros(1, int), motion.positions[:1], still, still)[0]
+        )
+    world = World(scene)
+    (q,) = world.coordinates.q(world.compute_positions(motion, motion.times[:1]))
+    data = world.model.createData()
+    jacobian = pin.computeJointJacobians(world.model, data, q)[:, : motion.robot_size]
+    pin.forwardKinematics(world.model, data, q)
+    joint = world.model.getJointId("stick.placement")
+    where = data.oMi[joint] * world.model.inertias[joint].lever
+    axes, hand = jacobian.T, []
+    for twist in axes[3:]:
+        hand.append(3.0 * 9.81 * (twist[:3] + np.cross(twist[3:], where))[2])
+    np.testing.assert_allclose(torques[1][3:] - torques[0][3:], hand, atol=1e-6)
+
+
+def seen(plan: vkc.Plan, file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest torque of every joint as the package and the oracle find it."""
+    own = MotorLoads(Samples(plan.scene, plan.trajectory)).torques
+    plan.save(file)
+    world = Judged(read_plan(file))
+    found = dict.fromkeys(world.robot.arm, 0.0)
+    excess, carries = motors.EXCESS, motors._carries
+    motors.EXCESS, motors._carries = -1.0, lambda *_: True  # type: ignore[assignment]
+    try:
+        for stage in world.stages():
+            for violation in motors.check_motors(world, stage):
+                found[violation.subject] = max(found[violation.subject], violation.amount)
+    finally:
+        motors.EXCESS, motors._carries = excess, carries
+    return np.abs(own).max(axis=0)[3:], np.array(list(found.values()))
+
+
+def test_virtual_work_comes_to_the_same_at_a_door_that_resists(tmp_path: Path) -> None:
+    scene = closer(damping=60.0, friction=3.0, stiffness=20.0, springref=-1.0)
+    plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2}, "handle_free")])
+    assert plan.success
+    own, other = seen(plan, tmp_path / "door.npz")
+    np.testing.assert_allclose(own, other, rtol=0.02, atol=0.05)
+
+
+def test_and_with_a_tray_and_what_stands_on_it(tmp_path: Path) -> None:
+    plan = vkc.plan(vkc.load_scene("tray"), [vkc.Place("tray", [-0.3, -1.96, 0.7])])
+    assert plan.success
+    own, other = seen(plan, tmp_path / "tray.npz")
+    np.testing.assert_allclose(own, other, rtol=0.02, atol=0.05)
+    alone = Torques(
+        changed(changed(plan.scene, "tray", mass=0.0), "cup", mass=0.0), plan.trajectory
+    )
+    assert "tray" in alone.massless_objects
+
+
+def test_acceleration_of_the_base_pulls_at_the_arm() -> None:
+    scene, motion = swung(2.0, base=0.4)
+    _, still = swung(2.0)
+    times = np.array([0.4, 0.9])
+    assert (
+        np.abs(Torques(scene, motion).along(times) - Torques(scene, still).along(times))[
+            :, 3:
+        ].max()
+        > 0.5
+    )
+    assert not Torques(scene, motion).along(times)[:, :3].any()

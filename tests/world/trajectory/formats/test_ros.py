@@ -1,0 +1,308 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.fake_plan import fake_plan
+from helpers.written import FILES, broken, trajectories
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.interpolate import PchipInterpolator
+
+import vkc_pin as vkc
+from vkc_pin.planning.plan import Plan
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.formats.ros import along, rates
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+COLUMNS = arrays(
+    float, st.tuples(st.integers(2, 8), st.integers(1, 3)), elements=st.floats(-10.0, 10.0)
+)
+
+
+def some(rng: np.random.Generator, n: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    return np.cumsum(rng.uniform(0.1, 0.5, n)), np.cumsum(rng.uniform(-0.2, 0.5, (n, 4)), axis=0)
+
+
+def test_velocities_inside_are_those_of_scipys_monotone_cubic() -> None:
+    times, positions = some(np.random.default_rng(0))
+    velocities, _ = rates(times, positions)
+    np.testing.assert_allclose(
+        velocities[1:-1], PchipInterpolator(times, positions).derivative()(times)[1:-1], atol=1e-12
+    )
+    assert (velocities[[0, -1]] == 0.0).all()
+
+
+def test_velocities_and_accelerations_are_the_derivatives_of_a_smooth_motion() -> None:
+    times = np.linspace(0.2, 1.2, 101)
+    velocities, accelerations = rates(times, np.sin(times)[:, None])
+    np.testing.assert_allclose(velocities[1:-1, 0], np.cos(times)[1:-1], atol=1e-4)
+    np.testing.assert_allclose(accelerations[1:-1, 0], -np.sin(times)[1:-1], atol=1e-4)
+
+
+def test_between_waypoints_the_derivatives_belong_to_the_positions() -> None:
+    times, positions = some(np.random.default_rng(1))
+    velocities, _ = rates(times, positions)
+    moments = np.linspace(times[0] + 0.01, times[-1] - 0.01, 57)
+    moments = moments[np.abs(moments[:, None] - times).min(axis=1) > 1e-4]
+    step = 1e-5
+    before, here, after = (
+        along(times, positions, velocities, moments + d) for d in (-step, 0.0, step)
+    )
+    np.testing.assert_allclose((after[0] - before[0]) / (2 * step), here[1], atol=1e-6)
+    np.testing.assert_allclose((after[1] - before[1]) / (2 * step), here[2], atol=1e-4)
+
+
+def test_it_passes_the_waypoints_with_their_velocities() -> None:
+    times, positions = some(np.random.default_rng(2))
+    velocities, _ = rates(times, positions)
+    place, speed, _ = along(times, positions, velocities, times)
+    np.testing.assert_array_equal(place, positions)
+    np.testing.assert_allclose(speed, velocities, atol=1e-12)
+
+
+@given(COLUMNS, st.integers(0, 1000))
+def test_no_coordinate_leaves_the_range_between_two_waypoints(
+    positions: np.ndarray, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.01, 2.0, len(positions)))
+    velocities, accelerations = rates(times, positions)
+    assert np.isfinite(velocities).all()
+    assert np.isfinite(accelerations).all()
+    moments = np.sort(rng.uniform(times[0], times[-1], 50))
+    place, _, _ = along(times, positions, velocities, moments)
+    at = np.clip(np.searchsorted(times, moments, side="right") - 1, 0, len(times) - 2)
+    assert (place >= np.minimum(positions[at], positions[at + 1])).all()
+    assert (place <= np.maximum(positions[at], positions[at + 1])).all()
+
+
+def test_what_rests_stays_at_rest() -> None:
+    times = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    positions = np.array([[0.0], [1.0], [1.0], [1.0], [0.5]])
+    velocities, accelerations = rates(times, positions)
+    assert (velocities == 0.0).all()
+    assert (accelerations == 0.0).all(), "it turns round where it rests"
+    place, speed, change = along(times, positions, velocities, np.linspace(1.0, 2.99, 20))
+    assert (place == 1.0).all()
+    assert (speed == 0.0).all()
+    assert (change == 0.0).all()
+
+
+def test_a_turn_without_a_rest_has_an_acceleration() -> None:
+    velocities, accelerations = rates(np.array([0.0, 1.0, 2.0]), np.array([[0.0], [1.0], [0.0]]))
+    assert velocities[1, 0] == 0.0
+    assert accelerations[1, 0] == pytest.approx(-2.0)
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return fake_plan()
+
+
+@FILES
+@given(trajectory=trajectories(largest=1e6))
+def test_ros_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None:
+    back = Trajectory.from_ros(
+        json.loads(json.dumps(trajectory.to_ros(joints="all"))), like=trajectory
+    )
+    np.testing.assert_allclose(
+        back.times, trajectory.times - trajectory.times[0], rtol=0.0, atol=1e-9
+    )
+    assert {**back.to_dict(), "times": 0} == {**trajectory.to_dict(), "times": 0}
+
+
+def test_a_message_has_the_fields_of_a_joint_trajectory(plan: Plan) -> None:
+    message = plan.to_ros(frame="map", stamp=1.5)
+    assert json.loads(json.dumps(message)) == message, "plain data"
+    assert set(message) == {"header", "joint_names", "points"}
+    assert message["header"] == {"stamp": {"sec": 1, "nanosec": 500_000_000}, "frame_id": "map"}
+    assert message["joint_names"] == list(plan.trajectory.names[:9]), "what has a motor"
+    for point, moment in zip(message["points"], plan.trajectory.times, strict=True):
+        assert set(point) == {
+            "positions",
+            "velocities",
+            "accelerations",
+            "effort",
+            "time_from_start",
+        }
+        assert {len(point[key]) for key in ("positions", "velocities", "accelerations")} == {9}
+        assert point["effort"] == []
+        since = point["time_from_start"]
+        assert type(since["sec"]) is type(since["nanosec"]) is int
+        assert 0 <= since["nanosec"] < 1_000_000_000
+        assert since["sec"] + 1e-9 * since["nanosec"] == pytest.approx(moment, abs=1e-9)
+    for end in (message["points"][0], message["points"][-1]):
+        assert set(end["velocities"]) == {0.0}
+
+
+def test_fewer_derivatives(plan: Plan) -> None:
+    for count in (0, 1, 2):
+        point = plan.to_ros(derivatives=count)["points"][1]
+        assert [len(point["velocities"]) > 0, len(point["accelerations"]) > 0] == [
+            count > 0,
+            count > 1,
+        ]
+
+
+def test_a_rate_that_would_fill_the_memory(plan: Plan) -> None:
+    duration = float(np.ptp(plan.trajectory.times))
+    with pytest.raises(vkc.InputError, match="too many points") as caught:
+        plan.to_ros(rate=1.1e6 / duration / len(plan.scene.start))
+    assert caught.value.field == "rate"
+    assert f"{1e6 // len(plan.scene.start) / duration:.4g} a second" in str(caught.value)
+
+
+@pytest.mark.parametrize("rate", [1.0, 7.0, 50])
+def test_points_at_a_rate(plan: Plan, rate: float) -> None:
+    message = plan.to_ros(rate=rate, joints="all")
+    times = np.array(
+        [
+            p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"]
+            for p in message["points"]
+        ]
+    )
+    assert len(times) == np.ceil(6.0 * rate) + 1
+    np.testing.assert_allclose(times[:-1], np.arange(len(times) - 1) / rate, atol=1e-9)
+    assert times[-1] == pytest.approx(6.0)
+    assert message["points"][0]["positions"] == plan.trajectory.positions[0].tolist()
+    assert message["points"][-1]["positions"] == plan.trajectory.positions[-1].tolist()
+    assert np.ptp([point["positions"] for point in message["points"]], axis=0) == pytest.approx(
+        np.ptp(plan.trajectory.positions, axis=0)
+    )
+
+
+@pytest.mark.parametrize("rate", [1.0, 3.0, 25.0])
+def test_rests_last_as_long_at_any_rate(rate: float) -> None:
+    """Where all stands still there are points at both ends of it, and none beside them but those of the rate."""
+    knots = np.array([0.0, 1.1, 1.4, 2.0, 2.00002, 3.3])
+    places = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0])[:, None] * np.ones(3)
+    curve = Curve(knots, places, np.zeros((6, 3)))
+    motion = Trajectory(
+        ("base_x", "base_y", "base_yaw"), knots, places, (vkc.PhaseSpan("drive", 0, 5),), 3, curve
+    )
+    sent = Trajectory.from_ros(motion.to_ros(rate=rate))
+    even = np.append(np.arange(np.ceil(3.3 * rate - 1e-6)) / rate, 3.3)
+    even = even[(np.abs(even[:, None] - knots[1:5]) > 1e-4).all(axis=1)]
+    np.testing.assert_allclose(sent.times, np.sort([*even, *knots[1:5]]), atol=1e-8)
+    moments = np.linspace(1.1, 1.4, 20)
+    np.testing.assert_allclose(sent.at(moments), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rate": 0.0}, "rate: out of range"),
+        ({"rate": "10"}, "rate: out of range"),
+        ({"derivatives": 3}, "derivatives: out of range"),
+        ({"stamp": -1.0}, "stamp: out of range"),
+        ({"joints": []}, "joints: no joints"),
+        ({"joints": (), "rate": 10.0}, "joints: no joints"),
+    ],
+)
+def test_bad_options(plan: Plan, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(vkc.InputError, match=message):
+        plan.to_ros(**options)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_group_may_be_empty(plan: Plan, smooth: bool) -> None:
+    """A motion in which no object moves has no coordinates of objects."""
+    motion = plan.trajectory
+    spans = (vkc.PhaseSpan("drive", 0, len(motion.times) - 1),)
+    base = vkc.Trajectory(motion.names[:3], motion.times, motion.positions[:, :3], spans, 3)
+    message = base.to_ros(joints="objects", rate=2.0, smooth=smooth)
+    assert message["joint_names"] == []
+    assert {len(point["positions"]) for point in message["points"]} == {0}
+
+
+def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """Return a copy with another value at a path such as "points/0/positions"; None removes it."""
+    copy = json.loads(json.dumps(message))
+    *way, last = [int(part) if part.isdigit() else part for part in path.split("/")]
+    inner = copy
+    for part in way:
+        inner = inner[part]
+    if value is None:
+        del inner[last]
+    else:
+        inner[last] = value
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "expected"),
+    [
+        ("joint_names", None, "joint_names: this is missing"),
+        ("joint_names", "x", "joint_names: wrong kind of value .expected a list, got 'x'"),
+        ("joint_names/1", "base_x", "Trajectory.names: a name occurs twice"),
+        ("points", {}, "points: wrong kind of value"),
+        ("points", [], "Trajectory.times: times do not increase"),
+        ("points/2", 3, r"points\[2\].positions: this is missing"),
+        (
+            "points/2/positions",
+            [1.0],
+            r"points\[2\].positions: wrong number of values .expected 9, got 1",
+        ),
+        (
+            "points/2/positions/4",
+            "far",
+            r"points\[2\].positions\[4\]: not a number .expected a number, got 'far'",
+        ),
+        ("points/2/positions/4", True, r"points\[2\].positions\[4\]: not a number"),
+        ("points/2/positions/4", float("nan"), r"Trajectory.positions\[2, 4\]: not finite"),
+        (
+            "points/1/time_from_start/sec",
+            0.5,
+            r"points\[1\].time_from_start.sec: wrong kind of value .expected a whole number",
+        ),
+        ("points/1/time_from_start", None, r"points\[1\].time_from_start: this is missing"),
+        (
+            "points/1/time_from_start/nanosec",
+            None,
+            r"points\[1\].time_from_start.nanosec: this is missing",
+        ),
+        ("points/1/time_from_start/sec", 5, "Trajectory.times: times do not increase"),
+    ],
+)
+def test_bad_messages(plan: Plan, tmp_path: Path, path: str, value: Any, expected: str) -> None:
+    message = changed(plan.to_ros(), path, value)
+    with pytest.raises(vkc.InputError, match=f"^{expected}"):
+        Trajectory.from_ros(message)
+    with pytest.raises(vkc.InputError, match=f"bad.json: {expected}"):
+        Trajectory.from_ros(broken(tmp_path / "bad.json", json.dumps(message)))
+
+
+def test_the_arm_alone_is_no_trajectory(plan: Plan) -> None:
+    few = plan.to_ros(joints=list(plan.trajectory.names[3:5]))
+    with pytest.raises(vkc.InputError, match="robot_size: out of range"):
+        Trajectory.from_ros(few)
+
+
+@pytest.mark.parametrize("rate", [20, 50, 125])
+@pytest.mark.parametrize("smooth", [True, False])
+def test_what_is_sent_can_be_validated(door_plan: Plan, smooth: bool, rate: float) -> None:
+    """Between waypoints, on lines or cubics, the motion does what was asked for, and keeps its distances."""
+    sent = Trajectory.from_ros(
+        door_plan.to_ros(joints="all", rate=rate, smooth=smooth), like=door_plan.trajectory
+    )
+    assert [phase.name for phase in sent.phases] == [
+        phase.name for phase in door_plan.trajectory.phases
+    ]
+    options = dataclasses.replace(
+        door_plan.options, dist_safe=0.01
+    )  # what is kept between waypoints
+    report = vkc.validate(door_plan.scene, door_plan.steps, sent, options)
+    wrong = (
+        {"acceleration", "closure"} if smooth else {"acceleration"}
+    )  # it jumps between linear pieces
+    assert {violation.constraint for violation in report.violations} <= wrong, report.lines()
+    assert report.closure_error < (2e-3 if smooth else 1e-3)
+    assert np.abs(sent.positions - door_plan.trajectory.at(sent.times)).max() < (
+        0.02 if smooth else 1e-9
+    )

@@ -1,0 +1,122 @@
+"""Cubics in time: against SciPy's, and against many moments looked at one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.trajectory.curve import Curve, concatenate_curves, sample_intervals
+
+
+def some(seed: int, knots: int = 7, size: int = 3) -> Curve:
+    rng = np.random.default_rng(seed)
+    times = 2.0 + np.cumsum(rng.uniform(0.1, 1.0, knots))
+    return Curve(times, rng.normal(size=(knots, size)), rng.normal(size=(knots, size)))
+
+
+@given(st.integers(0, 10**6), st.integers(2, 9))
+def test_it_is_scipys(seed: int, knots: int) -> None:
+    curve = some(seed, knots)
+    other = CubicHermiteSpline(curve.times, curve.positions, curve.rates)
+    moments = np.random.default_rng(seed).uniform(curve.times[0], curve.times[-1], 40)
+    for order, mine in enumerate((curve.at, curve.velocity, curve.acceleration)):
+        np.testing.assert_allclose(mine(moments), other(moments, order), rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(mine(moments[3]), other(moments[3], order), rtol=0.0, atol=1e-9)
+        assert mine(moments.reshape(8, 5)).shape == (8, 5, 3)
+
+
+def test_moments_are_at_shares_of_every_span() -> None:
+    knots, shares = np.array([0.0, 1.0, 4.0]), np.array([0.0, 0.5, 1.0])
+    np.testing.assert_allclose(sample_intervals(knots, shares), [0.0, 0.5, 1.0, 1.0, 2.5, 4.0])
+    np.testing.assert_allclose(
+        sample_intervals(knots, shares[:2], last=True), [0.0, 0.5, 1.0, 2.5, 4.0]
+    )
+
+
+def test_outside_all_stands_still() -> None:
+    curve = some(1)
+    moments = np.array([curve.times[0] - 1.0, curve.times[-1] + 1.0])
+    np.testing.assert_array_equal(curve.at(moments), curve.positions[[0, -1]])
+    np.testing.assert_array_equal(curve.velocity(moments), 0.0)
+    np.testing.assert_array_equal(curve.acceleration(moments), 0.0)
+
+
+@given(st.integers(0, 10**6), st.booleans())
+def test_extremes_and_speeds_are_those_of_many_moments(seed: int, even: bool) -> None:
+    curve = some(seed)
+    if even:  # parabolas and straight lines among them
+        chords = np.diff(curve.positions, axis=0) / np.diff(curve.times)[:, None]
+        curve = Curve(curve.times, curve.positions, np.vstack([chords, chords[-1:]]))
+    low, high = curve.compute_extrema()
+    fastest, strongest = curve.compute_max_rates()
+    for k, (begin, end) in enumerate(zip(curve.times, curve.times[1:], strict=False)):
+        moments = np.linspace(begin, end, 2001)[:-1]
+        places, velocities, changes = (
+            curve.at(moments),
+            np.abs(curve.velocity(moments)),
+            np.abs(curve.acceleration(moments)),
+        )
+        np.testing.assert_allclose(
+            low[k], np.minimum(places.min(axis=0), curve.positions[k + 1]), atol=1e-5
+        )
+        np.testing.assert_allclose(
+            high[k], np.maximum(places.max(axis=0), curve.positions[k + 1]), atol=1e-5
+        )
+        assert (low[k] <= places.min(axis=0) + 1e-12).all()
+        assert (high[k] >= places.max(axis=0) - 1e-12).all()
+        np.testing.assert_allclose(fastest[k], velocities.max(axis=0), rtol=2e-2, atol=1e-9)
+        assert (fastest[k] >= velocities.max(axis=0) - 1e-12).all()
+        np.testing.assert_allclose(strongest[k], changes.max(axis=0), rtol=2e-2, atol=1e-9)
+        assert (strongest[k] >= changes.max(axis=0) - 1e-9).all()
+
+
+def test_parts_put_together_are_the_whole() -> None:
+    curve = some(3)
+    middle = float(curve.times[3])
+    whole = concatenate_curves(
+        [curve.part(curve.times[0], middle), curve.part(middle, curve.times[-1]).shift_time(5.0)]
+    )
+    np.testing.assert_allclose(whole.times, curve.times, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(whole.positions, curve.positions)
+    np.testing.assert_array_equal(whole.rates, curve.rates)
+    np.testing.assert_array_equal(
+        curve.part(curve.times[1], middle, [2, 0]).positions, curve.positions[1:4][:, [2, 0]]
+    )
+
+
+@pytest.mark.parametrize(
+    ("arrays", "field"),
+    [
+        (([0.0, 0.0], np.zeros((2, 1)), np.zeros((2, 1))), "curve.times"),
+        (([0.0], np.zeros((1, 1)), np.zeros((1, 1))), "curve.times"),
+        (([0.0, np.nan], np.zeros((2, 1)), np.zeros((2, 1))), "curve.times"),
+        (([0.0, 1.0], np.zeros((3, 1)), np.zeros((2, 1))), "curve.positions"),
+        (([0.0, 1.0], np.zeros((2, 1)), np.zeros((2, 2))), "curve.rates"),
+        (([0.0, 1.0], np.zeros((2, 1)), np.full((2, 1), np.inf)), "curve.rates"),
+        (([0.0, 1.0], np.full((2, 1), 1e300), np.zeros((2, 1))), "curve.positions"),
+        (([0.0, 1.0], "here", np.zeros((2, 1))), "curve.positions"),
+    ],
+)
+def test_what_is_no_curve(arrays: tuple[object, object, object], field: str) -> None:
+    with pytest.raises(InputError) as raised:
+        Curve(*arrays)  # type: ignore[arg-type]
+    assert raised.value.field == field
+
+
+def test_it_leads_through_waypoints_or_says_so() -> None:
+    curve = some(4)
+    at = [0, 2, 6]
+    curve.check_through(curve.times[at], curve.positions[at])
+    with pytest.raises(InputError, match="a waypoint is none of its knots"):
+        curve.check_through(curve.times[[0, 2, 5]], curve.positions[[0, 2, 5]])
+    with pytest.raises(InputError, match="a waypoint is none of its knots"):
+        curve.check_through(curve.times[at] + [0.0, 1e-3, 0.0], curve.positions[at])
+    with pytest.raises(InputError, match="does not lead through a waypoint") as raised:
+        curve.check_through(curve.times[at], curve.positions[at] + [[0.0], [1e-6], [0.0]])
+    assert raised.value.field == "positions[1]"
+    with pytest.raises(InputError, match="wrong number of coordinates"):
+        curve.check_through(curve.times[at], curve.positions[at][:, :2])

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.fake_plan import fake_plan
+
+from vkc_pin.planning.plan import Plan
+from vkc_pin.world.trajectory.placements import Motion, key_times, sample_motion
+from vkc_pin.world.trajectory.world_model import World
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return fake_plan()
+
+
+@pytest.fixture(scope="module")
+def world(plan: Plan) -> World:
+    return World(plan.scene)
+
+
+@pytest.fixture(scope="module")
+def motion(world: World, plan: Plan) -> Motion:
+    return sample_motion(world, plan.trajectory)
+
+
+def test_key_frames_are_the_waypoints_and_more_where_it_turns_far(plan: Plan) -> None:
+    times = key_times(plan.trajectory)
+    assert set(plan.trajectory.times) <= set(times)
+    assert np.abs(np.diff(plan.trajectory.at(times), axis=0)).max() <= 1.0 + 1e-9
+    assert (np.diff(times) > 0).all()
+
+
+def test_where_joints_are_faster_than_what_moves_them_there_are_more(plan: Plan) -> None:
+    names = plan.trajectory.names
+    times = key_times(plan.trajectory, {names[0]: 2.0, names[3]: 0.0125})
+    moved = np.abs(np.diff(plan.trajectory.at(times), axis=0))
+    assert moved[:, 3].max() <= 0.0125 + 1e-9
+    assert len(times) > len(key_times(plan.trajectory))
+
+
+def test_placements_are_those_of_the_world(motion: Motion, world: World, plan: Plan) -> None:
+    data, k = world.model.createData(), 5
+    (row,) = world.compute_positions(plan.trajectory, [motion.times[k]])
+    pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
+    tool = data.oMf[world.model.getFrameId(plan.scene.robot.tool_frame)].translation
+    assert np.allclose(motion.tool[k], tool)
+    assert np.allclose(motion.base[k, :2], row[:2])
+    for j in range(1, world.model.njoints):
+        assert np.allclose(motion.world[k, j], data.oMi[j].homogeneous)
+        parent = motion.world[k, world.model.parents[j]]
+        assert np.allclose(parent @ motion.local[j][k].homogeneous, data.oMi[j].homogeneous)
+
+
+def test_what_moves_and_when_it_is_away(motion: Motion, world: World) -> None:
+    assert motion.moving[1:].all()
+    base = np.arange(world.model.njoints) == 1
+    away = motion.away(base, 0)
+    assert not away[0]
+    assert away[-1]
+    assert motion.away(base, -1).tolist()[-1] is False
+
+
+def test_a_scene_alone_stands_still(world: World) -> None:
+    still = sample_motion(world, None)
+    assert len(still.times) == 1
+    assert not still.moving.any()

@@ -1,0 +1,114 @@
+"""Motions are joined, extract_phases, and known where they were not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.written import NAMES, PHASES, ROWS, TIMES, example
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.scene.hold import Hold, make_holds
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.splicing import (
+    concatenate_trajectories,
+    extract_phases,
+    fill_missing_values,
+)
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+
+def test_what_is_not_known_is_as_it_was_or_as_it_will_be() -> None:
+    nan = np.nan
+    table = np.array(
+        [[nan, 1.0, nan], [2.0, nan, nan], [nan, nan, nan], [3.0, 4.0, nan], [nan, nan, nan]]
+    )
+    expected = [[2.0, 1.0, nan], [2.0, 1.0, nan], [2.0, 1.0, nan], [3.0, 4.0, nan], [3.0, 4.0, nan]]
+    np.testing.assert_array_equal(fill_missing_values(table), expected)
+    assert np.isnan(table[0, 0])  # what was given is left alone
+
+
+def parts() -> tuple[Trajectory, Trajectory, Trajectory]:
+    """Reach for the door, open it, and go on, holding what was held; only the second knows the door's hinge."""
+    robot = NAMES[:5]
+    held = (Hold("door", "handle"),)
+    reach = Trajectory(
+        robot,
+        np.array([0.0, 1.0, 3.0]),
+        ROWS[:3, :5],
+        (PhaseSpan("a", 0, 1), PhaseSpan("b", 1, 2)),
+        5,
+    )
+    opens = Trajectory(NAMES, np.array([7.0, 8.0]), ROWS[2:], (PhaseSpan("c", 0, 1, held),), 5)
+    after = Trajectory(
+        robot, np.array([0.0, 0.5]), ROWS[[3, 0], :5], (PhaseSpan("d", 0, 1, held),), 5
+    )
+    return reach, opens, after
+
+
+def test_motions_are_joined() -> None:
+    """The hand closes between the first two, so the robot waits there; between the others it does not."""
+    whole = concatenate_trajectories(parts(), pause=0.25)
+    assert whole.names == NAMES
+    np.testing.assert_allclose(whole.times, [0.0, 1.0, 3.0, 3.25, 4.25, 4.75])
+    np.testing.assert_array_equal(whole.positions[:, :5], ROWS[[0, 1, 2, 2, 3, 0], :5])
+    np.testing.assert_array_equal(
+        whole.positions[:, 5], [0.0, 0.0, 0.0, 0.0, 1.2, 1.2]
+    )  # as it will be, or as it was
+    # Waiting belongs to what follows.
+    assert [(p.name, p.first, p.last) for p in whole.phases] == [
+        ("a", 0, 1),
+        ("b", 1, 2),
+        ("c", 2, 4),
+        ("d", 4, 5),
+    ]
+    assert [dict(p.held) for p in whole.phases] == [{}, {}, {"door": "handle"}, {"door": "handle"}]
+    assert whole.robot_size == 5
+
+
+def test_what_is_held_through_another_thing_makes_a_pause_too() -> None:
+    both = {"stick": "grip", "ball": "pull"}
+    holds = [
+        make_holds(both, {"ball": "stick.tip"}),
+        make_holds(both),
+        make_holds({"stick": "grip"}),
+    ]
+    spans = [PhaseSpan(name, 0, 1, held) for name, held in zip("abc", holds, strict=True)]
+    motions = [Trajectory(NAMES, np.array([0.0, 1.0]), ROWS[[1, 2]], (span,), 5) for span in spans]
+    np.testing.assert_allclose(
+        concatenate_trajectories(motions, pause=0.5).times, [0.0, 1.0, 1.5, 2.5, 3.0, 4.0]
+    )
+
+
+def test_one_motion_alone_stays_as_it_is() -> None:
+    whole = concatenate_trajectories([example()], pause=1.0)
+    np.testing.assert_array_equal(whole.positions, ROWS)
+    np.testing.assert_array_equal(whole.times, TIMES)
+    assert whole.phases == PHASES
+
+
+def test_only_motions_that_follow_one_another_can_be_joined() -> None:
+    reach, opens, _ = parts()
+    with pytest.raises(InputError) as raised:
+        concatenate_trajectories([reach, reach], pause=0.1)
+    assert raised.value.field == "parts[1]"
+    moved = Trajectory(NAMES, opens.times, opens.positions + 2e-6, opens.phases, 5)
+    with pytest.raises(InputError):
+        concatenate_trajectories([reach, moved], pause=0.1)
+    closer = Trajectory(NAMES, opens.times, opens.positions + 5e-7, opens.phases, 5)
+    assert len(concatenate_trajectories([reach, closer], pause=0.1).times) == 5
+    with pytest.raises(InputError, match="nothing to concatenate"):
+        concatenate_trajectories([], pause=0.1)
+
+
+def test_what_was_joined_can_be_cut_apart() -> None:
+    first, last = 0, 0
+    whole = concatenate_trajectories(parts(), pause=0.25)
+    for part in parts():
+        last = first + len(part.phases)
+        found = extract_phases(whole, part.names, first, last)
+        count = len(part.times)
+        np.testing.assert_array_equal(found.positions[-count:], part.positions)
+        np.testing.assert_allclose(np.diff(found.times[-count:]), np.diff(part.times))
+        assert [phase.name for phase in found.phases] == [phase.name for phase in part.phases]
+        assert (found.phases[0].first, found.phases[-1].last) == (0, len(found.times) - 1)
+        first = last

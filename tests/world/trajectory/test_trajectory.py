@@ -1,0 +1,138 @@
+"""Trajectories: efforts and rates by hand, interpolation, phases, plain data, bad input."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.written import NAMES, PHASES, ROWS, TIMES, example
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.scene.hold import make_holds
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+
+def test_efforts() -> None:
+    assert example().base_effort() == pytest.approx(5.0 + 1.0)
+    assert example().base_effort_l1() == pytest.approx(3.0 + 4.0 + 1.0)
+    assert example().arm_effort() == pytest.approx(
+        0.1 + 0.2 + 0.4 + 0.1
+    )  # neither the heading nor the door counts
+
+
+def test_velocities() -> None:
+    expected = [[1.5, 2.0, 0.25, 0.05, -0.1, 0.0], [0.0] * 6, [-0.25, 0.0, 0.875, -0.1, 0.025, 0.3]]
+    np.testing.assert_allclose(example().velocities(), expected)
+
+
+def test_accelerations() -> None:
+    """The step of velocity over the shorter of both neighbours' durations; from and to rest."""
+    x, hinge = [1.5 / 2.0, -1.5 / 0.5, -0.25 / 0.5, 0.25 / 4.0], [0.0, 0.0, 0.3 / 0.5, -0.3 / 4.0]
+    np.testing.assert_allclose(example().accelerations()[:, 0], x)
+    np.testing.assert_allclose(example().accelerations()[:, 5], hinge)
+    assert example().accelerations().shape == (4, 6)
+
+
+def test_at() -> None:
+    motion = example()
+    np.testing.assert_allclose(motion.at(1.0), ROWS[1] / 2 + ROWS[0] / 2)
+    np.testing.assert_allclose(
+        motion.at([3.5, 6.5])[0], 0.75 * ROWS[2] + 0.25 * ROWS[3], atol=1e-15
+    )
+    np.testing.assert_array_equal(motion.at(TIMES), ROWS)
+    np.testing.assert_array_equal(motion.at([-1.0, 7.0]), ROWS[[0, -1]])
+    assert motion.at(np.zeros((2, 3))).shape == (2, 3, 6)
+
+
+@pytest.mark.parametrize("time", ["soon", float("nan"), [0.0, float("inf")]])
+def test_what_is_no_time(time: Any) -> None:
+    for ask in (example().at, example().velocity, example().acceleration):
+        with pytest.raises(InputError, match="time"):
+            ask(time)
+
+
+def test_columns() -> None:
+    column = example().column("door.hinge")
+    np.testing.assert_array_equal(column, ROWS[:, 5])
+    column[:] = 7.0  # a copy
+    np.testing.assert_array_equal(example().column("door.hinge"), ROWS[:, 5])
+    with pytest.raises(UnknownNameError) as caught:
+        example().column("door.hing")
+    assert caught.value.nearest == "door.hinge"
+
+
+def test_it_cannot_be_changed() -> None:
+    rows = ROWS.copy()
+    motion = example(positions=rows)
+    rows[0, 0] = 9.0
+    assert motion.positions[0, 0] == 0.0
+    for array in (motion.positions, motion.times):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+def test_round_trip() -> None:
+    motion = example(positions=np.random.default_rng(0).normal(size=ROWS.shape))
+    again = Trajectory.from_dict(json.loads(json.dumps(motion.to_dict())))
+    np.testing.assert_array_equal(again.positions, motion.positions)
+    np.testing.assert_array_equal(again.times, motion.times)
+    assert (again.names, again.phases, again.robot_size) == (
+        motion.names,
+        motion.phases,
+        motion.robot_size,
+    )
+
+
+def test_what_is_held_through_something_is_kept_too() -> None:
+    held, by = {"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"}
+    phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, make_holds(held, by)))
+    data = json.loads(json.dumps(example(phases=phases).to_dict()))
+    assert [phase["by"] for phase in data["phases"]] == [{}, by]
+    assert Trajectory.from_dict(data).phases == phases
+    for phase in data["phases"]:  # as motions were saved before there was such a thing
+        del phase["by"]
+    assert [phase.holds for phase in Trajectory.from_dict(data).phases] == [(), make_holds(held)]
+
+
+@pytest.mark.parametrize("key", ["names", "times", "positions", "phases", "robot_size"])
+def test_data_that_lacks_something(key: str) -> None:
+    data = example().to_dict()
+    del data[key]
+    with pytest.raises(InputError) as caught:
+        Trajectory.from_dict(data)
+    assert caught.value.field == key
+
+
+@pytest.mark.parametrize(
+    ("field", "changes"),
+    [
+        ("Trajectory.times", {"times": [0.0, 1.0, 1.0, 2.0]}),
+        ("Trajectory.times", {"times": [[0.0, 1.0, 2.0, 3.0]]}),
+        ("Trajectory.times", {"times": [0.0], "positions": ROWS[:1], "phases": ()}),
+        ("Trajectory.times", {"times": "soon"}),
+        ("Trajectory.times[3]", {"times": [0.0, 1.0, 2.0, np.inf]}),
+        ("Trajectory.positions", {"positions": ROWS[:3]}),
+        ("Trajectory.positions", {"positions": ROWS[:, :5]}),
+        ("Trajectory.positions", {"positions": [[0.0], [1.0, 2.0]]}),
+        (
+            "Trajectory.positions[2, 1]",
+            {"positions": np.where(np.arange(24).reshape(4, 6) == 13, np.nan, ROWS)},
+        ),
+        ("Trajectory.names", {"names": (*NAMES[:5], "elbow")}),
+        ("Trajectory.robot_size", {"robot_size": 7}),
+        ("Trajectory.robot_size", {"robot_size": 2}),
+        ("Trajectory.phases", {"phases": ()}),
+        ("Trajectory.phases", {"phases": PHASES[:1]}),
+        ("Trajectory.phases", {"phases": PHASES[1:]}),
+        ("Trajectory.phases", {"phases": (PHASES[0], PhaseSpan("gap", 1, 3))}),
+        ("Trajectory.phases", {"phases": (PHASES[0], PhaseSpan("nothing", 2, 2), PHASES[1])}),
+        ("Trajectory.phases", {"phases": (PHASES[0], PhaseSpan("beyond", 2, 4))}),
+    ],
+)
+def test_bad_input(field: str, changes: dict[str, Any]) -> None:
+    with pytest.raises(InputError) as caught:
+        example(**changes)
+    assert caught.value.field == field

@@ -1,0 +1,84 @@
+"""How a base on wheels moves in a step, against finely divided motions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.drives import hall
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vkc_pin.world.trajectory.wheels import OMNIDIRECTIONAL, RollingLimits, make_rolling_limits
+
+SPEEDS = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.6, 0.6)), min_size=1, max_size=8)
+
+
+def driven(speeds: list[tuple[float, float]]) -> np.ndarray:
+    """Return the poses that arcs lead to, of lengths [m] and turns [rad], by small steps along them."""
+    poses = [np.array([0.3, -0.2, 0.9])]
+    for length, turn in speeds:
+        heading = poses[-1][2] + turn * (np.arange(2000) + 0.5) / 2000
+        poses.append(
+            poses[-1]
+            + np.array([np.cos(heading).mean() * length, np.sin(heading).mean() * length, turn])
+        )
+    return np.array(poses)
+
+
+@settings(deadline=None)
+@given(SPEEDS)
+def test_arcs_go_along_alone(speeds: list[tuple[float, float]]) -> None:
+    """Their chords are as long as twice the radius times the sine of half of the turn."""
+    along, aside, turn = RollingLimits.compute_steps(driven(speeds))
+    lengths, turns = np.array(speeds).T
+    np.testing.assert_allclose(aside, 0.0, atol=1e-6)
+    np.testing.assert_allclose(turn, turns, atol=1e-9)
+    np.testing.assert_allclose(along, lengths * np.sinc(turns / (2 * np.pi)), atol=1e-6)
+    assert RollingLimits().compute_error(driven(speeds)) < 1e-6
+
+
+def test_the_error_is_the_worst_of_slipping_and_turning() -> None:
+    path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.03, 0.0], [1.1, 0.03, 0.2]])
+    assert RollingLimits().compute_error(path) == pytest.approx(0.03)
+    assert RollingLimits(turning_radius=0.8).compute_error(path) == pytest.approx(
+        0.8 * 0.2 - 0.1 * np.cos(0.1)
+    )
+    assert OMNIDIRECTIONAL.compute_error(path) == 0.0
+
+
+def test_gears_are_those_of_the_step_before_where_it_stands() -> None:
+    x = np.cumsum([0.0, 0.0, 0.2, 0.1, 0.0, -0.1, 0.0, 0.00005, 0.3])
+    path = np.column_stack([x, 0.0 * x, 0.0 * x])
+    np.testing.assert_array_equal(
+        RollingLimits(turning_radius=1.0).compute_gears(path), [1, 1, 1, 1, -1, -1, -1, 1]
+    )
+    np.testing.assert_array_equal(
+        RollingLimits(turning_radius=1.0).compute_gears(-path), [-1, -1, -1, -1, 1, 1, 1, -1]
+    )
+    np.testing.assert_array_equal(RollingLimits().compute_gears(0.0 * path), np.ones(8))
+    np.testing.assert_array_equal(OMNIDIRECTIONAL.compute_gears(-path), np.ones(8))
+
+
+def test_times_are_those_of_the_faster_wheel() -> None:
+    rolling = RollingLimits(track=0.6, wheel_speed=0.5)
+    path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [1.0, 0.0, -1.0]])
+    np.testing.assert_allclose(rolling.compute_min_times(path), [2.0, 0.6, 0.0])
+    assert rolling.has_wheel_limit
+    assert not RollingLimits().has_wheel_limit
+    assert not RollingLimits().compute_min_times(path).any()
+    assert not OMNIDIRECTIONAL.compute_min_times(path).any()
+
+
+def test_the_limits_are_the_robots() -> None:
+    assert make_rolling_limits(hall().robot) is OMNIDIRECTIONAL
+    assert make_rolling_limits(hall(base="fixed").robot) is OMNIDIRECTIONAL
+    tank, car = (
+        make_rolling_limits(hall(**robot).robot)
+        for robot in ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8})
+    )
+    assert (tank.turning_radius, car.turning_radius) == (0.0, 0.8)
+    assert (
+        (tank.track, tank.wheel_speed)
+        == (car.track, car.wheel_speed)
+        == (pytest.approx(0.5708 * 1.875, abs=1e-3), pytest.approx(1.0, rel=1e-3))
+    )

@@ -1,0 +1,180 @@
+"""The scene as one plain tree: everything is where robot and objects, looked at alone, have it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.small_problems import full_scene, random_configurations
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.planning.plan import Plan
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World, find_coordinate_units
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return World(full_scene())
+
+
+def random_rows(world: World, seed: int, count: int = 1) -> np.ndarray:
+    robot, objects = world.scene.robot, [placed.object for placed in world.scene.objects.values()]
+    lower = np.concatenate([robot.lower, *(item.lower for item in objects)])
+    upper = np.concatenate([robot.upper, *(item.upper for item in objects)])
+    return random_configurations(lower, upper, count, np.random.default_rng(seed))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_every_frame_is_where_it_is_alone(seed: int) -> None:
+    world = World(full_scene())
+    scene, (z,) = world.scene, random_rows(world, seed)
+    data = world.model.createData()
+    pin.framesForwardKinematics(world.model, data, world.coordinates.q(z))
+
+    def where(name: str, kind: pin.FrameType) -> np.ndarray:
+        return data.oMf[world.model.getFrameId(name, kind)].homogeneous
+
+    robot, n, seen = scene.robot, scene.robot.coordinates.size, 1
+    alone = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, alone, robot.coordinates.q(z[:n]))
+    for index, frame in enumerate(robot.model.frames[1:], 1):
+        np.testing.assert_allclose(
+            where(frame.name, frame.type), alone.oMf[index].homogeneous, atol=1e-12
+        )
+        seen += 1
+    for name, placed in scene.objects.items():
+        item, state = placed.object, z[n : n + placed.object.coordinates.size]
+        n += item.coordinates.size
+        alone = item.model.createData()
+        pin.framesForwardKinematics(item.model, alone, item.coordinates.q(state))
+        for index, frame in enumerate(item.model.frames[1:], 1):
+            expected = (placed.placement * alone.oMf[index]).homogeneous
+            np.testing.assert_allclose(
+                where(f"{name}.{frame.name}", frame.type), expected, atol=1e-12
+            )
+            seen += 1
+    assert seen == world.model.nframes
+    assert n == world.coordinates.size == world.model.nv
+
+
+@pytest.mark.parametrize("kind", ["collision", "visual"])
+def test_every_shape_is_where_it_is_alone(world: World, kind: str) -> None:
+    scene, (z,) = world.scene, random_rows(world, 3)
+    geometry = getattr(world, kind)
+    data, shapes = world.model.createData(), geometry.createData()
+    pin.updateGeometryPlacements(world.model, data, geometry, shapes, world.coordinates.q(z))
+    found = {
+        shape.name: (shape, where)
+        for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+    }
+    expected: dict[str, tuple[pin.GeometryObject, pin.SE3]] = {}
+    robot, n = scene.robot, scene.robot.coordinates.size
+    source = getattr(robot, kind)
+    alone, bodies = robot.model.createData(), source.createData()
+    pin.updateGeometryPlacements(robot.model, alone, source, bodies, robot.coordinates.q(z[:n]))
+    for shape, where in zip(source.geometryObjects, bodies.oMg, strict=True):
+        expected[shape.name] = shape, where
+    for name, placed in scene.objects.items():
+        joints = placed.object.coordinates.names
+        posed = placed.with_state(dict(zip(joints, z[n : n + len(joints)].tolist(), strict=True)))
+        n += len(joints)
+        for shape in make_world_shapes(posed, visual=kind == "visual"):
+            expected[f"{name}.{shape.name}"] = shape, shape.placement
+    obstacles = scene.obstacles if kind == "collision" else scene.obstacle_visual
+    for shape in obstacles:
+        expected[shape.name] = shape, shape.placement
+    assert list(found) == list(
+        expected
+    )  # none lost, none twice, robot before objects before obstacles
+    assert len(geometry.geometryObjects) == len(expected)
+    for name, (shape, where) in expected.items():
+        twin, there = found[name]
+        np.testing.assert_allclose(there.homogeneous, where.homogeneous, atol=1e-9)
+        np.testing.assert_array_equal(twin.meshColor, shape.meshColor)
+        np.testing.assert_array_equal(twin.meshScale, shape.meshScale)
+        assert twin.geometry.getNodeType() == shape.geometry.getNodeType()
+        assert (twin.meshPath, twin.overrideMaterial) == (shape.meshPath, shape.overrideMaterial)
+    assert len(geometry.collisionPairs) == 0
+
+
+def test_labels(world: World) -> None:
+    scene = world.scene
+    robots = [scene.robot.link_of(i) for i in range(len(scene.robot.collision.geometryObjects))]
+    assert world.collision_labels[: len(robots)] == robots
+    obstacles = list(scene.obstacle_labels)
+    assert world.collision_labels[-len(obstacles) :] == obstacles
+    objects = world.collision_labels[len(robots) : -len(obstacles)]
+    assert objects[:6] == ["door.frame"] * 3 + ["door.panel"] + ["door.lever"] * 2
+    assert {label.partition(".")[0] for label in objects} == set(scene.objects)
+    assert len(world.collision_labels) == len(world.collision.geometryObjects)
+    assert len(world.visual_labels) == len(world.visual.geometryObjects)
+    names = {frame.name for frame in world.model.frames}
+    moving = len(world.visual_labels) - len(scene.obstacle_visual)
+    assert set(world.visual_labels[:moving]) | set(robots) | set(objects) <= names
+    assert world.visual_labels[moving:] == [shape.name for shape in scene.obstacle_visual]
+
+
+def test_coordinates_and_start(world: World) -> None:
+    scene = world.scene
+    objects = [
+        f"{name}.{joint}"
+        for name, placed in scene.objects.items()
+        for joint in placed.object.coordinates.names
+    ]
+    assert world.coordinates.names == (*scene.robot.coordinates.names, *objects)
+    np.testing.assert_array_equal(world.start[: len(scene.start)], scene.start)
+    np.testing.assert_array_equal(
+        world.start[len(scene.start) :], np.concatenate([p.state for p in scene.objects.values()])
+    )
+    lower = np.concatenate(
+        [
+            scene.robot.coordinates.lower,
+            *(p.object.coordinates.lower for p in scene.objects.values()),
+        ]
+    )
+    np.testing.assert_array_equal(world.coordinates.lower, lower)
+    velocity = np.concatenate(
+        [scene.robot.coordinates.velocity, *(p.object.velocity for p in scene.objects.values())]
+    )
+    np.testing.assert_array_equal(world.coordinates.velocity, velocity)
+
+
+def test_positions_along_a_motion(world: World) -> None:
+    """By name, whatever the order; what is not named stays; virtual joints belong to nobody."""
+    robot = world.scene.robot.coordinates.names
+    names = (*robot, "drawer.slide", "door.handle_free", "door.hinge")
+    values = np.random.default_rng(0).normal(size=(3, len(names)))
+    motion = Trajectory(
+        names, np.array([0.0, 1.0, 3.0]), values, (PhaseSpan("all", 0, 2),), len(robot)
+    )
+    rows, half = world.compute_positions(motion), world.compute_positions(motion, [0.5])
+    for k, name in enumerate(world.coordinates.names):
+        if name in names:
+            np.testing.assert_array_equal(rows[:, k], values[:, names.index(name)])
+            assert half[0, k] == pytest.approx(values[:2, names.index(name)].mean())
+        else:
+            assert (rows[:, k] == world.start[k]).all()
+            assert half[0, k] == world.start[k]
+    assert world.compute_positions(motion, np.zeros(0)).shape == (0, world.coordinates.size)
+
+
+def test_the_robots_meshes_are_read_only_to_be_drawn() -> None:
+    assert "visual" not in vars(World(full_scene()))
+
+
+def test_units_of_joints_that_slide_and_of_grasps() -> None:
+    units = find_coordinate_units(vkc.load_scene("drawer"))
+    assert (units["drawer.slide"], units["base_x"], units["base_yaw"]) == ("m", "m", "rad")
+    stick = find_coordinate_units(vkc.load_scene("init_3"))
+    assert {stick[name] for name in stick if name.endswith("_slide")} == {"m"}
+    assert {stick[name] for name in stick if name.endswith("_turn")} == {"rad"}
+
+
+def test_every_coordinate_of_a_plan_has_a_unit(door_plan: Plan) -> None:
+    assert set(door_plan.trajectory.names) <= set(find_coordinate_units(door_plan.scene))

@@ -1,0 +1,180 @@
+"""Robots and objects as a run is asked for them: by name, or as files, which are imported into its folder first, once."""
+
+from __future__ import annotations
+
+import re
+import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of
+from vkc_pin.errors import InputError
+from vkc_pin.importing.objects.object_import import ImportedObject, import_object
+from vkc_pin.importing.robots.robot_import import import_robot
+from vkc_pin.world.files.writing import check_name, folder_at_once, write_atomically
+from vkc_pin.world.models.robot_file import find_robot, load_robot
+
+__all__ = ["DEFAULT", "Given", "parsed", "ready_object", "ready_robot"]
+
+DEFAULT = "default"
+"""The word that stands for all names that are there by default."""
+
+_GIVEN = re.compile(r"(?:(?P<called>[A-Za-z]\w*)=)?(?P<path>[^#]+)(?:#(?P<link>.+))?")
+_FILES = (".urdf", ".xml", ".mjcf", ".sdf")
+_SAMPLES = 1000  # for pairs that need no check, as of robots that are loaded without an SRDF
+_LEVEL = 0.5  # cosine of how steep an approach may be that tells where the front is
+
+
+@dataclass(frozen=True)
+class Given:
+    """A robot or an object as it is asked for.
+
+    Attributes:
+        called: What it is called in tables.
+        path: Its name, or the path of its file or folder.
+        link: The link of an object's file that is imported alone; None: all of it.
+    """
+
+    called: str
+    path: str
+    link: str | None = None
+
+    @property
+    def imported(self) -> bool:
+        """Whether it is a file that somebody else made."""
+        return self.path.lower().endswith(_FILES)
+
+
+def parsed(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Given]:
+    """Return what some texts ask for: names and paths, each as such or as "name=...", with "#link" for one link of a file.
+
+    Args:
+        texts: The texts.
+        field: What they are, for errors.
+        default: What "default" stands for.
+
+    Raises:
+        InputError: There are none, or two of the same name.
+    """
+    found = list[Given]()
+    for text in (one for given in texts for one in (default if given == DEFAULT else [str(given)])):
+        match = _GIVEN.fullmatch(text)
+        if match is None:
+            raise InputError(
+                "not a choice",
+                field=field,
+                expected="a name, a path, name=path or name=path#link",
+                got=text,
+            )
+        called, path, link = match["called"], match["path"], match["link"]
+        found.append(Given(called or link or _name(path), path, link))
+    names = [one.called for one in found]
+    if not names or len(set(names)) < len(names):
+        raise InputError(
+            "not a choice",
+            field=field,
+            expected="names, each once",
+            got=" ".join(map(str, texts)) or "none",
+        )
+    return found
+
+
+def ready_robot(one: Given, folder: Path) -> str:
+    """Return what to load for a robot: what was asked for if that says what its hand is, else a folder made by importing it.
+
+    Args:
+        one: The robot.
+        folder: Where folders are made; what is there is not made again.
+
+    Raises:
+        UnknownNameError: There is no such robot.
+        InputError: It cannot be imported, or its name in tables is not a plain file name.
+    """
+    mjcf = one.path.lower().endswith((".xml", ".mjcf"))
+    made = folder / check_name(one.called, "robots")
+    file = Path(one.path) if mjcf else find_robot(one.path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the doctor's report has them
+        if not (made / "robot.yaml").is_file():
+            if not mjcf and load_robot(one.path).touch_links:
+                return one.path
+            import_robot(file, made, samples=_SAMPLES)
+    return str(made)
+
+
+def ready_object(one: Given, folder: Path) -> str:
+    """Return what `description_of` takes for an object; a file is imported, and turned so that it is opened from -x.
+
+    Args:
+        one: The object.
+        folder: Where folders are made; what is there is not made again.
+
+    Raises:
+        UnknownNameError: There is no such object, or no such link.
+        InputError: It cannot be imported, its description cannot be read, or its name in tables is
+            not a plain file name.
+    """
+    if not one.imported:
+        if one.link is not None:
+            raise InputError(
+                "only a link of a file can be imported",
+                field="objects",
+                expected=" ".join(_FILES),
+                got=one.path,
+            )
+        description_of(one.path)
+        return one.path
+    name = check_name(one.called, "objects")
+    made = folder / name / f"{name}.yaml"
+    if not made.is_file():
+        with folder_at_once(made.parent, force=True) as staging, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is left out, its report would say
+            imported = import_object(one.path, staging / "as_it_was", link=one.link)
+            _face(imported)
+            for file in (staging / "as_it_was").iterdir():
+                file.rename(staging / (made.name if file == imported.file else file.name))
+            (staging / "as_it_was").rmdir()
+    return str(made)
+
+
+def _name(path: str) -> str:
+    """Return what to call something without a name of its own: its name, or that of its folder or file."""
+    file = Path(path) / "robot.yaml" if Path(path).is_dir() else Path(path)
+    return (
+        file.resolve().parent.name
+        if file.name == "robot.yaml"
+        else file.stem
+        if len(file.parts) > 1 or file.suffix
+        else path
+    )
+
+
+def _face(imported: ImportedObject) -> None:
+    """Turn an object by quarters of a turn so that the best proposed hand comes along x: files have their fronts anywhere."""
+    if not imported.proposals.found:
+        return
+    item, best = imported.proposals.object, imported.proposals.found[0].attachment
+    closed = np.clip(0.0, item.lower, item.upper)
+    x, y, _ = (item.link_placement(best.link, closed) * best.placement).rotation[:, 2].tolist()
+    quarters = round(-float(np.arctan2(y, x)) / (np.pi / 2.0)) % 4
+    if np.hypot(x, y) < _LEVEL or not quarters:
+        return
+    file = imported.file.with_suffix(".urdf")
+    root = ElementTree.parse(file).getroot()
+    front = "front"
+    while root.find(f"link[@name='{front}']") is not None:
+        front += "_"
+    link, joint = (
+        ElementTree.Element("link", name=front),
+        ElementTree.Element("joint", name=front, type="fixed"),
+    )
+    ElementTree.SubElement(joint, "parent", link=front)
+    ElementTree.SubElement(joint, "child", link=item.base_link)
+    ElementTree.SubElement(joint, "origin", xyz="0 0 0", rpy=f"0 0 {quarters * np.pi / 2.0:.12g}")
+    root.insert(0, link)
+    root.append(joint)
+    write_atomically(file, ElementTree.tostring(root, encoding="utf-8"))

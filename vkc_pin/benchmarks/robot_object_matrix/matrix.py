@@ -1,0 +1,154 @@
+"""What came out of robots × objects: tables in Markdown, and a chart with a cell for each combination."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vkc_pin.benchmarks.harness.limits import allowed
+from vkc_pin.benchmarks.harness.record import Record, distribution, values
+from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.robot_object_matrix.pairs import kind_of
+from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["chart", "report"]
+
+_SUMMARY = (
+    "robot",
+    "combinations",
+    "reachable",
+    "open from all starts",
+    "from any",
+    "time, median [s]",
+    "95th percentile [s]",
+    "load again [s]",
+)
+_ALL = "all"
+_UNREACHED = ("unreachable", "no hand")
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """Return the tables of a result in Markdown, with versions and machine at the foot."""
+    about, records = result["meta"], result["trials"]
+    groups = _groups(records)
+    robots, objects = (list(dict.fromkeys(key[k] for key in groups)) for k in (0, 1))
+    rows = [[name, *(_cell(groups.get((robot, name), ())) for robot in robots)] for name in objects]
+    parts = [
+        "# Robots × objects",
+        f"{len(robots)} robots, {len(objects)} objects of {len(set(map(kind_of, objects)))} kinds, "
+        f"{about['starts']} random starts each, seed {about['seed']}, {allowed(about)} each. A joint is opened by "
+        f"{about['share']:.0%} of its range, by whichever proposed attachment leads there; within reach is what the hand gets to "
+        "both shut and open by so much. Success is the word of the independent validation. "
+        "Times are those of all plans; loading again is the median over all combinations of a robot.",
+        markdown(
+            _SUMMARY, [*(_summary(robot, groups) for robot in robots), _summary(_ALL, groups)]
+        ),
+        "## Every combination",
+        "How many starts succeed; – is out of reach, ! could not be tried.",
+        markdown(["object", *robots], rows),
+        *_listed("What failed", [r for r in records if not r["success"] and _reached(r)]),
+        *_listed("What is out of reach", [r for r in records if not _reached(r)]),
+    ]
+    return "\n\n".join([*parts, foot(about)]) + "\n"
+
+
+def chart(records: Sequence[Record], path: str | Path | None) -> Figure:
+    """Draw the share of starts that succeed, a row for each object and a column for each robot; grey is out of reach.
+
+    Args:
+        records: As `run` makes them.
+        path: The file to write, .png, .svg or .pdf; None writes nothing.
+
+    Returns:
+        The figure.
+    """
+    groups = _groups(records)
+    robots, objects = (list(dict.fromkeys(key[k] for key in groups)) for k in (0, 1))
+    share = np.full((len(objects), len(robots)), np.nan)
+    with use_style():
+        figure = new_figure(4.5 + 0.6 * len(robots), 2.4 + 0.24 * len(objects))
+        axes = figure.subplots()
+        for i, name in enumerate(objects):
+            for j, robot in enumerate(robots):
+                own = groups.get((robot, name), ())
+                if any(map(_reached, own)):
+                    share[i, j] = 100.0 * float(np.mean([bool(r["success"]) for r in own]))
+                axes.text(j, i, _cell(own), ha="center", va="center", fontsize=7.5)
+        axes.set_facecolor("0.85")
+        image = axes.imshow(share, cmap="RdYlGn", vmin=0.0, vmax=100.0, aspect="auto", alpha=0.75)
+        axes.set_xticks(range(len(robots)), robots, rotation=45, ha="right")
+        axes.set_yticks(range(len(objects)), objects)
+        axes.grid(visible=False)
+        figure.colorbar(image, ax=axes, label="successful starts [%]", shrink=0.6)
+        axes.set_title("Opening by proposed attachments; grey is out of reach", fontsize=10)
+        return save_figure(figure, path)
+
+
+def _groups(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
+    """Return the records of each combination, by robot and object; an error may have been raised before any start."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        groups.setdefault((record["robot"], record["object"]), []).append(record)
+    return groups
+
+
+def _reached(record: Record) -> bool:
+    return record["status"] not in _UNREACHED
+
+
+def _cell(own: Sequence[Record]) -> str:
+    if any(record["status"] == "error" for record in own):
+        return "!"
+    good = sum(bool(record["success"]) for record in own)
+    return f"{good}/{len(own)}" if own and all(map(_reached, own)) else "–"
+
+
+def _summary(robot: str, groups: Mapping[tuple[str, str], Sequence[Record]]) -> list[str]:
+    """Return the row of a robot, or of all."""
+    chosen = [own for key, own in groups.items() if robot in (key[0], _ALL)]
+    reached = [own for own in chosen if all(map(_reached, own))]
+    flat = [record for own in chosen for record in own]
+    some = (
+        [all(r["success"] for r in own) for own in reached],
+        [any(r["success"] for r in own) for own in reached],
+    )
+    shares = (f"{sum(good)} ({sum(good) / max(len(reached), 1):.0%})" for good in some)
+    loads = values(flat, "load_time")
+    again = decimal(float(np.median(loads))) if loads else "–"
+    return [
+        robot,
+        str(len(chosen)),
+        str(len(reached)),
+        *shares,
+        *map(decimal, distribution(flat, "planning_time")),
+        again,
+    ]
+
+
+def _listed(title: str, records: Sequence[Record]) -> list[str]:
+    """Return a table of what did not succeed, with the reason on record; alike ones of a combination are one row."""
+    if not records:
+        return []
+    rows: Counter[tuple[str, ...]] = Counter()
+    for r in records:
+        why = r.get("because") or "; ".join(r.get("violations", ())[:1])
+        rows[
+            r["robot"],
+            "every object" if r["status"] == "no hand" else r["object"],
+            str(r["status"]),
+            why,
+        ] += 1
+    body = [
+        [robot, name, status, str(count), why] for (robot, name, status, why), count in rows.items()
+    ]
+    return [
+        f"## {title}",
+        markdown(["robot", "object", "status", "trials", "because"], body, text=5),
+    ]

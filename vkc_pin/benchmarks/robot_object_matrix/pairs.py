@@ -1,0 +1,262 @@
+"""A robot and a thing that opens, alone in a hall: which there are, and what is asked of the two."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.proposals.hand import make_hand
+from vkc_pin.importing.proposals.proposal import Proposals
+from vkc_pin.importing.proposals.propose import propose_attachments
+from vkc_pin.options import Options
+from vkc_pin.planning.diagnosis.diagnosis import diagnose_goals
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.procedural.furniture.catalogue import KINDS, random_object
+from vkc_pin.procedural.rooms import parts
+from vkc_pin.procedural.rooms.fixtures import RANDOM, Counter, Fixture, make_fixture
+from vkc_pin.procedural.rooms.footprints import Floor
+from vkc_pin.procedural.tasks import goals
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.files.documents import read_yaml
+from vkc_pin.world.files.resources import available, folder, located
+from vkc_pin.world.models.object_file import load_object
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.steps import Actuate
+
+__all__ = ["OBJECTS", "ROBOTS", "SHARE", "Pair", "description_of", "hall", "kind_of", "pair"]
+
+ROBOTS = (
+    "husky_ur5e",
+    "panda",
+    "tiago_pro",
+    "pr2",
+    "kinova",
+    "ur5_gripper",
+    "ur3_gripper",
+    "tiago",
+    "tiago_dual",
+    "baxter",
+)
+"""Mobile manipulators, and arms that ride on the virtual base, by the names that `load_robot` knows."""
+OBJECTS = (
+    *(f"{kind}_{number}" for kind in KINDS for number in range(2)),
+    *(
+        "door",
+        "narrow_door",
+        "wide_door",
+        "drawer",
+        "low_drawer",
+        "counter_drawer",
+        "cabinet",
+        "dishwasher",
+        "refrigerator",
+    ),
+)
+"""Two of every kind of `random_object`, as `<kind>_<seed>`, and what stands fixed in scenes/objects."""
+SHARE = 0.5
+"""Of a joint's range by which it is opened: the middle of what `random_task` draws."""
+
+_IT = "it"  # what the object is called in its hall
+_SIZE, _HEIGHT = 8.0, 2.4  # inner length of the walls, and their height [m]
+_FRONT = 3.0  # depth of the floor before the object that stays free [m]
+_BEYOND = 2.0  # of floor beyond a wall with a door [m]
+_START: Mapping[str, Any] = {
+    "x": [-2.0, 1.0],
+    "y": [-2.0, 2.0],
+}  # the object is at x = 4 m at most; any heading
+_LOW, _COUNTER = (
+    0.6,
+    0.8,
+)  # [m]: what is lower than the one and nobody says where it stands, stands on a counter so high
+_DEPTH, _BESIDE, _MARGIN, _AIR = (
+    0.5,
+    0.2,
+    0.03,
+    0.001,
+)  # [m] of it: its depth, beside, before and behind what stands there, below
+_OF_KIND = re.compile(r"(?P<kind>[a-z]+)_(?P<seed>\d+)")
+_SAME = 1e-6  # [rad] or [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What is asked of a robot and an object.
+
+    Attributes:
+        scene: Their hall, with random starts of the base; None where the robot has no hand.
+        step: What is to be done; None where the hand can take hold nowhere, or not go along so far.
+        because: Why not.
+    """
+
+    scene: Scene | None
+    step: Actuate | None
+    because: str = ""
+
+
+def kind_of(name: str) -> str:
+    """Return what kind of thing an object is: the last word of its name, without its number."""
+    last = re.sub(r"_\d+$", "", Path(name).stem).rpartition("_")[2]
+    return "drawers" if last == "drawer" else last
+
+
+def description_of(name: str) -> dict[str, Any]:
+    """Return the description of an object, which does not depend on where it is read from.
+
+    Args:
+        name: `<kind>_<seed>` of `random_object`, a name in scenes/objects, or the path of a
+            description (.yaml).
+
+    Raises:
+        UnknownNameError: There is no such object.
+        InputError: The description cannot be read.
+    """
+    match = _of_kind(name)
+    if match:
+        return random_object(*match)
+    stored = available("scenes", "objects/*.yaml")
+    if name not in stored and not _is_path(name):
+        raise UnknownNameError("object", name, [*OBJECTS, *stored], field="objects")
+    file = located(name, "scenes", "objects/*.yaml", what="object")
+    data = read_yaml(file).data
+    if not isinstance(data, dict) or not isinstance(data.get("urdf"), str):
+        raise InputError(
+            "not an object", file=file, field="urdf", expected="the path of a URDF, or what it says"
+        )
+    plain = data["urdf"].lstrip().startswith("<")
+    return data if plain else {**data, "urdf": str((file.parent / data["urdf"]).resolve())}
+
+
+def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
+    """Return a robot and an object alone in a hall: against a wall, in it, or on a counter, as it belongs.
+
+    Args:
+        robot: The robot's name, or the path of its file.
+        name: The object's name; see `description_of`.
+        description: Of the object.
+    """
+    match, floor = _of_kind(name), Floor(_SIZE, _SIZE)
+    own = make_fixture(RANDOM + match[0], match[1]) if match else make_fixture(name)
+    if _is_path(name) and own.high[2] - own.low[2] < _LOW:
+        own = _on_a_counter(own)
+    part = parts.make_openable(_IT, own, floor, 0, 0.0, _FRONT)
+    (entry,) = part.objects
+    half = _SIZE / 2.0
+    document = {
+        "name": f"{Path(name).stem.replace('.', '_')}_hall",
+        "robot": robot,
+        "start": {"base": [0.0, 0.0, 0.0]},
+        "arena": {"x": [-half, half + (_BEYOND if own.in_wall else 0.0)], "y": [-half, half]},
+        "start_region": dict(_START),
+        "obstacles": [*parts.make_walls(floor, _HEIGHT, [part]), *part.obstacles],
+        "objects": [{**entry, "type": dict(description)}],
+    }
+    return Scene.from_document(document, folder("scenes"))
+
+
+def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
+    """Return what is asked: to open the object by whichever proposed attachment leads there.
+
+    The first is the best one that the hand gets to, shut and open by so much; the others of that
+    joint are left to planning.
+
+    Args:
+        robot: The robot.
+        called: Its name, or the path of its file.
+        name: The object; see `description_of`.
+        seed: Of the configurations that are looked for.
+    """
+    try:
+        make_hand(robot)
+    except InputError as error:
+        return Pair(None, None, str(error))
+    description = description_of(name)
+    proposals = propose_attachments(load_object(description), robot)
+    taken = [proposal.description() for proposal in proposals.found]
+    scene = hall(called, name, {**description, "attachments": taken})
+    asked = _asked(scene, proposals)
+    if not asked:
+        return Pair(scene, None, _why_not(proposals))
+    cache, said = Cache(), list[str]()
+    for step in asked:
+        blocked = _blocked(scene, step, seed, cache)
+        if blocked is not None:
+            said.append(f"{step.attachment}: {blocked}")
+            continue
+        first = str(step.attachment)
+        others = [
+            str(other.attachment)
+            for other in asked
+            if other.joints == step.joints and other.attachment != first
+        ]
+        entries = {entry["name"]: entry for entry in taken}
+        left = [entries[attachment] for attachment in (first, *others)]
+        return Pair(
+            hall(called, name, {**description, "attachments": left}), Actuate(_IT, step.joints)
+        )
+    return Pair(scene, None, "; ".join(said))
+
+
+def _blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None:
+    """Return at the end of which phase no free configuration is found, and why not; None if there is one at all of them."""
+    options = Options()
+    problem = TrajectoryProblem(
+        scene, compile_task(scene, [step], options), options, (), cache=cache
+    )
+    return next((goal.text for goal in diagnose_goals(problem, seed)), None)
+
+
+def _asked(scene: Scene, proposals: Proposals) -> list[Actuate]:
+    """Return the steps that open a joint on the object's base, each by another attachment, the best one first."""
+    placed = scene.objects[_IT]
+    goal = {
+        joint: value
+        for step in goals(scene, share=SHARE)
+        if isinstance(step, Actuate)
+        for joint, value in step.joints.items()
+    }
+    steps = []
+    for proposal in proposals.found:
+        for joint in goal.keys() & proposal.opens.keys() if not proposal.when else ():
+            now = placed.state[placed.object.coordinates.index(joint)]
+            if np.sign(goal[joint] - now) * (proposal.opens[joint] - goal[joint]) >= -_SAME:
+                steps.append(Actuate(_IT, {joint: goal[joint]}, proposal.attachment.name))
+    return steps
+
+
+def _why_not(proposals: Proposals) -> str:
+    """Return why no joint on the base is opened by so much: what is in the way of all hands, and how far the proposals get."""
+    said = [f"{joint}: {reason}" for joint, reason in proposals.because.items()]
+    for proposal in proposals.found:
+        ends = [f"{joint} at {value:.3g}" for joint, value in proposal.opens.items()]
+        ends += [f"{joint} must be at {value:.3g} before" for joint, value in proposal.when.items()]
+        said.append(f"{proposal.attachment.name} ends with {', '.join(ends)}")
+    return "; ".join(said) or "nothing of it is to be opened"
+
+
+def _on_a_counter(own: Fixture) -> Fixture:
+    """Return something low as it stands on a counter that is deep enough for it."""
+    setback = round(float(-own.low[0]) + _MARGIN, 3)
+    depth, width = (
+        max(_DEPTH, setback + float(own.high[0]) + _MARGIN),
+        float(own.high[1] - own.low[1]) + 2.0 * _BESIDE,
+    )
+    counter = Counter((round(depth, 2), round(width, 2), _COUNTER), setback)
+    return replace(own, counter=counter, lift=own.lift + _AIR)
+
+
+def _of_kind(name: str) -> tuple[str, int] | None:
+    """Return kind and seed of what is made at random, None for other objects."""
+    match = _OF_KIND.fullmatch(name)
+    return (match["kind"], int(match["seed"])) if match and match["kind"] in KINDS else None
+
+
+def _is_path(name: str) -> bool:
+    return name.endswith((".yaml", ".yml")) or "/" in name

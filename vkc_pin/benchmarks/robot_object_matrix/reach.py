@@ -1,0 +1,86 @@
+"""Random poses that a robot can reach: those of its hand where its links keep apart, and off the floor."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import VkcError
+from vkc_pin.options import Options
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.shapes import ShapeDistances
+
+__all__ = ["random_poses"]
+
+_AWAY = 1.0  # [m] from the start, along x and along y, that the base drives at most
+# configurations for each pose: some of an arm folded tightly are free in one of a hundred
+_TRIES = 20_000
+
+
+def random_poses(robot: Robot, name: str, number: int, *, seed: int = 0) -> list[pin.SE3]:
+    """Return poses of the tool in the world, each that of a random configuration in which the robot keeps its default margins.
+
+    Joints are within their limits, ±π where they turn without end, the base at any heading up to a
+    metre away along x and y. Links keep `Options.self_distance`, or what they can; the arm keeps
+    `Options.dist_safe` from the floor.
+
+    Args:
+        robot: The robot, with its collision pairs.
+        name: What it is called: other robots get other random numbers.
+        number: How many poses.
+        seed: Of the random numbers.
+
+    Raises:
+        VkcError: Hardly any configuration is free.
+    """
+    rng = np.random.default_rng([11, seed, zlib.crc32(name.encode())])
+    low, high = (
+        np.where(np.isfinite(robot.lower), robot.lower, -np.pi),
+        np.where(np.isfinite(robot.upper), robot.upper, np.pi),
+    )
+    low[:3], high[:3] = (-_AWAY, -_AWAY, -np.pi), (_AWAY, _AWAY, np.pi)
+    free, data, frame = (
+        _Free(robot),
+        robot.model.createData(),
+        robot.model.getFrameId(robot.tool_frame),
+    )
+    poses = list[pin.SE3]()
+    for _ in range(number * _TRIES):
+        if len(poses) == number:
+            return poses
+        z = rng.uniform(low, high)
+        if free(z):
+            pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
+            pose = data.oMf[frame]
+            if pose.translation[2] > Options().dist_safe:
+                poses.append(pose.copy())
+    raise VkcError(
+        f"{name}: only {len(poses)} of {number * _TRIES} random configurations are free of collision"
+    )
+
+
+class _Free:
+    """Whether a robot keeps its default margins at a configuration."""
+
+    def __init__(self, robot: Robot) -> None:
+        options, shapes = Options(), robot.collision.geometryObjects
+        self._distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
+        margins = robot.own_margins(options.self_distance)
+        self._pairs, self._margins = list(margins), np.array(list(margins.values()))
+        self._numbers, self._floor = (
+            np.array(self._pairs, np.int64).reshape(-1, 2),
+            options.dist_safe,
+        )
+        self._carried = np.array([shape.parentJoint > 1 for shape in shapes])
+
+    def __call__(self, z: Floats) -> bool:
+        self._distances.set_configuration(z)
+        if (self._distances.compute_lowest_points()[self._carried] < self._floor).any():
+            return False
+        close = np.flatnonzero(self._distances.compute_lower_bounds(self._numbers) < self._margins)
+        return all(
+            self._distances.compute_distance([self._pairs[k]]) >= self._margins[k] for k in close
+        )

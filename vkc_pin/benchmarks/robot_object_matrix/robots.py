@@ -1,0 +1,292 @@
+"""Imports robots from their makers' files and lets them reach random poses: what works without a line written by hand?"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.record import Record, distribution, trial
+from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.robot_object_matrix.reach import random_poses
+from vkc_pin.errors import InputError, VkcError
+from vkc_pin.importing.robots.rest_configuration import Clearances
+from vkc_pin.importing.robots.robot_import import import_robot
+from vkc_pin.planning.planner import plan
+from vkc_pin.world.files.srdf import read_srdf
+from vkc_pin.world.files.writing import check_name
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import list_robots, load_robot
+from vkc_pin.world.models.self_collisions import set_collision_pairs
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Reach
+
+__all__ = ["ROBOTS", "report", "run"]
+
+ROBOTS = (
+    *(
+        "tiago",
+        "tiago_no_hand",
+        "tiago_dual",
+        "tiago_pro",
+        "pr2",
+        "baxter",
+        "centauro",
+        "anymal-kinova",
+        "b1-z1",
+    ),
+    *("panda", "panda_collision", "xarm7", "kinova", "z1", "so100", "so101", "talos_left_arm"),
+    *(
+        "ur3",
+        "ur3_joint_limited",
+        "ur3_gripper",
+        "ur5",
+        "ur5_joint_limited",
+        "ur5_gripper",
+        "ur10",
+        "ur10_joint_limited",
+    ),
+)
+"""The mobile manipulators and the arms of example-robot-data."""
+_FORMATS = (".urdf", ".xacro", ".xml", ".mjcf")
+_NOT_IMPORTED = ("not imported", "hardly free")
+_HEAD = (
+    *(
+        "robot",
+        "planned joints",
+        "pairs",
+        "import [s]",
+        "load again [s]",
+        "room at home [mm]",
+        "reached",
+    ),
+    *("time, median [s]", "95th percentile [s]"),
+)
+_LOAD = """
+import sys, time, warnings
+warnings.simplefilter("ignore")
+from vkc_pin.world.models.robot_file import load_robot
+began = time.process_time()
+load_robot(sys.argv[1])
+print(time.process_time() - began)
+"""
+
+
+def run(
+    *,
+    out: str | Path,
+    goals: int = 20,
+    seed: int = 0,
+    robots: Sequence[str] = ROBOTS,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
+
+    Args:
+        out: The folder; if it has trials of the same settings already, they are not run again.
+            Robots are imported into `out`/robots.
+        goals: How many poses each robot is to reach, at least 1.
+        seed: Of the poses, of importing and of planning.
+        robots: Names of example-robot-data, or paths of URDF, xacro and MJCF files.
+        jobs: Number of processes.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
+            `engine.results`.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        {"meta": ..., "trials": [...]}; see `runner.run`. A robot that cannot be imported has one
+        record, of status "not imported", one that is hardly ever free of collision one of status
+        "hardly free"; `because` says why.
+
+    Raises:
+        InputError: No goals, the same robot twice, no such file, or `out` has trials of other
+            settings.
+        UnknownNameError: There is no such robot.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+    """
+    if goals < 1:
+        raise InputError("out of range", field="goals", expected="at least 1", got=goals)
+    files = _files(robots)
+    settings = {
+        "benchmark": "robots",
+        "seed": seed,
+        "goals": goals,
+        "robots": list(files),
+        **LIMITS,
+    }
+    specs = [
+        {
+            "key": name,
+            "robot": name,
+            "file": str(file),
+            "out": str(out),
+            "goals": goals,
+            "seed": seed,
+        }
+        for name, file in files.items()
+    ]
+    return runner.run(
+        specs,
+        _records,
+        out,
+        settings=settings,
+        report=report,
+        jobs=jobs,
+        scheduler=scheduler,
+        progress=progress,
+    )
+
+
+def report(result: Mapping[str, Any]) -> str:
+    """Return the tables of a result in Markdown, with versions and machine at the foot."""
+    about, records = result["meta"], result["trials"]
+    groups: dict[str, list[Record]] = {name: [] for name in about["robots"]}
+    for record in records:
+        groups[record["robot"]].append(record)
+    lines = [_row(name, own) for name, own in groups.items()]
+    failed = [
+        [r["robot"], str(r["status"]), r.get("because") or "; ".join(r.get("violations", ())[:1])]
+        for r in records
+        if not r["success"]
+    ]
+    parts = [
+        "# Robots",
+        "Robots are imported from their makers' files, without anything written by hand; each then reaches "
+        f"{about['goals']} random poses, those of free configurations, seed {about['seed']}, {allowed(about)} each. Success is "
+        "the word of the independent validation. Importing, and loading again in a new process, are in processor time. Room at "
+        "home is the least distance between links that are not neighbours, and of the arm to the floor.",
+        markdown(_HEAD, lines),
+        *(
+            ["## What failed", markdown(("robot", "status", "because"), failed, text=3)]
+            if failed
+            else []
+        ),
+    ]
+    return "\n\n".join([*parts, foot(about)]) + "\n"
+
+
+def _row(name: str, own: Sequence[Record]) -> list[str]:
+    first = own[0]
+    if first["status"] == "error" or "import_time" not in first:
+        return [name, *["–"] * (len(_HEAD) - 1)]
+    good = sum(bool(record["success"]) for record in own)
+    reached = "–" if first["status"] in _NOT_IMPORTED else f"{good}/{len(own)}"
+    times = map(decimal, distribution(own, "planning_time"))
+    loads = (decimal(first[field]) for field in ("import_time", "load_time"))
+    room = (
+        "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"
+    )  # nothing that could come close
+    return [name, str(first["joints"]), str(first["pairs"]), *loads, room, reached, *times]
+
+
+def _files(robots: Sequence[str]) -> dict[str, Path]:
+    """Return name → file of every robot; files of one name are called as their folders, too."""
+    known, found = list_robots(), list[tuple[str, Path]]()
+    for robot in map(str, robots):
+        path = Path(robot)
+        if path.suffix.lower() in _FORMATS:
+            if not path.is_file():
+                raise InputError(
+                    "there is no such file",
+                    file=path,
+                    field="robots",
+                    expected="a URDF, xacro or MJCF file",
+                )
+            found.append((path.name.split(".")[0], path.resolve()))
+        else:
+            names = {name: file for name, file in known.items() if file.suffix == ".urdf"}
+            found += [(name, names[name]) for name in runner.chosen("robot", [robot], names)]
+    stems = [name for name, _ in found]
+    named = {
+        name if stems.count(name) == 1 else f"{file.parent.name}_{name}": file
+        for name, file in found
+    }
+    if not named or len(named) < len(found):
+        raise InputError(
+            "not a choice",
+            field="robots",
+            expected="names or files, each once",
+            got=" ".join(stems) or "none",
+        )
+    return named
+
+
+def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a record of every pose; a single one of a robot that cannot be imported, or is hardly ever free."""
+    seed, name = spec["seed"], spec["robot"]
+    folder = Path(spec["out"]) / "robots" / check_name(name, "robots")
+    about: dict[str, Any] = {"robot": name}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what importing found is in its report
+        try:
+            began = time.process_time()
+            imported = import_robot(spec["file"], folder, seed=seed, force=True)
+            about["import_time"] = time.process_time() - began
+        except InputError as error:
+            because = (
+                str(error).replace(str(Path(spec["file"]).parent), "").lstrip("/")
+            )  # the same wherever packages are
+            return [
+                {
+                    **about,
+                    "success": False,
+                    "status": "not imported",
+                    "seed": seed,
+                    "because": because,
+                }
+            ]
+        about |= _facts(imported.robot, folder)
+        try:
+            poses = random_poses(imported.robot, name, spec["goals"], seed=seed)
+        except VkcError as error:
+            return [
+                {
+                    **about,
+                    "success": False,
+                    "status": "hardly free",
+                    "seed": seed,
+                    "because": str(error),
+                }
+            ]
+        document = {
+            "name": f"{name}_reach",
+            "robot": str(folder.resolve()),
+            "start": {"base": [0.0, 0.0, 0.0]},
+        }
+        scene, records = Scene.from_document(document), []
+        for number, pose in enumerate(poses):
+            one = plan(scene, [Reach(pose)], seed=seed, **LIMITS)
+            because = "; ".join(one.validation.notes)
+            records.append(
+                trial(one, method="VKC", seed=seed, number=number, **about, because=because)
+            )
+    return records
+
+
+def _facts(robot: Robot, folder: Path) -> dict[str, Any]:
+    """Return what is measured of an imported robot."""
+    said = subprocess.run(
+        [sys.executable, "-c", _LOAD, str(folder)], capture_output=True, text=True, check=True
+    )
+    every = load_robot(folder, pairs="all")
+    (srdf,) = folder.glob("*.srdf")
+    look = Clearances(set_collision_pairs(every, read_srdf(srdf, links=every.file.links).allowed))
+    look.place(robot.home)  # also of pairs that loading exempts since they overlap there
+    links = {
+        tuple(sorted((robot.link_of(pair.first), robot.link_of(pair.second))))
+        for pair in robot.collision.collisionPairs
+    }
+    return {
+        "load_time": float(said.stdout),
+        "joints": len(robot.home),
+        "pairs": len(links),
+        "home_room": look.least(),
+    }

@@ -1,1 +1,0 @@
-"""The virtual kinematic chain: its kinematics, and what it can hit."""

@@ -1,1 +1,0 @@
-"""Signed distances of many placed shapes at once, by coal in compiled code; knows neither robots nor scenes."""

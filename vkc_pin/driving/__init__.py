@@ -1,1 +1,0 @@
-"""Paths of the base on the floor, by A*; knows shapes and coal, nothing else."""

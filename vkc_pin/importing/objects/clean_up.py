@@ -1,0 +1,332 @@
+"""Prepares an imported description for planning: names, fixed links, limits, scale and axes."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.objects.description import Description, Link, Part
+from vkc_pin.utils.arrays import Floats
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = [
+    "Surfaces",
+    "add_missing_limits",
+    "choose_name",
+    "compute_bounds",
+    "extract_subtree",
+    "find_closed_positions",
+    "find_multiple_objects",
+    "load_surfaces",
+    "make_upright",
+    "merge_fixed_links",
+    "move_root",
+    "rename_for_scenes",
+    "scale_object",
+]
+
+Surfaces = Mapping[int, "trimesh.Trimesh"]
+"""Surfaces of parts in the frame of their link, by `id` of the part."""
+_OPEN = np.pi / 2.0  # [rad] opening angle of hinges without limits
+_TINY_RANGE = 0.05  # [rad] hinge ranges below this suggest a wrong unit
+_PULLED = 0.8  # travel of drawers without limits, relative to their depth
+_UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
+
+
+def extract_subtree(description: Description, link: str) -> Description:
+    """Return a link and its descendants as an object of their own.
+
+    Raises:
+        UnknownNameError: The link does not exist.
+    """
+    if link not in description.links:
+        raise UnknownNameError("link", link, description.links, file=description.file, field="link")
+    subtree = description.subtree(link)
+    links = {name: item for name, item in description.links.items() if name in subtree}
+    joints = {
+        child: joint
+        for child, joint in description.joints.items()
+        if child in subtree and child != link
+    }
+    return dataclasses.replace(description, links=links, joints=joints)
+
+
+def find_multiple_objects(description: Description) -> tuple[str, ...]:
+    """Return a note if a file holds several objects with joints of their own; else nothing.
+
+    Several objects hang on a root without shapes, as in a scene file. If all of them are drawers
+    that slide on it, they are one chest of drawers.
+    """
+    joints, root = description.joints, description.root
+    children = [child for child, joint in joints.items() if joint.parent == root]
+    counts = {
+        link: sum(joints[child].kind != "fixed" for child in description.subtree(link))
+        for link in children
+    }
+    objects = {link: count for link, count in counts.items() if count}
+    if (
+        len(objects) < 2
+        or description.links[root].solid
+        or all(joints[link].kind != "fixed" for link in objects)
+    ):
+        return ()
+    listed = ", ".join(
+        f"'{link}' ({count} joint{'s' * (count != 1)})" for link, count in objects.items()
+    )
+    return (
+        f"the file holds several objects: {listed}; to import only one, name it (link, --link)",
+    )
+
+
+def choose_name(wanted: str, taken: set[str]) -> str:
+    """Choose a name that scenes accept and that is not in `taken`, and add it to `taken`.
+
+    Unprintable characters, ".", "/" and spaces become "_"; equal results are numbered.
+    """
+    plain = re.sub(r"[\s./]+", "_", wanted)
+    stem = "".join(letter if letter.isprintable() else "_" for letter in plain).strip("_") or "part"
+    name, number = stem, 1
+    while name in taken:
+        number += 1
+        name = f"{stem}_{number}"
+    taken.add(name)
+    return name
+
+
+def rename_for_scenes(description: Description) -> Description:
+    """Return the object with names of links and joints that scenes and steps accept."""
+    links_taken, joints_taken = set[str](), set[str]()
+    names = {name: choose_name(name, links_taken) for name in description.links}
+    links = {
+        names[name]: dataclasses.replace(link, name=names[name])
+        for name, link in description.links.items()
+    }
+    joints = {
+        names[child]: dataclasses.replace(
+            joint,
+            name=choose_name(joint.name, joints_taken),
+            parent=names[joint.parent],
+            child=names[child],
+        )
+        for child, joint in description.joints.items()
+    }
+    return dataclasses.replace(description, links=links, joints=joints)
+
+
+def merge_fixed_links(description: Description) -> Description:
+    """Return the object with fixed links merged into their parents.
+
+    Joints that move no shape are left out with their links, and noted. Joints with a single value
+    become fixed.
+    """
+    links, joints, notes = (
+        dict(description.links),
+        dict(description.joints),
+        list(description.notes),
+    )
+    for child in list(joints):
+        below = description.subtree(child)
+        if not any(links[name].solid for name in below if name in links):
+            notes.append(
+                f"joint '{joints[child].name}' moves no shape: left out with link '{child}'"
+            )
+            for name in below:
+                links.pop(name, None)
+                joints.pop(name, None)
+    for child, joint in joints.items():
+        if (
+            joint.kind != "fixed"
+            and joint.limits is not None
+            and joint.limits[0] == joint.limits[1] != 0.0
+        ):
+            placement = joint.placement * joint.compute_motion(joint.limits[0])
+            joints[child] = dataclasses.replace(joint, placement=placement, limits=(0.0, 0.0))
+    for child in list(joints):
+        joint = joints[child]
+        is_single_valued = joint.kind != "fixed" and joint.limits == (0.0, 0.0)
+        if is_single_valued:
+            notes.append(f"joint '{joint.name}' has a single value: fixed")
+        if joint.kind == "fixed" or is_single_valued:
+            parent, removed = links[joint.parent], links.pop(child)
+            transformed = (
+                _transform_parts(removed, parts, joint.placement)
+                for parts in (removed.visual, removed.collision)
+            )
+            visual, collision = transformed
+            # If only one of them has collision shapes, the other collides with its visual ones.
+            if bool(parent.collision) != bool(removed.collision):
+                parent, collision = (
+                    dataclasses.replace(parent, collision=parent.solid),
+                    collision or visual,
+                )
+            inertia = parent.inertia + joint.placement.act(removed.inertia)
+            links[joint.parent] = Link(
+                parent.name, (*parent.visual, *visual), (*parent.collision, *collision), inertia
+            )
+            del joints[child]
+            for name, other in joints.items():
+                if other.parent == child:
+                    placement = joint.placement * other.placement
+                    joints[name] = dataclasses.replace(
+                        other, parent=joint.parent, placement=placement
+                    )
+    return dataclasses.replace(description, links=links, joints=joints, notes=tuple(notes))
+
+
+def _transform_parts(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Part, ...]:
+    """Return the parts of a link in a frame in which the link is at `placement`."""
+    return tuple(
+        dataclasses.replace(
+            part, name=f"{link.name}_{part.name}".rstrip("_"), placement=placement * part.placement
+        )
+        for part in parts
+    )
+
+
+def load_surfaces(description: Description) -> Surfaces:
+    """Return the surfaces of all visual and collision shapes."""
+    parts = [
+        part for link in description.links.values() for part in (*link.visual, *link.collision)
+    ]
+    return {id(part): part.mesh() for part in parts}
+
+
+def compute_bounds(
+    description: Description, meshes: Surfaces, values: Mapping[str, float] | None = None
+) -> tuple[Floats, Floats]:
+    """Return the bounding box of the collision geometry in the root's frame [m].
+
+    Args:
+        description: The object.
+        meshes: Its surfaces.
+        values: Joint positions by name; others are at zero.
+
+    Raises:
+        InputError: The object has no shapes.
+    """
+    placements = description.compute_placements(values)
+    points = [
+        np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T
+        + placements[name].translation
+        for name, link in description.links.items()
+        for part in link.solid
+    ]
+    if not points:
+        raise InputError(
+            "the file has no shapes",
+            file=description.file,
+            expected="<collision> or <visual> elements",
+        )
+    vertices = np.vstack(points)
+    return vertices.min(axis=0), vertices.max(axis=0)
+
+
+def find_closed_positions(description: Description) -> dict[str, float]:
+    """Return the closed positions of joints, zero or the nearest limit, [rad] or [m]."""
+    return {
+        joint.name: min(max(0.0, joint.limits[0]), joint.limits[1])
+        for joint in description.joints.values()
+        if joint.limits
+    }
+
+
+def scale_object(description: Description, factor: float) -> Description:
+    """Scale an object: shapes, joint placements and prismatic limits; masses stay as stated."""
+    links = {}
+    for name, link in description.links.items():
+        visual, collision = (
+            tuple(_scale_part(part, factor) for part in parts)
+            for parts in (link.visual, link.collision)
+        )
+        inertia = pin.Inertia(
+            link.inertia.mass, factor * link.inertia.lever, factor**2 * link.inertia.inertia
+        )
+        links[name] = Link(name, visual, collision, inertia)
+    joints = {}
+    for child, joint in description.joints.items():
+        limits = joint.limits
+        if joint.kind == "prismatic" and limits is not None:
+            limits = (factor * limits[0], factor * limits[1])
+        placement = pin.SE3(joint.placement.rotation, factor * joint.placement.translation)
+        joints[child] = dataclasses.replace(joint, placement=placement, limits=limits)
+    return dataclasses.replace(description, links=links, joints=joints)
+
+
+def _scale_part(part: Part, factor: float) -> Part:
+    placement = pin.SE3(part.placement.rotation, factor * part.placement.translation)
+    return dataclasses.replace(
+        part, placement=placement, size=tuple(factor * size for size in part.size)
+    )
+
+
+def make_upright(description: Description, up: str) -> Description:
+    """Return the object rotated such that its axis `up`, "y" or "z", points upwards."""
+    return move_root(description, pin.SE3(_UP[up], np.zeros(3)))
+
+
+def move_root(description: Description, placement: pin.SE3) -> Description:
+    """Return the object with its root's frame moved such that the old one is at `placement`."""
+    links, root = dict(description.links), description.root
+    links[root] = links[root].transform(placement)
+    joints = {
+        child: dataclasses.replace(joint, placement=placement * joint.placement)
+        if joint.parent == root
+        else joint
+        for child, joint in description.joints.items()
+    }
+    return dataclasses.replace(description, links=links, joints=joints)
+
+
+def add_missing_limits(description: Description, meshes: Surfaces) -> Description:
+    """Return the object with limits for joints that state none, each noted.
+
+    A hinge opens by a right angle, a drawer by most of its depth, in the direction that moves the
+    part away from the centre of the object.
+    """
+    joints, notes = dict(description.joints), list(description.notes)
+    placements, (low, high) = description.compute_placements(), compute_bounds(description, meshes)
+    for child, joint in description.joints.items():
+        if (
+            joint.kind == "revolute"
+            and joint.limits is not None
+            and np.ptp(joint.limits) < _TINY_RANGE
+        ):
+            degrees = float(np.degrees(np.ptp(joint.limits)))
+            unit = "are its limits in another unit (MJCF: `angle` of <compiler>)?"
+            notes.append(f"joint '{joint.name}' has a range of only {degrees:.1g}°: {unit}")
+        if joint.kind not in ("revolute", "prismatic") or joint.limits is not None:
+            continue
+        below = description.subtree(child)
+        points = np.vstack(
+            [
+                np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T
+                + placements[name].translation
+                for name in below
+                for part in description.links[name].solid
+            ]
+        )
+        centre, axis = (
+            (points.min(axis=0) + points.max(axis=0)) / 2.0,
+            placements[child].rotation @ joint.axis,
+        )
+        direction = (
+            axis
+            if joint.kind == "prismatic"
+            else np.cross(axis, centre - placements[child].translation)
+        )
+        sign = 1.0 if direction @ (centre - (low + high) / 2.0) >= 0.0 else -1.0
+        travel = _OPEN if joint.kind == "revolute" else _PULLED * float(np.ptp(points @ axis))
+        limits = (0.0, travel) if sign > 0.0 else (-travel, 0.0)
+        joints[child] = dataclasses.replace(joint, limits=limits)
+        unit = "rad" if joint.kind == "revolute" else "m"
+        chosen = f"{limits[0]:.3g} to {limits[1]:.3g} {unit}"
+        notes.append(f"joint '{joint.name}' states no limits: {chosen} assumed, away from centre")
+    return dataclasses.replace(description, joints=joints, notes=tuple(notes))

@@ -1,0 +1,1 @@
+"""Proposes attachments for the joints of an object."""

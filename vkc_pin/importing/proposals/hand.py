@@ -1,0 +1,96 @@
+"""Describes a robot's open hand in its tool frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.models.grippers.bar_width import BAR_THICKNESS, find_widest_bar
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.shapes import compute_world_box, list_placed_shapes
+
+__all__ = ["Hand", "make_hand"]
+
+Placed = tuple[coal.CollisionGeometry, pin.SE3]
+
+
+@dataclass(frozen=True, eq=False)
+class Hand:
+    """An open hand.
+
+    Attributes:
+        robot: The robot's name.
+        touch: Shapes of the links that may touch a grasped object, with placements in the tool
+            frame.
+        others: Shapes of other links that move with the tool frame, with placements in it.
+        opening: Width of the widest bar between the fingers, at the tool's origin along its x axis
+            [m].
+        tip: Distance by which the fingers extend beyond the tool's origin along its z axis [m].
+        width: Width of the fingers along the tool's y axis [m].
+    """
+
+    robot: str
+    touch: tuple[Placed, ...]
+    others: tuple[Placed, ...]
+    opening: float
+    tip: float
+    width: float
+
+
+def make_hand(robot: Robot) -> Hand:
+    """Return the open hand of a robot.
+
+    Raises:
+        InputError: The robot has no touch links, or there is no room between them at the tool
+            frame.
+    """
+    if not robot.touch_links:
+        problem = f"the hand of '{robot.name}' is undefined"
+        expected = "touch_links in a robot.yaml, such as `vkc-pin import-robot` writes"
+        raise InputError(
+            problem, file=robot.urdf, field="touch_links", expected=expected, got="none"
+        )
+    data, frame = (
+        robot.model.createData(),
+        robot.model.frames[robot.model.getFrameId(robot.tool_frame)],
+    )
+    pin.framesForwardKinematics(
+        robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
+    )
+    tool = data.oMi[frame.parentJoint] * frame.placement
+    touch, others = list[pin.GeometryObject](), list[pin.GeometryObject]()
+    for number, shape in enumerate(robot.collision.geometryObjects):
+        placed = pin.GeometryObject(shape)
+        placed.placement = tool.inverse() * data.oMi[shape.parentJoint] * shape.placement
+        if robot.link_of(number) in robot.touch_links:
+            touch.append(placed)
+        elif frame.parentJoint in robot.model.supports[shape.parentJoint]:
+            others.append(placed)
+    fingers, others_placed = tuple(list_placed_shapes(touch)), tuple(list_placed_shapes(others))
+    opening = find_widest_bar(fingers)
+    if opening < 2.0 * BAR_THICKNESS:
+        problem = (
+            f"there is no room between the fingers of '{robot.name}' "
+            f"at its tool frame '{robot.tool_frame}'"
+        )
+        expected = "an open hand around its origin, with x as the closing direction"
+        raise InputError(problem, file=robot.urdf, field="tool_frame", expected=expected)
+    beyond = [
+        box
+        for geometry, where in fingers
+        if (box := compute_world_box(geometry, where))[1][2] > 0.0
+    ]  # shapes that extend beyond the origin
+    ends = beyond or [compute_world_box(geometry, where) for geometry, where in fingers]
+    width = max(high[1] for _, high in ends) - min(low[1] for low, _ in ends)
+    return Hand(
+        robot.name,
+        fingers,
+        others_placed,
+        opening,
+        max(0.0, float(max(high[2] for _, high in ends))),
+        float(width),
+    )

@@ -1,0 +1,146 @@
+"""Defines proposed attachments and the reasons why joints have none."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.importing.proposals.hand import Hand
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
+
+__all__ = ["Proposal", "Proposals"]
+
+_MAX_LISTED = 3  # other joints in a line
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A proposed attachment.
+
+    Attributes:
+        attachment: The attachment.
+        kind: "bar", "knob" or "edge".
+        named: Whether a name identifies it as a handle.
+        thickness: Thickness between the fingers [m].
+        score: Quality, from 0 to 1.
+        opens: Maps each joint to the position, [rad] or [m], to which it can be opened before the
+            hand collides with the object.
+        when: Maps other joints to positions at which they must be open for the hand to fit.
+    """
+
+    attachment: Attachment
+    kind: str
+    named: bool
+    thickness: float
+    score: float
+    opens: Mapping[str, float]
+    when: Mapping[str, float] = field(default_factory=dict)
+
+    def description(self) -> dict[str, Any]:
+        """Return the attachment as in an object's description file."""
+        item = self.attachment
+        data: dict[str, Any] = {
+            "name": item.name,
+            "link": item.link,
+            "position": _round_values(item.placement.translation, 5),
+            "approach": _round_values(item.placement.rotation[:, 2], 12),
+            "closing": _round_values(item.placement.rotation[:, 0], 12),
+        }
+        if item.freedoms:
+            data |= {"joint": item.joint, "axis": _round_values(item.freedoms[0].axis, 12)}
+            data["limits"] = [item.freedoms[0].lower, item.freedoms[0].upper]
+        if len(item.freedoms) == 2:
+            data["turn"] = [item.freedoms[1].lower, item.freedoms[1].upper]
+        if item.standoff:
+            data["standoff"] = round(item.standoff, 5)
+        if item.opening is not None:
+            data["opening"] = round(item.opening, 5)
+        return data
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Result of `propose_attachments`.
+
+    Attributes:
+        object: The object.
+        hand: The hand.
+        found: Proposed attachments, best first.
+        because: Maps joints to the reason why no hand can open them.
+    """
+
+    object: ArticulatedObject
+    hand: Hand
+    found: tuple[Proposal, ...]
+    because: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        names = ", ".join(proposal.attachment.name for proposal in self.found) or "none"
+        return f"<Proposals for {self.object.name}: {names}>"
+
+    def opening(self, joint: str) -> tuple[Proposal, ...]:
+        """Return the attachments with which a joint can be opened, best first."""
+        return tuple(proposal for proposal in self.found if joint in proposal.opens)
+
+    def applied(self) -> ArticulatedObject:
+        """Return the object with these attachments instead of its own, best first."""
+        attachments = {proposal.attachment.name: proposal.attachment for proposal in self.found}
+        return dataclasses.replace(self.object, attachments=MappingProxyType(attachments))
+
+    def report(self) -> str:
+        """Return a line for each attachment by joint, or the reason why it has none."""
+        lines = []
+        for index, joint in enumerate(self.object.coordinates.names):
+            low, high = self.object.lower[index], self.object.upper[index]
+            unit = self.object.coordinates.units[index]
+            lines.append(f"{joint}, {low:.3g} to {high:.3g} {unit}")
+            for proposal in self.opening(joint):
+                handle = ", named as a handle" if proposal.named else ""
+                name = f"{proposal.attachment.name} ({proposal.kind}{handle})"
+                slide = next(
+                    (
+                        freedom
+                        for freedom in proposal.attachment.freedoms
+                        if freedom.kind == "prismatic"
+                    ),
+                    None,
+                )
+                free = (
+                    f", {1e3 * (slide.upper - slide.lower):.0f} mm to slide along" if slide else ""
+                )
+                freedom = proposal.attachment.joint
+                when = _format_conditions(
+                    [f"{other} is at {value:.3g}" for other, value in proposal.when.items()]
+                )
+                wide = proposal.attachment.opening
+                narrow = "" if wide is None else f", fingers {1e3 * wide:.0f} mm apart"
+                lines.append(
+                    f"  {proposal.score:.2f}  {name}: "
+                    f"{1e3 * proposal.thickness:.0f} mm thick{narrow}, {freedom}{free}, "
+                    f"opens to {proposal.opens[joint]:.3g} {unit}{when}"
+                )
+            if joint in self.because:
+                lines.append(f"  no hand can open it: {self.because[joint]}")
+        return "\n".join(lines)
+
+
+def _format_conditions(conditions: list[str]) -> str:
+    """Format the required positions of other joints as the end of a line."""
+    if not conditions:
+        return ""
+    more = (
+        f" and {len(conditions) - _MAX_LISTED} more joints are open"
+        if len(conditions) > _MAX_LISTED
+        else ""
+    )
+    return f", while {', '.join(conditions[:_MAX_LISTED])}{more}"
+
+
+def _round_values(vector: Any, digits: int) -> list[float]:
+    """Return rounded values without negative zeros."""
+    return [float(value) + 0.0 for value in np.round(np.asarray(vector, float), digits) + 0.0]

@@ -1,0 +1,392 @@
+"""Proposes attachments for an object at its bars, knobs and edges, checked with a robot's hand."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.importing.proposals.candidates import Candidate, Thickness, find_candidates
+from vkc_pin.importing.proposals.fitting import HandClearance, Obstruction
+from vkc_pin.importing.proposals.freedom import GraspMotion
+from vkc_pin.importing.proposals.hand import make_hand
+from vkc_pin.importing.proposals.proposal import Proposal, Proposals
+from vkc_pin.importing.proposals.ranking import (
+    Opening,
+    find_named_handles,
+    find_openings,
+    score_grasp,
+)
+from vkc_pin.importing.proposals.sections import Piece
+from vkc_pin.utils.arguments import instance, number, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.urdf import read_urdf
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import load_robot
+
+__all__ = ["propose_attachments"]
+
+_TRIED = 600  # grasps of one body that are checked with the hand, the best by geometry
+_RETREAT = 0.25  # [m] straight path along which a hand must be able to retreat
+_STEP = 0.015  # [m] step of that path
+# [m] by which a fingertip grasp must extend beyond the centre of the grasped part
+_HELD = 0.005
+# Distance [m] and cosine of the angle (60°) below which two grasps are similar
+_NEAR, _SIMILAR = 0.06, 0.5
+# Factor for the rank of a grasp that differs from a better one by a rotation about the approach:
+# what one of them cannot reach, the other mostly cannot reach either.
+_TURNED = 0.5
+_ROOM = (0.02, 0.01)  # [m] extra clearances that increase the score
+_SLACK = 0.05  # [m] slide to either side above which the score does not increase further
+_WORTH = 0.1  # smallest score, relative to the best grasp of a joint
+_ROUND = 0.01  # [m] openings are multiples of this, and smaller than fully open by at least this
+_LITTLE = 0.1  # smallest travel of a joint, relative to its range, that counts as opening it
+
+
+@dataclass
+class _Tally:
+    """Counts of rejected grasps of one body."""
+
+    thickness: Thickness = field(default_factory=Thickness)
+    blocked: Counter[Obstruction] = field(default_factory=Counter)
+    cramped: int = 0
+    pieces: int = 0
+
+
+def propose_attachments(
+    item: ArticulatedObject,
+    robot: str | Robot = "husky_ur5e",
+    *,
+    dist_safe: float = 0.02,
+    grasp_clearance: float = 0.005,
+    most: int = 3,
+) -> Proposals:
+    """Propose attachments of an object for a robot's hand.
+
+    Every convex piece of a moving link is cut into cross-sections. Where its thickness fits between
+    the open fingers, and their pads meet faces off which they do not slip, there is a bar, a knob
+    or an edge. The open hand is placed there, and retreats straight, among all shapes of the closed
+    object; then it follows the joint as it opens. Where fully open fingers have no clearance, a
+    gripper's fingers are tried closer together; the attachment then has this `opening`.
+
+    Args:
+        item: The object, standing upright on its lowest point.
+        robot: The robot with the hand: a name, a file, or a robot.
+        dist_safe: Clearance between hand and object, as in `Options` [m].
+        grasp_clearance: Clearance between the touch links and the grasped link [m].
+        most: Largest number of proposals for one joint.
+
+    Returns:
+        The attachments, best first, and the reason why a joint has none.
+
+    Raises:
+        InputError: The robot has no touch links, they leave no room at its tool frame, or an
+            argument is invalid.
+        UnknownNameError: The robot is unknown.
+    """
+    instance(item, ArticulatedObject, "object")
+    whole(most, "most", low=1, high=100)
+    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    for name, value in (("dist_safe", dist_safe), ("grasp_clearance", grasp_clearance)):
+        number(value, name, "a distance [m]", low=0.0, high=1.0)
+    search = _Search(item, robot, dist_safe, grasp_clearance, most)
+    found = [
+        proposal
+        for number in range(1, item.model.njoints)
+        for proposal in search.propose_for_joint(number)
+    ]
+    found = search.assign_names(sorted(found, key=lambda proposal: -proposal.score))
+    because = {
+        opening.joint: search.explain_failure(opening)
+        for opening in search.openings.values()
+        if not any(opening.joint in proposal.opens for proposal in found)
+    }
+    return Proposals(item, search.hand, tuple(found), because)
+
+
+class _Search:
+    def __init__(
+        self,
+        item: ArticulatedObject,
+        robot: Robot,
+        dist_safe: float,
+        grasp_clearance: float,
+        most: int,
+    ) -> None:
+        self.item, self.robot, self.hand, self.most = item, robot, make_hand(robot), most
+        self.safe, self.close = dist_safe, grasp_clearance
+        self.pieces: dict[int, list[Piece]] = {}
+        for shape in item.collision.geometryObjects:
+            self.pieces.setdefault(int(shape.parentJoint), []).append(Piece.from_shape(shape))
+        self.openings = find_openings(item, self.pieces)
+        self.fitting = HandClearance(item, self.hand, dist_safe, grasp_clearance)
+        self.narrower: dict[float, HandClearance] = {}
+        self.closed = self.fitting.state.copy()
+        self.tallies: dict[int, _Tally] = {}
+        self._handles = {} if item.urdf is None else find_named_handles(read_urdf(item.urdf).root)
+
+    def propose_for_joint(self, number: int) -> list[Proposal]:
+        """Return the proposals for the links that joint `number` moves directly, best first.
+
+        If a part of another joint obstructs it, such as the door of a dishwasher its rack, that
+        joint is opened.
+        """
+        found = self._propose_at(number, {})
+        if not found:
+            links = {
+                blocked.link for blocked in self.tallies[number].blocked if blocked.what == "others"
+            }
+            above = {k for link in links for k in self.item.model.supports[self._joint_of(link)]}
+            own = {k for k in self.openings if number in self.item.model.supports[k]} | set(
+                self.item.model.supports[number]
+            )
+            others = [self.openings[k] for k in sorted(above - own - {0})]
+            if others:
+                before = self.tallies[number]
+                found = self._propose_at(number, {other.joint: other.opened for other in others})
+                self.tallies[number] = self.tallies[number] if found else before
+        return found
+
+    def _joint_of(self, link: str) -> int:
+        return int(self.item.model.frames[self.item.link_frame(link)].parentJoint)
+
+    def _propose_at(self, number: int, when: dict[str, float]) -> list[Proposal]:
+        """Return the proposals for a joint with other joints at positions `when`."""
+        tally = self.tallies[number] = _Tally(pieces=len(self.pieces.get(number, ())))
+        state = self.closed.copy()
+        for joint, value in when.items():
+            state[self.item.coordinates.index(joint)] = value
+        self.fitting.place(state)
+        at, opening = self.fitting.joint(number).copy(), self.openings[number]
+        ranked = [
+            (score_grasp(grasp, at * grasp.placement, opening, named=named), grasp, named)
+            for piece in self.pieces.get(number, ())
+            for named in (self._handles.get(piece.name, False),)
+            for grasp in find_candidates(
+                piece, self.hand, self.close, at.rotation[2], tally.thickness
+            )
+        ]
+        ranked.sort(key=lambda entry: -entry[0])  # stable, hence in file order for equal scores
+        kept = list[tuple[Proposal, Candidate]]()
+        for best, grasp, named in ranked[:_TRIED]:
+            ranks = _rank(kept)
+            if len(kept) >= self.most and best <= ranks[self.most - 1][0]:
+                break
+            if any(
+                best <= other.score and _are_similar(taken, other, grasp) for other, taken in kept
+            ):
+                continue
+            self.fitting.place(state)
+            proposal = self._evaluate(
+                best, grasp, opening, tally, named
+            ) or self._evaluate_narrower(best, grasp, opening, named, state)
+            if proposal is None or any(
+                _are_similar(taken, other, grasp) and other.score >= proposal.score
+                for other, taken in kept
+            ):
+                continue
+            proposal = dataclasses.replace(proposal, when=when)
+            kept = [
+                (other, taken) for other, taken in kept if not _are_similar(grasp, proposal, taken)
+            ]
+            kept = sorted([*kept, (proposal, grasp)], key=lambda entry: -entry[0].score)
+        chosen = [proposal for _, proposal in _rank(kept)[: self.most]]
+        return [proposal for proposal in chosen if proposal.score >= _WORTH * chosen[0].score]
+
+    def _evaluate_narrower(
+        self, best: float, grasp: Candidate, opening: Opening, named: bool, state: Floats
+    ) -> Proposal | None:
+        """Evaluate a grasp with fingers as close as it allows; None if they cannot be closer."""
+        room = _ROUND * float(np.ceil((grasp.thickness + 2.0 * self.close) / _ROUND - 1e-9))
+        wide = self.robot.opening(room)
+        if wide is None or not room <= wide <= self.hand.opening - _ROUND:
+            return None
+        if wide not in self.narrower:
+            self.narrower[wide] = HandClearance(
+                self.item, make_hand(self.robot.opened(wide)), self.safe, self.close
+            )
+        fully_open, self.fitting = self.fitting, self.narrower[wide]
+        try:
+            self.fitting.place(state)
+            found = self._evaluate(best, grasp, opening, _Tally(), named)
+        finally:
+            self.fitting = fully_open
+        return found and dataclasses.replace(
+            found, attachment=dataclasses.replace(found.attachment, opening=wide)
+        )
+
+    def _evaluate(
+        self, best: float, grasp: Candidate, opening: Opening, tally: _Tally, named: bool
+    ) -> Proposal | None:
+        """Evaluate a grasp with the hand placed there.
+
+        None means that the hand is obstructed, which `tally` records.
+        """
+        link, at = grasp.piece.link, self.fitting.joint(opening.number)
+        furthest = max(0.0, self.fitting.hand.tip - _HELD) if grasp.kind != "edge" else 0.0
+        reasons = list[Obstruction]()
+        for standoff in dict.fromkeys((0.0, furthest / 2.0, furthest)):
+            tool = at * grasp.placement * _retreat(standoff)
+            blocked = self.fitting.find_obstruction(tool, link) or self._check_retreat(tool, link)
+            if blocked is None:
+                break
+            reasons.append(blocked)
+        else:
+            tally.blocked[reasons[0]] += 1
+            return None
+        room = next(
+            (
+                room
+                for room in _ROOM
+                if self.fitting.find_obstruction(tool, link, extra_clearance=room) is None
+            ),
+            0.0,
+        )
+        grip, opens = GraspMotion(self.fitting, grasp, standoff), dict[str, float]()
+        for joint in self.item.model.supports[opening.number]:
+            if joint:
+                joint_opening = self.openings[joint]
+                reached = grip.follow(joint_opening)
+                if abs(reached - joint_opening.closed) > _LITTLE * abs(
+                    joint_opening.opened - joint_opening.closed
+                ):
+                    opens[joint_opening.joint] = reached
+        if opening.joint not in opens:
+            tally.cramped += 1
+            return None
+        kind, freedom = grip.freedoms()
+        share = abs(opens[opening.joint] - opening.closed) / max(
+            abs(opening.opened - opening.closed), 1e-9
+        )
+        score = (
+            best
+            * min(share, 1.0)
+            * (0.5 + 0.5 * min(grip.slack / _SLACK, 1.0))
+            * (0.7 + 0.3 * room / _ROOM[0])
+        )
+        score *= 1.0 - 0.2 * standoff / max(furthest, 1e-9) if standoff else 1.0
+        frame = self.item.model.frames[self.item.link_frame(link)]
+        placement = frame.placement.inverse() * grasp.placement
+        return Proposal(
+            Attachment(
+                name=link,
+                link=link,
+                placement=placement,
+                joint=kind,
+                freedoms=freedom,
+                standoff=standoff,
+            ),
+            grasp.kind,
+            named,
+            grasp.thickness,
+            score,
+            opens,
+        )
+
+    def _check_retreat(self, tool: pin.SE3, link: str) -> Obstruction | None:
+        """Return what obstructs a hand that retreats straight, if anything."""
+        for joint_opening in np.arange(_STEP, _RETREAT + _STEP / 2.0, _STEP):
+            if (
+                blocked := self.fitting.find_obstruction(tool * _retreat(joint_opening), link)
+            ) is not None:
+                return blocked
+        return None
+
+    def assign_names(self, found: Iterable[Proposal]) -> list[Proposal]:
+        """Return the proposals with names that are distinct from each other and from joints."""
+        taken, out = set(self.item.coordinates.names), list[Proposal]()
+        for proposal in found:
+            stem, number = f"{proposal.attachment.link}_{proposal.kind}", 1
+            while not taken.isdisjoint(
+                names := {
+                    (name := stem if number == 1 else f"{stem}_{number}"),
+                    f"{name}_slide",
+                    f"{name}_turn",
+                }
+            ):
+                number += 1
+            taken |= names
+            out.append(
+                dataclasses.replace(
+                    proposal, attachment=dataclasses.replace(proposal.attachment, name=name)
+                )
+            )
+        return out
+
+    def explain_failure(self, opening: Opening) -> str:
+        """Return the reason why no link that a joint moves directly offers a grasp."""
+        tally, hand = self.tallies[opening.number], self.hand
+        counts, rejected = tally.thickness, tally.blocked.most_common()
+        if not tally.pieces:
+            return "the link that it moves has no shape"
+        if opening.opened == opening.closed:
+            return "its limits leave it no travel"
+        fits = counts.tried - counts.too_thick
+        if not fits:
+            thinnest = (
+                f", it is {1e3 * counts.thinnest:.0f} mm at its thinnest"
+                if np.isfinite(counts.thinnest)
+                else ""
+            )
+            clear = 1e3 * self.close
+            between = (
+                f"the fingers, {1e3 * hand.opening:.0f} mm apart, with {clear:.0f} mm on both sides"
+            )
+            return f"nothing of it fits between {between}{thinnest}"
+        reasons = []
+        for blocked, count in rejected[:3]:
+            least = 1e3 * (self.close if blocked.what == "fingers" else self.safe)
+            near = (
+                "place the hand below the object's support"
+                if blocked.what == "floor"
+                else f"are not {least:.0f} mm from {blocked.link}"
+            )
+            reasons.append(f"{count} {near}")
+        if tally.cramped:
+            reasons.append(
+                f"{tally.cramped} let it open by less than a tenth before the hand collides"
+            )
+        return f"of {min(fits, _TRIED)} places that are thin enough, " + ", ".join(reasons)
+
+
+def _retreat(joint_opening: float) -> pin.SE3:
+    """Return the motion by a distance [m] against the direction of approach."""
+    return pin.SE3(np.eye(3), np.array([0.0, 0.0, -joint_opening]))
+
+
+def _rank(kept: list[tuple[Proposal, Candidate]]) -> list[tuple[float, Proposal]]:
+    """Return proposals with their ranks, best first.
+
+    The rank is the score, reduced for rotations of a better grasp about its approach.
+    """
+    ranked, better = list[tuple[float, Proposal]](), list[tuple[Proposal, Candidate]]()
+    for proposal, grasp in kept:
+        count = sum(_are_similar(taken, other, grasp, turned=True) for other, taken in better)
+        ranked.append((proposal.score * _TURNED**count, proposal))
+        better.append((proposal, grasp))
+    return sorted(ranked, key=lambda entry: -entry[0])
+
+
+def _are_similar(
+    taken: Candidate, proposal: Proposal, other: Candidate, *, turned: bool = False
+) -> bool:
+    """Return whether a grasp is similar to a proposed one.
+
+    It has a similar direction of approach, and a position to which the hand can slide. Its
+    orientation is similar as well, unless it may be `turned` about its approach.
+    """
+    first, second = taken.placement, other.placement
+    if first.rotation[:, 2] @ second.rotation[:, 2] < _SIMILAR:
+        return False
+    if not turned and abs(first.rotation[:, 1] @ second.rotation[:, 1]) < _SIMILAR:
+        return False
+    offset = first.rotation.T @ (second.translation - first.translation)
+    slide = next((item for item in proposal.attachment.freedoms if item.kind == "prismatic"), None)
+    low, high = (slide.lower, slide.upper) if slide else (0.0, 0.0)
+    offset[1] -= min(max(offset[1], low), high)
+    return bool(np.linalg.norm(offset) < _NEAR)

@@ -1,0 +1,197 @@
+"""Writes the meshes of a URDF into its folder: convex pieces and copies of visual meshes."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vkc_pin.errors import InputError
+from vkc_pin.importing.convex import Pieces, decompose
+from vkc_pin.world.files.hulls import compute_hull
+from vkc_pin.world.files.meshes import load_mesh
+from vkc_pin.world.files.resources import choose_file_names
+from vkc_pin.world.files.urdf import UrdfFile, UrdfShape
+
+__all__ = ["Piece", "write_meshes"]
+
+# Protrusion of a hull over its mesh that is acceptable on a robot [m], and relative to the longest
+# edge of the mesh, since fingers are small
+_MAX_ERROR, _MAX_RELATIVE_ERROR = 0.02, 0.15
+_MAX_OVERHEAD = 0.15  # acceptable excess volume of a hull, relative to its mesh
+_MATERIAL = "mtllib "  # statement of an OBJ file that names its material file
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Decomposition of a collision mesh.
+
+    Attributes:
+        link: Its link.
+        mesh: Name of its file.
+        count: Number of convex pieces.
+        overhead: Volume of the pieces in excess of the mesh, relative to it.
+        hull: Volume of the convex hull in excess of the mesh, relative to it.
+        error: Largest protrusion of the pieces over the mesh [m].
+    """
+
+    link: str
+    mesh: str
+    count: int
+    overhead: float
+    hull: float
+    error: float
+
+
+def write_meshes(
+    file: UrdfFile, folder: Path, *, most_pieces: int
+) -> tuple[ElementTree.Element, list[Piece], list[str]]:
+    """Write the meshes of a URDF into `folder`; return the URDF, the decompositions and notes.
+
+    Collision meshes are written as convex pieces, `collision/<link>_<k>.stl`; visual meshes are
+    copied into `visual`. `choose_file_names` chooses the names.
+
+    Links without collision shapes collide with their visual shapes. Flat collision meshes, and
+    visual meshes that cannot be read, are left out.
+
+    Args:
+        file: The URDF.
+        folder: Output folder.
+        most_pieces: Largest number of pieces of one mesh; 1 keeps hulls.
+
+    Raises:
+        InputError: A collision mesh cannot be read.
+    """
+    root = copy.deepcopy(file.root)
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    stems = dict(zip(links, choose_file_names(links), strict=True))
+    decompositions, notes = list[Piece](), list[str]()
+    shapes: dict[str, list[UrdfShape]] = {}
+    for shape in file.shapes("collision"):
+        shapes.setdefault(shape.link, []).append(shape)
+    # Pieces and hull volume by mesh file and scale
+    done: dict[tuple[Path, tuple[float, ...]], tuple[Pieces, float]] = {}
+    for name, link in links.items():
+        elements = link.findall("collision")
+        written = 0
+        for element, shape in zip(elements, shapes.get(name, []), strict=True):
+            if shape.file is None:
+                continue
+            place = list(link).index(element)
+            link.remove(element)
+            key = shape.file, shape.size
+            try:
+                if key not in done:
+                    mesh = load_mesh(shape.file, shape.size)
+                    error = min(_MAX_ERROR, _MAX_RELATIVE_ERROR * float(mesh.extents.max()))
+                    pieces = decompose(
+                        mesh, most_pieces=most_pieces, error=error, overhead=_MAX_OVERHEAD
+                    )
+                    done[key] = pieces, float(compute_hull(mesh.vertices).volume)
+            except InputError as error_:
+                if "flat" not in error_.problem:
+                    raise
+                notes.append(
+                    f"{name}: {shape.file.name} is flat and was removed from the collision geometry"
+                )
+                continue
+            pieces, hull = done[key]
+            decompositions.append(
+                Piece(
+                    name,
+                    shape.file.name,
+                    len(pieces.meshes),
+                    pieces.overhead,
+                    hull / pieces.solid - 1.0,
+                    pieces.error,
+                )
+            )
+            for mesh in pieces.meshes:
+                path = folder / "collision" / f"{stems[name]}_{written}.stl"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(mesh.export(file_type="stl"))
+                piece = copy.deepcopy(element)
+                for geometry in piece.iter("mesh"):
+                    geometry.attrib.clear()
+                    geometry.set("filename", f"collision/{path.name}")
+                link.insert(place, piece)
+                place, written = place + 1, written + 1
+    _copy_visual(file, links, folder, notes)
+    return root, decompositions, notes
+
+
+def _copy_visual(
+    file: UrdfFile, links: dict[str, ElementTree.Element], folder: Path, notes: list[str]
+) -> None:
+    users: dict[Path, list[ElementTree.Element]] = {}
+    missing = []
+    for name, link in links.items():
+        for element in link.findall("visual"):
+            mesh = element.find("geometry/mesh")
+            if mesh is None:
+                continue
+            try:
+                path = file.resolve(mesh.get("filename", ""))
+                load_mesh(path)
+            except InputError:
+                link.remove(element)
+                missing.append(name)
+                continue
+            users.setdefault(path, []).append(mesh)
+    for path, copy_name in _copy_meshes(list(users), folder / "visual").items():
+        for mesh in users[path]:
+            mesh.set("filename", f"visual/{copy_name}")
+    if missing:
+        notes.append(f"left out unreadable visual meshes of {', '.join(dict.fromkeys(missing))}")
+
+
+def _copy_meshes(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
+    """Copy meshes and the materials of OBJ files; return the names of the copies."""
+    used = {path: _find_materials(path) for path in paths if path.suffix.lower() == ".obj"}
+    materials = dict.fromkeys(file for files in used.values() for file in files)
+    names = _name_copies([*paths, *materials])
+    for path, name in names.items():
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, folder / name)
+    for path, files in used.items():
+        new = {file.name: names[file] for file in files if names[file] != file.name}
+        if new:
+            _rename_materials(folder / names[path], new)
+    return {path: names[path] for path in paths}
+
+
+def _name_copies(paths: Sequence[Path]) -> dict[Path, str]:
+    """Choose distinct names for copies of files in one folder; extensions stay."""
+    names = dict[Path, str]()
+    for extension in dict.fromkeys(path.suffix.lower() for path in paths):
+        same = [path for path in paths if path.suffix.lower() == extension]
+        stems = choose_file_names(path.stem for path in same)
+        names |= {path: f"{stem}{path.suffix}" for path, stem in zip(same, stems, strict=True)}
+    return names
+
+
+def _find_materials(path: Path) -> list[Path]:
+    """Return the material files beside an OBJ file that it names."""
+    named = [path.parent / name for line in _read_lines(path) if (name := _get_material(line))]
+    return [file for file in named if file.is_file() and file.parent == path.parent]
+
+
+def _rename_materials(path: Path, names: Mapping[str, str]) -> None:
+    """Replace names of material files in an OBJ file."""
+    lines = (
+        f"{_MATERIAL}{names[name]}" if (name := _get_material(line)) in names else line
+        for line in _read_lines(path)
+    )
+    path.write_text("\n".join(lines), encoding="utf-8", errors="surrogateescape")
+
+
+def _get_material(line: str) -> str:
+    """Return the material file that a line of an OBJ file names, or ""."""
+    return line.removeprefix(_MATERIAL).strip() if line.startswith(_MATERIAL) else ""
+
+
+def _read_lines(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8", errors="surrogateescape").split("\n")

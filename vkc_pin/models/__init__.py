@@ -1,1 +1,0 @@
-"""Robots and articulated objects: Pinocchio models with convex shapes and limits."""

@@ -1,1 +1,0 @@
-"""Joints that follow others, as in a telescope: one coordinate moves all of them."""

@@ -1,1 +1,0 @@
-"""Furniture and appliances made by rule and number: what they are like, where their handles are, and how these are taken."""

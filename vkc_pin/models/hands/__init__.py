@@ -1,1 +1,0 @@
-"""Hands: their fingers, how these open and close, and how much fits between them."""

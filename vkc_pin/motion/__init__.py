@@ -1,1 +1,0 @@
-"""Motions over time, the scene along them, and both as files."""

@@ -1,1 +1,0 @@
-"""Motions as files and messages: saved plans, tables, JSON, ROS."""

@@ -1,0 +1,332 @@
+"""Checks whether shapes on the base keep their margins along a straight drive or a turn in place.
+
+Turning and driving preserve the height of every shape, so shapes at different heights never meet.
+For the others, the plan view bounds the distance from below: along a direction u, they are
+u·p − h(u) apart, where p is the base position and h the sum of both support functions. One
+direction that separates them during the whole motion is sufficient. Only pairs without one need
+coal, whose normal bounds how far the motion may continue until the next query.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arrays import Floats, Ints
+
+__all__ = ["DIRECTIONS", "MovingShapes", "Obstacles", "Shape", "compute_hull_points"]
+
+Shape = tuple[coal.CollisionGeometry, pin.SE3]
+"""A convex shape and its placement."""
+
+# Towards the neighbours of a cell and the cells a knight's move away, since bases and walls mostly
+# have such sides; and between these.
+_TOWARDS = np.arctan2([0, 1, 1, 2], [1, 2, 1, 1])
+_QUADRANT = np.column_stack([_TOWARDS, (_TOWARDS + np.append(_TOWARDS[1:], np.pi / 2)) / 2]).ravel()
+_ANGLES = np.concatenate([_QUADRANT + quarter * np.pi / 2 for quarter in range(4)])
+DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+"""Unit vectors along which distances are bounded, eight per quadrant from x on, shape (32, 2)."""
+
+_AXES = slice(0, len(DIRECTIONS), len(DIRECTIONS) // 4)  # those of `DIRECTIONS` along world axes
+_RIM_ANGLES = 2 * np.pi * np.arange(16) / 16  # corners that approximate a circle
+_CORNERS = np.array(list(itertools.product((False, True), repeat=3)))  # of a box: upper ends or not
+_STEP, _ARC = 0.25, 0.13  # [m], [rad] above which motions are halved before coal is called
+_LONG_ARC = 0.5  # [rad] of turning that one row of bounds may cover
+# [m] minimum advance between distance queries: half of it is the largest undetected violation
+_MIN_ADVANCE = 2e-3
+_ROUNDING = 1e-6  # [m] rounding error of coal
+_CACHE_SIZE = 512  # tables
+
+
+class Obstacles:
+    """Obstacles in the world.
+
+    Attributes:
+        shapes: Convex shapes and their placements.
+        support: Support functions along `DIRECTIONS`, shape (S, 32) [m].
+        extent: Support functions along the world axes, shape (S, 4) [m].
+        height: Lowest and highest z, shape (S, 2) [m].
+    """
+
+    def __init__(self, shapes: Sequence[Shape]) -> None:
+        self.shapes = [(shape, _transform(placement)) for shape, placement in shapes]
+        self.support, self.height = (
+            np.empty((len(shapes), len(DIRECTIONS))),
+            np.empty((len(shapes), 2)),
+        )
+        for s, (shape, placement) in enumerate(shapes):
+            points, radius = compute_hull_points(shape, placement, outer=True)
+            self.support[s] = (points[:, :2] @ DIRECTIONS.T).max(axis=0) + radius
+            self.height[s] = points[:, 2].min() - radius, points[:, 2].max() + radius
+        self.extent = self.support[:, _AXES].copy()
+
+
+class MovingShapes:
+    """Shapes that move with the base, and their pairs with obstacles at the same height.
+
+    Attributes:
+        exclusion_radius: Distance from each obstacle beyond which no heading collides with it;
+            -inf if no shape shares its height, shape (S,) [m].
+    """
+
+    def __init__(self, shapes: Sequence[Shape], world: Obstacles, margin: float) -> None:
+        self.world, self.margin = world, margin
+        self.shapes = [(shape, _transform(placement)) for shape, placement in shapes]
+        outlines = [
+            compute_hull_points(shape, placement, outer=True) for shape, placement in shapes
+        ]
+        radius = np.array([radius for _, radius in outlines])
+        low = np.array([points[:, 2].min() for points, _ in outlines]) - radius
+        high = np.array([points[:, 2].max() for points, _ in outlines]) + radius
+        self.reach = np.array([np.hypot(*points[:, :2].T).max() for points, _ in outlines]) + radius
+        gaps = np.maximum(low[:, None] - world.height[:, 1], world.height[:, 0] - high[:, None])
+        self.moving, self.standing = np.nonzero(gaps < margin)
+        self.exclusion_radius = np.full(len(world.shapes), -np.inf)
+        np.maximum.at(self.exclusion_radius, self.standing, self.reach[self.moving] + margin)
+        self._points = (
+            np.concatenate([points[:, :2] for points, _ in outlines])
+            if outlines
+            else np.empty((0, 2))
+        )
+        self._first_point = np.concatenate(
+            [[0], np.cumsum([len(points) for points, _ in outlines])[:-1]]
+        ).astype(int)
+        self._radius = radius[:, None]
+        self._tables: dict[tuple[float, float], Floats] = {}
+        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+        order = np.argsort(self.standing, kind="stable")
+        self._pairs_by_obstacle = np.split(
+            order, np.searchsorted(self.standing[order], np.arange(1, len(world.shapes)))
+        )
+        self._margins = np.full(len(world.shapes), margin)
+
+    def is_drive_free(
+        self, a: Floats, b: Floats, yaw: float, margins: Floats | None = None
+    ) -> bool:
+        """Return whether the margins are kept along a line; see `BaseGrid.is_drive_free`."""
+        if not len(self.moving):
+            return True
+        margins = self._margins if margins is None else margins
+        rows = self._find_close_pairs(np.minimum(DIRECTIONS @ a, DIRECTIONS @ b))
+        return not len(rows) or self._check_drive(
+            a, b, yaw, extents=self._compute_extents(yaw, yaw, rows), rows=rows, margins=margins
+        )
+
+    def is_turn_free(
+        self, at: Floats, start: float, end: float, margins: Floats | None = None
+    ) -> bool:
+        """Return whether the margins are kept while turning; see `BaseGrid.is_turn_free`."""
+        if not len(self.moving):
+            return True
+        along = DIRECTIONS @ at
+        rows = self._find_close_pairs(along)
+        yaws = np.linspace(
+            start, end, 1 + max(1, int(np.ceil(abs(end - start) / _LONG_ARC)))
+        ).tolist()
+        margins = self._margins if margins is None else margins
+        return not len(rows) or all(
+            self._check_turn(at, along, p, q, rows=rows, margins=margins)
+            for p, q in itertools.pairwise(yaws)
+        )
+
+    def compute_exit_margins(self, at: Floats, yaw: float) -> Floats:
+        """Return the margins that hold at a pose; see `BaseGrid.compute_exit_margins`."""
+        margins = self._margins.copy()
+        for row in self._find_close_pairs(DIRECTIONS @ at).tolist():
+            distance, _ = self._compute_distance(row, at, yaw)
+            least = distance - _ROUNDING if distance > 0.0 else -np.inf
+            margins[self.standing[row]] = min(margins[self.standing[row]], least)
+        return margins
+
+    def _find_close_pairs(self, along: Floats) -> Ints:
+        """Return pairs that may collide, given lower bounds of the base position, (32,) [m]."""
+        world = self.world
+        near = np.flatnonzero((along[_AXES] - world.extent).max(axis=1) < self.exclusion_radius)
+        near = near[(along - world.support[near]).max(axis=1) < self.exclusion_radius[near]]
+        return (
+            np.sort(np.concatenate([self._pairs_by_obstacle[s] for s in near.tolist()]))
+            if len(near)
+            else near
+        )
+
+    def _compute_extents(self, start: float, end: float, rows: Ints) -> Floats:
+        """Return upper bounds of the extents of pairs against `DIRECTIONS`, shape (n, 32) [m]."""
+        moving = self.moving[rows]
+        extents = (
+            self._get_extent_table(start, end)[moving] + self.world.support[self.standing[rows]]
+        )
+        return (
+            extents
+            if start == end
+            else extents + (self.reach * (1.0 - np.cos((end - start) / 4)))[moving, None]
+        )
+
+    def _get_extent_table(self, start: float, end: float) -> Floats:
+        """Return upper bounds of the shapes' extents between two yaws, shape (M, 32) [m]."""
+        key = (start, end)
+        if key not in self._tables:
+            if start == end:
+                cosine, sine = np.cos(start), np.sin(start)
+                turned = DIRECTIONS @ np.array(
+                    [[-cosine, sine], [-sine, -cosine]]
+                )  # against u, in the base's frame
+                table = (
+                    np.maximum.reduceat(self._points @ turned.T, self._first_point, axis=0)
+                    + self._radius
+                )
+            else:
+                middle = (start + end) / 2
+                table = np.maximum(
+                    self._get_extent_table(start, start), self._get_extent_table(end, end)
+                )
+                table = np.maximum(table, self._get_extent_table(middle, middle))
+            if len(self._tables) >= _CACHE_SIZE:
+                self._tables.clear()
+            self._tables[key] = table
+        return self._tables[key]
+
+    def _check_drive(
+        self, a: Floats, b: Floats, yaw: float, *, extents: Floats, rows: Ints, margins: Floats
+    ) -> bool:
+        """Return whether pairs `rows` keep their margins along a line, given their extents."""
+        near = (np.minimum(DIRECTIONS @ a, DIRECTIONS @ b) - extents).max(axis=1) < margins[
+            self.standing[rows]
+        ]
+        rows, extents = rows[near], extents[near]
+        if not len(rows):
+            return True
+        length = float(np.hypot(*(b - a)))
+        if length > _STEP:
+            ends = itertools.pairwise((a, (a + b) / 2, b))
+            return all(
+                self._check_drive(*half, yaw, extents=extents, rows=rows, margins=margins)
+                for half in ends
+            )
+        direction = (b - a) / max(length, 1e-12)
+
+        def query(row: int, at: float) -> tuple[float, float]:
+            distance, normal = self._compute_distance(row, a + at * direction, yaw)
+            return distance, float(direction @ normal)
+
+        return all(
+            self._keeps_margin(row, query, length, _MIN_ADVANCE, margins) for row in rows.tolist()
+        )
+
+    def _check_turn(
+        self, at: Floats, along: Floats, start: float, end: float, *, rows: Ints, margins: Floats
+    ) -> bool:
+        """Return whether pairs `rows` keep their margins during a turn, given `DIRECTIONS` @ at."""
+        gaps = (along - self._compute_extents(start, end, rows)).max(axis=1)
+        rows = rows[gaps < margins[self.standing[rows]]]
+        if not len(rows):
+            return True
+        angle = abs(end - start)
+        if angle > _ARC:
+            ends = itertools.pairwise((start, (start + end) / 2, end))
+            return all(
+                self._check_turn(at, along, *half, rows=rows, margins=margins) for half in ends
+            )
+
+        def query(row: int, turned: float) -> tuple[float, float]:
+            yaw = start + np.copysign(turned, end - start)
+            distance, normal = self._compute_distance(row, at, yaw)
+            return distance, float(self.reach[self.moving[row]] * np.hypot(*normal))
+
+        return all(
+            self._keeps_margin(
+                row, query, angle, _MIN_ADVANCE / self.reach[self.moving[row]], margins
+            )
+            for row in rows.tolist()
+        )
+
+    def _keeps_margin(
+        self,
+        row: int,
+        query: Callable[[int, float], tuple[float, float]],
+        end: float,
+        advance: float,
+        margins: Floats,
+    ) -> bool:
+        """Return whether a pair keeps its margin by conservative advancement.
+
+        The plane between two convex shapes separates them until one has moved through it.
+
+        Args:
+            row: Number of the pair.
+            query: Function of row and progress that returns the distance [m] and an upper bound of
+                the closing speed.
+            end: Progress at the end of the motion.
+            advance: Minimum advance between queries.
+            margins: Margins from each obstacle, shape (S,) [m].
+        """
+        at, margin = 0.0, margins[self.standing[row]]
+        while True:
+            distance, speed = query(row, at)
+            if distance < margin:
+                return False
+            sure = (distance - margin) / max(speed, 1e-9)
+            if at >= end or at + sure >= end:
+                return True
+            at = min(at + max(sure, advance), end)
+
+    def _compute_distance(self, row: int, at: Floats, yaw: float) -> tuple[float, Floats]:
+        """Return the distance of a pair at a base pose [m], and its normal in the plane, (2,)."""
+        shape, placement = self.shapes[self.moving[row]]
+        other, where = self.world.shapes[self.standing[row]]
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        turned = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        self._result.clear()
+        there = coal.Transform3s(turned, np.array([at[0], at[1], 0.0])) * placement
+        distance = coal.distance(shape, there, other, where, self._request, self._result)
+        return distance, self._result.normal[:2].copy()
+
+
+def _transform(placement: pin.SE3) -> coal.Transform3s:
+    return coal.Transform3s(placement.rotation, placement.translation)
+
+
+def compute_hull_points(
+    shape: coal.CollisionGeometry, placement: pin.SE3, *, outer: bool
+) -> tuple[Floats, float]:
+    """Return points, shape (n, 3), and a radius around them that bound a convex shape [m].
+
+    Args:
+        shape: Convex shape.
+        placement: Its placement.
+        outer: Whether the hull of the points contains the shape; otherwise it is inside.
+    """
+    rim = np.column_stack(
+        [np.cos(_RIM_ANGLES), np.sin(_RIM_ANGLES), np.zeros(len(_RIM_ANGLES))]
+    ) / (np.cos(_RIM_ANGLES[1] / 2) if outer else 1.0)
+    radius = shape.getSweptSphereRadius() if outer else 0.0
+    if isinstance(shape, coal.Cylinder | coal.Cone):
+        top = np.array([0.0, 0.0, shape.halfLength])
+        points = np.concatenate(
+            [
+                shape.radius * rim - top,
+                shape.radius * rim + top if isinstance(shape, coal.Cylinder) else top[None],
+            ]
+        )
+    elif isinstance(shape, coal.Sphere | coal.Capsule):
+        top = np.array([0.0, 0.0, shape.halfLength if isinstance(shape, coal.Capsule) else 0.0])
+        balls = (
+            np.zeros((1, 3))
+            if outer
+            else shape.radius * np.concatenate([rim, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+        )
+        points = np.concatenate([balls - top, balls + top])
+        radius += shape.radius if outer else 0.0
+    elif isinstance(shape, coal.ConvexBase):
+        points = np.asarray(shape.points())
+    elif isinstance(shape, coal.Box) or outer:
+        shape.computeLocalAABB()
+        box = shape.aabb_local
+        points = np.where(_CORNERS, box.max_, box.min_)
+    else:
+        points = np.empty((0, 3))
+    return points @ placement.rotation.T + placement.translation, radius

@@ -1,0 +1,217 @@
+"""Plans the base's path from a start to the best of several goals: straight drives and turns."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vkc_pin.errors import InputError
+from vkc_pin.planning.base_paths.grid import BaseGrid
+from vkc_pin.planning.base_paths.lattice_search import find_cheapest_path
+from vkc_pin.planning.base_paths.motion_primitives import Drive, SearchSpace, wrap_angle
+from vkc_pin.utils.arrays import Floats
+
+__all__ = ["BasePath", "sample_poses", "shortest_path"]
+
+_SHORTCUT_SPACING = 0.5  # [m] spacing of the points between which shortcuts are tried
+_SAME = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class BasePath:
+    """Base path of straight drives, forwards or backwards, with turns in place between them.
+
+    Attributes:
+        poses: x, y [m] and continuous yaw [rad] at the ends of drives and turns, from the start to
+            the goal, shape (K, 3).
+        goal: Number of the goal that it reaches.
+        cost: Length driven, backwards times `BACKWARDS`, sideways next to start or goal times
+            `SIDEWAYS`, plus the angle turned times `BaseGrid.turning`, plus the goal's additional
+            cost [m].
+    """
+
+    poses: Floats
+    goal: int
+    cost: float
+
+
+def shortest_path(
+    grid: BaseGrid,
+    start: Sequence[float],
+    goals: Floats,
+    *,
+    costs: Sequence[float] | Floats | None = None,
+    smooth: bool = True,
+) -> BasePath | None:
+    """Find the cheapest path from the start to one of the goals, or None if there is none.
+
+    A blocked start can be left; blocked goals are not reached. The result is deterministic.
+
+    Args:
+        grid: Grid of free base poses.
+        start: x, y [m] and yaw [rad].
+        goals: Goal poses, shape (G, 3).
+        costs: Additional cost of each goal, shape (G,) [m]. Default: none.
+        smooth: Whether to shorten the path where it turns more often than necessary.
+
+    Raises:
+        InputError: A shape is wrong, or a number is not finite.
+    """
+    begin, ends = np.asarray(start, float), np.asarray(goals, float)
+    extra = np.zeros(len(ends)) if costs is None else np.asarray(costs, float)
+    for field, value, shape in (
+        ("start", begin, (3,)),
+        ("goals", ends, (len(ends), 3)),
+        ("costs", extra, (len(ends),)),
+    ):
+        if value.shape != shape or not np.all(np.isfinite(value)):
+            expected = f"finite numbers, shape {shape}"
+            raise InputError(
+                "wrong shape or values", field=field, expected=expected, got=value.tolist()
+            )
+    if np.any(extra < 0.0):
+        raise InputError(
+            "a cost is negative", field="costs", expected="numbers >= 0", got=extra.tolist()
+        )
+    space = SearchSpace(grid, begin, ends)
+    found = find_cheapest_path(space, extra)
+    if found is None:
+        return None
+    _, goal, drives, yaw = found
+    if smooth:
+        drives, yaw = _shorten(space, drives, yaw)
+    return _assemble(space, drives, yaw, goal, float(extra[goal]))
+
+
+def sample_poses(path: BasePath, steps: int, *, turning: float) -> Floats:
+    """Sample poses along a path without its start, slow at both ends, the last at its goal.
+
+    Args:
+        path: Base path.
+        steps: Number of poses, at least 1.
+        turning: Cost of turning, relative to driving [m/rad].
+
+    Returns:
+        Poses, shape (steps, 3) [m, rad].
+    """
+    if steps < 1:
+        raise InputError("no waypoints", field="steps", expected="at least 1", got=steps)
+    change = np.diff(path.poses, axis=0)
+    passed = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + turning * np.abs(change[:, 2]))]
+    )
+    u = np.arange(1, steps + 1) / steps
+    at = passed[-1] * (3.0 - 2.0 * u) * u**2
+    poses = np.column_stack([np.interp(at, passed, column) for column in path.poses.T])
+    poses[-1] = path.poses[-1]
+    return poses
+
+
+def _shorten(space: SearchSpace, drives: list[Drive], last: float) -> tuple[list[Drive], float]:
+    """Replace drives by straight shortcuts where those are free and cheaper.
+
+    Args:
+        space: Search space.
+        drives: Drives of the path.
+        last: Yaw at the goal [rad].
+
+    Returns:
+        Drives, and the yaw at the goal [rad].
+    """
+    forced = 0 if space.exit_margins is None else 1  # the first drive leaves a blocked start
+    result, yaw = drives[:forced], drives[0].yaw if forced else float(space.start[2])
+    rest = []
+    for drive in drives[forced:]:
+        points = np.linspace(drive.a, drive.b, 1 + max(1, int(drive.length / _SHORTCUT_SPACING)))
+        rest += [Drive(a, b, drive.yaw) for a, b in itertools.pairwise(points)]
+    while rest:
+        yaws = np.array([yaw, *(drive.yaw for drive in rest), last])
+        turns = space.grid.turning * np.abs(np.diff(yaws))
+        # Cost up to the end of each drive, including the turn to the next.
+        cost = turns[0] + np.cumsum([drive.cost for drive in rest] + turns[1:])
+        best, low, high = None, 1, len(rest)
+        tried = high
+        while low < tried:
+            turns_to, limit = float(yaws[tried + 1]), float(cost[tried - 1])
+            straight = _find_shortcut(
+                space, rest[0].a, rest[tried - 1].b, before=yaw, after=turns_to, limit=limit
+            )
+            if straight is None:
+                high = tried - 1
+            else:
+                best, low = straight, tried
+            tried = (low + high + 1) // 2
+        after = float(yaws[low + 1])
+        drive, end = best or (rest[0], after)
+        result.append(drive)
+        # The same turns from there on, relative to an equivalent angle.
+        rest = [Drive(other.a, other.b, other.yaw + end - after) for other in rest[low:]]
+        yaw, last = drive.yaw, last + end - after
+    return result, last
+
+
+def _find_shortcut(
+    space: SearchSpace, a: Floats, b: Floats, *, before: float, after: float, limit: float
+) -> tuple[Drive, float] | None:
+    """Return a straight drive between points, and the yaw after it, if it is free and cheap.
+
+    Args:
+        space: Search space.
+        a: Start, shape (2,) [m].
+        b: End, shape (2,) [m].
+        before: Yaw before the first turn [rad].
+        after: Yaw after the last turn, up to full turns [rad].
+        limit: Cost of drive and turns that must not be reached [m].
+    """
+    found = []
+    if np.hypot(*(b - a)) < _SAME:
+        return None
+    for backwards in (0.0, np.pi):
+        yaw = float(before + wrap_angle(np.arctan2(b[1] - a[1], b[0] - a[0]) + backwards - before))
+        drive, end = Drive(a, b, yaw), float(yaw + wrap_angle(after - yaw))
+        found.append(
+            (
+                drive.cost + space.grid.turning * (abs(yaw - before) + abs(end - yaw)),
+                backwards,
+                drive,
+                end,
+            )
+        )
+    cost, _, drive, end = min(found)
+    is_useful = (
+        cost < limit - _SAME and space.looks_free(drive) and space.is_sweep_free(before, drive, end)
+    )
+    return (drive, end) if is_useful else None
+
+
+def _assemble(
+    space: SearchSpace, drives: list[Drive], last: float, goal: int, extra: float
+) -> BasePath:
+    """Make a path of drives, merging those in line; `last` is the yaw at the goal [rad]."""
+    merged: list[Drive] = []
+    for drive in drives:
+        combined = Drive(merged[-1].a, drive.b, drive.yaw) if merged else drive
+        if (
+            merged
+            and merged[-1].yaw == drive.yaw
+            and combined.length >= merged[-1].length + drive.length - _SAME
+        ):
+            merged[-1] = combined
+        else:
+            merged.append(drive)
+    turns = float(np.rint((last - space.goals[goal, 2]) / (2 * np.pi)))
+    end = space.goals[goal] + [0.0, 0.0, 2 * np.pi * turns]
+    poses = [space.start]
+    for pose in [
+        *(np.array([*place, drive.yaw]) for drive in merged for place in (drive.a, drive.b)),
+        end,
+    ]:
+        if np.abs(pose - poses[-1]).max() > _SAME:
+            poses.append(pose)
+    poses = [*poses[:-1], end] if len(poses) > 1 else [space.start, end]
+    turned = sum(abs(b[2] - a[2]) for a, b in itertools.pairwise(poses))
+    cost = sum(drive.cost for drive in drives) + space.grid.turning * turned + extra
+    return BasePath(np.array(poses), goal, float(cost))

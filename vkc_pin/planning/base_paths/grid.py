@@ -1,0 +1,365 @@
+"""Discretizes an arena into cells and headings, and checks where the base fits with its load."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vkc_pin.errors import InputError
+from vkc_pin.planning.base_paths.base_clearance import DIRECTIONS, MovingShapes, Obstacles, Shape
+from vkc_pin.planning.base_paths.blocked_cells import Lattice, SupportCache, find_colliding_cells
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.cache import Cache
+from vkc_pin.utils.optional_imports import compiled_module
+
+__all__ = ["HEADINGS", "BaseGrid", "compute_fine_cell_count"]
+
+HEADINGS = 16
+"""Number of headings: to a cell's eight neighbours and, between these, a knight's move away."""
+
+_CELL_MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
+_CELL_MOVES = np.concatenate([_CELL_MOVES, -_CELL_MOVES])  # by heading, in cells
+_FREE, _FORWARD, _LEFT = range(3)  # queries: a cell, the move ahead, the left turn
+_DEFAULT_CELLS, _MAX_CELLS = 100, 250  # along a side
+_MAX_CLEARANCE = 0.5  # [m] above which more clearance makes no difference
+
+
+def compute_fine_cell_count(arena: Sequence[float], margin: float) -> int:
+    """Return the cells per side that put one in the middle of any passage, within limits.
+
+    Args:
+        arena: x_min, x_max, y_min, y_max [m].
+        margin: Clearance that passages leave on either side [m].
+    """
+    size = max(arena[1] - arena[0], arena[3] - arena[2])
+    return int(np.clip(np.ceil(size / (2.0 * margin)), _DEFAULT_CELLS, _MAX_CELLS))
+
+
+class BaseGrid:
+    """Grid of the base poses in an arena, by cell and heading, with cached collision checks.
+
+    Attributes:
+        cells: Number of cells along each side.
+        origin: Centre of cell (0, 0) in the world, shape (2,) [m].
+        step: Size of a cell, shape (2,) [m].
+        moves: Cells that a forward move advances at each heading, shape (HEADINGS, 2).
+        yaws: Headings, ascending from 0, shape (HEADINGS,) [rad].
+        lengths: Lengths of the moves, shape (HEADINGS,) [m].
+        near: Radius around the start and goals of a search in which only the base counts [m].
+        turning: Cost of turning, relative to driving [m/rad].
+        base, carried: Shapes of the base, and of arm and load.
+        blocked: Where the base certainly collides, shape (cells, cells, HEADINGS).
+        carried_blocked: Where arm or load certainly collide, shape (cells, cells, HEADINGS).
+        turn_limits: Cached turning ranges at starts and goals, by pose; see
+            `SearchSpace.find_turnable`.
+    """
+
+    def __init__(
+        self,
+        base: Sequence[Shape],
+        carried: Sequence[Shape],
+        standing: Sequence[Shape],
+        arena: Sequence[float],
+        margin: float,
+        *,
+        cells: int = _DEFAULT_CELLS,
+        near: float = 1.0,
+        turning: float = 0.3,
+        cache: Cache | None = None,
+    ) -> None:
+        """Find certainly blocked cells, without exact collision checks.
+
+        Args:
+            base: Convex shapes of the base, in its frame.
+            carried: Convex shapes of arm and load in their carrying posture, in the base's frame.
+            standing: Convex obstacles without the floor, in the world.
+            arena: x_min, x_max, y_min, y_max [m]; the base's origin stays inside.
+            margin: Clearance to keep [m].
+            cells: Number of cells along each side.
+            near: Radius around the start and goals of a search in which only `base` counts, since
+                the arm approaches or retreats there [m].
+            turning: Cost of turning, relative to driving [m/rad].
+            cache: Cache of support functions. Default: none.
+
+        Raises:
+            InputError: The arena is empty, or a number is out of range.
+        """
+        low, high = np.array(arena[::2], float), np.array(arena[1::2], float)
+        if not (len(arena) == 4 and np.all(np.isfinite(arena)) and np.all(high > low)):
+            raise InputError(
+                "the arena is empty",
+                field="arena",
+                expected="x_min < x_max and y_min < y_max",
+                got=list(arena),
+            )
+        for field, value, least in (
+            ("margin", margin, 0.0),
+            ("near", near, 0.0),
+            ("cells", cells, 2),
+        ):
+            if not (np.isfinite(value) and value >= least):
+                raise InputError(
+                    "out of range", field=field, expected=f"at least {least:g}", got=value
+                )
+        self.cells, self.near, self.turning = int(cells), float(near), float(turning)
+        self.step = (high - low) / cells
+        self.origin = low + self.step / 2
+        self.moves = _CELL_MOVES
+        self.yaws = np.arctan2(
+            _CELL_MOVES[:, 1] * self.step[1], _CELL_MOVES[:, 0] * self.step[0]
+        ) % (2 * np.pi)
+        self.lengths = np.hypot(*(_CELL_MOVES * self.step).T)
+        world = Obstacles(standing)
+        self.base, self.carried = (
+            MovingShapes(base, world, margin),
+            MovingShapes(carried, world, margin),
+        )
+        views = (cache or Cache()).get("plan views", SupportCache)
+        lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
+        self.blocked, self.carried_blocked = find_colliding_cells(
+            base, carried, standing, lattice, margin, views=views
+        )
+        self.turn_limits: dict[tuple[bytes, bool, bytes | None], tuple[float, float]] = {}
+        # Cached answers for everything and for the base alone; -1: not checked yet.
+        self._known = np.full((3, 2, self.cells, self.cells, HEADINGS), -1, np.int8)
+        self._blocked_moves: list[tuple[list[tuple[int, ...]], ...]] = [([], []) for _ in range(3)]
+
+    def center(self, i: int, j: int) -> tuple[float, float]:
+        """Return the world position of a cell's centre [m]."""
+        return float(self.origin[0] + i * self.step[0]), float(self.origin[1] + j * self.step[1])
+
+    def find_cells_within(self, x: float, y: float, radius: float) -> Ints:
+        """Return the cells whose centres are within `radius` [m] of a place, shape (C, 2)."""
+        low = np.maximum(np.ceil((np.array([x, y]) - radius - self.origin) / self.step), 0).astype(
+            int
+        )
+        high = (
+            np.minimum(
+                np.floor((np.array([x, y]) + radius - self.origin) / self.step), self.cells - 1
+            ).astype(int)
+            + 1
+        )
+        i, j = (
+            grid.ravel()
+            for grid in np.meshgrid(
+                np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij"
+            )
+        )
+        inside = (
+            np.hypot(self.origin[0] + i * self.step[0] - x, self.origin[1] + j * self.step[1] - y)
+            <= radius
+        )
+        return np.column_stack([i[inside], j[inside]])
+
+    def is_cell_free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
+        """Return whether a cell is free at a heading, 0 to HEADINGS - 1; cached.
+
+        `reaching` as in `is_pose_free`.
+        """
+        key = (_FREE, int(reaching), i, j, heading)
+        if self._known[key] < 0:
+            roomy = self._is_roomy(i, j, reaching)
+            self._store(
+                key,
+                roomy
+                or self.is_pose_free(
+                    *self.center(i, j), float(self.yaws[heading]), reaching=reaching
+                ),
+            )
+        return bool(self._known[key])
+
+    def is_pose_free(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
+        """Return whether the margins are kept at a pose in the world.
+
+        Args:
+            x: Position [m].
+            y: Position [m].
+            yaw: Heading [rad].
+            reaching: Whether the arm approaches or retreats, so that only the base counts.
+        """
+        return self.is_drive_free((x, y), (x, y), yaw, reaching=reaching)
+
+    def is_drive_free(
+        self, a: ArrayLike, b: ArrayLike, yaw: float, *, reaching: bool = False
+    ) -> bool:
+        """Return whether the margins are kept along a straight line.
+
+        Args:
+            a: Start in the world, shape (2,) [m].
+            b: End in the world, shape (2,) [m].
+            yaw: Constant heading [rad].
+            reaching: As in `is_pose_free`.
+        """
+        begin, end = np.asarray(a, float), np.asarray(b, float)
+        return self.base.is_drive_free(begin, end, yaw) and (
+            reaching or self.carried.is_drive_free(begin, end, yaw)
+        )
+
+    def is_turn_free(
+        self,
+        at: ArrayLike,
+        start: float,
+        end: float,
+        *,
+        reaching: bool = False,
+        margins: Floats | None = None,
+    ) -> bool:
+        """Return whether the margins are kept while turning in place from one yaw to another.
+
+        Args:
+            at: Position in the world, shape (2,) [m].
+            start: First yaw [rad].
+            end: Last yaw [rad].
+            reaching: As in `is_pose_free`.
+            margins: Margins of the base from each obstacle, shape (S,) [m]. Default: the grid's.
+        """
+        place = np.asarray(at, float)
+        return self.base.is_turn_free(place, start, end, margins) and (
+            reaching or self.carried.is_turn_free(place, start, end)
+        )
+
+    def compute_exit_margins(self, x: float, y: float, yaw: float) -> Floats | None:
+        """Return the margins that the base can keep when it leaves a blocked pose.
+
+        It comes no closer to obstacles within the margin; those it overlaps are ignored.
+
+        Returns:
+            Margin from each of `standing`, shape (S,) [m], -inf for ignored ones; None if the pose
+            is free.
+        """
+        return (
+            None
+            if self.is_pose_free(x, y, yaw, reaching=True)
+            else self.base.compute_exit_margins(np.array([x, y]), yaw)
+        )
+
+    def is_move_free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
+        """Return whether the move ahead from a cell at a heading is free; cached."""
+        key = (_FORWARD, int(reaching), i, j, heading)
+        if self._known[key] < 0:
+            k, m = i + int(self.moves[heading, 0]), j + int(self.moves[heading, 1])
+            enough = self.lengths[heading]
+            room = [maps[i][j] + maps[k][m] for maps in self._clearance_maps]
+            roomy = room[0] >= enough and (reaching or room[1] >= enough)
+            ends = self.center(i, j), self.center(k, m)
+            self._store(
+                key,
+                roomy or self.is_drive_free(*ends, float(self.yaws[heading]), reaching=reaching),
+            )
+        return bool(self._known[key])
+
+    def is_left_turn_free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
+        """Return whether turning in a cell from a heading to the next is free; cached."""
+        key = (_LEFT, int(reaching), i, j, heading)
+        if self._known[key] < 0:
+            end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
+            roomy = self._is_roomy(i, j, reaching)
+            self._store(
+                key,
+                roomy
+                or self.is_turn_free(
+                    self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
+                ),
+            )
+        return bool(self._known[key])
+
+    def get_blocked_moves(self, reaching: Bools) -> tuple[Ints, Ints, Ints]:
+        """Return the known blocked queries: cells, moves ahead, and left turns.
+
+        Args:
+            reaching: Where only the base counts, shape (cells, cells).
+
+        Returns:
+            Cells and headings as in `is_cell_free`, `is_move_free` and `is_left_turn_free`, shape
+            (K, 3) each.
+        """
+        found = []
+        for parts in self._blocked_moves:
+            rows = [np.array(part, int).reshape(-1, 3) for part in parts]
+            found.append(
+                np.concatenate(
+                    [
+                        part[reaching[part[:, 0], part[:, 1]] == alone]
+                        for alone, part in enumerate(rows)
+                    ]
+                )
+            )
+        return found[_FREE], found[_FORWARD], found[_LEFT]
+
+    def _store(self, key: tuple[int, int, int, int, int], free: bool) -> None:
+        """Cache an answer; `key` holds query, whether only the base counts, cell and heading."""
+        self._known[key] = free
+        if not free:
+            self._blocked_moves[key[0]][key[1]].append(key[2:])
+
+    def _is_roomy(self, i: int, j: int, reaching: bool) -> bool:
+        """Return whether a cell is free at any heading."""
+        return self._clearance_maps[0][i][j] >= 0.0 and (
+            reaching or self._clearance_maps[1][i][j] >= 0.0
+        )
+
+    @cached_property
+    def _clearance_maps(self) -> list[list[list[float]]]:
+        """Lower bounds of the clearance of every cell at any heading, of base and load [m]."""
+        x, y = (self.origin[axis] + self.step[axis] * np.arange(self.cells) for axis in (0, 1))
+        along_x, along_y = np.outer(x, DIRECTIONS[:, 0]), np.outer(y, DIRECTIONS[:, 1])
+        bodies = (self.base, self.carried)
+        shape = (self.cells, self.cells)
+        rooms = (np.full(shape, _MAX_CLEARANCE), np.full(shape, _MAX_CLEARANCE))
+        for s, support in enumerate(self.base.world.support):
+            spend()
+            reach = max(float(body.exclusion_radius[s]) for body in bodies) + _MAX_CLEARANCE
+            if reach < 0.0:  # no shape can hit it
+                continue
+            rows = slice(*np.searchsorted(x, [-support[16] - reach, support[0] + reach]))
+            columns = slice(*np.searchsorted(y, [-support[24] - reach, support[8] + reach]))
+            distance = (along_x[rows, None] + (along_y[columns] - support)).max(axis=2)
+            for body, room in zip(bodies, rooms, strict=True):
+                np.minimum(
+                    room[rows, columns],
+                    distance - body.exclusion_radius[s],
+                    out=room[rows, columns],
+                )
+        return [room.tolist() for room in rooms]
+
+    def compute_distances(self, starts: Floats, *, threads: int = 1) -> Floats:
+        """Return lower bounds of the driving distance from places to every cell.
+
+        Turning is free, and only certain collisions of the base count. Each start takes about a
+        millisecond on 100 x 100 cells.
+
+        Args:
+            starts: Places, shape (W, 2) [m].
+            threads: Number of threads; it does not change the result.
+
+        Returns:
+            Distances, shape (W, cells, cells) [m]; infinite: there is no path.
+        """
+        blocked = np.asarray(self.blocked.all(axis=2))
+        entries: list[tuple[Ints, Floats]] = []
+        for x, y in np.asarray(starts, float):
+            for radius in (2.5 * float(self.step.max()), 2.0 * _MAX_CLEARANCE, np.inf):
+                cells = self.find_cells_within(x, y, radius)
+                cells = cells[~blocked[cells[:, 0], cells[:, 1]]]
+                if len(cells):
+                    break
+            entries.append(
+                (
+                    self.cells * cells[:, 0] + cells[:, 1],
+                    np.hypot(*(self.origin + cells * self.step - (x, y)).T),
+                )
+            )
+        firsts = np.cumsum([0, *(len(cells) for cells, _ in entries)])
+        begins, costs = (np.concatenate(part) for part in zip(*entries, strict=True))
+        return np.asarray(self._floor.distances(firsts, begins, costs, threads))
+
+    @cached_property
+    def _floor(self) -> Any:
+        """Compiled search of distances over the cells, turning being free."""
+        module = compiled_module("vkc_pin.planning.base_paths._driving")
+        return module.Floor(self.blocked.view(np.uint8), self.moves, self.lengths)

@@ -1,0 +1,252 @@
+"""Finds floor that the base certainly cannot reach at any heading.
+
+Whatever its heading, the base covers a disc around a point of it. The point cannot be within the
+disc's radius of an obstacle. A cell counts as blocked only if all of it is; no motion reaches the
+cells that a flood fill over the others, including diagonal neighbours, does not reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vkc_pin.planning.base_paths.base_clearance import Shape
+from vkc_pin.planning.base_paths.blocked_cells import Solid, make_solids, slice_solid
+from vkc_pin.utils.arrays import Bools, Floats
+
+__all__ = ["CellGrid", "InscribedDiscs", "Wall", "find_blocked_cells", "flood_fill"]
+
+_HEIGHT_SAMPLES = 9  # heights of the base at which discs are inscribed
+_SLACK = 5e-3  # [m] by which discs are reduced: more than the overlap that validation accepts
+_TINY = 1e-9
+_CACHE_SIZE = 4096  # slices
+
+
+class Wall(NamedTuple):
+    """Part of an obstacle at some height, and its distance from the base's origin.
+
+    Attributes:
+        outline: Corners of a convex polygon inside the obstacle, counter-clockwise, shape (n, 2)
+            [m].
+        radius: Radius of a disc inside the base at the same height [m].
+        number: Number of the obstacle.
+    """
+
+    outline: Floats
+    radius: float
+    number: int
+
+
+class CellGrid(NamedTuple):
+    """Cells of a rectangle of the floor.
+
+    Attributes:
+        origin: Centre of cell (0, 0), shape (2,) [m].
+        step: Size of a cell [m].
+        shape: Numbers of cells along x and y.
+    """
+
+    origin: Floats
+    step: float
+    shape: tuple[int, int]
+
+    @classmethod
+    def over(cls, low: Floats, high: Floats, step: float) -> CellGrid:
+        """Return cells that cover a rectangle with corners `low` and `high`, shape (2,) [m]."""
+        size = np.maximum(np.ceil((high - low) / step), 1).astype(int)
+        return cls(low + step / 2, step, (int(size[0]), int(size[1])))
+
+    def centers(self) -> tuple[Floats, Floats]:
+        """Return x of the rows, shape (X, 1), and y of the columns, shape (1, Y) [m]."""
+        x, y = (self.origin[axis] + self.step * np.arange(self.shape[axis]) for axis in (0, 1))
+        return x[:, None], y[None]
+
+    def at(self, place: Floats) -> tuple[int, int]:
+        """Return the cell nearest to a place, shape (2,) [m]."""
+        i, j = np.clip(
+            np.rint((place - self.origin) / self.step), 0, np.array(self.shape) - 1
+        ).astype(int)
+        return int(i), int(j)
+
+
+class InscribedDiscs:
+    """Discs inscribed in a base, by height, with a cache of obstacle slices.
+
+    Args:
+        base: Convex shapes fixed to the base, in its frame.
+    """
+
+    def __init__(self, base: Sequence[Shape]) -> None:
+        self._solids = make_solids(base)
+        self._bottom = min((solid.bottom for solid in self._solids), default=0.0)
+        self._top = max((solid.top for solid in self._solids), default=0.0)
+        self._radii: dict[float, float] = {}
+        self._outlines: dict[tuple[bytes, float], Floats] = {}
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory [bytes]."""
+        return sum(outline.nbytes for outline in self._outlines.values())
+
+    def get_radius(self, height: float) -> float:
+        """Return the radius of the disc around the base's origin at a height [m]; ≤ 0: none."""
+        if height not in self._radii:
+            part = [
+                _compute_outline(solid, height)
+                for solid in self._solids
+                if solid.bottom < height < solid.top
+            ]
+            self._radii[height] = _find_largest_disc(part) - _SLACK
+        return self._radii[height]
+
+    def make_walls(self, standing: Sequence[Shape]) -> list[Wall]:
+        """Return the walls that keep the base's origin away, whatever its heading.
+
+        Args:
+            standing: Convex obstacles in the world.
+        """
+        levels = np.linspace(self._bottom, self._top, _HEIGHT_SAMPLES + 2)[1:-1].tolist()
+        found = []
+        for number, shape in enumerate(standing):
+            for solid in make_solids([shape]):
+                low, high = max(solid.bottom, self._bottom), min(solid.top, self._top)
+                heights = [z for z in levels if low < z < high] or [(low + high) / 2.0] * (
+                    low < high
+                )
+                if solid.prism and heights:
+                    heights = [max(heights, key=self.get_radius)]
+                found += [
+                    Wall(self._slice(solid, z), self.get_radius(z), number)
+                    for z in heights
+                    if self.get_radius(z) > 0.0
+                ]
+        return [wall for wall in found if len(wall.outline)]
+
+    def _slice(self, solid: Solid, height: float) -> Floats:
+        key = (solid.key, 0.0 if solid.prism else height)
+        if key not in self._outlines:
+            if len(self._outlines) >= _CACHE_SIZE:
+                self._outlines.clear()
+            self._outlines[key] = _compute_outline(solid, height)
+        return self._outlines[key]
+
+
+def _compute_outline(solid: Solid, height: float) -> Floats:
+    """Return a convex polygon inside a slice of a solid, counter-clockwise, shape (n, 2) [m]."""
+    points = slice_solid(solid, height, height)
+    offset = points - points.mean(axis=0)
+    return points[np.argsort(np.arctan2(offset[:, 1], offset[:, 0]), kind="stable")]
+
+
+def _find_largest_disc(outlines: Sequence[Floats]) -> float:
+    """Return the radius of the disc around the origin that convex polygons cover [m]; 0: none."""
+    if not any(_is_inside(outline, np.zeros((1, 2)))[0] for outline in outlines):
+        return 0.0
+    least = np.inf
+    for number, outline in enumerate(outlines):
+        others = [other for k, other in enumerate(outlines) if k != number]
+        for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+            for begin, end in _clip_uncovered(a, b, others):
+                p, q = a + begin * (b - a), a + end * (b - a)
+                along = q - p
+                share = np.clip(-(p @ along) / max(float(along @ along), _TINY), 0.0, 1.0)
+                least = min(least, float(np.hypot(*(p + share * along))))
+    return least if np.isfinite(least) else 0.0
+
+
+def _clip_uncovered(
+    a: Floats, b: Floats, others: Sequence[Floats]
+) -> Iterator[tuple[float, float]]:
+    """Yield the parts of segment ab outside all convex polygons, as shares from 0 to 1."""
+    covered = []
+    for outline in others:
+        begin, end = 0.0, 1.0
+        for p, q in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+            normal = np.array([p[1] - q[1], q[0] - p[0]])  # inwards
+            first, last = float(normal @ (a - p)), float(normal @ (b - p))
+            if max(first, last) <= _TINY:
+                begin, end = 1.0, 0.0
+            elif min(first, last) < 0.0:
+                at = first / (first - last)
+                begin, end = (max(begin, at), end) if first < 0.0 else (begin, min(end, at))
+        if begin < end:
+            covered.append((begin, end))
+    done = 0.0
+    for begin, end in sorted(covered):
+        if begin > done:
+            yield done, begin
+        done = max(done, end)
+    if done < 1.0:
+        yield done, 1.0
+
+
+def _is_inside(outline: Floats, places: Floats) -> Bools:
+    """Return which places, shape (B, 2), are inside a convex polygon, shape (B,)."""
+    edge = np.roll(outline, -1, axis=0) - outline
+    offset = places[:, None] - outline
+    return np.asarray((edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0] > 0.0).all(axis=1))
+
+
+def find_blocked_cells(
+    cells: CellGrid, wall: Wall, grown: float
+) -> tuple[tuple[slice, slice], Bools]:
+    """Return a window of cells, and a mask of the cells in it that a wall blocks.
+
+    Args:
+        cells: Cells of the floor.
+        wall: Wall that keeps the base's origin away.
+        grown: Addition to the wall's radius, within which the centre of a blocked cell lies [m].
+            Minus half a cell's diagonal: blocked cells are blocked entirely. Plus: other cells are
+            free entirely.
+    """
+    outline, reach = wall.outline, wall.radius + grown
+    low = np.ceil((outline.min(axis=0) - max(reach, 0.0) - cells.origin) / cells.step)
+    high = np.floor((outline.max(axis=0) + max(reach, 0.0) - cells.origin) / cells.step) + 1
+    rows, columns = (
+        slice(*np.clip([low[k], high[k]], 0, cells.shape[k]).astype(int).tolist()) for k in (0, 1)
+    )
+    x, y = cells.centers()
+    return (rows, columns), _compute_signed_distance(outline, x[rows], y[:, columns]) < reach
+
+
+def _compute_signed_distance(outline: Floats, x: Floats, y: Floats) -> Floats:
+    """Return signed distances from a convex polygon, negative inside.
+
+    Args:
+        outline: Corners, counter-clockwise, shape (n, 2) [m].
+        x: Coordinates of the rows, shape (X, 1) [m].
+        y: Coordinates of the columns, shape (1, Y) [m].
+
+    Returns:
+        Distances, shape (X, Y) [m].
+    """
+    square, inside = (
+        np.full((len(x), y.shape[1]), np.inf),
+        np.full((len(x), y.shape[1]), len(outline) > 2),
+    )
+    for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        ex, ey, ox, oy = bx - ax, by - ay, x - ax, y - ay
+        share = np.clip((ox * ex + oy * ey) / max(ex * ex + ey * ey, _TINY), 0.0, 1.0)
+        np.minimum(square, (ox - share * ex) ** 2 + (oy - share * ey) ** 2, out=square)
+        inside &= ex * oy - ey * ox > 0.0
+    distance = np.sqrt(square)
+    return np.where(inside, -distance, distance)
+
+
+def flood_fill(free: Bools, begin: Bools, *, corners: bool) -> Bools:
+    """Return the cells that are connected with the starting cells over free ones.
+
+    Args:
+        free: Mask of free cells, shape (X, Y).
+        begin: Mask of starting cells, which need not be free, shape (X, Y).
+        corners: Whether cells that share only a corner are connected.
+    """
+    from scipy import ndimage
+
+    around = np.ones((3, 3), bool) if corners else ndimage.generate_binary_structure(2, 1)
+    labels, _ = ndimage.label(free, structure=around)
+    near = ndimage.binary_dilation(begin, structure=around) if corners else begin
+    known = np.unique(labels[near & free])
+    return np.asarray(begin | (np.isin(labels, known[known > 0])))

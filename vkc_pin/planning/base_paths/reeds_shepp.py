@@ -1,0 +1,58 @@
+"""Computes the shortest paths of a car that drives forwards and backwards, in closed form.
+
+J. A. Reeds and L. A. Shepp, Optimal paths for a car that goes both forwards and backwards, Pacific
+Journal of Mathematics 145 (2), 1990: they are among 48 words of at most five pieces, arcs of the
+smallest radius and straight lines. Each formula gives the pieces of some (8.1 to 8.4 and 8.7 to
+8.11); time reversal, mirroring and reversed order give the others. The formulas are compiled
+(`reeds_shepp.hpp`), since a search for initial guesses needs thousands of lengths. Goals are
+relative to the start, in units of the radius.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import compiled_module
+
+__all__ = ["compute_lengths", "find_shortest_path_pieces"]
+
+_SAME = 1e-9
+
+
+def compute_lengths(goals: Floats, radius: float) -> tuple[Floats, Floats]:
+    """Return lengths [m] and turns [rad] of the shortest paths to goals, shape (B,) each.
+
+    Args:
+        goals: Goals relative to the start, in units of the radius, shape (B, 3).
+        radius: Smallest turning radius [m].
+
+    Raises:
+        BuildError: The compiled module is missing.
+    """
+    length, turned = np.abs(_compute_words(goals)).sum(axis=1).T
+    return radius * length, turned
+
+
+def find_shortest_path_pieces(goal: Floats, radius: float) -> list[tuple[float, float]]:
+    """Return the pieces of the shortest path to a goal, shape (3,): lengths [m] and turns [rad].
+
+    Lengths are negative backwards, turns positive to the left.
+
+    Raises:
+        BuildError: The compiled module is missing.
+    """
+    return [
+        (radius * length, turn)
+        for length, turn in _compute_words(goal[None])[0].tolist()
+        if abs(length) > _SAME
+    ]
+
+
+def _compute_words(goals: Floats) -> Floats:
+    """Return lengths in radii and turns of the pieces of paths, (B, 5, 2); 0 if unused."""
+    return np.asarray(
+        compiled_module("vkc_pin.planning.base_paths._driving").shortest_words(
+            np.ascontiguousarray(goals, float)
+        )
+    )

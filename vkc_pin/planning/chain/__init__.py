@@ -1,0 +1,1 @@
+"""Builds the virtual kinematic chain, its kinematics and its collision model."""

@@ -1,0 +1,397 @@
+"""Builds the virtual kinematic chain: virtual base, robot and inverted objects in one model."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.planning.chain.inversion import invert
+from vkc_pin.planning.chain.kinematics import Kinematics, get_kinematics
+from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.models.grafting import graft, graft_geometry, round_placement
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
+from vkc_pin.world.scene.hold import Hold, make_holds, resolve_holds
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import SupportedObject
+
+__all__ = ["Closure", "VirtualKinematicChain", "consolidate"]
+
+FREEDOM_VELOCITY = 1.0  # [rad/s] or [m/s], limit of a freedom of the grasp
+FREEDOM_ACCELERATION = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """h_chain of eq. 2: target pose of a held object's base link.
+
+    For a fixed object, that is where its base link must stay; for a free one, where it is grasped.
+
+    Attributes:
+        joint: Joint of the chain that carries the object's base link.
+        local: Placement of the base link on that joint.
+        target: Placement of the base link in the world.
+    """
+
+    joint: int
+    local: pin.SE3
+    target: pin.SE3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VirtualKinematicChain:
+    """C^V: one model of everything that moves together.
+
+    Attributes:
+        robot: The robot at its root.
+        model: `pinocchio.Model`; joint 1 is the planar virtual base, followed by the arm and, for
+            each grasp, the virtual joint of the attachment and the object's joints from the
+            attachable link to its base, inverted.
+        coordinates: Minimal coordinates z of `model`.
+        names: Coordinate names, shape (n,); `<object>.<joint>` for objects, `<object>.<attachment>`
+            for virtual joints.
+        lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
+        collision: Collision geometry of the robot (first, in the robot's order) and of the moving
+            parts of objects.
+        held_geometries: Hold → indices in `collision` of the object's geometry that moves when
+            held.
+        ride_geometries: Ride → indices in `collision` of the geometry of the supported object.
+        closures: Hold → closure of the object's base link.
+        virtual: Hold → names of the coordinates of its attachment's virtual joint.
+        added: Hold → names of all coordinates that it adds: virtual joint and object joints.
+        prefixes: Hold → prefix of the object's frames and joints in `model`.
+        cache: Cache of functions built for the chain, shared with others.
+    """
+
+    robot: Robot
+    model: pin.Model
+    coordinates: Coordinates
+    names: tuple[str, ...]
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
+    collision: pin.GeometryModel
+    held_geometries: Mapping[Hold, tuple[int, ...]]
+    ride_geometries: Mapping[SupportedObject, tuple[int, ...]]
+    closures: Mapping[Hold, Closure]
+    virtual: Mapping[Hold, tuple[str, ...]]
+    added: Mapping[Hold, tuple[str, ...]]
+    prefixes: Mapping[Hold, str]
+    cache: Cache = field(repr=False)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates n."""
+        return len(self.names)
+
+    @cached_property
+    def metric(self) -> Floats:
+        """Weight of each coordinate in searches, shape (n,), [rad/m] and 1.
+
+        It converts displacements to equivalent rotations: a metre counts as the rotation that moves
+        the hand by a metre, see `Robot.lever`. The displacements of coupled joints add up.
+        """
+        return self.coordinates.turns + self.coordinates.lengths / self.robot.lever
+
+    @cached_property
+    def _kinematics(self) -> Kinematics:
+        """Kinematics, stored here because a cache lookup takes as long as an evaluation."""
+        return get_kinematics(self.model, self.cache)
+
+    def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return the world placements of all joints.
+
+        Args:
+            z: Configurations, shape (W, n).
+
+        Returns:
+            Rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m]; joint 0 is the
+            world.
+        """
+        batch, joints = len(z), self.model.njoints
+        (columns,) = self._kinematics.batch(z)
+        columns = columns.reshape(batch, joints - 1, 12)
+        rotations, translations = np.zeros((batch, joints, 3, 3)), np.zeros((batch, joints, 3))
+        rotations[:, 0] = np.eye(3)
+        rotations[:, 1:] = columns[..., :9].reshape(batch, joints - 1, 3, 3).swapaxes(2, 3)
+        translations[:, 1:] = columns[..., 9:]
+        return rotations, translations
+
+    @cached_property
+    def carries(self) -> Bools:
+        """Mask of shape (J, J): whether joint j moves when joint k does."""
+        joints = range(self.model.njoints)
+        return np.array([[k in self.model.supports[j] for k in joints] for j in joints])
+
+    @cached_property
+    def motions(self) -> tuple[Ints, Ints, Floats, Floats, Bools]:
+        """Motion of joints per coordinate, one row for each of `Coordinates.moves`.
+
+        These are coordinate and joint, shape (m,) each, linear and angular velocity in the joint's
+        frame, shape (m, 3) each, and a mask of rows whose linear velocity is along the world's
+        axes, shape (m,): x and y of a planar joint.
+        """
+        data, moves = self.model.createData(), self.coordinates.moves
+        pin.forwardKinematics(self.model, data, pin.neutral(self.model))
+        linear, angular, fixed = (
+            np.zeros((len(moves), 3)),
+            np.zeros((len(moves), 3)),
+            np.zeros(len(moves), bool),
+        )
+        for row, move in enumerate(moves):
+            if str(self.model.joints[move.joint].shortname()) == "JointModelPlanar":
+                part = move.coordinate - self.coordinates.joints.index(move.joint)
+                fixed[row] = part < 2
+                (linear if part < 2 else angular)[row, part] = 1.0
+            else:
+                motion = np.asarray(data.joints[move.joint].S, float).ravel()
+                linear[row], angular[row] = motion[:3], motion[3:]
+        return (
+            np.array([m.coordinate for m in moves]),
+            np.array([m.joint for m in moves]),
+            linear,
+            angular,
+            fixed,
+        )
+
+    def point_jacobians(self, z: Floats, which: Ints, joint: Ints, point: Floats) -> Floats:
+        """Return the Jacobians of points that are fixed in joints' frames, shape (C, 3, n).
+
+        Args:
+            z: Configurations, shape (B, n).
+            which: Configuration of each point, shape (C,).
+            joint: Joint that carries the point, shape (C,); 0 is the world.
+            point: Position of the point in the world, shape (C, 3) [m].
+        """
+        coordinate, owner, linear, angular, fixed = self.motions
+        rotations, translations = self.joint_placements(z)
+        axes = rotations[:, owner]
+        linear_motion = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[
+            which
+        ]
+        angular_motion = np.einsum("bnij,nj->bni", axes, angular)[which]
+        motion = linear_motion + np.cross(
+            angular_motion, point[:, None] - translations[:, owner][which]
+        )
+        motion = motion * self.carries[joint][:, owner, None]
+        return np.asarray(
+            np.add.reduceat(
+                motion, np.searchsorted(coordinate, np.arange(self.size)), axis=1
+            ).swapaxes(1, 2)
+        )
+
+    def opened(self, opening: float | None) -> pin.GeometryModel:
+        """Return the collision geometry with the robot's gripper at an opening [m].
+
+        If `opening` is None, the gripper is as in the robot's home configuration.
+        """
+        if opening is None:
+            return self.collision
+        geometry = self.collision.copy()
+        for k, shape in enumerate(self.robot.opened(opening).collision.geometryObjects):
+            geometry.geometryObjects[k].placement = shape.placement
+        return geometry
+
+    def index(self, name: str) -> int:
+        """Return the position of coordinate `name` in z.
+
+        Raises:
+            UnknownNameError: There is no such coordinate.
+        """
+        if name not in self.names:
+            raise UnknownNameError("coordinate", name, self.names)
+        return self.names.index(name)
+
+    def holder(self, hold: Hold) -> tuple[int, pin.SE3]:
+        """Return the joint that carries the frame of a hold, and the frame's placement on it."""
+        return (
+            self.frame(self.robot.tool_frame)
+            if hold.by is None
+            else self.frame(str(hold.link), hold.by)
+        )
+
+    def frame(
+        self, name: str, hold: Hold | None = None, *, opening: float | None = None
+    ) -> tuple[int, pin.SE3]:
+        """Return the joint that carries a frame, and the frame's placement on it.
+
+        Args:
+            name: Frame of the robot, or link of a held object.
+            hold: Hold of that object; None for a frame of the robot.
+            opening: Opening of the robot's gripper [m], which determines the frames of its fingers.
+                Defaults to that of the home configuration.
+        """
+        if hold is None:
+            model = self.robot.opened(opening).model  # the chain starts with the robot's joints
+        else:
+            model, name = self.model, self.prefixes[hold] + name
+        frame = model.frames[model.getFrameId(name)]
+        return frame.parentJoint, pin.SE3(frame.placement)
+
+
+def consolidate(
+    scene: Scene,
+    holds: Iterable[Hold] | Mapping[str, str],
+    *,
+    rides: Iterable[SupportedObject] = (),
+    cache: Cache | None = None,
+) -> VirtualKinematicChain:
+    """Merge the scene's robot with the objects it holds into one model (section III of the paper).
+
+    Args:
+        scene: Robot and placed objects.
+        holds: All holds at any time, each after the hold it depends on; or object → attachment, all
+            held by the tool. Several holds become branches of one tree. A branch is closed only at
+            waypoints where its object is held and fixed in the world.
+        rides: Objects supported by links of held objects at any time.
+        cache: Cache of the chain's kinematics. Defaults to one of its own.
+
+    Returns:
+        The chain. Branches of an object that are not on the path from grasp to base are locked at
+        their present state.
+
+    Raises:
+        UnknownNameError: The scene has no such object, or the object no such attachment.
+        InputError: Two grasps move the same joint, or a freedom of a grasp has the name of a joint
+            of its object.
+    """
+    robot = instance(scene, Scene, "scene").robot
+    holds = resolve_holds(scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds)
+    cache = Cache() if cache is None else instance(cache, Cache, "cache")
+    model, collision = pin.Model(robot.model), pin.GeometryModel()
+    graft_geometry(
+        collision,
+        robot.collision.geometryObjects,
+        joints=list(range(model.njoints)),
+        placement=pin.SE3.Identity(),
+    )
+    names = list(robot.coordinates.names)
+    limits = [list(robot.lower), list(robot.upper), list(robot.velocity), list(robot.acceleration)]
+    held_geometries, closures, virtual, hold_coordinates = {}, {}, {}, {}
+    prefixes: dict[Hold, str] = {}
+    for hold in holds:
+        name = hold.object
+        placed = scene.objects[name]
+        attachment = placed.object.attachment(hold.attachment)
+        # Pinocchio finds frames by unique names: the second branch of an object needs another
+        # prefix.
+        prefix = prefixes[hold] = name + "'" * sum(other.object == name for other in prefixes) + "."
+        holder = robot.tool_frame if hold.by is None else f"{prefixes[hold.by]}{hold.link}"
+        tool = model.frames[model.getFrameId(holder)]
+        parent, placement = (
+            tool.parentJoint,
+            tool.placement * compute_hand_frame(robot, attachment) * attachment.offset.inverse(),
+        )
+        added = []
+        # J(v)⁻¹, tool to object: the axis of each joint is negated and the order of joints
+        # reversed.
+        for suffix, freedom in reversed(
+            [*zip(attachment.coordinates, attachment.freedoms, strict=True)]
+        ):
+            kind = (
+                pin.JointModelRevoluteUnaligned
+                if freedom.kind == "revolute"
+                else pin.JointModelPrismaticUnaligned
+            )
+            joint_name, joint, low, high = (
+                f"{name}.{suffix}",
+                kind(-freedom.axis),
+                freedom.lower,
+                freedom.upper,
+            )
+            own = [np.array([value]) for value in (np.inf, FREEDOM_VELOCITY, low, high)]
+            through = pin.SE3(np.eye(3), freedom.through)
+            parent = model.addJoint(
+                parent, joint, round_placement(placement * through), joint_name, *own
+            )
+            placement = through.inverse()
+            added.append(joint_name)
+            for row, value in zip(
+                limits, (low, high, FREEDOM_VELOCITY, FREEDOM_ACCELERATION), strict=True
+            ):
+                row.append(value)
+        virtual[hold] = tuple(added)
+        tree = invert(placed.object, attachment.link, placed.state)
+        placement = round_placement(placement * attachment.placement.inverse())
+        joints = graft(model, tree.model, parent=parent, placement=placement, prefix=prefix)
+        names += added
+        for joint_name in tree.model.names[1:]:
+            names.append(f"{name}.{joint_name}")
+            index = placed.object.coordinates.names.index(joint_name)
+            object_limits = (
+                placed.object.lower,
+                placed.object.upper,
+                placed.object.velocity,
+                placed.object.acceleration,
+            )
+            for row, values in zip(limits, object_limits, strict=True):
+                row.append(float(values[index]))
+        hold_coordinates[hold] = (
+            *added,
+            *(f"{name}.{joint_name}" for joint_name in tree.model.names[1:]),
+        )
+        base = model.frames[model.getFrameId(f"{prefix}{placed.object.base_link}")]
+        moving = list(tree.collision.geometryObjects)
+        if not placed.object.free:
+            # Links that the held joints do not move (a door's frame, another door in it) are fixed
+            # in the world, whether or not the chain is closed.
+            moving = [shape for shape in moving if joints[shape.parentJoint] != base.parentJoint]
+        held_geometries[hold] = tuple(
+            graft_geometry(collision, moving, joints=joints, placement=placement, prefix=prefix)
+        )
+        target = placed.link_placement(placed.object.base_link)
+        closures[hold] = Closure(base.parentJoint, pin.SE3(base.placement), target)
+    for joint_name in names:
+        if names.count(joint_name) > 1:
+            problem = (
+                "two coordinates share this name (two grasps of one joint, "
+                "or an attachment named like a joint of its object)"
+            )
+            raise InputError(problem, field=joint_name, expected="unique coordinate names")
+    ride_geometries = {}
+    for number, ride in enumerate(rides):
+        frame = model.frames[model.getFrameId(prefixes[ride.hold] + ride.link)]
+        placed = dataclasses.replace(
+            scene.objects[ride.object], placement=frame.placement * ride.placement_in_link
+        )
+        prefix = ride.object + "^" * (number + 1) + "."
+        shapes = make_world_shapes(placed)
+        ride_geometries[ride] = tuple(
+            graft_geometry(
+                collision,
+                shapes,
+                joints=[frame.parentJoint],
+                placement=pin.SE3.Identity(),
+                prefix=prefix,
+            )
+        )
+    lower, upper, velocity, acceleration = (np.array(row, float) for row in limits)
+    return VirtualKinematicChain(
+        robot=robot,
+        model=model,
+        coordinates=Coordinates(model),
+        names=tuple(names),
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+        acceleration=acceleration,
+        collision=collision,
+        held_geometries=held_geometries,
+        ride_geometries=ride_geometries,
+        closures=closures,
+        virtual=virtual,
+        added=hold_coordinates,
+        prefixes=prefixes,
+        cache=cache,
+    )

@@ -1,0 +1,370 @@
+"""Computes signed distances of collision pairs (coal) and witness planes, linearising eqs. 6 and 7.
+
+For a pair (A, B) coal gives the witness points a, b and the normal n of the signed distance d =
+n·(b − a). With a fixed in body A, b in body B and n in the world, n·(b(z) − a(z)) is smooth in z,
+and its value and gradient equal those of the signed distance at the linearisation point. It is
+linear in the joint placements: C·vec(M(z)) − R.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.options import Options
+from vkc_pin.planning.chain.chain import VirtualKinematicChain
+from vkc_pin.planning.chain.collision_pairs import build_phase_geometries
+from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
+from vkc_pin.world.collision.clearances import Clearances
+from vkc_pin.world.collision.placements import ShapePlacements
+from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.phases import Task
+
+__all__ = ["ContactModel", "Contacts", "make_empty_contacts"]
+
+# Tolerance of coal's distances. With coal's default of 1e-6, plane gradients have errors of up to
+# 5e-3; this value takes no longer.
+_DISTANCE_TOLERANCE = 1e-8
+_KINEMATICS_BATCH = 256  # configurations per kinematics evaluation
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Close pairs at waypoints; arrays over C contacts, nearest first within a waypoint.
+
+    Attributes:
+        waypoint: Row of the configuration, shape (C,).
+        pair: Geometry indices, shape (C, 2).
+        distance: Signed distance, shape (C,) [m].
+        margin: Required clearance, shape (C,) [m].
+        normal: Unit normal from the first to the second in the world, shape (C, 3).
+        first, second: Witness points in the world, shape (C, 3) [m].
+    """
+
+    waypoint: Ints
+    pair: Ints
+    distance: Floats
+    margin: Floats
+    normal: Floats
+    first: Floats
+    second: Floats
+
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """Return the arrays in the order of the attributes."""
+        return (
+            self.waypoint,
+            self.pair,
+            self.distance,
+            self.margin,
+            self.normal,
+            self.first,
+            self.second,
+        )
+
+    def select(self, index: Ints) -> Contacts:
+        """Return the contacts at `index`, in that order."""
+        return Contacts(*(array[index] for array in self.arrays()))
+
+    @property
+    def slot(self) -> Ints:
+        """Rank of each contact within its waypoint, from 0, shape (C,)."""
+        return np.arange(len(self.waypoint)) - np.searchsorted(self.waypoint, self.waypoint)
+
+    def compute_violation(self) -> float:
+        """Return the largest margin shortfall [m]; 0 if all pairs keep their margins."""
+        return float(max(0.0, np.max(self.margin - self.distance, initial=0.0)))
+
+    def compute_shortfall(self, segments: int) -> Floats:
+        """Return the largest margin shortfall per configuration, shape (segments,) [m]."""
+        worst = np.zeros(segments)
+        np.maximum.at(worst, self.waypoint, self.margin - self.distance)
+        return worst
+
+    def compute_clearance(self) -> float:
+        """Return the smallest distance [m]; infinite if there are no contacts."""
+        return float(np.min(self.distance, initial=np.inf))
+
+
+def make_empty_contacts() -> Contacts:
+    """Return an empty set of contacts."""
+    none, vectors = np.zeros(0), np.zeros((0, 3))
+    return Contacts(np.zeros(0, int), np.zeros((0, 2), int), none, none, vectors, vectors, vectors)
+
+
+class ContactModel:
+    """Collision pairs and distances in each phase of a task.
+
+    Attributes:
+        phases: Geometry and pairs of each phase.
+        first_waypoint: Waypoint at which each phase starts.
+    """
+
+    def __init__(
+        self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
+    ) -> None:
+        self.scene, self.chain, self.task = scene, chain, task
+        self.first_waypoint = np.concatenate(
+            [[0], np.cumsum([phase.segments for phase in task.phases])]
+        )
+        openings = dict.fromkeys(phase.opening for phase in task.phases)
+        placed = {
+            opening: ShapePlacements(chain.model, chain.opened(opening)) for opening in openings
+        }
+        self.phases = build_phase_geometries(scene, chain, task, options)
+        self._clearances = [
+            self._make_clearances(part, placed[phase.opening])
+            for part, phase in zip(self.phases, task.phases, strict=True)
+        ]
+        # All geometries after the chain's own are fixed in the world.
+        own = [shape.parentJoint for shape in chain.collision.geometryObjects]
+        self._joints = np.array(
+            own + [0] * (max(len(part.labels) for part in self.phases) - len(own))
+        )
+
+    def _make_clearances(self, part: PhaseGeometry, placed: ShapePlacements) -> Clearances:
+        moving = len(self.chain.collision.geometryObjects)
+        standing = [shape.placement for shape in part.shapes[moving:]]
+        shapes = Shapes(
+            [shape.geometry for shape in part.shapes], standing, tolerance=_DISTANCE_TOLERANCE
+        )
+        return Clearances(placed, part.boxes, shapes, part.margin_table)
+
+    def with_released_objects(self, z: Floats) -> ContactModel:
+        """Return a copy with released objects where the motion z_1..z_N, shape (N, n), puts them.
+
+        In the original they are where the task expects them, which is only approximate if the
+        motion chooses the placement itself.
+        """
+        if not any(phase.released_by for phase in self.task.phases):
+            return self
+        view = copy.copy(self)
+        view.phases, view._clearances = list(self.phases), list(self._clearances)
+        for number, phase in enumerate(self.task.phases):
+            where: dict[int, pin.SE3] = {}
+            for name, (hold, before) in phase.released_by.items():
+                closure = self.chain.closures[hold]
+                rotations, translations = self.chain.joint_placements(
+                    z[[self.first_waypoint[before + 1] - 1]]
+                )
+                carrier = pin.SE3(rotations[0, closure.joint], translations[0, closure.joint])
+                placed = dataclasses.replace(
+                    self.scene.objects[name], placement=carrier * closure.local
+                )
+                shapes = zip(
+                    self.phases[number].released[name], make_world_shapes(placed), strict=True
+                )
+                where |= {index: shape.placement for index, shape in shapes}
+            if where:
+                view.phases[number] = self.phases[number].with_placements(where)
+                view._clearances[number] = self._clearances[number].move_fixed(
+                    view.phases[number].boxes, where
+                )
+        return view
+
+    def find_attached_geometries(self, phase: int) -> list[int]:
+        """Return the geometries of grasped objects in a phase and of objects supported by them."""
+        held, supported = self.task.phases[phase].held, self.task.phases[phase].supported
+        found = [self.chain.held_geometries[hold] for hold in held] + [
+            self.chain.ride_geometries[ride] for ride in supported
+        ]
+        return [i for indices in found for i in indices]
+
+    def find_phase(self, waypoint: int) -> int:
+        """Return the phase of a waypoint: at a boundary the earlier one, before the grasp."""
+        return max(int(self.first_waypoint.searchsorted(waypoint)) - 1, 0)
+
+    def find_phases(self, waypoints: Ints) -> Ints:
+        """Return the phase of each waypoint, shape (W,), see `find_phase`."""
+        return np.maximum(np.searchsorted(self.first_waypoint, waypoints) - 1, 0)
+
+    def find_waypoint(self, phase: int) -> int:
+        """Return a waypoint that belongs to a phase."""
+        return int(self.first_waypoint[phase]) + 1
+
+    def evaluate(
+        self,
+        z: Floats,
+        waypoints: Ints,
+        *,
+        reach: float,
+        nearest: int | None = None,
+        static: bool = True,
+    ) -> Contacts:
+        """Return the pairs closer than `reach` [m].
+
+        Args:
+            z: Configurations, shape (W, n).
+            waypoints: Waypoint whose phase each configuration belongs to, shape (W,).
+            reach: Pairs further apart are omitted [m].
+            nearest: Maximum number of pairs per configuration, those with the largest shortfall.
+                Defaults to all.
+            static: Whether pairs with geometry fixed in the world count; otherwise only pairs of
+                two moving geometries.
+        """
+        spend(len(z))
+        q, phase_of = self.chain.coordinates.q(z), self.find_phases(waypoints)
+        parts: list[tuple[NDArray[Any], ...]] = []
+        for number in dict.fromkeys(phase_of.tolist()):
+            members = np.flatnonzero(phase_of == number)
+            queries = (
+                (q, z, waypoints)
+                if len(members) == len(z)
+                else (q[members], z[members], waypoints[members])
+            )
+            found = self._clearances[number].find_closest_pairs(
+                *queries, reach=reach, max_pairs=nearest, include_fixed=static
+            )
+            pairs = self.phases[number].pairs[found.pair]
+            parts.append((members[found.row], pairs, *found[2:]))
+        if len(parts) == 1:
+            return Contacts(*parts[0])
+        if not parts:
+            return make_empty_contacts()
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return Contacts(*columns).select(np.argsort(columns[0], kind="stable"))
+
+    def first_blocked(self, z: Floats, waypoint: int, *, reach: float, allowed: float) -> int:
+        """Return the first configuration with a shortfall of more than `allowed` [m]; W if none.
+
+        The search stops at that configuration. This saves most of the work of `evaluate` if only
+        the first collision matters.
+
+        Args:
+            z: Configurations, shape (W, n).
+            waypoint: Waypoint whose phase all of them belong to.
+            reach: Pairs further apart are ignored [m].
+            allowed: Allowed margin shortfall [m].
+        """
+        clearances = self._clearances[self.find_phase(waypoint)]
+        found = clearances.find_first_violation(
+            self.chain.coordinates.q(z), z, waypoint, reach=reach, allowed=allowed
+        )
+        spend(min(found + 1, len(z)))
+        return found
+
+    def make_line_checker(
+        self,
+        z: Floats,
+        waypoint: int,
+        *,
+        weights: Floats,
+        step: float,
+        reach: float,
+        allowed: float,
+    ) -> Any:
+        """Return a checker of straight lines in the first coordinates.
+
+        See `Clearances.make_line_checker`.
+
+        Args:
+            z: Configuration that gives all other coordinates, shape (n,).
+            waypoint: Waypoint whose phase counts.
+            weights: Weight of each coordinate that moves, shape (m,).
+            step: Maximum weighted distance between consecutive checks.
+            reach: Pairs further apart are ignored [m].
+            allowed: Allowed margin shortfall [m].
+        """
+        places, clearances = (
+            self.chain.coordinates.index_maps,
+            self._clearances[self.find_phase(waypoint)],
+        )
+        return clearances.make_line_checker(
+            places, z, waypoint, weights=weights, step=step, reach=reach, allowed=allowed
+        )
+
+    def compute_placements(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return the chain's `joint_placements`, evaluated in batches of one size.
+
+        CasADi prepares a function anew for each batch size.
+        """
+        parts = [
+            self.chain.joint_placements(z[row : row + _KINEMATICS_BATCH])
+            for row in range(0, max(len(z), 1), _KINEMATICS_BATCH)
+        ]
+        return np.concatenate([rotations for rotations, _ in parts]), np.concatenate(
+            [moves for _, moves in parts]
+        )
+
+    def get_joints(self, geometries: Ints) -> Ints:
+        """Return the chain's joints that carry `geometries`; 0 for geometry fixed in the world."""
+        return self._joints[geometries]
+
+    def compute_gradients(self, z: Floats, contacts: Contacts) -> Floats:
+        """Return the distance gradients n·(∂b − ∂a) of contacts at `z`, shape (C, n)."""
+        joints = self.get_joints(contacts.pair)
+        which, points = (
+            np.tile(contacts.waypoint, 2),
+            np.concatenate([contacts.first, contacts.second]),
+        )
+        first, second = np.split(self.chain.point_jacobians(z, which, joints.T.ravel(), points), 2)
+        return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
+
+    def compute_normals(self, z: Floats, waypoints: Ints, pairs: Ints) -> Floats:
+        """Return the normal, from first to second, of one pair per configuration, shape (B, 3).
+
+        Args:
+            z: Configurations, shape (B, n).
+            waypoints: Waypoint whose phase each configuration belongs to, shape (B,).
+            pairs: Geometries of these phases, shape (B, 2).
+        """
+        found, phase_of = np.empty((len(z), 3)), self.find_phases(waypoints)
+        for number in set(phase_of.tolist()):
+            members = np.flatnonzero(phase_of == number)
+            where = self._clearances[number].placements.compute_placements(
+                self.chain.coordinates.q(z[members])
+            )
+            found[members] = (
+                self._clearances[number]
+                .shapes.compute_witnesses(where, np.arange(len(members)), pairs[members])
+                .normal
+            )
+        return found
+
+    def compute_planes(self, z: Floats, contacts: Contacts, *, slots: int) -> tuple[Floats, Floats]:
+        """Return the witness planes of the nearest contacts, C·vec(M(z)) − R ≥ 0.
+
+        A plane states that its contact keeps the margin; M are the placements of all joints (see
+        `cpin`). Unused slots have C = 0, R = −1.
+
+        Args:
+            z: Configurations, shape (W, n).
+            contacts: Contacts at these configurations.
+            slots: Planes per configuration; further contacts are ignored.
+
+        Returns:
+            Coefficients C, shape (W, slots, 12·joints), and offsets R, shape (W, slots).
+        """
+        joints = self.chain.model.njoints - 1
+        # for each joint the columns of R, then t
+        coefficients = np.zeros((len(z), slots, joints, 4, 3))
+        offsets = np.full((len(z), slots), -1.0)
+        place = contacts.slot
+        keep = np.flatnonzero(place < slots)
+        row, slot, normal = contacts.waypoint[keep], place[keep], contacts.normal[keep]
+        offset = contacts.margin[keep].copy()
+        rotations, translations = self.chain.joint_placements(z)
+        for column, points, sign in (
+            (0, contacts.first[keep], -1.0),
+            (1, contacts.second[keep], 1.0),
+        ):
+            joint = self._joints[contacts.pair[keep, column]]
+            is_static = joint == 0
+            offset[is_static] -= sign * np.einsum("ci,ci->c", normal[is_static], points[is_static])
+            r, s, j, n = row[~is_static], slot[~is_static], joint[~is_static], normal[~is_static]
+            local = np.einsum(
+                "cij,ci->cj", rotations[r, j], points[~is_static] - translations[r, j]
+            )
+            coefficients[r, s, j - 1, :3] += sign * local[:, :, None] * n[:, None, :]
+            coefficients[r, s, j - 1, 3] += sign * n
+        offsets[row, slot] = offset
+        return coefficients.reshape(len(z), slots, 12 * joints), offsets

@@ -1,0 +1,187 @@
+"""Finds pairs whose margin is temporarily reduced, at grasps, placements and touches."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.options import Options
+from vkc_pin.planning.chain.chain import VirtualKinematicChain
+from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_local_name
+from vkc_pin.world.scene.contact_rules import (
+    CONTACT_DEPTH,
+    CONTACT_WINDOW,
+    compute_hand_clearance,
+    find_touch_links,
+)
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import SupportedObject
+from vkc_pin.world.task.phases import Task
+
+__all__ = ["REDUCED_MARGIN_RATIO", "find_reduced_margins"]
+
+REDUCED_MARGIN_RATIO = 0.5  # Margin relative to the distance at the contact itself.
+
+ReducedMargins = dict[int, list[tuple[int, int, float]]]
+
+
+def find_reduced_margins(
+    scene: Scene,
+    chain: VirtualKinematicChain,
+    task: Task,
+    number: int,
+    part: PhaseGeometry,
+    options: Options,
+) -> ReducedMargins:
+    """Return pair → (first waypoint, last waypoint, margin [m]) of temporarily reduced margins.
+
+    A hand keeps the attachment's clearance from the object that it grasps or releases. A free
+    object rests on something where it is lifted and where it is placed, and possibly in the hand at
+    the start, with the objects it supports. A frame that touches a target may come close to the
+    surface around the target. In these cases the margin is half the distance at the contact. A
+    penetration of a grasped object in the initial scene is allowed at the start. See
+    `world.scene.contact_rules`.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        chain: Virtual kinematic chain.
+        task: Phases of the task.
+        number: Number of the phase.
+        part: Geometry and pairs of the phase.
+        options: Options; waypoint spacing and clearances.
+    """
+    phase, before = task.phases[number], task.phases[number - 1] if number else None
+    first = sum(earlier.segments for earlier in task.phases[:number])
+    last, steps = first + phase.segments, options.steps(CONTACT_WINDOW)
+    shapes, reduced = part.shapes, ReducedMargins()
+
+    def reduce_margins(
+        moving: int,
+        shape: coal.CollisionGeometry,
+        where: pin.SE3,
+        begin: int,
+        end: int,
+        *,
+        inside: bool = False,
+    ) -> None:
+        """Reduce the margins of a moving geometry with static ones close to `shape`."""
+        nearby = part.find_static_near(float(part.margins.max()), *compute_world_box(shape, where))
+        for k in part.find_pairs(moving, nearby).tolist():
+            other = shapes[int(part.pairs[k, 1])]
+            distance = compute_shape_distance(shape, where, other.geometry, other.placement)
+            resting_margin = REDUCED_MARGIN_RATIO * max(distance, 0.0)
+            if distance < part.margins[k]:
+                reduced.setdefault(k, []).append(
+                    (
+                        begin,
+                        end,
+                        distance if inside and distance < -CONTACT_DEPTH else resting_margin,
+                    )
+                )
+
+    for holds, begin, end in (
+        (phase.released, first, first + steps),
+        (phase.grasps, last - steps, last),
+    ):
+        for hold in holds:
+            is_hand = np.isin(part.labels, list(find_touch_links(scene, hold)))
+            is_object = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
+            for k in np.flatnonzero(
+                is_hand[part.pairs[:, 0]] & is_object[part.pairs[:, 1]]
+            ).tolist():
+                margin = compute_hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
+                reduced.setdefault(k, []).append((begin, end, margin))
+    for geometries, placed, begins in _find_lift_and_place_moments(scene, chain, task, number):
+        stands = {shape.name: shape.placement for shape in make_world_shapes(placed)}
+        for i in geometries:
+            begin, end = (first, first + steps) if begins else (last - steps, last)
+            new = begins and placed.name not in {
+                hold.object for earlier in task.phases[:number] for hold in earlier.held
+            }
+            reduce_margins(
+                i,
+                shapes[i].geometry,
+                stands[get_local_name(shapes[i].name)],
+                begin,
+                end,
+                inside=new,
+            )
+    touch_goals = [(goal, last - steps, last) for goal in phase.frames]
+    touch_goals += [(goal, first, first + steps) for goal in (before.frames if before else ())]
+    for goal, begin, end in touch_goals:
+        if not goal.touches:
+            continue
+        point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
+        joint, _ = chain.frame(goal.frame, goal.hold)
+        for i in range(len(chain.collision.geometryObjects)):
+            if part.labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint:
+                reduce_margins(i, point, where, begin, end)
+    return reduced
+
+
+def _find_lift_and_place_moments(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, number: int
+) -> Iterator[tuple[Sequence[int], PlacedObject, bool]]:
+    """Yield geometries, their object as placed, and whether it is lifted or placed then.
+
+    These are the objects whose transport begins (True) or ends (False) in a phase. Transport of an
+    object held at the start begins in the first phase.
+    """
+    phase = task.phases[number]
+    at_start = {
+        hold: scene.objects[hold.object].placement
+        for hold in phase.held
+        if number == 0 and hold in scene.holds
+    }
+    for moments, begins in ((at_start, True), (phase.lifted, True), (phase.lowered, False)):
+        for hold, placement in moments.items():
+            if not scene.objects[hold.object].object.free:
+                continue
+            placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
+            yield chain.held_geometries[hold], placed, begins
+            for ride in phase.supported:
+                if ride.hold == hold:
+                    yield (
+                        chain.ride_geometries[ride],
+                        _place_supported_object(scene, ride, placed),
+                        begins,
+                    )
+    for ride in phase.supported:
+        carrier = scene.objects[ride.hold.object]
+        if not carrier.object.free:
+            goals = {
+                name: float(np.clip(value, *phase.ranges[name]))
+                for name, value in phase.values.items()
+            }
+            for state, begins in (
+                (phase.initial_values, True),
+                ({**phase.initial_values, **goals}, False),
+            ):
+                yield (
+                    chain.ride_geometries[ride],
+                    _place_supported_object(scene, ride, _with_joint_positions(carrier, state)),
+                    begins,
+                )
+
+
+def _place_supported_object(
+    scene: Scene, ride: SupportedObject, carrier: PlacedObject
+) -> PlacedObject:
+    """Return the supported object, placed on its carrier."""
+    return dataclasses.replace(
+        scene.objects[ride.object],
+        placement=carrier.link_placement(ride.link) * ride.placement_in_link,
+    )
+
+
+def _with_joint_positions(placed: PlacedObject, state: Mapping[str, float]) -> PlacedObject:
+    """Return an object with those of the positions "<object>.<joint>" that are its own."""
+    return placed.with_state(
+        {c.partition(".")[2]: v for c, v in state.items() if c.partition(".")[0] == placed.name}
+    )

@@ -1,0 +1,132 @@
+"""Solves inverse kinematics of the whole chain for many guesses at once by damped Gauss-Newton."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.planning.chain.kinematics import get_kinematics
+from vkc_pin.planning.chain.pose import PoseRow, build_pose_residual, flatten_target
+from vkc_pin.planning.kinematics.batch import BatchFunction
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.cache import Cache
+
+__all__ = ["MAX_STEP", "PoseSolver"]
+
+MAX_STEP = 0.5  # [m] or [rad]: maximum Gauss-Newton step of a coordinate
+
+
+class PoseSolver:
+    """Moves one frame of a model to a target pose, for a batch of configurations.
+
+    Attributes:
+        size: Number of coordinates n.
+        rows: Number of residuals m: 6 for a pose, 5 for an upright pose, 3 for a point; see `pose`.
+    """
+
+    def __init__(self, model: pin.Model, pose: PoseRow, cache: Cache | None = None) -> None:
+        self.size = model.nv
+        z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
+        placements = get_kinematics(model, cache or Cache()).build_placements(z)
+        residual = ca.densify(
+            build_pose_residual(pose.kind, *pose.build_placement(placements), target)
+        )
+        self.rows = int(residual.numel())
+        jacobian = ca.densify(ca.jacobian(residual, z))
+        self._function = BatchFunction(ca.Function("pose", [z, target], [residual, jacobian]))
+        lower, upper, weights = (
+            ca.SX.sym(name, self.size) for name in ("lower", "upper", "weights")
+        )
+        step = _build_step(z, residual, jacobian, weights, (lower, upper))
+        moved = [ca.mmax(ca.fabs(residual)), ca.fmin(ca.fmax(z + step, lower), upper)]
+        self._step_function = BatchFunction(
+            ca.Function("moved", [z, target, lower, upper, weights], moved)
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Estimated size in memory [bytes]."""
+        return self._function.nbytes + self._step_function.nbytes
+
+    def evaluate(self, z: Floats, target: pin.SE3) -> tuple[Floats, Floats]:
+        """Return the pose residuals and their Jacobians at `z`.
+
+        Args:
+            z: Configurations, shape (B, n).
+            target: Target placement of the frame in the world.
+
+        Returns:
+            Residuals, shape (B, m), [m] and [rad], and Jacobians, shape (B, m, n).
+        """
+        residual, jacobian = self._function(z, flatten_target(target))
+        return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
+
+    def solve(
+        self,
+        z: Floats,
+        target: pin.SE3,
+        *,
+        lower: Floats,
+        upper: Floats,
+        weights: Floats,
+        iterations: int = 12,
+        tolerance: float = 1e-6,
+    ) -> tuple[Floats, Bools]:
+        """Return configurations near `z` that satisfy the pose within limits.
+
+        Args:
+            z: Initial guesses, shape (B, n).
+            target: Target placement of the frame in the world.
+            lower: Lower limits, shape (n,) or (B, n).
+            upper: Upper limits, shape (n,) or (B, n); a coordinate with equal limits is fixed.
+            weights: Cost of moving each coordinate, shape (n,).
+            iterations: Maximum number of steps.
+            tolerance: Largest residual of a solution, [m] and [rad].
+
+        Returns:
+            Configurations, shape (B, n), and a mask of those that satisfy the pose, shape (B,).
+        """
+        z, goal = np.clip(z, lower, upper), flatten_target(target)
+        lower, upper = np.broadcast_to(lower, z.shape), np.broadcast_to(upper, z.shape)
+        errors = np.empty(len(z))
+        unsolved, rows = np.arange(len(z)), z  # unsolved configurations and their limits
+        for remaining in range(iterations, -1, -1):
+            spend(len(rows))
+            error, moved = self._step_function(rows, goal, lower, upper, weights)
+            errors[unsolved] = error[:, 0]
+            is_unsolved = error[:, 0] >= tolerance
+            if not is_unsolved.all():
+                unsolved, moved, lower, upper = (
+                    unsolved[is_unsolved],
+                    moved[is_unsolved],
+                    lower[is_unsolved],
+                    upper[is_unsolved],
+                )
+            if not len(unsolved) or not remaining:
+                break
+            z[unsolved] = rows = moved
+        return z, errors < tolerance
+
+
+def _build_step(
+    z: ca.SX, residual: ca.SX, jacobian: ca.SX, weights: ca.SX, limits: tuple[ca.SX, ca.SX]
+) -> ca.SX:
+    """Return the damped Gauss-Newton step, shape (n,).
+
+    Coordinates that the step would move beyond their limits are fixed, and the step is solved once
+    more without them.
+    """
+    lower, upper = limits
+    free = upper - lower > 1e-9
+    damping = 1e-8 + 1e-3 * ca.fmin(1.0, ca.sumsqr(residual))
+    step = ca.SX.zeros(z.numel())
+    for _ in range(2):
+        scaled = jacobian @ ca.diag(free / weights)
+        system = scaled @ jacobian.T + damping * ca.SX.eye(residual.numel())
+        step = -scaled.T @ ca.ldl_solve(residual, *ca.ldl(system))
+        step *= ca.fmin(1.0, MAX_STEP / ca.fmax(ca.mmax(ca.fabs(step)), 1e-12))
+        blocked = ca.logic_or(z + step < lower - 1e-12, z + step > upper + 1e-12)
+        free = ca.logic_and(free, ca.logic_not(blocked))
+    return step

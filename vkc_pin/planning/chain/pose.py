@@ -1,0 +1,246 @@
+"""Builds symbolic residuals between placements: h_chain of eq. 2 and f_task of eq. 3.
+
+There are four kinds of goals: "pose" prescribes the whole placement; "point" only the translation;
+"level" the direction of the world's vertical seen from the frame, at any position and heading;
+"upright" that and the translation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arrays import Floats
+
+__all__ = [
+    "POSE_OFFSET_SIZE",
+    "ROW_BOUNDS",
+    "PoseRow",
+    "build_pose_residual",
+    "build_pose_rows",
+    "compute_pose_offsets",
+    "flatten_target",
+    "relax_target",
+]
+
+ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
+    "pose": (
+        np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
+        np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.inf]),
+    ),
+    "point": (np.zeros(3), np.zeros(3)),
+    "upright": (np.zeros(6), np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
+    "level": (np.zeros(3), np.array([0.0, 0.0, np.inf])),
+}
+"""For every kind of goal, the bounds between which `pose_rows` must lie."""
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """A frame that must attain a parametric placement at some waypoints.
+
+    Attributes:
+        joint: Joint of the model that carries the frame.
+        local: Placement of the frame on the joint.
+        waypoints: Waypoints at which the goal applies, counted from 1.
+        kind: "pose", "point", "upright" or "level"; see `pose`.
+        shift: (joint, vector): vector [m], fixed in the frame of another joint, that is added to
+            the frame's translation. It keeps a hand at a given distance from a grasp along its
+            approach direction, whatever the freedoms of the grasp.
+    """
+
+    joint: int
+    local: pin.SE3
+    waypoints: tuple[int, ...]
+    kind: str = "pose"
+    shift: tuple[int, tuple[float, float, float]] | None = None
+
+    @property
+    def rows(self) -> int:
+        """Number of constraint rows."""
+        return len(ROW_BOUNDS[self.kind][0])
+
+    def build_placement(self, placements: Any) -> tuple[Any, Any]:
+        """Return the symbolic placement of the frame, given those of all joints (see `cpin`).
+
+        Args:
+            placements: Placements of all joints, shape (12, J − 1).
+
+        Returns:
+            Rotation, shape (3, 3), and translation, shape (3, 1).
+        """
+        column = placements[:, self.joint - 1]
+        rotation = ca.reshape(column[:9], 3, 3)
+        translation = rotation @ self.local.translation + column[9:]
+        if self.shift is not None:
+            joint, vector = self.shift
+            translation = translation + ca.reshape(placements[:9, joint - 1], 3, 3) @ ca.DM(vector)
+        return rotation @ self.local.rotation, translation
+
+    def compute_placements(self, rotations: Floats, translations: Floats) -> tuple[Floats, Floats]:
+        """Return numeric placements of the frame, given those of all joints.
+
+        Args:
+            rotations: Rotations of all joints, shape (B, J, 3, 3).
+            translations: Their translations, shape (B, J, 3) [m].
+
+        Returns:
+            Rotations, shape (B, 3, 3), and translations, shape (B, 3) [m].
+        """
+        rotation = rotations[:, self.joint]
+        translation = rotation @ self.local.translation + translations[:, self.joint]
+        if self.shift is not None:
+            joint, vector = self.shift
+            translation = translation + rotations[:, joint] @ np.array(vector)
+        return rotation @ self.local.rotation, translation
+
+
+_VERTICAL = ("upright", "level")
+_MIN_SQUARED_COSINE = 1e-6  # of (2 cos(θ/2))²
+_GENERIC_VECTOR = ca.DM([0.3, 0.55, 0.78])  # not perpendicular to any axis that occurs in practice
+
+
+def build_pose_residual(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
+    """Return the residual (p − p*, 2 sin(θ/2)·a) of a placement to `target` = (R*, p*).
+
+    The target has shape (12, 1), with R* column by column. For a "pose" the residual has shape (6,
+    1); θ and a are angle and axis of E = R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π too,
+    it increases up to π, where the sign of the axis is ambiguous. Within 1e-3 of π it is computed
+    from E + I = 2aaᵀ instead, with a gradient that leads away from π. For a "point" the residual is
+    p − p*, shape (3, 1). For "upright", shape (5, 1), θ is the angle between the two verticals, and
+    a has two components; "level", shape (2, 1), has only these.
+    """
+    offset = translation - target[9:]
+    if kind == "point":
+        return offset
+    if kind in _VERTICAL:
+        tilt_components, along = _compute_tilt(rotation, target)
+        squared = 2.0 + 2.0 * along  # (2 cos(θ/2))²
+        upside_down = ca.DM([2.0, 0.0])
+        tilt = ca.if_else(
+            squared > _MIN_SQUARED_COSINE,
+            2.0 * tilt_components / ca.sqrt(ca.fmax(squared, _MIN_SQUARED_COSINE)),
+            upside_down + tilt_components,
+        )
+        return ca.vertcat(offset, tilt) if kind == "upright" else tilt
+    error = ca.reshape(target[:9], 3, 3).T @ rotation
+    vee = ca.vertcat(
+        error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]
+    )
+    squared = 1.0 + error[0, 0] + error[1, 1] + error[2, 2]  # (2 cos(θ/2))²
+    flipped = error @ _GENERIC_VECTOR + _GENERIC_VECTOR  # 2(a·g)a
+    flipped = 2.0 * flipped / ca.sqrt(ca.fmax(ca.sumsqr(flipped), _MIN_SQUARED_COSINE)) + vee
+    angle = ca.if_else(
+        squared > _MIN_SQUARED_COSINE, vee / ca.sqrt(ca.fmax(squared, _MIN_SQUARED_COSINE)), flipped
+    )
+    return ca.vertcat(offset, angle)
+
+
+def build_pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
+    """Return constraint rows that lie within `ROW_BOUNDS` if and only if the goal holds.
+
+    A "pose" gives (p − p*, ½ vee(E − Eᵀ), trace E) with E = R*ᵀR, shape (7, 1); the trace excludes
+    half turns, where the antisymmetric part vanishes too. "level" gives the components of the
+    vertical across the target's vertical and along it, shape (3, 1); the last one excludes the
+    upside-down orientation. "upright" gives p − p* and these, shape (6, 1). The rows are linear in
+    (R, p) and therefore add nothing to the second derivatives of the kinematics, as
+    `build_pose_residual` would.
+    """
+    offset = translation - target[9:]
+    if kind == "point":
+        return offset
+    if kind in _VERTICAL:
+        return ca.vertcat(
+            *([offset] if kind == "upright" else []), *_compute_tilt(rotation, target)
+        )
+    error = ca.reshape(target[:9], 3, 3).T @ rotation
+    vee = (
+        ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
+        / 2
+    )
+    return ca.vertcat(offset, vee, error[0, 0] + error[1, 1] + error[2, 2])
+
+
+# Size of a pose offset: translation [m], rotation axis and rotation angle [rad].
+POSE_OFFSET_SIZE = 7
+
+
+def compute_pose_offsets(
+    kind: str, rotations: Floats, translations: Floats, target: pin.SE3
+) -> Floats:
+    """Return the offsets of frames from their target, shape (B, 7).
+
+    An offset consists of p − p* [m], and axis a and angle θ [rad] of exp(θa) = R*ᵀR. For "upright"
+    and "level" the rotation is the shortest one that aligns the verticals; for "point" there is
+    none, and for "level" there is no translation; see `relax_target`. Unlike `build_pose_residual`,
+    offsets are accurate near half turns, too.
+
+    Args:
+        kind: Kind of the goal.
+        rotations: Rotations of the frames, shape (B, 3, 3).
+        translations: Translations of the frames, shape (B, 3) [m].
+        target: Target placement.
+    """
+    axis_sine, cosine = (
+        np.zeros((len(rotations), 3)),
+        np.ones(len(rotations)),
+    )  # a·sin and cos of θ, or of θ/2 for a pose
+    if (
+        kind in _VERTICAL
+        # θ is the tilt of the vertical in the world; an upside-down frame tilts about any level
+        # axis
+    ):
+        vertical = rotations[:, 2] @ target.rotation.T
+        axis_sine = np.column_stack([vertical[:, 1], -vertical[:, 0], np.zeros(len(axis_sine))])
+        axis_sine, cosine = (
+            np.where(axis_sine.any(axis=1, keepdims=True), axis_sine, [1e-99, 0.0, 0.0])
+            @ target.rotation,
+            vertical[:, 2],
+        )
+    elif kind == "pose":
+        errors = map(
+            np.asfortranarray, target.rotation.T @ rotations
+        )  # eigenpy never frees its copies of row-major matrices
+        quaternions = np.array([pin.Quaternion(error).coeffs() for error in errors]).reshape(-1, 4)
+        axis_sine, cosine = (
+            quaternions[:, :3] * np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0),
+            np.abs(quaternions[:, 3]),
+        )
+    size = np.linalg.norm(axis_sine, axis=1, keepdims=True)
+    axis = np.where(size > 0.0, axis_sine / np.maximum(size, np.finfo(float).tiny), [0.0, 0.0, 1.0])
+    angle = (2.0 if kind == "pose" else 1.0) * np.arctan2(size[:, 0], cosine)
+    return np.column_stack([(kind != "level") * (translations - target.translation), axis, angle])
+
+
+def relax_target(target: Any, pose_offset: Any, relaxation: Any) -> Any:
+    """Return a target moved towards a frame: R*·exp(e·θ·a) and p* + e·(p − p*), shape (12, 1).
+
+    With relaxation e = 1 it is where the frame was when `pose_offset`, shape (7, 1), was computed,
+    see `compute_pose_offsets`; with e = 0 it is the target itself. Orientations in between follow a
+    geodesic, so that half turns need no special treatment.
+    """
+    skew = ca.skew(pose_offset[3:6])
+    turn = (
+        ca.DM.eye(3)
+        + ca.sin(relaxation * pose_offset[6]) * skew
+        + (1.0 - ca.cos(relaxation * pose_offset[6])) * (skew @ skew)
+    )
+    return ca.vertcat(
+        ca.vec(ca.reshape(target[:9], 3, 3) @ turn), target[9:] + relaxation * pose_offset[:3]
+    )
+
+
+def _compute_tilt(rotation: Any, target: Any) -> tuple[Any, Any]:
+    """Return the components of the vertical across and along the target's, in the frame."""
+    vertical = ca.reshape(target[:9], 3, 3) @ rotation[2, :].T
+    return vertical[:2], vertical[2]
+
+
+def flatten_target(placement: pin.SE3) -> Floats:
+    """Return `placement` as the 12 numbers of a target."""
+    return np.concatenate([placement.rotation.T.ravel(), placement.translation])

@@ -1,0 +1,339 @@
+"""Proves that a task is impossible: goals out of reach, and floor that the base cannot reach."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.planning.base_paths.blocked_cells import make_solids
+from vkc_pin.planning.base_paths.reachable_floor import (
+    CellGrid,
+    InscribedDiscs,
+    Wall,
+    find_blocked_cells,
+    flood_fill,
+)
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.task.phases import Phase
+
+__all__ = ["PROVEN", "find_proofs"]
+
+PROVEN = "proven: "
+"""Prefix of the part of a note that is certain."""
+
+_COARSE_CELL = 0.1  # [m] cells for finding a path, which makes a proof unnecessary
+_FINE_CELL, _MAX_CELLS = 0.02, 400_000  # [m] and number of cells for proofs
+# [m] by which a base may leave the arena, or a frame miss its goal: more than validation accepts
+_TOLERANCE = 0.02
+_MAX_NAMES = 6  # obstacles named in a message
+_CLOSED_TOLERANCE = 0.05  # [rad], [m] up to which a joint counts as closed
+_BASE = 1  # the joint of the model that is the base
+
+
+_Window = tuple[tuple[slice, slice], Bools]
+"""A window of cells, and a mask of those that are blocked."""
+
+
+@dataclass(frozen=True, eq=False)
+class _BaseGoal:
+    """Where a point of the base must be at the end of a phase.
+
+    Attributes:
+        at: Centre, shape (2,) [m]; nan: any.
+        radius: Largest distance from it [m].
+    """
+
+    at: Floats
+    radius: float
+
+    def allows(self, cells: CellGrid, grown: float) -> Bools:
+        """Return which cell centres are within the radius plus `grown` [m], shape (X, Y)."""
+        x, y = (
+            np.nan_to_num(centers - at)
+            for centers, at in zip(cells.centers(), self.at, strict=True)
+        )
+        return np.asarray(np.hypot(x, y) <= self.radius + grown)
+
+
+@dataclass(frozen=True, eq=False)
+class _PhaseFloor:
+    """A phase with the goals of the base and the walls that keep it away, numbered as `names`."""
+
+    phase: Phase
+    goals: Sequence[_BaseGoal]
+    walls: Sequence[Wall]
+    names: Sequence[str]
+
+
+def find_proofs(problem: TrajectoryProblem) -> list[str]:
+    """Explain why a task is certainly impossible.
+
+    Attached objects are no obstacles, nor are objects that the motion itself leaves at a place of
+    its choice.
+
+    Returns:
+        Explanations; none if nothing is proven.
+    """
+    if problem.chain.robot.base == "fixed":
+        return []
+    goals = []
+    for number, phase in enumerate(problem.task.phases):
+        found, beyond = _find_base_goals(problem, number)
+        if beyond:
+            return [f"{phase.name}: out of reach, {PROVEN}{text}" for text in beyond]
+        goals.append(found)
+    low, high = (
+        np.array(side)
+        for side in zip(*(problem.limits(name) for name in problem.chain.names[:2]), strict=True)
+    )
+    x, y, yaw = problem.start[:3].tolist()
+    for point in _find_tracked_points(problem):
+        offset = float(np.hypot(*point))
+        start = (
+            np.array([x, y])
+            + np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ point
+        )
+        parts = []
+        for number, phase in enumerate(problem.task.phases):
+            own = [_BaseGoal(goal.at, goal.radius + offset) for goal in goals[number]]
+            parts.append(_PhaseFloor(phase, own, *_collect_walls(problem, number, point)))
+        begin, end = low - _TOLERANCE - offset, high + _TOLERANCE + offset
+        step = max(_FINE_CELL, float(np.sqrt(np.prod(end - begin) / _MAX_CELLS)))
+        if not any(part.goals for part in parts) or _finds_path(
+            start, parts, CellGrid.over(begin, end, _COARSE_CELL)
+        ):
+            continue
+        explanation = _explain_missing_path(problem, start, parts, CellGrid.over(begin, end, step))
+        if explanation:
+            return explanation
+    return []
+
+
+def _find_tracked_points(problem: TrajectoryProblem) -> list[Floats]:
+    """Return points of the base to track, (2,) [m] each: its origin, and where it is highest."""
+    robot = problem.chain.robot.collision.geometryObjects
+    solids = make_solids(
+        [(shape.geometry, shape.placement) for shape in robot if shape.parentJoint == _BASE]
+    )
+    if not solids:
+        return []
+    corners = max(solids, key=lambda solid: solid.top).points[:, :2]
+    return [np.zeros(2), (corners.min(axis=0) + corners.max(axis=0)) / 2.0]
+
+
+def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_BaseGoal], list[str]]:
+    """Return necessary base positions at a phase's end, and reasons why goals are unreachable."""
+    phase, end = problem.task.phases[number], int(problem.ends[number])
+    goals, beyond = [], []
+    if phase.base is not None:
+        x, y = (np.nan if value is None else float(value) for value in phase.base[:2])
+        goals.append(_BaseGoal(np.array([x, y]), _TOLERANCE))
+    for goal in problem.pose_goals:
+        if end in goal.row.waypoints and goal.row.kind != "level" and goal.row.shift is None:
+            shoulder, length = _compute_arm_reach(
+                problem, goal.row.joint, goal.row.local.translation
+            )
+            at = goal.target.translation
+            height = abs(at[2] - shoulder[2])
+            if height > length:
+                beyond.append(
+                    f"{goal.about} at z = {at[2]:.2f} m is {height - length:.2f} m too high "
+                    "or low, wherever the base is: "
+                    f"it turns about a joint at z = {shoulder[2]:.2f} m, "
+                    f"and the whole arm with it is {length:.2f} m long"
+                )
+            elif np.isfinite(length):
+                goals.append(
+                    _BaseGoal(
+                        at[:2].copy(),
+                        float(np.hypot(*shoulder[:2]) + np.sqrt(length**2 - height**2)),
+                    )
+                )
+    return goals, beyond
+
+
+def _compute_arm_reach(
+    problem: TrajectoryProblem, joint: int, local: Floats
+) -> tuple[Floats, float]:
+    """Return the position of a frame's first joint in the base, (3,), and the reach from it [m]."""
+    chain = problem.chain
+    model, along = chain.model, [k for k in chain.model.supports[joint] if k > _BASE]
+    if not along:
+        return np.asarray(local), _TOLERANCE
+    length = float(np.linalg.norm(local)) + _TOLERANCE
+    length += sum(float(np.linalg.norm(model.jointPlacements[k].translation)) for k in along[1:])
+    for column, owner, factor, offset, slides in chain.coordinates.moves:
+        if owner in along and slides:
+            length += (
+                float(
+                    max(
+                        abs(factor * bound + offset)
+                        for bound in (chain.lower[column], chain.upper[column])
+                    )
+                )
+                + _TOLERANCE
+            )
+    return np.asarray(model.jointPlacements[along[0]].translation), length
+
+
+def _collect_walls(
+    problem: TrajectoryProblem, number: int, point: Floats
+) -> tuple[list[Wall], list[str]]:
+    """Return the walls that keep a point of the base away in a phase, and their names."""
+    part = problem.contacts.phases[number]
+    robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
+    base = [i for i, shape in enumerate(robot) if shape.parentJoint == _BASE]
+    left = {i for own in part.released.values() for i in own}
+    eased = {
+        int(part.pairs[pair, 1]) for pair in part.reduced_margins if part.pairs[pair, 0] in base
+    }
+    hits = np.bincount(part.pairs[np.isin(part.pairs[:, 0], base), 1], minlength=len(part.shapes))
+    solid = [
+        i
+        for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True))
+        if shape.parentJoint == 0
+        and label != FLOOR
+        and hits[i] == len(base)
+        and i not in left | eased
+    ]
+    below, shapes = (
+        [(part.shapes[i].geometry, part.shapes[i].placement) for i in which]
+        for which in (base, solid)
+    )
+    below = [
+        (shape, pin.SE3(np.eye(3), -np.array([*point, 0.0])) * where) for shape, where in below
+    ]
+    key = ("discs", *(solid.key for solid in make_solids(below)))
+    discs = problem.cache.get(key, lambda: InscribedDiscs(below))
+    return discs.make_walls(shapes), [part.labels[i] for i in solid]
+
+
+def _finds_path(start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid) -> bool:
+    """Return whether the disc certainly has a path from goal to goal, over entirely free cells."""
+    half = cells.step * float(np.sqrt(0.5))
+    here = np.zeros(cells.shape, bool)
+    here[cells.at(start)] = True
+    known: dict[tuple[bytes, float], _Window] = {}  # most obstacles recur in the next phase
+    for part in parts:
+        free = np.ones(cells.shape, bool)
+        for wall in part.walls:
+            key = (wall.outline.tobytes(), wall.radius)
+            if key not in known:
+                known[key] = find_blocked_cells(cells, wall, half)
+            window, own = known[key]
+            free[window] &= ~own
+        here = flood_fill(free, here & free, corners=False)
+        for goal in part.goals:
+            here &= goal.allows(cells, 0.0)
+        if not here.any():
+            return False
+    return True
+
+
+def _explain_missing_path(
+    problem: TrajectoryProblem, start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid
+) -> list[str]:
+    """Explain the first phase whose goals the base certainly cannot reach, if any."""
+    half = cells.step * float(np.sqrt(0.5))
+    here = np.zeros(cells.shape, bool)
+    here[cells.at(start)] = True
+    for part in parts:
+        taking: dict[int, list[_Window]] = {}
+        for wall in part.walls:
+            window, own = find_blocked_cells(cells, wall, -half)
+            if own.any():
+                taking.setdefault(wall.number, []).append((window, own))
+        goal = np.ones(cells.shape, bool)
+        for one in part.goals:
+            goal &= one.allows(cells, half)
+        cut = _Separation(here, goal, taking)
+        here = cut.reached & goal
+        if not here.any():
+            if not goal.any():
+                return [
+                    f"{part.phase.name}: no place for the base, {PROVEN}"
+                    "the goal is in reach from outside the arena alone"
+                ]
+            names = [part.names[number] for number in cut.obstacles()]
+            return [f"{part.phase.name}: {cut.what}{_list_names(problem, part.phase, names)}"]
+    return []
+
+
+class _Separation:
+    """What separates the base from its goals.
+
+    Attributes:
+        reached: Cells that the base may reach.
+        what: Beginning of a sentence that explains the separation.
+    """
+
+    def __init__(self, here: Bools, goal: Bools, taking: dict[int, list[_Window]]) -> None:
+        self.here, self.goal, self.taking = here, goal, taking
+        self.count = np.zeros(here.shape, np.int16)
+        for window, own in itertools.chain.from_iterable(taking.values()):
+            self.count[window] += own
+        self.reached = flood_fill(self.count == 0, here, corners=True)
+        has_free_goal = (goal & (self.count == 0)).any()
+        self.what = (
+            f"no path for the base, {PROVEN}"
+            "at any heading, with the arm anywhere, it is cut off by "
+            if has_free_goal
+            else f"no place for the base, {PROVEN}"
+            "wherever it would have to be, at any heading, it hits "
+        )
+
+    def obstacles(self) -> list[int]:
+        """Return a minimal set of obstacles that separate the base from its goals."""
+        from scipy import ndimage
+
+        beside = (
+            ndimage.binary_dilation(self.reached, structure=np.ones((3, 3), bool)) & ~self.reached
+        )
+        seen = {
+            k
+            for k, windows in self.taking.items()
+            if any((own & beside[window]).any() for window, own in windows)
+        }
+        count, kept = self.count.copy(), set(self.taking)
+        for some in (
+            kept - seen,
+            *({number} for number in sorted(seen)),
+            *({number} for number in sorted(kept - seen)),
+        ):
+            some = some & kept
+            less = count.copy()
+            for window, own in itertools.chain.from_iterable(
+                self.taking[number] for number in some
+            ):
+                less[window] -= own
+            if some and not (flood_fill(less == 0, self.here, corners=True) & self.goal).any():
+                count, kept = less, kept - some
+        return sorted(kept)
+
+
+def _list_names(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) -> str:
+    """List names in a sentence, with the joint positions of articulated objects among them."""
+    found = list(dict.fromkeys(names))
+    more = f" and {len(found) - _MAX_NAMES} more" if len(found) > _MAX_NAMES else ""
+    text = ", ".join(found[:_MAX_NAMES]) + more
+    for name in dict.fromkeys(label.partition(".")[0] for label in found):
+        placed = problem.scene.objects.get(name)
+        if placed is None or placed.object.free or not len(placed.state):
+            continue
+        joints = placed.object.coordinates.names
+        state = [
+            phase.initial_values.get(f"{name}.{joint}", float(value))
+            for joint, value in zip(joints, placed.state, strict=True)
+        ]
+        ajar = ", ".join(
+            f"at {joint} = {value:.2f}" for joint, value in zip(joints, state, strict=True)
+        )
+        closed = max(map(abs, state)) < _CLOSED_TOLERANCE
+        text += f"; {name} is {'closed' if closed else ajar} meanwhile"
+    return text

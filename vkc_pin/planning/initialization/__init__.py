@@ -1,0 +1,1 @@
+"""Generates initial guesses for the solver."""

@@ -1,0 +1,110 @@
+"""Defines initial guesses for the solver, and makes them from solutions of parts of a task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.task.phases import PhaseKey
+from vkc_pin.world.trajectory.splicing import fill_missing_values
+
+__all__ = ["InitialGuess", "PhaseWaypoints", "make_initial_guess", "perturb"]
+
+# [m], [rad] initial trust region: a nearly feasible guess is improved in smaller steps
+_WARM_RADIUS = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class InitialGuess:
+    """Initial guess of a trajectory.
+
+    Attributes:
+        name: Initialization method, with the number of the attempt from the second on.
+        z: z_1..z_N, shape (N, n).
+        penetration: Largest clearance shortfall at a waypoint beyond `Options.dist_safe` [m]; NaN
+            if unknown.
+        radius: Initial trust-region radii, shape (N,) [m] or [rad]. Default: the solver's.
+    """
+
+    name: str
+    z: Floats
+    penetration: float = float("nan")
+    radius: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseWaypoints:
+    """Waypoints of consecutive phases.
+
+    Attributes:
+        phases: Keys of the phases.
+        names: Names of the n coordinates.
+        waypoints: Waypoints of each phase, from the last one of the phase before to its own last.
+        initialization: Name of the initial guess that led to them.
+    """
+
+    phases: tuple[PhaseKey, ...]
+    names: tuple[str, ...]
+    waypoints: tuple[Floats, ...]
+    initialization: str
+
+
+def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> InitialGuess:
+    """Concatenate waypoints of parts of a task to an initial guess for the whole task."""
+    chain = problem.chain
+    z = np.full((problem.segments, chain.size), np.nan)
+    begin = number = 0
+    for part in parts:
+        count = len(part.phases)
+        phases = problem.task.phases[number : number + count]
+        if part.phases != tuple(phase.key for phase in phases):
+            # A phase that only waits for the gripper to open is no phase of the whole task.
+            continue
+        number += count
+        # The other coordinates belong to objects that are no longer attached.
+        known = [k for k, name in enumerate(part.names) if name in chain.names]
+        columns = [chain.index(part.names[k]) for k in known]
+        for phase, waypoints in zip(phases, part.waypoints, strict=True):
+            z[begin : begin + phase.segments, columns] = _resample(
+                waypoints[:, known], phase.segments
+            )
+            begin += phase.segments
+    z = fill_missing_values(z)
+    z = np.where(np.isnan(z), problem.start, z)  # coordinates that no part moves
+    name = ", ".join(part.initialization for part in parts) + ", then all at once"
+    return InitialGuess(name, z, radius=np.full(problem.segments, _WARM_RADIUS))
+
+
+def _resample(waypoints: Floats, segments: int) -> Floats:
+    """Resample waypoints, shape (K, n), to `segments` waypoints after the first."""
+    if len(waypoints) == segments + 1:
+        return waypoints[1:]
+    at = np.linspace(0.0, len(waypoints) - 1, segments + 1)[1:]
+    return np.stack(
+        [np.interp(at, np.arange(len(waypoints)), column) for column in waypoints.T], axis=1
+    )
+
+
+def perturb(
+    problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator
+) -> Floats:
+    """Add smooth noise to the robot's coordinates: sine half-waves with amplitudes ∝ length².
+
+    Args:
+        problem: Problem.
+        z: z_1..z_N, shape (N, n).
+        deviation: Standard deviation of the noise [m] or [rad].
+        rng: Random number generator.
+    """
+    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, len(z) + 1)
+    shape = np.sin(np.pi * np.outer(waves / (len(z) + 1), waves)) / waves**2
+    noise = (
+        shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**4))
+    )
+    z = z.copy()
+    z[:, :robot] += noise
+    return problem.clip(z)

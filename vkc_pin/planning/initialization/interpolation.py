@@ -1,0 +1,308 @@
+"""Interpolates between keyframes: straight, along base paths, or along paths of base and arm."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from vkc_pin.planning.base_paths.arcs import Curves, interpolate_arcs, sample_path
+from vkc_pin.planning.initialization.approach_paths import ApproachPaths
+from vkc_pin.planning.initialization.base_routes import BaseRoutes
+from vkc_pin.planning.initialization.constrained_rrt import find_constrained_path, is_obstructed
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
+from vkc_pin.planning.initialization.rrt import MAX_EXTENSIONS, connect, resample_path
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.task.phases import Phase
+
+__all__ = ["AStarPaths", "CurvePaths", "Interpolator", "Paths", "RrtPaths", "make_base_paths"]
+
+
+class AStarPaths:
+    """Paths with the base on the shortest path around obstacles and the arm straight."""
+
+    checks_approach = False
+    """Whether approach configurations in collision are left out."""
+
+    def __init__(self, routes: BaseRoutes) -> None:
+        self.routes = routes
+
+    def find_path(
+        self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
+    ) -> Floats | None:
+        """Find a path of the robot's leading coordinates in an open phase.
+
+        Args:
+            phase: Number of the phase.
+            first: Configuration at its start, shape (n,).
+            last: Configuration at its end, shape (n,).
+            steps: Number of rows.
+            turns: Whether the final heading may differ by full turns.
+            reaches: Whether the arm must end as in `last`.
+
+        Returns:
+            Rows without `first`, shape (steps, c); None if there is no path.
+        """
+        path = self.routes.find_path(phase, first[:3], last[:3], steps)
+        if path is not None and not turns:
+            path[:, 2] -= (path[-1, 2] - last[2]) * np.arange(1, steps + 1) / steps
+        return path
+
+
+class CurvePaths:
+    """Paths with the base on the shortest curve, ignoring obstacles, and the arm straight."""
+
+    checks_approach = False
+
+    def __init__(self, curves: Curves) -> None:
+        self.curves = curves
+
+    def find_path(
+        self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
+    ) -> Floats:
+        """See `AStarPaths.find_path`."""
+        corners = self.curves.compute_corners(first[:3], last[:3])
+        if not turns:
+            corners = np.vstack([corners, last[None, :3]])
+        return sample_path(corners, steps, turning=self.curves.turning)
+
+
+class RrtPaths:
+    """Paths of base and arm by RRT: guided by a base path, or constrained to a closed chain."""
+
+    checks_approach = True
+
+    def __init__(self, sampler: KeyframeSampler, routes: BaseRoutes) -> None:
+        self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
+        self.failed: Counter[int] = Counter()  # consecutive failures per phase
+
+    def find_path(
+        self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
+    ) -> Floats | None:
+        """See `AStarPaths.find_path`."""
+        problem, size = self.problem, self.sampler.robot_size
+        poses, last = first[None, :3], last.copy()
+        if problem.chain.robot.base != "fixed":
+            guide = self.routes.find_guide_path(phase, first[:3], last[:3], 2 * steps)
+            if guide is None:
+                return None
+            turned = 2 * np.pi * np.rint((guide[-1, 2] - last[2]) / (2 * np.pi))
+            if turns:
+                last[2] += turned
+            else:
+                guide[:, 2] -= turned  # the trees find where the base can turn
+            poses = guide
+        folded = (
+            self.routes.get_folded_arm(phase),
+            self.routes.find_nearest_folded_arm(phase, first[3:size], last[3:size]),
+        )
+        arms = [first[3:size], last[3:size], problem.chain.robot.home, *folded]
+        ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
+        if not reaches:
+            ends[:, 3:] = arms
+        rng, tries = self.sampler.rng, self._get_extension_limit(phase)
+        path = connect(
+            problem, phase, first, ends, poses=poses, arms=np.array(arms), rng=rng, tries=tries
+        )
+        self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
+        return (
+            None
+            if path is None
+            else resample_path(path, steps, self.sampler.chain.metric[: path.shape[1]])
+        )
+
+    def find_constrained_path(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
+        """Find waypoints of a closed phase around obstacles; None if straight lines are free."""
+        if not is_obstructed(self.sampler, phase, through, straight):
+            return None
+        path = find_constrained_path(
+            self.sampler, phase, through, len(straight), self._get_extension_limit(phase)
+        )
+        self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
+        return path
+
+    def _get_extension_limit(self, phase: int) -> int:
+        """Return the tree extension limit of a phase, which is halved after every failure."""
+        return max(1, MAX_EXTENSIONS // 2 ** self.failed[phase])
+
+
+Paths = CurvePaths | AStarPaths | RrtPaths
+
+
+def make_base_paths(sampler: KeyframeSampler, routes: BaseRoutes | None) -> Paths | None:
+    """Return base paths around obstacles or, without routes, along curves; None: straight."""
+    if routes is not None:
+        return AStarPaths(routes)
+    return None if sampler.curves is None else CurvePaths(sampler.curves)
+
+
+class Interpolator:
+    """Interpolates between keyframes of a problem.
+
+    Args:
+        sampler: Keyframe sampler.
+        approach: Straight approach and retreat paths.
+        paths: Paths for open phases. Default: straight.
+    """
+
+    def __init__(
+        self, sampler: KeyframeSampler, approach: ApproachPaths, paths: Paths | None
+    ) -> None:
+        self.sampler, self.problem = sampler, sampler.problem
+        self.approach, self.paths = approach, paths
+        self.blocked: list[str] = []
+        """A line for every phase without a path."""
+
+    def interpolate(self, through: Floats, at: list[int]) -> Floats | None:
+        """Interpolate waypoints through keyframes, and close the chain where it must be closed.
+
+        Args:
+            through: Configurations at the keyframes, shape (K, n).
+            at: Waypoints of the keyframes.
+
+        Returns:
+            z_1..z_N, shape (N, n); None if a phase has no path.
+        """
+        problem, size = self.problem, self.problem.chain.size
+        z, keyframes, objects = (
+            np.empty((problem.segments, size)),
+            through.copy(),
+            self.sampler.object_motion.copy(),
+        )
+        begin, previous = 0, None
+        for number, (phase, end) in enumerate(
+            zip(problem.task.phases, problem.ends.tolist(), strict=True)
+        ):
+            inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
+            if problem.closed(phase):
+                self._fill_straight(
+                    z[begin:end], keyframes[inside], [at[k] - begin for k in inside]
+                )
+                path = (
+                    self.paths.find_constrained_path(number, keyframes[inside], z[begin:end])
+                    if isinstance(self.paths, RrtPaths)
+                    else None
+                )
+                if path is not None:
+                    z[begin:end] = objects[begin:end] = path
+                    keyframes[inside[-1]] = path[-1]
+            elif not self._fill_open_phase(z[begin:end], keyframes, inside, number, previous):
+                return None
+            begin, previous = end, phase
+        self._close_chain(z, objects)
+        return problem.clip(z)
+
+    def _fill_straight(self, z: Floats, through: Floats, when: list[int]) -> None:
+        """Fill rows of z, shape (steps, n), with straight lines through configurations.
+
+        Args:
+            z: Rows to fill.
+            through: Configurations, shape (K, n).
+            when: Their rows, counted from the row before z.
+        """
+        s = np.concatenate([[0.0], sample_smoothstep(len(z))])
+        for column in range(z.shape[1]):
+            z[:, column] = np.interp(s[1:], s[when], through[:, column])
+        if self.sampler.curves is not None:
+            at = np.interp(s[1:], s[when], np.arange(len(when)))
+            leg = np.minimum(at.astype(int), len(when) - 2)
+            z[:, :3] = interpolate_arcs(through[leg, :3], through[leg + 1, :3], at - leg)
+
+    def _fill_open_phase(
+        self, z: Floats, keyframes: Floats, inside: list[int], number: int, previous: Phase | None
+    ) -> bool:
+        """Fill the rows of an open phase, and turn later keyframes by its full turns.
+
+        Args:
+            z: Rows to fill, shape (steps, n).
+            keyframes: All keyframes, shape (K, n); modified in place.
+            inside: Indices of the keyframes at the start and the end of the phase.
+            number: Number of the phase.
+            previous: Phase before it.
+
+        Returns:
+            Whether there is a path.
+        """
+        problem, phase = self.problem, self.problem.task.phases[number]
+        end = int(problem.ends[number])
+        through, when, leave, arrive = self._find_via_points(
+            keyframes[inside], number, previous, len(z)
+        )
+        path = None
+        if self.paths is not None:
+            steps = when[arrive] - when[leave]
+            reaches = self.sampler.find_pose(end) is not None
+            # The heading is free unless the goal fixes it.
+            turns = problem.lower[end - 1, 2] < problem.upper[end - 1, 2]
+            path = self.paths.find_path(
+                number, through[leave], through[arrive], steps, turns=turns, reaches=reaches
+            )
+            if path is None:
+                blocked = f"{phase.name}: found no path for the base"
+                (x, y), (u, v) = through[[leave, arrive], :2]
+                if not any(note.startswith(blocked) for note in self.blocked):
+                    self.blocked.append(f"{blocked} from ({x:.2f}, {y:.2f}) to ({u:.2f}, {v:.2f})")
+                return False
+            turned = path[-1, 2] - through[arrive, 2]  # later headings continue from there
+            through[arrive:, 2] += turned
+            keyframes[inside[-1] :, 2] += turned
+        self._fill_straight(z, through, when)
+        if path is not None:
+            z[when[leave] : when[arrive], : path.shape[1]] = path
+            keyframes[inside[-1], : path.shape[1]] = z[-1, : path.shape[1]]
+        return True
+
+    def _find_via_points(
+        self, ends: Floats, number: int, previous: Phase | None, segments: int
+    ) -> tuple[Floats, list[int], int, int]:
+        """Find the configurations through which a phase passes, with retreat and approach.
+
+        Args:
+            ends: Configurations at its start and its end, shape (2, n).
+            number: Number of the phase.
+            previous: Phase before it.
+            segments: Number of its segments.
+
+        Returns:
+            Configurations, shape (K, n); their waypoints, from 0; indices of those between which
+            the path is neither retreat nor approach.
+        """
+        phase = self.problem.task.phases[number]
+        first = self.approach.find_retreat_end(ends[0], phase, previous)
+        last = self.approach.find_approach_start(ends[1], phase)
+        if self.paths is not None and self.paths.checks_approach:
+            waypoint = self.problem.contacts.find_waypoint(number)
+            first, last = (
+                part[: len(part) if self._is_free(part, waypoint) else 0] for part in (first, last)
+            )
+        steps = self.problem.options.steps(self.problem.options.approach_time)
+        spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))
+        when = [0, *(spacing * (1 + k) for k in range(len(first)))]
+        when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]
+        return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
+
+    def _is_free(self, z: Floats, waypoint: int) -> bool:
+        return not len(z) or bool(
+            np.all(self.sampler.compute_shortfall(z, waypoint) < self.problem.options.dist_safe / 2)
+        )
+
+    def _close_chain(self, z: Floats, objects: Floats) -> None:
+        """Set object joints in z, shape (N, n), to those of `objects`, and solve the closures."""
+        problem, columns = self.problem, self.sampler.object_columns
+        z[:, columns] = objects[:, columns]
+        for pose, row in enumerate(problem.transcription.structure.poses):
+            if len(row.waypoints) > 1:
+                rows = np.array(row.waypoints) - 1
+                lower, upper = problem.lower[rows].copy(), problem.upper[rows].copy()
+                lower[:, columns] = upper[:, columns] = objects[np.ix_(rows, columns)]
+                if self.sampler.curves is not None:
+                    lower[:, :3] = upper[:, :3] = z[rows, :3]
+                solver, target = self.sampler.get_pose_solver(pose)
+                z[rows], _ = solver.solve(
+                    z[rows],
+                    target,
+                    lower=lower,
+                    upper=upper,
+                    weights=self.sampler.weights,
+                    iterations=6,
+                )

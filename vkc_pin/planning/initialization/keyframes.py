@@ -1,0 +1,403 @@
+"""Samples keyframe configurations that satisfy pose constraints, and measures their shortfall."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.planning.base_paths.arcs import Curves, find_nearest_arc
+from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
+from vkc_pin.planning.initialization.collision_recovery import resolve_collisions
+from vkc_pin.planning.nlp.merit import TOLERANCE
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Bools, Floats
+
+__all__ = [
+    "SAMPLE_COUNT",
+    "SIMILARITY_TOLERANCE",
+    "KeyframeCache",
+    "KeyframeSampler",
+    "compute_shortfall",
+    "interpolate_object_joints",
+    "sample_goal_configurations",
+    "sample_smoothstep",
+]
+
+SIMILARITY_TOLERANCE = 0.1  # [m], [rad] within which configurations are treated as the same
+SAMPLE_COUNT = 192  # random start configurations of inverse kinematics per keyframe
+
+
+class KeyframeCache:
+    """Results that the searches of one problem share.
+
+    Searches with the same random seed start with the same configurations.
+
+    Attributes:
+        samples: Sampled keyframes, keyed by generator state, waypoint and start configurations.
+            Values: samples, mask of feasible samples, generator state afterwards.
+        shortfalls: Clearance shortfall, keyed by waypoint and configuration [m].
+        pushed: Configuration after `KeyframeSampler.push_clear`, keyed in the same way.
+    """
+
+    def __init__(self) -> None:
+        self.samples: dict[tuple[str, int, bytes], tuple[Floats, Bools, Any]] = {}
+        self.shortfalls: dict[tuple[int, bytes], Floats] = {}
+        self.pushed: dict[tuple[int, bytes], Floats] = {}
+
+
+_RowCache = dict[tuple[int, bytes], Floats]
+
+
+def _look_up_rows(
+    known: _RowCache, compute: Callable[[Floats, int], Floats], z: Floats, waypoint: int
+) -> Floats:
+    """Return `compute(z, waypoint)`, one result per row of z, computing only uncached rows."""
+    keys = [(waypoint, row.tobytes()) for row in z]
+    new = [k for k, key in enumerate(keys) if key not in known]
+    if len(new) == len(z):
+        found = compute(z, waypoint)
+        known.update(zip(keys, found, strict=True))
+        return found
+    if new:
+        known.update(zip((keys[k] for k in new), compute(z[new], waypoint), strict=True))
+    return np.array([known[key] for key in keys])
+
+
+class KeyframeSampler:
+    """Samples configurations for waypoints of a problem.
+
+    Args:
+        problem: Problem.
+        rng: Random number generator.
+        cache: Results of other searches of the problem. Default: an empty cache.
+
+    Attributes:
+        problem: Problem.
+        object_motion: Motion of the object joints, shape (N, n); the other columns are the start's.
+        object_columns: Columns of the object joints.
+        weights: Weight of each coordinate in distances, shape (n,).
+        robot_size: Number of robot coordinates.
+        curves: Curves that the base drives; None for a holonomic or fixed base.
+    """
+
+    def __init__(
+        self,
+        problem: TrajectoryProblem,
+        rng: np.random.Generator,
+        cache: KeyframeCache | None = None,
+    ) -> None:
+        self.problem, self.rng = problem, rng
+        self.cache = KeyframeCache() if cache is None else cache
+        self.chain = problem.chain
+        self.robot_size = self.chain.robot.coordinates.size
+        self.weights = self.chain.metric.copy()
+        # Also where a grasp slides.
+        self.weights[[column for column, _, _ in problem.choices]] = 1.0
+        self.curves = (
+            None
+            if problem.rolling.is_omnidirectional
+            else Curves(problem.rolling.turning_radius, self.chain.robot.lever)
+        )
+        self.object_columns = np.array([self.chain.index(name) for name in problem.task.state], int)
+        self.object_motion = interpolate_object_joints(
+            problem, np.tile(problem.start, (problem.segments, 1))
+        )
+
+    def find_pose(self, waypoint: int) -> int | None:
+        """Return the index of the pose constraint at a waypoint; None: at most a level one."""
+        poses = self.problem.transcription.structure.poses
+        return next(
+            (
+                k
+                for k, pose in enumerate(poses)
+                if waypoint in pose.waypoints and pose.kind != "level"
+            ),
+            None,
+        )
+
+    def get_pose_solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
+        """Return the inverse kinematics solver of a pose constraint, and its target."""
+        return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
+
+    def sample(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
+        """Sample configurations for a waypoint.
+
+        Args:
+            before: Preceding configurations, shape (B, n).
+            waypoint: Waypoint of the samples.
+            how: "scatter": random configurations. "track": the nearest feasible ones. "shake": near
+                `before` with randomly perturbed arms, so that the search can leave a dead end.
+
+        Returns:
+            Samples, shape (B, n); mask of those that satisfy the pose constraint, shape (B,).
+        """
+        if how != "scatter":
+            return self._sample(before, waypoint, how)
+        key = (str(self.rng.bit_generator.state), waypoint, before.tobytes())
+        if key not in self.cache.samples:
+            self.cache.samples[key] = (
+                *self._sample(before, waypoint, how),
+                self.rng.bit_generator.state,
+            )
+        z, found, self.rng.bit_generator.state = self.cache.samples[key]
+        return z.copy(), found.copy()
+
+    def _sample(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
+        z = before.copy()
+        z[:, self.object_columns] = self.object_motion[waypoint - 1, self.object_columns]
+        lower, upper = self.compute_limits(before, waypoint)
+        pose = self.find_pose(waypoint)
+        if pose is None:
+            return np.clip(z, lower, upper), np.ones(len(z), bool)
+        solver, target = self.get_pose_solver(pose)
+        # Random grasps; half of the arms near home, the others near the preceding configuration.
+        if how == "scatter":
+            for hold in self.problem.task.phases[
+                int(np.searchsorted(self.problem.ends, waypoint))
+            ].grasps:
+                for column in map(self.chain.index, self.chain.virtual[hold]):
+                    z[:, column] = self.rng.uniform(
+                        self.chain.lower[column], self.chain.upper[column], len(z)
+                    )
+            z[::2, 3 : self.robot_size] = self.chain.robot.home
+        if how != "track":
+            z = self._perturb_arms(z, pose, (0.1, 2.0) if how == "scatter" else (0.05, 0.5))
+        z, found = solver.solve(
+            z, target, lower=lower, upper=upper, weights=self.weights, tolerance=TOLERANCE
+        )
+        if how == "scatter":
+            z = self._unwrap_angles(z, before, lower, upper)
+        elif self.curves is not None and self._is_closed_at(waypoint):
+            z, found = self._fit_base_to_arc(z, found, before, waypoint, pose)
+        return z, found
+
+    def _fit_base_to_arc(
+        self, z: Floats, found: Bools, before: Floats, waypoint: int, pose: int
+    ) -> tuple[Floats, Bools]:
+        """Move the bases to the nearest pose on an arc from `before`, if the arms still reach."""
+        rolling, turning = self.problem.rolling, self.chain.robot.lever
+        there, (solver, target) = z.copy(), self.get_pose_solver(pose)
+        there[:, :3] = find_nearest_arc(
+            before[:, :3], z[:, :3], radius=rolling.turning_radius, turning=turning
+        )
+        lower, upper = self.compute_limits(before, waypoint)
+        lower[:, :3] = upper[:, :3] = np.clip(there[:, :3], lower[:, :3], upper[:, :3])
+        there, reached = solver.solve(
+            there, target, lower=lower, upper=upper, weights=self.weights, tolerance=TOLERANCE
+        )
+        return np.where(reached[:, None], there, z), reached
+
+    def _is_closed_at(self, waypoint: int) -> bool:
+        return self.problem.closed(
+            self.problem.task.phases[self.problem.contacts.find_phase(waypoint)]
+        )
+
+    def push_clear(self, z: Floats, waypoint: int) -> Floats:
+        """Push configurations, shape (B, n), out of collision; see `resolve_collisions`."""
+        pose = self.find_pose(waypoint)
+        if pose is None:
+            return z
+        return _look_up_rows(
+            self.cache.pushed, lambda rows, at: self._push_clear(rows, at, pose), z, waypoint
+        )
+
+    def _push_clear(self, z: Floats, waypoint: int, pose: int) -> Floats:
+        lower, upper = self.compute_limits(z, waypoint)
+        if self.curves is not None and self._is_closed_at(waypoint):
+            lower[:, :3] = upper[:, :3] = z[:, :3]  # the base stays on its arc
+        solver, target = self.get_pose_solver(pose)
+        weights = self.weights
+        pushed = resolve_collisions(
+            self.problem, z, waypoint, solver, target, lower=lower, upper=upper, weights=weights
+        )
+        exact, _ = solver.solve(
+            pushed,
+            target,
+            lower=lower,
+            upper=upper,
+            weights=weights,
+            iterations=3,
+            tolerance=TOLERANCE,
+        )
+        return exact
+
+    def compute_limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:
+        """Return limits at a waypoint after configurations `before`, shape (B, n) each."""
+        row = waypoint - 1
+        lower, upper = (
+            np.tile(limits[row], (len(before), 1))
+            for limits in (self.problem.lower, self.problem.upper)
+        )
+        lower[:, self.object_columns] = upper[:, self.object_columns] = self.object_motion[
+            row, self.object_columns
+        ]
+        for column in self.find_grasp_columns(waypoint):
+            lower[:, column] = upper[:, column] = before[:, column]
+        return lower, upper
+
+    def find_grasp_columns(self, waypoint: int) -> list[int]:
+        """Return the columns of grasp coordinates that an earlier grasp fixes at a waypoint."""
+        return [column for column, grasp, last in self.problem.choices if grasp < waypoint <= last]
+
+    def _perturb_arms(self, z: Floats, pose: int, deviations: tuple[float, float]) -> Floats:
+        """Perturb the arms and align the bases with pose constraint `pose`.
+
+        Args:
+            z: Configurations, shape (B, n).
+            pose: Index of the pose constraint.
+            deviations: Bounds of the standard deviation, [m] and [rad].
+        """
+        spread, z = self.rng.uniform(*deviations, (len(z), 1)), z.copy()
+        z[:, 3 : self.robot_size] += spread * self.rng.normal(
+            0.0, 1.0, (len(z), self.robot_size - 3)
+        )
+        return self._align_bases(np.clip(z, self.chain.lower, self.chain.upper), pose)
+
+    def _align_bases(self, z: Floats, pose: int) -> Floats:
+        """Move the bases so that pose constraint `pose` holds in position and heading.
+
+        Height and tilt are left to the arm. A base motion multiplies the frame's placement from the
+        left, so it equals the error T* T⁻¹, projected to the floor.
+        """
+        row, target = self.problem.transcription.structure.poses[pose], self.problem.targets[pose]
+        rotations, translations = self.chain.joint_placements(z)
+        rotation = rotations[:, row.joint] @ row.local.rotation
+        translation = rotations[:, row.joint] @ row.local.translation + translations[:, row.joint]
+        error = np.einsum("ij,bkj->bik", target.rotation, rotation)
+        if row.kind == "pose":
+            turn = np.arctan2(error[:, 1, 0] - error[:, 0, 1], error[:, 0, 0] + error[:, 1, 1])
+        else:  # any heading will do
+            turn = self.rng.uniform(-np.pi, np.pi, len(z))
+        cos, sin = np.cos(turn), np.sin(turn)
+        planar = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
+        z = z.copy()
+        z[:, :2] = target.translation[:2] + np.einsum(
+            "bij,bj->bi", planar, z[:, :2] - translation[:, :2]
+        )
+        z[:, 2] += turn
+        return z
+
+    def _unwrap_angles(self, z: Floats, before: Floats, lower: Floats, upper: Floats) -> Floats:
+        """Replace each revolute robot joint's angle by the equivalent one nearest to `before`."""
+        z = z.copy()
+        for column in range(2, self.robot_size):
+            if self.problem.unit(self.chain.names[column]) == "m":
+                continue
+            nearest = (
+                before[:, column] + (z[:, column] - before[:, column] + np.pi) % (2 * np.pi) - np.pi
+            )
+            inside = (nearest >= lower[:, column]) & (nearest <= upper[:, column])
+            z[:, column] = np.where(inside, nearest, z[:, column])
+        return z
+
+    def compute_shortfall(self, z: Floats, waypoint: int) -> Floats:
+        """Return the clearance shortfall of each configuration, shape (B,) [m]."""
+        return _look_up_rows(
+            self.cache.shortfalls,
+            lambda rows, at: compute_shortfall(self.problem, rows, at),
+            z,
+            waypoint,
+        )
+
+    def has_free_keyframe(self, waypoint: int) -> bool:
+        """Return whether a search found a collision-free, feasible configuration for a waypoint."""
+        rows = [
+            np.frombuffer(row)
+            for (at, row), shortfall in self.cache.shortfalls.items()
+            if at == waypoint and shortfall <= 0.0
+        ]
+        pose = self.find_pose(waypoint)
+        if pose is None or not rows:
+            return bool(rows)
+        solver, target = self.get_pose_solver(pose)
+        return bool(
+            (np.abs(solver.evaluate(np.array(rows), target)[0]).max(axis=1) < TOLERANCE).any()
+        )
+
+
+def compute_shortfall(
+    problem: TrajectoryProblem,
+    z: Floats,
+    waypoint: int,
+    *,
+    standing: bool = True,
+    reach: float | None = None,
+) -> Floats:
+    """Return the clearance shortfall of configurations at a waypoint, shape (B,) [m].
+
+    Args:
+        problem: Problem.
+        z: Configurations, shape (B, n).
+        waypoint: Waypoint of the configurations.
+        standing: Whether fixed obstacles count; otherwise only the robot itself and attached
+            objects.
+        reach: Largest distance of pairs that count [m]. Default: the largest margin.
+    """
+    waypoints, reach = (
+        np.full(len(z), waypoint),
+        problem.options.largest_margin if reach is None else reach,
+    )
+    contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, static=standing)
+    return contacts.compute_shortfall(len(z))
+
+
+def sample_goal_configurations(
+    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
+) -> tuple[Floats, Floats] | None:
+    """Sample random configurations at the goal of a waypoint.
+
+    Args:
+        problem: Problem.
+        waypoint: Waypoint of the goal.
+        rng: Random number generator.
+
+    Returns:
+        Configurations, shape (B, n), and their residuals, shape (B,) [m] or [rad]; None if the
+        waypoint has neither a pose constraint nor a fixed base position.
+    """
+    search = KeyframeSampler(problem, rng)
+    pose, row = search.find_pose(waypoint), waypoint - 1
+    z = np.tile(problem.start, (SAMPLE_COUNT, 1))
+    for column in search.find_grasp_columns(waypoint):  # the earlier grasp is free here
+        lower, upper = np.clip(
+            [problem.lower[row, column], problem.upper[row, column]], -np.pi, np.pi
+        )
+        z[:, column] = rng.uniform(lower, upper, SAMPLE_COUNT)
+    if pose is not None:
+        z, found = search.sample(z, waypoint, "scatter")
+        pushed = z.copy()
+        pushed[found] = search.push_clear(z[found], waypoint)
+        solver, target = search.get_pose_solver(pose)
+        before, after = (
+            np.abs(solver.evaluate(rows, target)[0]).max(axis=1) for rows in (z, pushed)
+        )
+        kept = after < TOLERANCE  # where the pushed configuration is still feasible
+        return np.where(kept[:, None], pushed, z), np.where(kept, after, before)
+    if (problem.lower[row, :2] < problem.upper[row, :2]).any():
+        return None
+    z[:, 2:] += rng.normal(0.0, 1.0, z[:, 2:].shape)
+    return np.clip(z, problem.lower[row], problem.upper[row]), np.zeros(len(z))
+
+
+def sample_smoothstep(steps: int) -> Floats:
+    """Return 3s² − 2s³, which starts and ends at rest, for s = 1/steps, ..., 1, shape (steps,)."""
+    s = np.arange(1, steps + 1) / steps
+    return s * s * (3.0 - 2.0 * s)
+
+
+def interpolate_object_joints(problem: TrajectoryProblem, z: Floats) -> Floats:
+    """Move the object joints in z, shape (N, n), to their goals phase by phase."""
+    begin, current = 0, problem.start.copy()
+    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+        for name in phase.initial_values:
+            column = problem.chain.index(name)
+            goal = problem.lower[end - 1, column] if name in phase.values else current[column]
+            z[begin:end, column] = current[column] + (goal - current[column]) * sample_smoothstep(
+                end - begin
+            )
+            current[column] = goal
+        begin = end
+    return problem.clip(z)

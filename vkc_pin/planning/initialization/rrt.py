@@ -1,0 +1,245 @@
+"""Finds paths of base and arm between two configurations with RRT-Connect.
+
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is sampled near a
+guide path, the arm near postures that are likely to be needed there, so that narrow passages are
+found quickly.
+"""
+
+from __future__ import annotations
+
+import itertools
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_smoothstep
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.optional_imports import compiled_module
+
+__all__ = ["MAX_EXTENSIONS", "STEP", "connect", "has_arm_detour", "resample_path"]
+
+MAX_EXTENSIONS = 1500
+"""Maximum number of tree extensions."""
+STEP = 0.15
+"""Distance between collision checks, in the metric of searches: [rad] of a joint."""
+
+# of successive searches: the second if the first one missed a collision
+_STEP_SIZES = (STEP, 0.04)
+_SHORTCUT_ROUNDS = 11  # partial shortcuts per coordinate between random points
+# relative saving in length that a shortcut needs, or a further round of shortcuts
+_MIN_SAVING = 1e-3
+# share of a path by which the arm may exceed its straight path before another one is searched for
+_MAX_DETOUR = 1 / 3
+_PATH_SPREAD = 0.1  # [m], [rad] largest standard deviation of base samples from the guide path
+_END_SPREAD = 0.4  # [m], [rad] largest standard deviation of base samples at the ends, and of arms
+
+
+def connect(
+    problem: TrajectoryProblem,
+    phase: int,
+    first: Floats,
+    ends: Floats,
+    *,
+    poses: Floats,
+    arms: Floats,
+    rng: np.random.Generator,
+    tries: int = MAX_EXTENSIONS,
+) -> Floats | None:
+    """Find a nearly collision-free path of the robot.
+
+    Args:
+        problem: Problem.
+        phase: Number of the phase, an open one.
+        first: Start configuration, shape (n,); coordinates outside the robot stay constant.
+        ends: Possible end configurations, shape (E, m).
+        poses: x, y [m] and yaw [rad] along a guide path of the base, shape (P, 3).
+        arms: Arm postures that are likely to be needed, shape (A, m - 3) [m] or [rad].
+        rng: Random number generator.
+        tries: Maximum number of tree extensions.
+
+    Returns:
+        Corners of the path, shape (K, m); None if no path was found.
+    """
+    coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEP_SIZES)
+    path = coarse.run(ends, tries)
+    if path is not None and not fine.is_free(path):
+        path = fine.run(ends, tries)
+    return None if path is None else fine.straighten(path)
+
+
+def has_arm_detour(problem: TrajectoryProblem, z: Floats) -> bool:
+    """Return whether the arm takes a detour in an open phase of a motion z_1..z_N, shape (N, n)."""
+    rows, metric = (
+        problem.waypoints(z)[:, : problem.chain.robot.coordinates.size],
+        problem.chain.metric,
+    )
+    spans = zip(problem.task.phases, itertools.pairwise([0, *problem.ends.tolist()]), strict=True)
+    paths = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.closed(phase)]
+    return any(_compute_detour(path, metric[: path.shape[1]]) > _MAX_DETOUR for path in paths)
+
+
+def _compute_detour(path: Floats, metric: Floats) -> float:
+    """Return the share of a path, shape (K, m), by which the arm exceeds its straight path."""
+    base, arm = np.split(path * metric, [3], axis=1)
+    length, driven = (
+        np.abs(np.diff(arm, axis=0)).sum(),
+        np.linalg.norm(np.diff(base, axis=0), axis=1).sum(),
+    )
+    return float((length - np.abs(arm[-1] - arm[0]).sum()) / max(length + driven, 1e-12))
+
+
+def resample_path(path: Floats, steps: int, metric: Floats) -> Floats:
+    """Resample a path, shape (K, m), to `steps` rows without its first, slow at both ends."""
+    lengths = np.linalg.norm(np.diff(path, axis=0) * metric, axis=1)
+    passed = np.concatenate([[0.0], np.cumsum(lengths + 1e-12)])
+    at = passed[-1] * sample_smoothstep(steps)
+    return np.column_stack([np.interp(at, passed, column) for column in path.T])
+
+
+class _Search:
+    """Searches paths in one open phase; expensive parts are compiled (`_trees.cpp`)."""
+
+    def __init__(
+        self,
+        problem: TrajectoryProblem,
+        phase: int,
+        first: Floats,
+        poses: Floats,
+        arms: Floats,
+        rng: np.random.Generator,
+        step: float,
+    ) -> None:
+        self.problem, self.first, self.poses, self.arms, self.rng, self.step = (
+            problem,
+            first,
+            poses,
+            arms,
+            rng,
+            step,
+        )
+        self.size = problem.chain.robot.coordinates.size
+        self.waypoint = problem.contacts.find_waypoint(phase)
+        # Shortfalls up to the margin are allowed: the solver resolves them.
+        self.allowed = problem.options.dist_safe
+        self.weights = problem.chain.metric[: self.size]
+        limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
+        self.lower, self.upper = np.ascontiguousarray(limits.T)
+
+    def run(self, ends: Floats, tries: int) -> Floats | None:
+        """Find a path to one of `ends`, shape (E, m); None if there is none."""
+        shortfall = self._compute_shortfall(ends)
+        ends = ends[shortfall <= max(self.allowed, shortfall.min())]
+        path = self._trees.run(_as_rows(self.first[None, : self.size]), _as_rows(ends), tries)
+        self._spend()
+        return self._shorten(path) if len(path) else None
+
+    @cached_property
+    def free_runs(self) -> list[Floats]:
+        """Collision-free sections of the guide path with each of the arms, shape (R, m) each."""
+        runs = []
+        for arm in self.arms:
+            rows = np.clip(
+                np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))]),
+                self.lower,
+                self.upper,
+            )
+            middles = (rows[1:] + rows[:-1]) / 2
+            free = self._compute_shortfall(np.concatenate([rows, middles])) <= self.allowed
+            begin = None
+            for k in range(len(rows)):
+                if begin is None and free[k]:
+                    begin = k
+                if begin is not None and (
+                    k + 1 == len(rows) or not (free[len(rows) + k] and free[k + 1])
+                ):
+                    runs.append(rows[begin : k + 1])
+                    begin = None
+        return runs
+
+    @cached_property
+    def _lines(self) -> Any:
+        """Collision checker of straight lines."""
+        contacts, weights = self.problem.contacts, self.weights
+        return contacts.make_line_checker(
+            self.first,
+            self.waypoint,
+            weights=weights,
+            step=self.step,
+            reach=0.0,
+            allowed=self.allowed,
+        )
+
+    @cached_property
+    def _trees(self) -> Any:
+        """Compiled trees and shortcuts."""
+        runs = np.concatenate(self.free_runs) if self.free_runs else np.empty((0, self.size))
+        rows = map(_as_rows, (self.weights, self.lower, self.upper, self.poses, self.arms, runs))
+        lengths, seed = (
+            np.array([len(run) for run in self.free_runs], np.int64),
+            int(self.rng.integers(2**63)),
+        )
+        module = compiled_module("vkc_pin.planning.initialization._trees")
+        return module.Trees(self._lines, *rows, lengths, _PATH_SPREAD, _END_SPREAD, seed)
+
+    def _spend(self) -> None:
+        spend(self._lines.looked())
+
+    def is_free(self, path: Floats) -> bool:
+        """Return whether a path, shape (K, m), is nearly collision-free."""
+        return all(self.compute_free_share(a, b) == 1.0 for a, b in itertools.pairwise(path))
+
+    def compute_free_share(self, a: Floats, b: Floats) -> float:
+        """Return the collision-free share of the straight line from `a` to `b`, both (m,)."""
+        share = float(self._trees.along(_as_rows([a, b])))
+        self._spend()
+        return share
+
+    def _compute_shortfall(self, rows: Floats) -> Floats:
+        """Return the shortfall of overlapping pairs for robot rows, (B, m), shape (B,) [m]."""
+        z = np.tile(self.first, (len(rows), 1))
+        z[:, : self.size] = rows
+        return compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
+
+    def _shorten(self, path: Floats) -> Floats:
+        """Shortcut a path between random points on it, as many times as it has rows."""
+        path = self._trees.shortened(_as_rows(path))
+        self._spend()
+        return path
+
+    def straighten(self, path: Floats) -> Floats:
+        """Straighten the motion of the arm, and of each joint alone, where that is collision-free.
+
+        A path through a narrow passage with another posture moves all joints. Straight lines in all
+        coordinates seldom undo that, and the solver cannot, because obstacles are in between. So
+        coordinates are treated separately (partial shortcuts: Geraerts and Overmars, IJRR 2007),
+        first along the whole path, then between random points on it. Detours of the arm are treated
+        repeatedly as long as that pays off.
+        """
+        length, path = np.inf, self._shorten_partially(path, 0)
+        while self.compute_length(path) < (1.0 - _MIN_SAVING) * length:
+            length, path = (
+                self.compute_length(path),
+                self._shorten_partially(path, _SHORTCUT_ROUNDS),
+            )
+            if _compute_detour(path, self.weights) <= _MAX_DETOUR:
+                break
+        return path
+
+    def _shorten_partially(self, path: Floats, times: int) -> Floats:
+        """Apply partial shortcuts, along the whole path (`times` 0) or between random points."""
+        path = self._trees.evened(_as_rows(path), times, _MIN_SAVING)
+        self._spend()
+        return path
+
+    def compute_length(self, path: Floats) -> float:
+        """Return the length of a path, shape (K, m)."""
+        return float(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1).sum())
+
+
+def _as_rows(rows: ArrayLike) -> Floats:
+    """Return rows as a contiguous array, as the compiled code expects it."""
+    return np.ascontiguousarray(rows, float)

@@ -1,0 +1,196 @@
+"""Provides Pinocchio's algorithms as CasADi functions of a model's q, v and a.
+
+Every function here takes a numeric `pinocchio.Model` and returns a `casadi.Function` built from SX
+expressions, with exact derivatives of any order. q is Pinocchio's configuration (a planar joint has
+x, y, cos θ, sin θ); v and a are in its tangent space. Entries that vanish at every configuration
+are structural zeros of the result.
+
+If upstream's `pinocchio.casadi` can be imported (conda-forge), it builds the functions; otherwise a
+small module does, which is compiled when this package is installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Literal
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arguments import instance, items, known, whole
+
+if TYPE_CHECKING:
+    import casadi
+    import pinocchio as pin
+
+__all__ = [
+    "backend_name",
+    "center_of_mass",
+    "frame_jacobian",
+    "frame_placements",
+    "joint_placements",
+    "rnea",
+]
+
+# values of pinocchio.ReferenceFrame
+_REFERENCE_FRAMES = {"world": 0, "local": 1, "local_world_aligned": 2}
+
+
+@cache
+def _get_backend() -> Callable[..., casadi.Function]:
+    """Return the backend, chosen at the first use so that importing this package is fast."""
+    from vkc_pin.planning.kinematics import backends
+
+    try:
+        import_module("pinocchio.casadi")
+    except ImportError:
+        return backends.build_compiled
+    return backends.build_upstream
+
+
+def backend_name() -> str:
+    """Return the name of the backend in use.
+
+    Returns:
+        "upstream" (`pinocchio.casadi`) or "compiled" (this package's own module).
+    """
+    return _get_backend().__name__.removeprefix("build_")
+
+
+def joint_placements(model: pin.Model) -> casadi.Function:
+    """Return the function q → M of the placements of all joints in the world.
+
+    Args:
+        model: The model, with nq configuration entries and njoints joints including the universe.
+
+    Returns:
+        q, shape (nq, 1) → M, shape (12, njoints - 1). Column i belongs to joint i + 1 (the universe
+        is omitted) and stacks the columns of the rotation matrix and the translation [m]: [R[:, 0];
+        R[:, 1]; R[:, 2]; t].
+
+    Raises:
+        BuildError: The compiled module is missing or does not fit the installed packages.
+    """
+    return _get_backend()("joint_placements", _round_quarter_turns(model))
+
+
+def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Function:
+    """Return the function q → M of the placements of selected frames in the world.
+
+    Args:
+        model: The model.
+        frames: Names or indices of the frames, in the order of the columns.
+
+    Returns:
+        q, shape (nq, 1) → M, shape (12, len(frames)), columns as in `joint_placements`.
+
+    Raises:
+        UnknownNameError: The model has no such frame.
+        InputError: Several different frames of the model have this name.
+        BuildError: The compiled module is missing or does not fit the installed packages.
+    """
+    listed: tuple[Any, ...] = items(
+        [frames] if isinstance(frames, str) else frames, "frames", "a list of frames"
+    )
+    indices = [_find_frame(model, frame, f"frames[{i}]") for i, frame in enumerate(listed)]
+    return _get_backend()("frame_placements", _round_quarter_turns(model), indices)
+
+
+def frame_jacobian(
+    model: pin.Model,
+    frame: str | int,
+    reference: Literal["local_world_aligned", "local", "world"] = "local_world_aligned",
+) -> casadi.Function:
+    """Return the function q → J of the Jacobian of a frame; its spatial velocity is J·v.
+
+    Args:
+        model: The model.
+        frame: Name or index of the frame.
+        reference: Point and axes of the velocity: frame origin and world axes
+            ("local_world_aligned"), frame origin and frame axes ("local"), or world origin and
+            world axes ("world").
+
+    Returns:
+        q, shape (nq, 1) → J, shape (6, nv); rows 0-2 linear [m/s], rows 3-5 angular [rad/s] per
+        unit of v.
+
+    Raises:
+        UnknownNameError: The model has no such frame, or there is no such reference.
+        InputError: Several different frames of the model have this name.
+        BuildError: The compiled module is missing or does not fit the installed packages.
+    """
+    known(reference, _REFERENCE_FRAMES, "reference", "reference")
+    index = _find_frame(model, frame, "frame")
+    return _get_backend()(
+        "frame_jacobian", _round_quarter_turns(model), index, _REFERENCE_FRAMES[reference]
+    )
+
+
+def rnea(model: pin.Model) -> casadi.Function:
+    """Return the function (q, v, a) → tau of inverse dynamics (recursive Newton-Euler).
+
+    Args:
+        model: The model, with inertias.
+
+    Returns:
+        q, shape (nq, 1), v [rad/s, m/s] and a [rad/s², m/s²], shape (nv, 1) → tau [N·m, N], shape
+        (nv, 1).
+
+    Raises:
+        BuildError: The compiled module is missing or does not fit the installed packages.
+    """
+    return _get_backend()("rnea", _round_quarter_turns(model))
+
+
+def center_of_mass(model: pin.Model) -> casadi.Function:
+    """Return the function q → com of the centre of mass of the model.
+
+    Args:
+        model: The model, with inertias.
+
+    Returns:
+        q, shape (nq, 1) → com [m] in the world frame, shape (3, 1).
+
+    Raises:
+        BuildError: The compiled module is missing or does not fit the installed packages.
+    """
+    return _get_backend()("center_of_mass", _round_quarter_turns(model))
+
+
+def _find_frame(model: pin.Model, frame: str | int, field: str) -> int:
+    """Return the checked index of `frame` in `model.frames`."""
+    names = [f.name for f in _round_quarter_turns(model).frames]
+    if not isinstance(frame, str):
+        number = whole(frame, field, low=-1)
+        if not 0 <= number < len(names):
+            raise UnknownNameError("frame", str(number), [f"0 to {len(names) - 1}"], field=field)
+        return number
+    found = [index for index, name in enumerate(names) if name == frame]
+    if not found:
+        raise UnknownNameError("frame", frame, names, field=field)
+    first = model.frames[found[0]]
+    # In a URDF a joint and a link may have frames of the same name. As long as they coincide,
+    # either one will do.
+    for other in (model.frames[index] for index in found[1:]):
+        if other.parentJoint != first.parentJoint or other.placement != first.placement:
+            raise InputError(
+                f"several frames are named '{frame}'", field=field, expected="an index", got=found
+            )
+    return found[0]
+
+
+def _round_quarter_turns(model: pin.Model) -> pin.Model:
+    """Return a copy of `model` with exact quarter turns in its placements.
+
+    They are stored as cos(π/2) = 6e-17, and a number other than 0 and ±1 stays in every expression
+    that it enters: without rounding, the functions of a UR5e on a planar base take ten per cent
+    longer. The change is below the rounding errors of the numeric algorithms.
+    """
+    import numpy as np
+    import pinocchio as pin
+
+    copy = instance(model, pin.Model, "model").copy()
+    for placement in [*copy.jointPlacements, *(frame.placement for frame in copy.frames)]:
+        rotation, nearest = placement.rotation, np.round(placement.rotation)
+        placement.rotation = np.where(np.abs(rotation - nearest) <= 4e-16, nearest, rotation)
+    return copy

@@ -1,0 +1,118 @@
+"""Builds CasADi functions of Pinocchio's algorithms with one of two backends.
+
+These are the compiled module `_cpin` and upstream's `pinocchio.casadi`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+# CasADi and Pinocchio are imported first, so that the compiled module uses the libraries that these
+# packages have loaded, wherever they are installed.
+import casadi
+import pinocchio as pin
+
+from vkc_pin.errors import BuildError
+from vkc_pin.utils.optional_imports import REBUILD, compiled_module
+
+__all__ = ["build_compiled", "build_upstream", "check_versions"]
+
+
+def build_compiled(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
+    """Return the named function, built by the compiled module.
+
+    Args:
+        name: Name of the function in `vkc_pin.planning.kinematics`.
+        model: The model.
+        arguments: Its further arguments; frames and references as numbers.
+    """
+    return casadi.Function.deserialize(
+        getattr(_import_extension(), name)(model.saveToString(), *arguments)
+    )
+
+
+def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
+    """Check that the compiled module fits the installed libraries, up to the minor release.
+
+    Args:
+        built: Package name → version that the module was compiled against.
+        installed: Package name → installed version.
+
+    Raises:
+        BuildError: A release differs; the message says which, and what to install.
+    """
+    mismatched = [
+        name for name in built if _parse_release(built[name]) != _parse_release(installed[name])
+    ]
+    if mismatched:
+        mismatches = " and ".join(
+            f"{name} {built[name]}, but {installed[name]} is installed" for name in mismatched
+        )
+        requirements = " ".join(
+            f"'{name}=={'.'.join(map(str, _parse_release(built[name])))}.*'" for name in mismatched
+        )
+        raise BuildError(
+            f"vkc_pin.planning.kinematics was compiled against {mismatches}. "
+            f"Either pip install {requirements}, or {REBUILD}"
+        )
+
+
+def _parse_release(version: str) -> tuple[int, int]:
+    """Return (major, minor) of `version` as numbers, since as text 3.10 precedes 3.9."""
+    parts = version.split("+")[0].split(".")
+    try:
+        return int(parts[0]), int(parts[1])
+    except (IndexError, ValueError):
+        raise BuildError(
+            f"cannot read the version '{version}' of a library that "
+            f"vkc_pin.planning.kinematics needs; {REBUILD}"
+        ) from None
+
+
+@cache
+def _import_extension() -> Any:
+    """Import the compiled module once and check its versions."""
+    extension = compiled_module("vkc_pin.planning.kinematics._cpin")
+    check_versions(
+        {"pin": extension.PINOCCHIO_VERSION, "casadi": extension.CASADI_VERSION},
+        {"pin": pin.__version__, "casadi": casadi.__version__},
+    )
+    return extension
+
+
+def build_upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
+    """Return the named function, built by `pinocchio.casadi`; see `build_compiled`."""
+    cpin = import_module("pinocchio.casadi")
+    symbolic, inputs = cpin.Model(model), {"q": casadi.SX.sym("q", model.nq, 1)}
+    data, q = symbolic.createData(), inputs["q"]
+    if name == "rnea":
+        inputs |= {part: casadi.SX.sym(part, model.nv, 1) for part in ("v", "a")}
+        output, result = cpin.rnea(symbolic, data, *inputs.values()), "tau"
+    elif name == "center_of_mass":
+        output, result = cpin.centerOfMass(symbolic, data, q), "com"
+    elif name == "frame_jacobian":
+        frame, reference = arguments
+        cpin.computeJointJacobians(symbolic, data, q)
+        cpin.updateFramePlacements(symbolic, data)
+        output, result = (
+            cpin.getFrameJacobian(symbolic, data, frame, pin.ReferenceFrame.values[reference]),
+            "J",
+        )
+    else:
+        cpin.forwardKinematics(symbolic, data, q)
+        cpin.updateFramePlacements(symbolic, data)
+        joints = name == "joint_placements"
+        placements = (
+            [data.oMi[i] for i in range(1, model.njoints)]
+            if joints
+            else [data.oMf[i] for i in arguments[0]]
+        )
+        columns = [
+            casadi.vertcat(casadi.vec(casadi.SX(m.rotation)), casadi.SX(m.translation))
+            for m in placements
+        ]
+        output, result = casadi.horzcat(casadi.SX(12, 0), *columns), "M"
+    simplified = casadi.cse(casadi.sparsify(casadi.SX(output)))
+    return casadi.Function(name, list(inputs.values()), [simplified], list(inputs), [result])

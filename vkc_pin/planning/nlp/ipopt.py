@@ -1,0 +1,146 @@
+"""Runs Ipopt on a program with given derivatives, and stops it when the budget is exhausted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.budget import SpentError, spend
+
+__all__ = ["BYTES_PER_ENTRY", "Ipopt", "Monitor", "make_ipopt"]
+
+_MEMORY_INDEX = 1  # CasADi reserves memory 0 of a function; the buffer gets the next one
+# [bytes] per nonzero of Jacobian or Hessian, in program and solver together, measured on the door
+BYTES_PER_ENTRY = 600
+
+
+class Monitor(ca.Callback):
+    """CasADi iteration callback that charges the budget.
+
+    Args:
+        variables: Number of variables of the program.
+        rows: Number of rows.
+        parameters: Number of parameters.
+        waypoints: Evaluations charged per iteration.
+    """
+
+    def __init__(self, variables: int, rows: int, parameters: int, waypoints: int) -> None:
+        ca.Callback.__init__(self)
+        self._waypoints = waypoints
+        self._sizes = {
+            "x": variables,
+            "f": 1,
+            "g": rows,
+            "lam_x": variables,
+            "lam_g": rows,
+            "lam_p": parameters,
+        }
+        self.construct("monitor", {})
+
+    def get_n_in(self) -> int:
+        """Return the number of inputs, which are the outputs of nlpsol."""
+        return int(ca.nlpsol_n_out())
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Return the sparsity of input `i`."""
+        return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arguments: list[ca.DM]) -> list[int]:
+        """Return [1] (stop) if the budget is exhausted, otherwise [0]."""
+        try:
+            spend(self._waypoints)
+        except SpentError:
+            return [1]
+        return [0]
+
+
+class Ipopt:
+    """An Ipopt solver with the arrays that it reads and writes.
+
+    CasADi converts arguments and results number by number, 0.1 ms per thousand numbers. The arrays
+    are therefore shared with it once.
+
+    Args:
+        function: CasADi solver function.
+        monitor: Callback that stops it.
+        nbytes: Estimated size in memory [bytes].
+
+    Attributes:
+        stats: CasADi's statistics of the last call; its times accumulate over all calls.
+        evaluation_time: Time spent in the program's functions during the last call [s].
+    """
+
+    def __init__(self, function: ca.Function, monitor: Monitor, nbytes: int) -> None:
+        self.function, self.monitor, self.nbytes = function, monitor, nbytes
+        self._buffer, self._run = function.buffer()
+        self.stats: dict[str, Any] = {}
+        self.evaluation_time = self._total = 0.0
+        self._inputs = {
+            function.name_in(i): np.zeros(function.nnz_in(i)) for i in range(function.n_in())
+        }
+        self._outputs = {
+            function.name_out(i): np.zeros(function.nnz_out(i)) for i in range(function.n_out())
+        }
+        for i, values in enumerate(self._inputs.values()):
+            self._buffer.set_arg(i, values.data)
+        for i, values in enumerate(self._outputs.values()):
+            self._buffer.set_res(i, values.data)
+
+    def __call__(self, **values_by_name: Floats) -> dict[str, Floats]:
+        """Run the solver; return CasADi's outputs by name. Inputs that are not given are zero."""
+        for name, values in self._inputs.items():
+            values[:] = values_by_name.get(name, 0.0)
+        self._run()
+        self.stats = dict(self.function.stats(_MEMORY_INDEX))
+        total = sum(value for key, value in self.stats.items() if key.startswith("t_wall_nlp_"))
+        self.evaluation_time, self._total = total - self._total, total
+        return {name: values.copy() for name, values in self._outputs.items()}
+
+
+def make_ipopt(
+    x: ca.MX,
+    parameters: ca.MX,
+    objective: tuple[ca.MX, ca.MX],
+    rows: tuple[ca.MX, ca.MX],
+    lagrangian: tuple[ca.MX, ca.MX, ca.MX],
+    options: dict[str, Any],
+    *,
+    waypoints: int,
+) -> Ipopt:
+    """Return an Ipopt solver of min f(x) subject to bounds on g(x).
+
+    Args:
+        x: Variables.
+        parameters: Parameters.
+        objective: f and its gradient.
+        rows: g and its Jacobian.
+        lagrangian: Symbols of the weight σ of f and of the multipliers λ, and the upper triangle of
+            the Hessian of σ·f + λᵀ·g.
+        options: Options of CasADi's nlpsol.
+        waypoints: Evaluations charged per iteration.
+    """
+    weight, multipliers, hessian = lagrangian
+    inputs, (f, g) = [x, parameters], (objective[0], rows[0])
+    functions = {
+        "grad_f": ca.Function("nlp_grad_f", inputs, list(objective), ["x", "p"], ["f", "grad_f_x"]),
+        "jac_g": ca.Function("nlp_jac_g", inputs, list(rows), ["x", "p"], ["g", "jac_g_x"]),
+        "hess_lag": ca.Function(
+            "nlp_hess_l",
+            [*inputs, weight, multipliers],
+            [hessian],
+            ["x", "p", "lam_f", "lam_g"],
+            ["triu_hess_gamma_x_x"],
+        ),
+    }
+    defaults = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
+    monitor = Monitor(x.numel(), g.numel(), parameters.numel(), waypoints)
+    callback = {"iteration_callback": monitor}
+    spend()
+    program = {"x": x, "p": parameters, "f": f, "g": g}
+    solver = ca.nlpsol(
+        "trajectory", "ipopt", program, {**defaults, **functions, **callback, **options}
+    )
+    return Ipopt(solver, monitor, BYTES_PER_ENTRY * (rows[1].nnz() + hessian.nnz()))

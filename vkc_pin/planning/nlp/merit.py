@@ -1,0 +1,144 @@
+"""Computes the exact ℓ1 merit function: the objective plus weighted constraint violations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vkc_pin.planning.chain.contacts import Contacts
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, compute_pose_offsets
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.timing import Timing
+from vkc_pin.utils.arrays import Floats
+
+__all__ = [
+    "GROWTH",
+    "TOLERANCE",
+    "Infeasibility",
+    "Merit",
+    "compute_shortfalls",
+    "measure_infeasibility",
+]
+
+# [m], [rad], and relative to the limits for rates: tolerance of all constraints except clearance
+TOLERANCE = 1e-4
+GROWTH = 4.0  # factor by which a weight grows if it proved too small
+
+
+@dataclass(frozen=True, eq=False)
+class Infeasibility:
+    """Constraint violations along a motion.
+
+    Attributes:
+        amounts: For each kind of constraint, the summed violation at each waypoint, shape (N,):
+            "clearance" [m], "poses" (closure, goals and grasps: distance and angle) [m] and [rad],
+            "rolling" [m], "clamped" [m] and [rad], "terms" (1e-3 is their tolerance), "rates" [m]
+            and [rad].
+        pose_offsets: See `Transcription.parameter_vector`, shape (N, poses, 7).
+        excess: Bound violations of rolling, clamping and user-defined rows, in the order of the
+            rows.
+        rate_excess: Bound violations of velocities and accelerations; empty if they are not rows of
+            the program.
+    """
+
+    amounts: Mapping[str, Floats]
+    pose_offsets: Floats
+    excess: Floats
+    rate_excess: Floats
+
+    @property
+    def total(self) -> float:
+        """Sum of all violations."""
+        return float(sum(amount.sum() for amount in self.amounts.values()))
+
+    @property
+    def max_violation(self) -> float:
+        """Largest violation of one kind at a waypoint, except clearance."""
+        return float(
+            np.max([amount for kind, amount in self.amounts.items() if kind != "clearance"])
+        )
+
+
+def compute_shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
+    """Return the clearance shortfall of the pairs with witness planes, shape (N, K) [m]."""
+    plane = contacts.slot
+    has_plane = plane < slots
+    shortfalls = np.zeros((segments, slots))
+    shortfalls[contacts.waypoint[has_plane], plane[has_plane]] = np.maximum(
+        contacts.margin[has_plane] - contacts.distance[has_plane], 0.0
+    )
+    return shortfalls
+
+
+def measure_infeasibility(
+    problem: TrajectoryProblem, z: Floats, timing: Timing, contacts: Contacts, *, rates: bool
+) -> Infeasibility:
+    """Return the constraint violations at z_1..z_N, shape (N, n).
+
+    Args:
+        problem: The planning problem.
+        z: The waypoints.
+        timing: Step durations.
+        contacts: Close pairs at the waypoints.
+        rates: Whether velocity and acceleration limits count.
+    """
+    t = problem.transcription
+    amounts = {kind: np.zeros(len(z)) for kind in ("poses", "rolling", "clamped", "terms", "rates")}
+    amounts["clearance"] = compute_shortfalls(contacts, len(z), t.slots).sum(axis=1)
+    pose_offsets = np.zeros((len(z), len(problem.pose_goals), POSE_OFFSET_SIZE))
+    rotations, translations = problem.chain.joint_placements(z)
+    for k, goal in enumerate(problem.pose_goals):
+        if goal.row.waypoints:
+            at = np.array(goal.row.waypoints) - 1
+            pose_offsets[at, k] = compute_pose_offsets(
+                goal.row.kind,
+                *goal.row.compute_placements(rotations[at], translations[at]),
+                goal.target,
+            )
+    amounts["poses"] = np.linalg.norm(pose_offsets[:, :, :3], axis=2).sum(axis=1) + pose_offsets[
+        :, :, 6
+    ].sum(axis=1)
+    excess = problem.excess(z, timing, rates=rates)
+    for kind, scale in problem.row_kinds.items():
+        np.add.at(amounts[kind], t.row_waypoints, scale * np.abs(excess))
+    rate_excess = np.zeros(0)
+    if rates:
+        values = np.concatenate([part.ravel() for part in problem.rates(z)])
+        bound = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
+        rate_excess = values - np.clip(values, -bound, bound)
+        np.add.at(amounts["rates"], t.rate_waypoints, np.abs(rate_excess))
+    return Infeasibility(amounts, pose_offsets, excess, rate_excess)
+
+
+class Merit:
+    """The merit function φ(z) = f(z) + Σ_k ν_k Σ_t v_kt(z), with f of eq. 1.
+
+    ν_k and v_k are the weight and `Infeasibility.amounts` of constraint kind k. φ is exact: if the
+    weights exceed the multipliers, its minima are those of the program (Nocedal and Wright,
+    Numerical Optimization, theorem 17.3).
+
+    Attributes:
+        weights: ν_k of each kind, [1/m] and [1/rad].
+    """
+
+    def __init__(self, weight: float) -> None:
+        kinds = ("clearance", "poses", "rolling", "clamped", "terms", "rates")
+        self.weights = dict.fromkeys(kinds, weight)
+
+    def compute_penalty(self, infeasibility: Infeasibility, *, clearance: bool) -> Floats:
+        """Return the penalty at each waypoint, shape (N,), with or without clearance."""
+        kinds = (kind for kind in self.weights if clearance or kind != "clearance")
+        return np.asarray(sum(self.weights[kind] * infeasibility.amounts[kind] for kind in kinds))
+
+    def increase_weights(self, infeasibility: Infeasibility, tolerance: float) -> bool:
+        """Increase the weights of kinds violated by more than `tolerance`; return whether any."""
+        violated = [
+            kind
+            for kind in self.weights
+            if infeasibility.amounts[kind].max(initial=0.0) > tolerance
+        ]
+        for kind in violated:
+            self.weights[kind] *= GROWTH
+        return bool(violated)

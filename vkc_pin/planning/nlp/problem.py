@@ -1,0 +1,393 @@
+"""Formulates one task in one scene as a nonlinear program (eqs. 1 to 7) over one or more phases."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from vkc_pin.options import Options
+from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
+from vkc_pin.planning.chain.contacts import ContactModel, Contacts
+from vkc_pin.planning.chain.pose import ROW_BOUNDS, flatten_target
+from vkc_pin.planning.nlp.objective import MotionCost
+from vkc_pin.planning.nlp.pose_goals import (
+    find_approach_waypoint,
+    find_chosen_freedoms,
+    find_pushed_coordinates,
+    make_pose_goals,
+)
+from vkc_pin.planning.nlp.term_locations import TermEvaluator, locate_terms
+from vkc_pin.planning.nlp.term_rows import TermRow
+from vkc_pin.planning.nlp.timing import Timing, compute_step_times, split_at_stops
+from vkc_pin.planning.nlp.transcription import transcribe
+from vkc_pin.planning.nlp.waypoint import Structure
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import wrap_angle
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.phases import Phase, Task
+from vkc_pin.world.task.terms import Term
+from vkc_pin.world.trajectory.wheels import make_rolling_limits
+
+__all__ = ["TrajectoryProblem"]
+
+# Relative cost of coordinates that are chosen at the grasp and constant afterwards; it only
+# regularises the problem.
+_CHOSEN_FREEDOM_WEIGHT = 1e-4
+
+
+class TrajectoryProblem:
+    """A task in a scene, ready to be solved.
+
+    It is immutable. The duration of steps belongs to a motion, see `timing_for`.
+
+    Attributes:
+        scene, task, options: Scene, task and options that it was built from.
+        chain: Virtual kinematic chain with n coordinates.
+        rolling: Motion constraints of its base.
+        contacts: Collision model of the task.
+        transcription: Symbolic program, shared between problems of one structure.
+        effort: Cost of the motion.
+        start: z_0, shape (n,).
+        lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), fixed coordinates,
+            joint goals.
+        pose_goals: Pose goals (eqs. 2 and 3), one for each of `transcription.structure.poses`.
+        targets: Their target placements.
+        choices: Freedoms chosen when a hand clamps: column, grasp waypoint and last waypoint held.
+        terms: User-defined constraints and costs that can change something in this task, one for
+            each of `transcription.structure.terms`.
+        term_evaluator: Evaluates the terms along a motion.
+        cache: Cache of the symbolic program and of what searches build.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        task: Task,
+        options: Options,
+        terms: Sequence[Term] = (),
+        *,
+        cache: Cache | None = None,
+    ) -> None:
+        self.scene, self.task, self.options, self.cache = scene, task, options, cache or Cache()
+        self.chain: VirtualKinematicChain = consolidate(
+            scene, task.holds, rides=task.supported, cache=self.cache
+        )
+        self.rolling = make_rolling_limits(self.chain.robot)
+        self.contacts = ContactModel(scene, self.chain, task, options)
+        self.ends = np.cumsum([phase.segments for phase in task.phases])
+        self.pose_goals = make_pose_goals(scene, self.chain, task, options)
+        self.choices = find_chosen_freedoms(scene, self.chain, task)
+        self.targets = tuple(goal.target for goal in self.pose_goals)
+        rows, self.terms = locate_terms(scene, self.chain, task, terms)
+        self.transcription = transcribe(self._make_structure(rows), self.cache)
+        self.effort = self._make_motion_cost()
+        self.start = self._make_start()
+        self.lower, self.upper = self._make_bounds()
+        for array in (self.start, self.lower, self.upper):
+            array.setflags(write=False)
+        self.term_evaluator = TermEvaluator(self.terms, self.transcription, self.start)
+        self.term_evaluator.check(self.still, np.full(self.segments, options.dt))
+
+    def with_bounds(self, lower: Floats, upper: Floats) -> TrajectoryProblem:
+        """Return the same problem with other bounds of z_1..z_N, shape (N, n)."""
+        other = copy.copy(self)
+        other.lower, other.upper = lower.copy(), upper.copy()
+        for array in (other.lower, other.upper):
+            array.setflags(write=False)
+        return other
+
+    @property
+    def segments(self) -> int:
+        """N, the number of waypoints after the start."""
+        return int(self.ends[-1])
+
+    @property
+    def still(self) -> Floats:
+        """z_1..z_N of the stationary motion, shape (N, n)."""
+        return np.tile(self.start, (self.segments, 1))
+
+    def _make_structure(self, terms: tuple[TermRow, ...]) -> Structure:
+        """Return the structure of the program: pose goals, stops, clamped coordinates, etc."""
+        o = self.options
+        # Clamped freedoms are constant from the start of the straight approach, because the hand
+        # already has to be where it will close.
+        starts = np.concatenate([[0], self.ends[:-1]])
+        phase_starts = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
+        clamped = tuple(
+            (column, find_approach_waypoint(phase_starts[grasp], grasp, o), last)
+            for column, grasp, last in self.choices
+        )
+        # The robot is at rest while its gripper closes or opens.
+        phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
+        stops = tuple(int(end) for end, phase, after in phases if phase.grasps or after.released)
+        return Structure(
+            model=self.chain.model,
+            segments=self.segments,
+            poses=tuple(goal.row for goal in self.pose_goals),
+            slots=o.contact_slots,
+            stops=stops,
+            rolling=self.rolling,
+            clamped=clamped,
+            pushed=find_pushed_coordinates(self.chain, self.task),
+            terms=terms,
+        )
+
+    def _make_motion_cost(self) -> MotionCost:
+        """Return the motion cost: one weight for all lengths, turns weighted by group of joints."""
+        o, robot = self.options, self.chain.robot.coordinates.size
+        metric = np.full(self.chain.size, o.velocity_weight_object)
+        metric[2], metric[3:robot] = o.velocity_weight_heading, o.velocity_weight_arm
+        coordinates = self.chain.coordinates  # the displacements of coupled joints add up
+        metric = metric * coordinates.turns**2 + o.velocity_weight_base * coordinates.lengths**2
+        metric[[column for column, _, _ in self.choices]] *= _CHOSEN_FREEDOM_WEIGHT
+        stops = self.transcription.structure.stops
+        return MotionCost(
+            metric, o.acceleration_weight / o.dt**2, self.ends, stops, length=o.effort == "length"
+        )
+
+    def _make_start(self) -> Floats:
+        start = np.zeros(self.chain.size)
+        start[: len(self.scene.start)] = self.scene.start
+        for name, value in self.task.state.items():
+            start[self.chain.index(name)] = value
+        for hold in self._find_initial_holds():
+            names = self.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
+            for name, value in zip(names, hold.at, strict=True):
+                start[self.chain.index(f"{hold.object}.{name}")] = value
+        return start
+
+    def _find_initial_holds(self) -> list[Hold]:
+        """Return the holds at the start that the task continues, not those it releases at once."""
+        return [hold for hold in self.scene.holds if hold in self.task.holds]
+
+    def _make_bounds(self) -> tuple[Floats, Floats]:
+        """Return the joint limits (eq. 4) per waypoint, narrowed by phases and clamped grasps."""
+        lower, upper = (
+            np.tile(self.chain.lower, (self.segments, 1)),
+            np.tile(self.chain.upper, (self.segments, 1)),
+        )
+        for column, name in enumerate(self.chain.names[:3]):
+            lower[:, column], upper[:, column] = self.limits(name)
+        first = 0
+        for phase, end in zip(self.task.phases, self.ends, strict=True):
+            inside = slice(first, end)  # row t belongs to waypoint t + 1
+            if phase.kind == "stand" and not self.closed(
+                phase
+            ):  # a released object stays where it is
+                robot_columns = slice(0, self.chain.robot.coordinates.size)
+                lower[inside, robot_columns] = upper[inside, robot_columns] = self.start[
+                    robot_columns
+                ]
+            for name, value in phase.initial_values.items():
+                column = self.chain.index(name)
+                low, high = phase.ranges.get(name, (value, value))
+                lower[inside, column], upper[inside, column] = low, high
+            for name, value in phase.values.items():
+                column = self.chain.index(name)
+                nearest = np.clip(value, self.chain.lower[column], self.chain.upper[column])
+                lower[end - 1, column] = upper[end - 1, column] = nearest
+            if phase.base is not None:
+                for column, goal in enumerate(phase.base):
+                    if goal is not None:
+                        # the equivalent heading nearest to the start
+                        turn = wrap_angle(goal - self.start[2])
+                        lower[end - 1, column] = upper[end - 1, column] = (
+                            self.start[2] + turn if column == 2 else goal
+                        )
+            first = end
+        for (
+            hold
+            # clamped freedoms are constant until the object is released
+        ) in self._find_initial_holds():
+            if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
+                held = [hold in phase.held for phase in self.task.phases]
+                until = (
+                    int(self.ends[(held.index(False) if False in held else len(held)) - 1])
+                    if held[0]
+                    else 0
+                )
+                for column in map(self.chain.index, self.chain.virtual[hold]):
+                    lower[:until, column] = upper[:until, column] = self.start[column]
+        return lower, upper
+
+    def timing_for(self, z: Floats) -> Timing:
+        """Return the step durations for the initial guess z_1..z_N, shape (N, n).
+
+        See `compute_step_times`. User-defined terms may require longer steps.
+        """
+        structure, limits = (
+            self.transcription.structure,
+            (self.chain.velocity, self.chain.acceleration),
+        )
+        runs = split_at_stops(structure.stops, self.segments)
+        path = self.waypoints(z)
+        dt = compute_step_times(
+            path, self.options.dt, runs, limits, self.rolling.compute_min_times(path)
+        )
+        if structure.timed:
+            dt = self.term_evaluator.lengthen_steps(z, dt, runs)
+        return Timing(dt, dt, runs, limits)
+
+    def closed(self, phase: Phase) -> bool:
+        """Return whether the chain is closed, by a grasp of an object fixed in the world."""
+        return any(not self.scene.objects[hold.object].object.free for hold in phase.held)
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Return the position limits of a coordinate.
+
+        The base is limited by the arena; a fixed base stays at the start.
+        """
+        column = self.chain.index(name)
+        if column < 3 and self.chain.robot.base == "fixed":
+            return float(self.start[column]), float(self.start[column])
+        lower, upper = float(self.chain.lower[column]), float(self.chain.upper[column])
+        if column < 2:
+            lower, upper = (
+                max(lower, self.scene.arena[2 * column]),
+                min(upper, self.scene.arena[2 * column + 1]),
+            )
+        return lower, upper
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a coordinate, "m" or "rad"."""
+        return self.chain.coordinates.units[self.chain.index(name)]
+
+    def waypoints(self, z: Floats) -> Floats:
+        """Return z_0..z_N, shape (N + 1, n), given z_1..z_N, shape (N, n)."""
+        return np.vstack([self.start, z])
+
+    def clip(self, z: Floats) -> Floats:
+        """Return `z` clipped to the bounds."""
+        return np.clip(z, self.lower, self.upper)
+
+    def evaluate_contacts(self, z: Floats, *, reach: float, nearest: int | None = None) -> Contacts:
+        """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n).
+
+        Args:
+            z: z_1..z_N.
+            reach: Pairs further apart are omitted [m].
+            nearest: Maximum number of pairs per waypoint. Defaults to all.
+        """
+        return self.contacts.with_released_objects(z).evaluate(
+            z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest
+        )
+
+    def rates(self, z: Floats) -> tuple[Floats, Floats]:
+        """Return the steps δz, shape (N, n), and their changes δδz, shape (N + 1 + stops, n)."""
+        t = self.transcription
+        first = t.first @ z + np.outer(t.start_first, self.start)
+        return first, t.second @ z + np.outer(t.start_second, self.start)
+
+    def pace(self, z: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return `rates` and the minimum step durations for the wheels, shape (N,) [s]."""
+        return *self.rates(z), self.rolling.compute_min_times(self.waypoints(z))
+
+    def objective(self, z: Floats, dt: Floats) -> float:
+        """Return the cost of z_1..z_N, shape (N, n), including user-defined costs.
+
+        Args:
+            z: z_1..z_N.
+            dt: Step durations, shape (N,) [s].
+        """
+        return self.effort.value(*self.rates(z)) + self.term_evaluator.compute_cost(z, dt)
+
+    def pose_error(self, z: Floats) -> float:
+        """Return the largest residual of closure (eq. 2), goals (eq. 3) and rolling [m], [rad]."""
+        errors = [0.0]
+        for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
+            if goal.row.waypoints:
+                residual, _ = solver.evaluate(z[np.array(goal.row.waypoints) - 1], goal.target)
+                errors.append(float(np.abs(residual).max()))
+        return max(*errors, self.rolling.compute_error(self.waypoints(z)))
+
+    def row_error(self, z: Floats, dt: Floats) -> float:
+        """Return the larger of `pose_error` and the violation of user-defined constraints."""
+        return max(self.pose_error(z), self.term_evaluator.compute_violation(z, dt))
+
+    def excess(self, z: Floats, timing: Timing, *, rates: bool = False) -> Floats:
+        """Return the signed bound violations of the rolling, clamping and user-defined rows.
+
+        Args:
+            z: z_1..z_N, shape (N, n).
+            timing: Step durations.
+            rates: Whether the wheel speed limits count.
+        """
+        t = self.transcription
+        if t.rows == t.first_relaxed_row:
+            return np.zeros(0)
+        values = np.asarray(
+            t.relaxed_row_values(
+                t.pack(z), self.start, timing.dt, self.rolling.compute_gears(self.waypoints(z))
+            )
+        ).ravel()
+        lower, upper = (
+            bound[t.first_relaxed_row : t.rows]
+            for bound in self.row_bounds(timing if rates else None)
+        )
+        return np.asarray(values - np.clip(values, lower, upper))
+
+    @cached_property
+    def row_kinds(self) -> Mapping[str, Floats]:
+        """For each kind of these rows, the factor of their excess; 0 for rows of other kinds."""
+        t = self.transcription
+        rolling, terms = np.zeros(t.rows), np.zeros(t.rows)
+        rolling[t.base_rows] = 1.0
+        terms[self.term_evaluator.rows] = self.term_evaluator.scale
+        clamped = np.where((rolling == 0.0) & (terms == 0.0), 1.0, 0.0)
+        return {
+            kind: own[t.first_relaxed_row :]
+            for kind, own in (("rolling", rolling), ("clamped", clamped), ("terms", terms))
+        }
+
+    def drift(self, z: Floats) -> float:
+        """Return the largest closure error between waypoints, relative to the tolerances.
+
+        It is evaluated half-way between consecutive waypoints.
+        """
+        path, worst = self.waypoints(z), 0.0
+        midpoints = (path[1:] + path[:-1]) / 2
+        allowed = np.array([self.options.closure_position, self.options.closure_angle])
+        for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
+            closed = np.array(
+                [t - 1 for t in goal.row.waypoints if t - 1 in goal.row.waypoints], int
+            )
+            if len(closed) and goal.kind == "closure":
+                residual, _ = solver.evaluate(midpoints[closed], goal.target)
+                amounts = np.linalg.norm(residual.reshape(len(closed), 2, 3), axis=2)
+                worst = max(worst, float((amounts / allowed).max()))
+        return worst
+
+    def row_bounds(self, timing: Timing | None) -> tuple[Floats, Floats]:
+        """Return the bounds of the rows, followed by those of the rates if a timing is given."""
+        t, terms = self.transcription, self.term_evaluator
+        lower, upper = np.zeros(t.rows), np.zeros(t.rows)
+        upper[t.slot_rows] = upper[t.pushed_rows] = np.inf
+        for pose, at in zip(t.structure.poses, t.pose_rows, strict=True):
+            for rows in at.values():
+                lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
+        lower[terms.rows], upper[terms.rows] = terms.lower, terms.upper
+        if not self.rolling.is_omnidirectional:
+            lower[t.base_rows], upper[t.base_rows] = t.steps.bounds(
+                None if timing is None else timing.dt
+            )
+        if timing is not None:
+            rates = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
+            lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
+        return lower, upper
+
+    def target_matrix(self) -> Floats:
+        """Return the pose targets as parameters, shape (poses, 12)."""
+        return np.array([flatten_target(t) for t in self.targets]).reshape(-1, 12)
+
+    def __repr__(self) -> str:
+        t, time = self.transcription, self.timing_for(self.still).dt.sum()
+        return (
+            f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: "
+            f"{self.segments} steps in {time:g} s, {t.size} variables, {t.rows} rows, "
+            f"{sum(len(p.pairs) for p in self.contacts.phases)} collision pairs>"
+        )

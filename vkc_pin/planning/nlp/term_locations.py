@@ -1,0 +1,235 @@
+"""Locates the frames of user-defined terms in a task, and evaluates the terms along a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.planning.chain.chain import VirtualKinematicChain
+from vkc_pin.planning.chain.pose import flatten_target
+from vkc_pin.planning.nlp.term_rows import FrameLocation, TermLocation, TermRow, Tree, Value
+from vkc_pin.planning.nlp.transcription import Transcription
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.phases import Task, summarize_phases
+from vkc_pin.world.task.terms import Cost, Term
+
+__all__ = ["TermEvaluator", "locate_terms"]
+
+_STRETCH_FACTOR, _MAX_STRETCH = (
+    1.2,
+    8.0,
+)  # Factor by which steps are lengthened at a time, and its maximum in total.
+# Scaled violation of a term that is violated by its tolerance, comparable to pose residuals.
+_TOLERANCE_SCALE = 1e-3
+
+
+def locate_terms(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, terms: Sequence[Term]
+) -> tuple[tuple[TermRow, ...], tuple[Term, ...]]:
+    """Return the program rows of the terms that can change something in this task, and these terms.
+
+    Args:
+        scene: Scene with the objects.
+        chain: Virtual kinematic chain.
+        task: Phases of the task.
+        terms: Traced terms.
+    """
+    locator = _FrameLocator(scene, chain, task)
+    rows, used_terms = [], []
+    for term in terms:
+        formula, at = term.formula, []
+        values = tuple(locator.resolve_coordinate(name) for name in formula.coordinates)
+        for number, (name, held) in enumerate(summarize_phases(task)):
+            if not term.is_active(name, held):
+                continue
+            for waypoint in range(locator.starts[number] + 1, locator.ends[number] + 1):
+                earlier = number if waypoint - 1 > locator.starts[number] else max(number - 1, 0)
+                now = tuple(
+                    locator.locate_frame(frame, number, waypoint) for frame in formula.frames
+                )
+                before = tuple(
+                    locator.locate_frame(frame, earlier, waypoint - 1) for frame in formula.frames
+                )
+                at.append(TermLocation(waypoint, now, before))
+        row = TermRow(formula, term.weight if isinstance(term, Cost) else None, values, tuple(at))
+        at = [
+            item for item in at if any(waypoint > 0 for waypoint in row.kind(item)[0])
+        ]  # others are constant
+        if at:
+            rows.append(TermRow(formula, row.weight, values, tuple(at)))
+            used_terms.append(term)
+    return tuple(rows), tuple(used_terms)
+
+
+class _FrameLocator:
+    """Locates frames and coordinates at the waypoints of a task.
+
+    Attributes:
+        starts, ends: First and last waypoint of each phase.
+    """
+
+    def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task) -> None:
+        self.scene, self.chain, self.phases = scene, chain, task.phases
+        self.ends = [int(end) for end in np.cumsum([phase.segments for phase in task.phases])]
+        self.starts = [0, *self.ends[:-1]]
+
+    def resolve_coordinate(self, name: str) -> Value:
+        """Return a coordinate of the scene as a column of the chain or a constant."""
+        if name in self.chain.names:
+            return Value(self.chain.index(name))
+        owner, _, joint = name.partition(".")
+        placed = self.scene.objects[owner]
+        return Value(None, float(placed.state[placed.object.coordinates.index(joint)]))
+
+    def locate_frame(self, frame: str, number: int, waypoint: int) -> FrameLocation:
+        """Return the location of a frame at a waypoint of phase `number`."""
+        owner, dot, link = frame.partition(".")
+        if not dot or owner not in self.scene.objects:
+            return self._locate_on_chain(
+                self.chain.frame(frame, opening=self.phases[number].opening), waypoint
+            )
+        placed, phase = self.scene.objects[owner], self.phases[number]
+        item = placed.object
+        if not item.free:  # independent of holds: if the object is held, the chain is closed
+            found = item.model.frames[item.model.getFrameId(link, pin.FrameType.BODY)]
+            values = tuple(
+                self.resolve_coordinate(f"{owner}.{name}") for name in item.coordinates.names
+            )
+            tree = Tree(item.model.saveToString(), _flatten_placement(placed.placement), values)
+            moves = found.parentJoint > 0 and any(value.column is not None for value in values)
+            return FrameLocation(
+                _flatten_placement(found.placement),
+                found.parentJoint,
+                waypoint if moves else -1,
+                tree,
+            )
+        hold = next((hold for hold in phase.held if hold.object == owner), None)
+        if hold is not None:
+            return self._locate_on_chain(self.chain.frame(link, hold), waypoint)
+        if owner in phase.released_by:  # the object is where the hand released it
+            hold, last = phase.released_by[owner]
+            return self._locate_on_chain(self.chain.frame(link, hold), self.ends[last])
+        stands = phase.resting.get(owner, placed.placement)
+        return FrameLocation(_flatten_placement(stands * item.link_placement(link, placed.state)))
+
+    def _locate_on_chain(self, at: tuple[int, pin.SE3], waypoint: int) -> FrameLocation:
+        joint, local = at
+        return FrameLocation(_flatten_placement(local), joint, waypoint if joint else -1)
+
+
+def _flatten_placement(placement: pin.SE3) -> tuple[float, ...]:
+    return tuple(flatten_target(placement).tolist())
+
+
+class TermEvaluator:
+    """Evaluates the terms of a program along a motion.
+
+    Attributes:
+        rows: Program rows of the constraints, shape (R,).
+        lower, upper: Their bounds, shape (R,).
+        scale: Factor from violation to scaled violation, shape (R,).
+    """
+
+    def __init__(self, terms: Sequence[Term], transcription: Transcription, start: Floats) -> None:
+        self.terms, self.transcription, self.start = terms, transcription, start
+        rows, bounds, scales = [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros(0)]
+        timed, names = [np.zeros(0, bool)], []
+        for term, at in zip(terms, transcription.term_rows, strict=True):
+            if isinstance(term, Cost):
+                continue
+            for own in at.values():
+                rows.append(own)
+                bounds.append(np.column_stack(term.compute_bounds(len(own))))
+                scales.append(np.full(len(own), _TOLERANCE_SCALE / term.tolerance))
+                timed.append(np.full(len(own), term.formula.uses_time_step))
+                names += [term.name] * len(own)
+        order = np.argsort(np.concatenate(rows))
+        self.rows = np.concatenate(rows)[order]
+        self.lower, self.upper = np.concatenate(bounds)[order].T
+        self.scale, self._timed = np.concatenate(scales)[order], np.concatenate(timed)[order]
+        self._names = [names[k] for k in order]
+
+    def compute_violation(self, z: Floats, dt: Floats) -> float:
+        """Return the largest scaled violation of a constraint at z_1..z_N; 1e-3: tolerance."""
+        return float(self._compute_excess(z, dt).max(initial=0.0))
+
+    def compute_cost(self, z: Floats, dt: Floats) -> float:
+        """Return the weighted sum of all costs."""
+        return float(self._evaluate(z, dt)[2]) if self.terms else 0.0
+
+    def lengthen_steps(self, z: Floats, dt: Floats, runs: Sequence[tuple[int, int]]) -> Floats:
+        """Return step durations that satisfy the time-dependent constraints, as far as possible.
+
+        Args:
+            z: z_1..z_N, shape (N, n).
+            dt: Current step durations, shape (N,) [s].
+            runs: First and last waypoint of each run; all steps of a run take the same time.
+        """
+        waypoint = np.zeros(len(self.rows), int)
+        for at in self.transcription.term_rows:
+            for number, rows in at.items():
+                waypoint[np.searchsorted(self.rows, rows)] = number
+        for begin, end in runs:
+            depends_on_time = self._timed & (waypoint > begin) & (waypoint <= end)
+            best, least = 1.0, np.inf
+            trial, factor = dt.copy(), 1.0
+            while depends_on_time.any() and factor <= _MAX_STRETCH and least > _TOLERANCE_SCALE:
+                trial[begin:end] = factor * dt[begin:end]
+                excess = float(self._compute_excess(z, trial)[depends_on_time].max())
+                if excess < least * (1.0 - 1e-3):
+                    best, least = factor, excess
+                factor *= _STRETCH_FACTOR
+            dt = np.concatenate([dt[:begin], best * dt[begin:end], dt[end:]])
+        return dt
+
+    def check(self, z: Floats, dt: Floats) -> None:
+        """Check that values and derivatives of the terms are finite at z_1..z_N.
+
+        Raises:
+            InputError: A term or its derivative is not finite.
+        """
+        if not self.terms:
+            return
+        values, jacobian, cost, gradient = self._evaluate(z, dt)
+        row, entries = (
+            np.array(jacobian.sparsity().get_triplet()[0], int),
+            np.array(jacobian.nonzeros(), float),
+        )
+        undefined_rows = ~np.isfinite(values)
+        undefined_rows[row[~np.isfinite(entries)]] = True
+        names = {name for name, bad in zip(self._names, undefined_rows, strict=True) if bad}
+        if not (np.isfinite(cost) and np.isfinite(gradient).all()):
+            names |= {term.name for term in self.terms if isinstance(term, Cost)}
+        if names:
+            name = min(names)
+            expected = (
+                "a smooth expression, e.g. cos(a) >= 0.98 instead of a <= 0.2, "
+                "or squares instead of roots"
+            )
+            raise InputError(
+                "its value or derivative is not finite at the start",
+                field=f"terms[{name!r}].expression",
+                expected=expected,
+            )
+
+    def _compute_excess(self, z: Floats, dt: Floats) -> Floats:
+        if not len(self.rows):
+            return np.zeros(0)
+        values = self._evaluate(z, dt)[0]
+        excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0) * self.scale
+        return np.where(np.isnan(excess), np.inf, excess)
+
+    def _evaluate(self, z: Floats, dt: Floats) -> tuple[Floats, Any, float, Any]:
+        x = self.transcription.pack(z)
+        values, jacobian, cost, gradient = self.transcription.term_values(x, self.start, dt)
+        return (
+            np.asarray(values).ravel(),
+            jacobian,
+            float(cost),
+            np.asarray(gradient.nonzeros()),
+        )

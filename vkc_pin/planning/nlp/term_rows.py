@@ -1,0 +1,367 @@
+"""Builds the rows of user-defined constraints and costs, exact to second order.
+
+There is one SX function for each kind of waypoint.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.planning.chain.kinematics import get_kinematics
+from vkc_pin.planning.kinematics.batch import estimate_size
+from vkc_pin.planning.nlp.sparse import assemble
+from vkc_pin.utils.arrays import Ints
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.task.formula import Formula
+
+__all__ = ["FrameLocation", "TermLocation", "TermProgram", "TermRow", "Tree", "Value"]
+
+
+@dataclass(frozen=True)
+class Value:
+    """A coordinate: a column of the chain, or a constant if `column` is None."""
+
+    column: int | None
+    number: float = 0.0
+
+
+@dataclass(frozen=True)
+class Tree:
+    """The kinematic tree of an object in the world.
+
+    Attributes:
+        model: Its `pinocchio.Model`, as text.
+        base: Placement of its root in the world: R column by column and p, 12 numbers.
+        values: Its minimal coordinates.
+    """
+
+    model: str
+    base: tuple[float, ...]
+    values: tuple[Value, ...]
+
+
+@dataclass(frozen=True)
+class FrameLocation:
+    """The location of a frame.
+
+    Attributes:
+        local: Its placement in the joint's frame: R column by column and p, 12 numbers.
+        joint: Joint of the chain, or of `tree`, that carries it; 0 is the world, or the root of the
+            tree.
+        waypoint: Waypoint whose coordinates matter; -1 if the frame is fixed.
+        tree: Kinematic tree of the object that the joint belongs to.
+    """
+
+    local: tuple[float, ...]
+    joint: int = 0
+    waypoint: int = -1
+    tree: Tree | None = None
+
+
+@dataclass(frozen=True)
+class TermLocation:
+    """A term at a waypoint: locations of its frames there and at the waypoint before."""
+
+    waypoint: int
+    now: tuple[FrameLocation, ...]
+    before: tuple[FrameLocation, ...]
+
+
+@dataclass(frozen=True)
+class TermRow:
+    """A constraint or cost at some waypoints.
+
+    Attributes:
+        formula: Its expression.
+        weight: Weight of a cost; None for a constraint.
+        values: Coordinates that it depends on.
+        locations: Locations at the waypoints at which it depends on a variable.
+    """
+
+    formula: Formula
+    weight: float | None
+    values: tuple[Value, ...]
+    locations: tuple[TermLocation, ...]
+
+    def kind(self, at: TermLocation) -> tuple[tuple[int, ...], tuple[TermLocation, int]]:
+        """Return the waypoints that the term depends on at `at`, and the key of its function.
+
+        The waypoints increase. The key is `at` with waypoints replaced by positions among these,
+        and the position of the previous waypoint if the formula depends on it; terms with equal
+        keys share a function.
+        """
+        frames = (*at.now, *(at.before if self.formula.uses_previous else ()))
+        involved = {frame.waypoint for frame in frames if frame.waypoint >= 0}
+        if any(value.column is not None for value in self.values):
+            involved |= (
+                {at.waypoint, at.waypoint - 1} if self.formula.uses_previous else {at.waypoint}
+            )
+        waypoints = tuple(sorted(involved))
+
+        def position(waypoint: int) -> int:
+            return waypoints.index(waypoint) if waypoint in waypoints else -1
+
+        now = tuple(replace(frame, waypoint=position(frame.waypoint)) for frame in at.now)
+        before = (
+            tuple(replace(frame, waypoint=position(frame.waypoint)) for frame in at.before)
+            if self.formula.uses_previous
+            else now
+        )
+        last = position(at.waypoint - 1) if self.formula.uses_previous else position(at.waypoint)
+        return waypoints, (TermLocation(position(at.waypoint), now, before), last)
+
+
+class TermFunctions:
+    """SX functions of one kind of row, of z of all waypoints involved and the step duration.
+
+    Attributes:
+        value, jacobian, hessian: The formula, the nonzeros of its Jacobian, and those of the
+            Hessian of λ·formula, upper triangle.
+        jacobian_pattern, hessian_pattern: Their rows and columns.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        row: TermRow,
+        at: TermLocation,
+        before: int,
+        waypoints: int,
+        cache: Cache,
+    ) -> None:
+        coordinates, formula = Coordinates(model), row.formula
+        z, dt, multipliers = (
+            ca.SX.sym("z", coordinates.size * waypoints),
+            ca.SX.sym("dt"),
+            ca.SX.sym("lam", formula.rows),
+        )
+        points = ca.vertsplit(z, coordinates.size) if waypoints else []
+        chain: dict[int, Any] = {}
+
+        def column(frame: FrameLocation) -> Any:
+            local = _to_matrix(ca.DM(frame.local))
+            if frame.tree is not None:
+                return _to_column(_place_in_tree(frame, points, cache) @ local)
+            if frame.joint == 0:
+                return ca.DM(frame.local)
+            if frame.waypoint not in chain:
+                chain[frame.waypoint] = get_kinematics(model, cache).build_placements(
+                    points[frame.waypoint]
+                )
+            return _to_column(_to_matrix(chain[frame.waypoint][:, frame.joint - 1]) @ local)
+
+        inputs = []
+        for frames, position in ((at.now, at.waypoint), (at.before, before)):
+            inputs += [column(frame) for frame in frames]
+            inputs += [
+                points[position][v.column] if v.column is not None else ca.SX(v.number)
+                for v in row.values
+            ]
+        value = formula.function(ca.vertcat(*inputs, dt))
+        jacobian, hessian = (
+            ca.jacobian(value, z),
+            ca.triu(ca.hessian(ca.dot(multipliers, value), z)[0]),
+        )
+        options = {"cse": True}
+        self.value = ca.Function("term", [z, dt], [value], options)
+        self.jacobian = ca.Function(
+            "term_jacobian", [z, dt], [ca.vertcat(*jacobian.nonzeros())], options
+        )
+        self.hessian = ca.Function(
+            "term_hessian", [z, dt, multipliers], [ca.vertcat(*hessian.nonzeros())], options
+        )
+        self.jacobian_pattern = [np.array(part, int) for part in jacobian.sparsity().get_triplet()]
+        self.hessian_pattern = [np.array(part, int) for part in hessian.sparsity().get_triplet()]
+        self.nbytes = estimate_size(self.value, self.jacobian, self.hessian)
+
+
+def _place_in_tree(frame: FrameLocation, points: list[Any], cache: Cache) -> Any:
+    """Return the world placement of the joint of a frame in an object's tree, shape (4, 4)."""
+    tree = frame.tree
+    assert tree is not None
+    base = _to_matrix(ca.DM(tree.base))
+    if frame.joint == 0:
+        return base
+    model = pin.Model()
+    model.loadFromString(tree.model)
+    values = [
+        points[frame.waypoint][v.column] if v.column is not None else ca.SX(v.number)
+        for v in tree.values
+    ]
+    placements = get_kinematics(model, cache).build_placements(ca.vertcat(*values))
+    return base @ _to_matrix(placements[:, frame.joint - 1])
+
+
+def _to_matrix(column: Any) -> Any:
+    """Return R (column by column) and p as a homogeneous matrix."""
+    return ca.vertcat(
+        ca.horzcat(ca.reshape(column[:9], 3, 3), column[9:]), ca.DM([[0.0, 0.0, 0.0, 1.0]])
+    )
+
+
+def _to_column(matrix: Any) -> Any:
+    """Return a homogeneous matrix as R (column by column) and p."""
+    return ca.densify(ca.vec(matrix[:3, :]))
+
+
+class TermProgram:
+    """All terms of a program.
+
+    Attributes:
+        rows: Number of constraint rows.
+        rows_by_waypoint: For each term, waypoint → its rows; empty for costs.
+        row_waypoints: Waypoint of each row, counted from 0, shape (rows,).
+        values, jacobian: Values of the constraints and their Jacobian.
+        cost, gradient, cost_hessian: Weighted sum of all costs and its derivatives.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        terms: tuple[TermRow, ...],
+        z: Any,
+        dt: Any,
+        cache: Cache,
+        *,
+        width: int | None = None,
+    ) -> None:
+        """Assemble the terms.
+
+        Args:
+            model: Model of the virtual kinematic chain.
+            terms: The terms.
+            z: z_0..z_N as columns, shape (n, N + 1).
+            dt: Step durations, shape (N, 1).
+            cache: Cache of the functions.
+            width: Number of variables per waypoint, z first. Defaults to n.
+        """
+        self._n = z.shape[0]
+        self._width = width or self._n
+        self._size = (z.shape[1] - 1) * self._width
+        self._hessians: list[tuple[ca.Function, list[Any], Ints, Ints, Any]] = []
+        self.rows, self.rows_by_waypoint = 0, [dict[int, Ints]() for _ in terms]
+        text = model.saveToString()
+        self.cost: Any = ca.MX(0)
+        values, jacobians, jacobian_positions = [], [], []
+        gradients, gradient_positions, curvatures, curvature_positions = [], [], [], []
+        for term, rows_at in zip(terms, self.rows_by_waypoint, strict=True):
+            kinds: dict[tuple[TermLocation, int], list[tuple[int, tuple[int, ...]]]] = {}
+            for at in term.locations:
+                waypoints, kind = term.kind(at)
+                kinds.setdefault(kind, []).append((at.waypoint, waypoints))
+            for (at, before), locations in kinds.items():
+                arguments = (term, at, before, len(locations[0][1]))
+                key = ("term", text, term.formula, term.values, *arguments[1:])
+                functions = cache.get(
+                    key, functools.partial(TermFunctions, model, *arguments, cache)
+                )
+                involved = np.array([waypoints for _, waypoints in locations])
+                steps = [waypoint - 1 for waypoint, _ in locations]
+                inputs = [
+                    ca.vertcat(*(z[:, columns.tolist()] for columns in involved.T)),
+                    dt[steps].T,
+                ]
+                height, count = term.formula.rows, len(locations)
+                first = self.rows + height * np.arange(count)
+                value = ca.vec(functions.value.map(count)(*inputs))
+                jacobian_entries = ca.vec(functions.jacobian.map(count)(*inputs))
+                row, column = functions.jacobian_pattern
+                positions = np.stack(
+                    [(first[:, None] + row).ravel(), self._find_variables(involved, column)]
+                )
+                is_variable = positions[1] >= 0  # the others belong to the start
+                positions, jacobian_entries = (
+                    positions[:, is_variable],
+                    jacobian_entries[np.flatnonzero(is_variable).tolist()],
+                )
+                if term.weight is None:
+                    values.append(value)
+                    jacobians.append(jacobian_entries)
+                    jacobian_positions.append(positions)
+                    rows = first[:, None] + np.arange(height)
+                    rows_at.update(zip((waypoint for waypoint, _ in locations), rows, strict=True))
+                    self._hessians.append(
+                        (functions.hessian, inputs, involved, rows, functions.hessian_pattern)
+                    )
+                    self.rows += height * count
+                else:
+                    self.cost += term.weight * ca.sum1(value)
+                    gradients.append(term.weight * jacobian_entries)
+                    gradient_positions.append(np.stack([positions[1], np.zeros_like(positions[1])]))
+                    weights, pattern = ca.DM.ones(1, count) * term.weight, functions.hessian_pattern
+                    curvature, entry_positions = self._weight_hessians(
+                        functions.hessian, inputs, involved, pattern, weights
+                    )
+                    curvatures.append(curvature)
+                    curvature_positions.append(entry_positions)
+        self.row_waypoints = np.zeros(self.rows, int)
+        for waypoint, rows in (
+            (waypoint, rows)
+            for rows_at in self.rows_by_waypoint
+            for waypoint, rows in rows_at.items()
+        ):
+            self.row_waypoints[rows] = waypoint - 1
+        self.values = ca.vertcat(*values) if values else ca.MX(0, 1)
+        self.jacobian = (
+            assemble(jacobians, jacobian_positions, self.rows, self._size)
+            if jacobians
+            else ca.MX(self.rows, self._size)
+        )
+        self.gradient = (
+            assemble(gradients, gradient_positions, self._size, 1)
+            if gradients
+            else ca.MX(self._size, 1)
+        )
+        empty = ca.MX(self._size, self._size)
+        self.cost_hessian = (
+            assemble(curvatures, curvature_positions, self._size, self._size)
+            if curvatures
+            else empty
+        )
+
+    def hessian(self, multipliers: Any) -> Any:
+        """Return the upper triangle of the Hessian of multipliers·values."""
+        parts, at = [], []
+        for function, inputs, involved, rows, pattern in self._hessians:
+            row_multipliers = ca.reshape(
+                multipliers[rows.ravel().tolist()], rows.shape[1], rows.shape[0]
+            )
+            part, positions = self._weight_hessians(
+                function, inputs, involved, pattern, row_multipliers
+            )
+            parts.append(part)
+            at.append(positions)
+        return (
+            assemble(parts, at, self._size, self._size) if parts else ca.MX(self._size, self._size)
+        )
+
+    def _weight_hessians(
+        self,
+        function: ca.Function,
+        inputs: list[Any],
+        involved: Ints,
+        pattern: Any,
+        multipliers: Any,
+    ) -> Any:
+        """Return the nonzeros of the Hessians of all waypoints of a kind, and their positions.
+
+        Entries that belong to the start are omitted.
+        """
+        part = ca.vec(function.map(len(involved))(*inputs, multipliers))
+        row, column = (self._find_variables(involved, index) for index in pattern)
+        is_variable = (row >= 0) & (column >= 0)
+        return part[np.flatnonzero(is_variable).tolist()], np.stack(
+            [row[is_variable], column[is_variable]]
+        )
+
+    def _find_variables(self, involved: Ints, index: Ints) -> Ints:
+        """Return the variables of entries `index` of z for all waypoints of a kind; -1: start."""
+        waypoint, coordinate = involved[:, index // self._n], index % self._n
+        return np.where(waypoint > 0, (waypoint - 1) * self._width + coordinate, -1).ravel()

@@ -1,0 +1,449 @@
+"""Transcribes a trajectory into a symbolic nonlinear program, built once per structure and cached.
+
+The variables are the waypoints after the start, each with one clearance slack per witness plane and
+one relaxation variable e: x = (z_1, s_1, e_1, ..., z_N, s_N, e_N). With e = 1 the waypoint may
+violate all its other constraints by as much as the iterate at which the program was set up; with e
+= 0 they hold exactly. Slacks and relaxation variables are penalised in the objective, which makes
+it an exact ℓ1 penalty function. Whatever differs between two tasks of the same structure is a
+parameter or a bound: start, targets, witness planes, penalty weights. The rows come from one small
+SX function per kind of waypoint, mapped over the waypoints. Its exact Hessian is that of
+λᵀ·C·vec(M(z)) plus the pose rows, regardless of the number of witness planes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE
+from vkc_pin.planning.kinematics.machine_code import MachineCode
+from vkc_pin.planning.nlp.ipopt import BYTES_PER_ENTRY, Ipopt, make_ipopt
+from vkc_pin.planning.nlp.objective import find_change_steps
+from vkc_pin.planning.nlp.sparse import assemble, make_curvature, make_differences, make_sparse
+from vkc_pin.planning.nlp.term_rows import TermProgram
+from vkc_pin.planning.nlp.waypoint import StepRows, Structure, get_waypoint_functions
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.trajectory.wheels import RollingLimits
+
+__all__ = ["Transcription", "transcribe"]
+
+
+class Transcription:
+    """Symbols, functions and Ipopt solvers of the program of one `Structure`, reused between tasks.
+
+    Attributes:
+        structure: Structure that the program was built for.
+        n, segments, slots: Sizes n, N and K.
+        width, size: Number of variables per waypoint, n + K + 1, and in total, N·(n + K + 1).
+        rows: Number of constraint rows without the rate rows.
+        slot_rows: Rows of the witness planes, shape (N, K).
+        pose_rows: For each pose, waypoint → its rows; see `pose.build_pose_rows`.
+        base_rows: RollingLimits rows of a wheeled base, see `StepRows`, shape (N·rows per step,); empty
+            for other bases.
+        term_rows: For each user-defined term, waypoint → its rows; empty for costs. These are the
+            last rows.
+        term_values: Function of x, z_0 and all step durations → values of these rows, their
+            Jacobian, and the sum and gradient of the costs.
+        pose_solvers: Inverse kinematics of each pose.
+        first_relaxed_row: First of the rows that do not come from waypoint functions: rolling,
+            clamping and user-defined constraints.
+        row_waypoints, rate_waypoints: Waypoint, counted from 0, whose relaxation variable widens
+            the bounds of each of these rows and of the rate rows.
+        relaxed_row_values: Function of x, z_0, step durations and gears → values of these rows.
+        uncompiled_functions: Waypoint functions that were not yet machine code at construction.
+        rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x +
+            rate_start·z_0.
+    """
+
+    def __init__(self, structure: Structure, cache: Cache) -> None:
+        self.structure, self.cache = structure, cache
+        self.n, self.segments, self.slots = (
+            Coordinates(structure.model).size,
+            structure.segments,
+            structure.slots,
+        )
+        self.width = self.n + self.slots + 1
+        self.size = self.segments * self.width
+        self.uncompiled_functions: list[MachineCode] = []
+        self._make_symbols()
+        for part in (self._make_objective, self._make_constraints, self._make_rates):
+            spend()
+            part()
+        self.pose_solvers = [PoseSolver(structure.model, pose, cache) for pose in structure.poses]
+
+    @property
+    def nbytes(self) -> int:
+        """Estimated size in memory [bytes]."""
+        return BYTES_PER_ENTRY * (self.jacobian.nnz() + self.hessian.nnz()) + sum(
+            solver.nbytes for solver in self.pose_solvers
+        )
+
+    def _make_symbols(self) -> None:
+        n, N, K = self.n, self.segments, self.slots
+        joints, poses = self.structure.model.njoints - 1, max(len(self.structure.poses), 1)
+        self.x = ca.MX.sym("x", self.size)
+        self.waypoint_variables = ca.reshape(self.x, self.width, N)  # one column per waypoint
+        self.z, self.start, self.dt = (
+            self.waypoint_variables[:n, :],
+            ca.MX.sym("z0", n),
+            ca.MX.sym("dt", N),
+        )
+        self.planes, self.offsets = ca.MX.sym("C", K * 12 * joints, N), ca.MX.sym("R", K, N)
+        self.targets, self.pose_offsets = (
+            ca.MX.sym("W", 12, poses),
+            ca.MX.sym("D", POSE_OFFSET_SIZE * poses, N),
+        )
+        self.penalty, self.relaxation_weights, self.gears = (
+            ca.MX.sym("rho"),
+            ca.MX.sym("p", N),
+            ca.MX.sym("gear", N),
+        )
+
+    def parameter_vector(
+        self,
+        start: Floats,
+        planes: Floats,
+        offsets: Floats,
+        targets: Floats,
+        *,
+        weights: tuple[Floats, Floats],
+        penalty: float,
+        dt: Floats | None = None,
+        pose_offsets: Floats | None = None,
+        excess: Floats | None = None,
+        relaxation_weights: Floats | None = None,
+        gears: Floats | None = None,
+    ) -> Floats:
+        """Return the parameters of the program.
+
+        Args:
+            start: z_0, shape (n,).
+            planes: Witness plane coefficients C, shape (N, K, 12·joints).
+            offsets: Witness plane offsets R, shape (N, K).
+            targets: Pose targets, shape (poses, 12).
+            weights: Weights of the squared steps and of their squared changes, see
+                `MotionCost.weights`.
+            penalty: Penalty weight of the clearance slacks [1/m].
+            dt: Step durations, shape (N,) [s]. Used only if a term depends on them.
+            pose_offsets: Offsets of frames from their targets at the iterate, shape (N, poses, 7),
+                see `pose.compute_pose_offsets`. Defaults to zero.
+            excess: Bound violations of the rolling, clamping and user-defined rows at the iterate,
+                shape (rows - first_relaxed_row,). Defaults to zero.
+            relaxation_weights: Penalty of each relaxation variable, shape (N,). Defaults to zero.
+            gears: Gears of a wheeled base for each step, shape (N,). Defaults to forward.
+        """
+        columns = planes.transpose(
+            0, 2, 1
+        ).ravel()  # each waypoint's K × 12J matrix in column-major order
+        padded = targets.ravel() if len(targets) else np.zeros(12)
+        pose_offsets = (
+            np.zeros(self.pose_offsets.numel())
+            if pose_offsets is None or not pose_offsets.size
+            else pose_offsets.ravel()
+        )
+        excess = np.zeros(self.excess.numel()) if excess is None else excess
+        relaxation_weights = (
+            np.zeros(self.segments) if relaxation_weights is None else relaxation_weights
+        )
+        times = dt if self.structure.timed and dt is not None else np.zeros(0)
+        gears = (
+            np.zeros(0)
+            if self.structure.rolling.is_omnidirectional
+            else np.ones(self.segments)
+            if gears is None
+            else gears
+        )
+        head = (start, columns, offsets.ravel(), padded, *(part.T.ravel() for part in weights))
+        return np.concatenate(
+            [*head, [penalty], pose_offsets, relaxation_weights, excess, gears, times]
+        )
+
+    def pack(
+        self, z: Floats, slack: Floats | float = 0.0, relaxations: Floats | float = 0.0
+    ) -> Floats:
+        """Return x for waypoints, shape (N, n), their slacks and their relaxation variables.
+
+        Args:
+            z: z_1..z_N, shape (N, n).
+            slack: Clearance slacks, shape (N, K), or one value for all [m].
+            relaxations: Relaxation variables, shape (N,), or one value for all.
+        """
+        slack = np.broadcast_to(slack, (len(z), self.slots))
+        return np.column_stack([z, slack, relaxations * np.ones(len(z))]).ravel()
+
+    def _make_objective(self) -> None:
+        """Build the objective: weighted squared steps and changes, and the penalties."""
+        n, N = self.n, self.segments
+        self.first, self.second, self.start_first, self.start_second = make_differences(
+            N, self.structure.stops
+        )
+        symbols = self.step_weights, self.change_weights = (
+            ca.MX.sym("w", N, n),
+            ca.MX.sym("v", len(self.second), n),
+        )
+        costs = ca.vertcat(ca.repmat(self.penalty, self.slots, N), self.relaxation_weights.T)
+        self.f, gradient = ca.dot(costs, self.waypoint_variables[n:, :]), ca.MX(N, n)
+        for matrix, start, weights in zip(
+            (self.first, self.second), (self.start_first, self.start_second), symbols, strict=True
+        ):
+            difference = make_sparse(matrix) @ self.z.T + ca.DM(start) @ self.start.T
+            self.f += ca.dot(weights, difference**2)
+            gradient += 2 * make_sparse(matrix.T) @ (weights * difference)
+        self.gradient = ca.vec(ca.vertcat(gradient.T, costs))
+        positions, (by_steps, by_changes) = make_curvature([self.first, self.second])
+        at = np.stack(positions)[:, None, :] * self.width + np.arange(n)[:, None]
+        values = [ca.vec(by_steps @ self.step_weights + by_changes @ self.change_weights)]
+        self.objective_curvature = assemble(values, [at.reshape(2, -1)], self.size, self.size)
+
+    def _make_constraints(self) -> None:
+        """Build the rows of eqs. 2, 3, 6 and 7, their Jacobian and the Hessian of λᵀ·rows."""
+        N, K = self.segments, self.slots
+        poses_at: list[tuple[int, ...]] = [() for _ in range(N)]
+        for index, pose in enumerate(self.structure.poses):
+            for waypoint in pose.waypoints:
+                poses_at[waypoint - 1] += (index,)
+        count = [K + sum(self.structure.poses[k].rows for k in poses) for poses in poses_at]
+        first_row = np.concatenate([[0], np.cumsum(count)])
+        self.rows = int(first_row[-1])
+        self.slot_rows = first_row[:-1, None] + np.arange(K)
+        self.pose_rows: list[dict[int, Ints]] = [{} for _ in self.structure.poses]
+        values, jacobians, hessians = [], [], []
+        value_rows, jacobian_at, hessian_at = [], [], []
+        self.multipliers = ca.MX.sym("lam_g", self.rows)
+        for poses in sorted(set(poses_at)):
+            at = [t for t in range(N) if poses_at[t] == poses]
+            kind = get_waypoint_functions(
+                self.structure.model, K, tuple(self.structure.poses[k] for k in poses), self.cache
+            )
+            self.uncompiled_functions += kind.use_machine_code(len(at))
+            targets = ca.repmat(
+                ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0]), 1, len(at)
+            )
+            pose_offsets = self.pose_offsets[
+                [POSE_OFFSET_SIZE * k + i for k in poses or (0,) for i in range(POSE_OFFSET_SIZE)],
+                at,
+            ]
+            inputs = [
+                self.waypoint_variables[:, at],
+                self.planes[:, at],
+                self.offsets[:, at],
+                targets,
+                pose_offsets,
+            ]
+            rows = first_row[at][:, None] + np.arange(kind.rows)
+            multipliers = ca.reshape(self.multipliers[rows.ravel().tolist()], kind.rows, len(at))
+            values.append(ca.vec(kind.value.map(len(at))(*inputs)))
+            jacobians.append(ca.vec(kind.jacobian.map(len(at))(*inputs)))
+            hessians.append(ca.vec(kind.hessian.map(len(at))(*inputs, multipliers)))
+            value_rows.append(rows.ravel())
+            offset = np.array(at)[:, None] * self.width
+            row, column = (np.array(part) for part in kind.jacobian_pattern)
+            jacobian_at.append(
+                np.stack([(first_row[at][:, None] + row).ravel(), (offset + column).ravel()])
+            )
+            row, column = (np.array(part) for part in kind.hessian_pattern)
+            hessian_at.append(np.stack([(offset + row).ravel(), (offset + column).ravel()]))
+            offset_in_waypoint = K
+            for index, height in zip(poses, kind.pose_rows, strict=True):
+                for t in at:
+                    self.pose_rows[index][t + 1] = (
+                        first_row[t] + offset_in_waypoint + np.arange(height)
+                    )
+                offset_in_waypoint += height
+        order = np.argsort(np.concatenate(value_rows))
+        self.g = ca.vertcat(*values)[order.tolist()]
+        self.jacobian = assemble(jacobians, jacobian_at, self.rows, self.size)
+        self.hessian = assemble(hessians, hessian_at, self.size, self.size)
+        self.base_rows = np.zeros(0, int)
+        # the rows that follow do not come from waypoint functions
+        self.first_relaxed_row = self.rows
+        self.row_waypoints, self.remaining_rows = np.zeros(0, int), ca.MX(0, 1)
+        if not self.structure.rolling.is_omnidirectional:
+            self._append_rolling_rows(self.structure.rolling)
+        self._append_clamping_rows()
+        self.term_rows: list[dict[int, Ints]] = []
+        if self.structure.terms:
+            self._append_term_rows()
+        self._relax_remaining_rows()
+
+    def _append_rows(self, values: ca.MX, jacobian: ca.MX, row_waypoints: Ints) -> ca.MX:
+        """Append rows with their Jacobian and waypoints (from 0); return their multipliers."""
+        rows, self.row_waypoints = self.rows, np.concatenate([self.row_waypoints, row_waypoints])
+        self.remaining_rows = ca.vertcat(self.remaining_rows, values)
+        self.g, self.jacobian, self.rows = (
+            ca.vertcat(self.g, values),
+            ca.vertcat(self.jacobian, jacobian),
+            rows + values.numel(),
+        )
+        multipliers = ca.MX.sym("lam_g", self.rows)
+        (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [multipliers[:rows]])
+        self.multipliers = multipliers
+        return multipliers[rows:]
+
+    def _append_rolling_rows(self, rolling: RollingLimits) -> None:
+        """Append the rolling rows of a wheeled base, step by step."""
+        self.steps = StepRows(rolling, ca.horzcat(self.start, self.z), self.gears, width=self.width)
+        self.base_rows = self.rows + np.arange(len(self.steps.waypoints))
+        multipliers = self._append_rows(
+            self.steps.values, self.steps.jacobian, self.steps.waypoints
+        )
+        self.hessian = self.hessian + self.steps.hessian(multipliers)
+
+    def _append_clamping_rows(self) -> None:
+        """Append z_t − z_{t−1} = 0 for clamped and ±(z_t − z_{t−1}) ≥ 0 for pushed coordinates."""
+        steps = [
+            (c, t, 1)
+            for c, first, last in self.structure.clamped
+            for t in range(first + 1, last + 1)
+        ]
+        pushes = [
+            (c, t, direction)
+            for c, first, last, direction in self.structure.pushed
+            for t in range(first + 1, last + 1)
+        ]
+        self.pushed_rows = self.rows + len(steps) + np.arange(len(pushes))
+        if not (steps := steps + pushes):
+            return
+        difference = ca.DM(len(steps), self.n + self.size)  # the start's columns come first
+        for row, (column, t, direction) in enumerate(steps):
+            difference[row, self.n + (t - 1) * self.width + column] = direction
+            difference[
+                row, self.n + (t - 2) * self.width + column if t > 1 else column
+            ] = -direction
+        start, variables = difference[:, : self.n], difference[:, self.n :]
+        self._append_rows(
+            start @ self.start + variables @ self.x,
+            variables,
+            np.array([t - 1 for _, t, _ in steps]),
+        )
+
+    def _append_term_rows(self) -> None:
+        """Append the user-defined constraints and add the user-defined costs to the objective."""
+        dt, terms = (
+            self.dt if self.structure.timed else ca.MX.zeros(self.segments),
+            self.structure.terms,
+        )
+        part = TermProgram(
+            self.structure.model,
+            terms,
+            ca.horzcat(self.start, self.z),
+            dt,
+            self.cache,
+            width=self.width,
+        )
+        self.term_rows = [
+            {waypoint: self.rows + rows for waypoint, rows in at.items()}
+            for at in part.rows_by_waypoint
+        ]
+        outputs = [part.values, part.jacobian, part.cost, part.gradient]
+        self.term_values = ca.Function("terms", [self.x, self.start, self.dt], outputs)
+        multipliers = self._append_rows(part.values, part.jacobian, part.row_waypoints)
+        self.hessian = self.hessian + part.hessian(multipliers)
+        self.f, self.gradient = self.f + part.cost, self.gradient + part.gradient
+        self.objective_curvature = self.objective_curvature + part.cost_hessian
+
+    def _relax_remaining_rows(self) -> None:
+        """Relax the rows that do not come from waypoint functions, and collect all parameters."""
+        self.excess = ca.MX.sym("r", self.rows - self.first_relaxed_row)
+        self.relaxed_row_values = ca.Function(
+            "others", [self.x, self.start, self.dt, self.gears], [self.remaining_rows]
+        )
+        if len(self.row_waypoints):
+            rows = np.arange(self.first_relaxed_row, self.rows)
+            self.g, self.jacobian = self._subtract_relaxation(
+                self.g, self.jacobian, rows, self.row_waypoints, self.excess
+            )
+        parameters = [
+            self.start,
+            self.planes,
+            self.offsets,
+            self.targets,
+            self.step_weights,
+            self.change_weights,
+            self.penalty,
+        ]
+        parameters += [self.pose_offsets, self.relaxation_weights, self.excess]
+        parameters += [] if self.structure.rolling.is_omnidirectional else [self.gears]
+        self.parameters = ca.veccat(*parameters, *([self.dt] if self.structure.timed else []))
+
+    def _subtract_relaxation(
+        self, g: ca.MX, jacobian: ca.MX, rows: Ints, row_waypoints: Ints, excess: ca.MX
+    ) -> tuple[ca.MX, ca.MX]:
+        """Return rows and Jacobian with excess times relaxation subtracted from `rows`."""
+        positions = np.stack([rows, row_waypoints * self.width + self.width - 1])
+        reduction = assemble([excess], [positions], g.numel(), self.size)
+        return g - reduction @ self.x, jacobian - reduction
+
+    def _make_rates(self) -> None:
+        """Build the matrices of eq. 5: velocities and accelerations per step."""
+        n = self.n
+        select, identity = (
+            ca.horzcat(ca.DM.eye(n), ca.DM(n, self.slots + 1)),
+            ca.DM.eye(n),
+        )  # omits slacks and relaxation variables
+        self.rate_matrix = ca.vertcat(
+            *(ca.kron(make_sparse(part), select) for part in (self.first, self.second))
+        )
+        self.rate_waypoints = np.repeat(
+            [*range(self.segments), *find_change_steps(self.structure.stops, self.segments)], n
+        )
+        starts = (self.start_first[:, None], self.start_second[:, None])
+        self.rate_start = ca.vertcat(*(ca.kron(make_sparse(part), identity) for part in starts))
+
+    def solver(self, *, rates: bool, options: dict[str, Any]) -> Ipopt:
+        """Return an Ipopt solver of this program.
+
+        Args:
+            rates: Whether velocity and acceleration rows are appended to the rows, and their excess
+                to the parameters.
+            options: Options of CasADi's nlpsol.
+        """
+        key = ("ipopt", self.structure.key, rates, tuple(sorted(options.items())))
+        return self.cache.get(key, lambda: self._make_solver(rates, options))
+
+    def _make_solver(self, rates: bool, options: dict[str, Any]) -> Ipopt:
+        g, jacobian, multipliers, parameters = (
+            self.g,
+            self.jacobian,
+            self.multipliers,
+            self.parameters,
+        )
+        weight, n_rows = ca.MX.sym("lam_f"), self.rows
+        hessian = weight * self.objective_curvature + self.hessian
+        if rates:
+            g = ca.vertcat(g, self.rate_matrix @ self.x + self.rate_start @ self.start)
+            jacobian = ca.vertcat(jacobian, self.rate_matrix)
+            multipliers, excess = ca.MX.sym("lam", g.numel()), ca.MX.sym("r", g.numel() - n_rows)
+            g, jacobian = self._subtract_relaxation(
+                g, jacobian, np.arange(n_rows, g.numel()), self.rate_waypoints, excess
+            )
+            parameters = ca.vertcat(parameters, excess)
+            (hessian,) = ca.substitute([hessian], [self.multipliers], [multipliers[:n_rows]])
+        lagrangian = (weight, multipliers, hessian)
+        return make_ipopt(
+            self.x,
+            parameters,
+            (self.f, self.gradient),
+            (g, jacobian),
+            lagrangian,
+            options,
+            waypoints=self.segments,
+        )
+
+
+def transcribe(structure: Structure, cache: Cache) -> Transcription:
+    """Return the program of `structure`, rebuilt if machine code has become available since."""
+    program = cache.get(key := ("program", structure.key), lambda: Transcription(structure, cache))
+    if not program.uncompiled_functions or not all(
+        code.try_load() for code in program.uncompiled_functions
+    ):
+        return program
+    cache.drop(*key)
+    cache.drop("ipopt", structure.key)
+    return cache.get(key, lambda: Transcription(structure, cache))

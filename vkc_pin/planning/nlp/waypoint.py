@@ -1,0 +1,326 @@
+"""Builds the constraint rows of one waypoint (eqs. 2, 3, 6, 7) and of one step of a wheeled base.
+
+They are small SX functions with exact second derivatives, mapped over waypoints or steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.planning.chain.kinematics import get_kinematics
+from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, build_pose_rows, relax_target
+from vkc_pin.planning.kinematics.batch import estimate_size
+from vkc_pin.planning.kinematics.machine_code import MachineCode
+from vkc_pin.planning.nlp.sparse import assemble
+from vkc_pin.planning.nlp.term_rows import TermRow
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.budget import spend
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.trajectory.wheels import OMNIDIRECTIONAL, RollingLimits
+
+__all__ = ["StepRows", "Structure", "WaypointFunctions", "get_waypoint_functions"]
+
+# Minimum number of waypoints of one kind for which compilation pays off. Most kinds occur once, at
+# a grasp, or about thirty times.
+_MIN_WAYPOINTS_TO_COMPILE = 4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Structure:
+    """Everything that a symbolic program depends on.
+
+    Attributes:
+        model: Model of the virtual kinematic chain.
+        segments: N, the number of waypoints after the start.
+        poses: Frames with a pose goal.
+        slots: K, witness planes per waypoint.
+        stops: Interior waypoints at which the motion is at rest, as it is at its start and end.
+        rolling: Motion constraints of the base.
+        clamped: (column, first, last): coordinates that are constant from waypoint `first` to
+            `last`, such as the freedoms of a clamped grasp.
+        pushed: (column, first, last, direction): coordinates that may only increase (direction 1)
+            or decrease (-1) from waypoint `first` to `last`.
+        terms: User-defined constraints and costs.
+    """
+
+    model: pin.Model
+    segments: int
+    poses: tuple[PoseRow, ...]
+    slots: int
+    stops: tuple[int, ...] = ()
+    rolling: RollingLimits = OMNIDIRECTIONAL
+    clamped: tuple[tuple[int, int, int], ...] = ()
+    pushed: tuple[tuple[int, int, int, int], ...] = ()
+    terms: tuple[TermRow, ...] = ()
+
+    @property
+    def timed(self) -> bool:
+        """Whether any term depends on the step duration."""
+        return any(term.formula.uses_time_step for term in self.terms)
+
+    @cached_property
+    def key(self) -> tuple[Any, ...]:
+        """Cache key, equal for structures that share one program."""
+        poses = tuple((*_pose_key(pose), pose.waypoints) for pose in self.poses)
+        others = (self.stops, self.rolling, self.clamped, self.pushed, self.terms)
+        return (self.model.saveToString(), self.segments, poses, self.slots, *others)
+
+
+def _pose_key(pose: PoseRow) -> tuple[Any, ...]:
+    """Return a key that is equal for poses with the same constraint rows."""
+    return pose.joint, (pose.local.homogeneous + 0.0).tobytes(), pose.kind, pose.shift
+
+
+def get_waypoint_functions(
+    model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
+) -> WaypointFunctions:
+    """Return the functions of one kind of waypoint, built if they are not in the cache."""
+    key = ("waypoint", model.saveToString(), slots, *(_pose_key(pose) for pose in poses))
+    return cache.get(key, lambda: WaypointFunctions(model, slots, poses, cache))
+
+
+class WaypointFunctions:
+    """SX functions of one kind of waypoint: model, number of witness planes, and pose goals."""
+
+    def __init__(
+        self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
+    ) -> None:
+        n, joints = Coordinates(model).size, model.njoints - 1
+        z, s, relaxation = ca.SX.sym("z", n), ca.SX.sym("s", slots), ca.SX.sym("e")
+        planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
+        targets, pose_offsets = (
+            ca.SX.sym("W", 12, max(len(poses), 1)),
+            ca.SX.sym("D", POSE_OFFSET_SIZE, max(len(poses), 1)),
+        )
+        sweep = cache.get(
+            ("sweep", model.saveToString(), slots), lambda: _KinematicSweep(model, slots, cache)
+        )
+        placements, coordinate_jacobian = sweep.function(z, planes)
+        stacked = ca.vec(placements)
+        # Every row is linear in the placements, rows = L·vec(M) + const, so one kinematic sweep
+        # serves all of them.
+        parts = []
+        for k, pose in enumerate(poses):
+            target = relax_target(targets[:, k], pose_offsets[:, k], relaxation)
+            parts.append(build_pose_rows(pose.kind, *pose.build_placement(placements), target))
+        pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
+        self.pose_rows = [pose.rows for pose in poses]
+        self.rows = slots + sum(self.pose_rows)
+        rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
+        multipliers = ca.SX.sym("lam", self.rows)
+        plane_multipliers, pose_multipliers = ca.vertsplit(
+            multipliers, [0, slots, self.rows]
+        )  # vertsplit, because slicing a scalar would give a row
+        variables = ca.vertcat(z, s, relaxation)
+        plane_jacobian = ca.horzcat(coordinate_jacobian, ca.SX.eye(slots), ca.SX(slots, 1))
+        jacobian = ca.vertcat(plane_jacobian, ca.jacobian(pose_values, variables))
+        spend()
+        w = ca.SX.sym("w", 12 * joints)
+        hessian = ca.triu(
+            ca.hessian(ca.dot(w, stacked) + ca.dot(pose_multipliers, pose_values), variables)[0]
+        )
+        inner = ca.Function(
+            "inner", [z, relaxation, targets, pose_offsets, w, multipliers], [hessian]
+        )
+        hessian = inner(
+            z, relaxation, targets, pose_offsets, planes.T @ plane_multipliers, multipliers
+        )
+        inputs = [variables, ca.vec(planes), offsets, ca.vec(targets), ca.vec(pose_offsets)]
+        spend()
+        self.value = ca.Function("g", inputs, [rows])
+        self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())])
+        spend()
+        self.jacobian_pattern = jacobian.sparsity().get_triplet()
+        self.hessian = ca.Function(
+            "lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())]
+        )
+        self.hessian_pattern = hessian.sparsity().get_triplet()
+        self.code = MachineCode(self.value, self.jacobian, self.hessian)
+        self.nbytes = estimate_size(self.value, self.jacobian, self.hessian)
+
+    def use_machine_code(self, waypoints: int) -> list[MachineCode]:
+        """Switch to machine code if it pays off; return the code that is not available yet."""
+        if waypoints < _MIN_WAYPOINTS_TO_COMPILE:
+            return []
+        self.code.try_load()
+        self.value, self.jacobian, self.hessian = self.code.functions
+        return [] if self.code.is_compiled else [self.code]
+
+
+class StepRows:
+    """Constraint rows of all steps of a wheeled base, from one pose (x, y, yaw) to the next.
+
+    The rows of one step, all in metres, use its longitudinal displacement c, lateral displacement s
+    and rotation δθ (see `RollingLimits.compute_steps`): s, which must be zero; for steered bases,
+    gear·c ∓ radius·δθ, which must not be negative; and, if the wheel speed is limited, the wheel
+    travel c ∓ track/2·δθ.
+
+    Args:
+        rolling: Limits of the base.
+        path: z_0..z_N, shape (n, N + 1); z_1..z_N are variables.
+        gears: 1 (forward) or -1 (backward) for each step, shape (N,).
+        width: Number of variables per waypoint; the first three are the base's.
+
+    Attributes:
+        values, jacobian: Row values and their Jacobian, step by step.
+        waypoints: Waypoint at which the step of each row ends, counted from 0.
+    """
+
+    def __init__(self, rolling: RollingLimits, path: ca.MX, gears: ca.MX, *, width: int) -> None:
+        self.rolling, self.segments, self.size = (
+            rolling,
+            path.shape[1] - 1,
+            width * (path.shape[1] - 1),
+        )
+        value, jacobian, self._hessian = _make_step_functions(rolling)
+        self.rows, steps = value.size1_out(0), np.arange(self.segments)
+        self._inputs = [ca.vertcat(path[:3, :-1], path[:3, 1:]), gears.T]
+        columns = (steps[:, None, None] + [[-1], [0]]) * width + np.arange(3)
+        # columns of both poses in x; negative for the start, which is no variable
+        self._columns = columns.reshape(-1, 6)
+        self.waypoints = np.repeat(steps, self.rows)
+        self.values = ca.vec(value.map(self.segments)(*self._inputs))
+        row, column = (np.array(part) for part in jacobian.sparsity_out(0).get_triplet())
+        slopes = jacobian.map(self.segments)(*self._inputs)
+        self.jacobian = self._place_nonzeros(
+            slopes, steps[:, None] * self.rows + row, self._columns[:, column], len(self.waypoints)
+        )
+
+    def hessian(self, multipliers: ca.MX) -> ca.MX:
+        """Return the upper triangle of the Hessian of multipliers·rows."""
+        row, column = (np.array(part) for part in self._hessian.sparsity_out(0).get_triplet())
+        curvatures = self._hessian.map(self.segments)(
+            *self._inputs, ca.reshape(multipliers, self.rows, self.segments)
+        )
+        return self._place_nonzeros(
+            curvatures, self._columns[:, row], self._columns[:, column], self.size
+        )
+
+    def _place_nonzeros(self, parts: ca.MX, row: Ints, column: Ints, height: int) -> ca.MX:
+        """Return the sparse matrix of all steps' nonzeros, without those of the start."""
+        positions = np.stack([row.ravel(), column.ravel()])
+        is_variable = (positions >= 0).all(axis=0)
+        nonzeros = ca.vertcat(
+            *(part.nz[:] for part in ca.horzsplit(parts, parts.shape[1] // self.segments))
+        )
+        return assemble(
+            [nonzeros[np.flatnonzero(is_variable).tolist()]],
+            [positions[:, is_variable]],
+            height,
+            self.size,
+        )
+
+    def bounds(self, dt: Floats | None) -> tuple[Floats, Floats]:
+        """Return the bounds of the rows; `dt`, shape (N,) [s], limits wheel travel if given."""
+        travel = np.full(self.segments, np.inf) if dt is None else self.rolling.wheel_speed * dt
+        lower, upper = np.zeros((self.segments, self.rows)), np.zeros((self.segments, self.rows))
+        upper[:, 1:] = np.inf
+        if self.rolling.has_wheel_limit:
+            lower[:, -2:], upper[:, -2:] = -travel[:, None], travel[:, None]
+        return lower.ravel(), upper.ravel()
+
+
+def _make_step_functions(rolling: RollingLimits) -> tuple[ca.Function, ca.Function, ca.Function]:
+    """Return the SX functions of one step: rows, Jacobian, and upper triangle of the Hessian."""
+    poses, gear = ca.SX.sym("b", 6), ca.SX.sym("g")
+    dx, dy, turn = ca.vertsplit(poses[3:] - poses[:3])
+    heading = (poses[2] + poses[5]) / 2
+    longitudinal, lateral = (
+        ca.cos(heading) * dx + ca.sin(heading) * dy,
+        ca.cos(heading) * dy - ca.sin(heading) * dx,
+    )
+    steered = (
+        [gear * longitudinal + side * rolling.turning_radius * turn for side in (-1, 1)]
+        if rolling.turning_radius
+        else []
+    )
+    wheels = (
+        [longitudinal + side * rolling.track / 2 * turn for side in (-1, 1)]
+        if rolling.has_wheel_limit
+        else []
+    )
+    rows = ca.vertcat(lateral, *steered, *wheels)
+    multipliers = ca.SX.sym("lam", rows.numel())
+    hessian = ca.triu(ca.hessian(ca.dot(multipliers, rows), poses)[0])
+    return (
+        ca.Function("roll", [poses, gear], [rows], {"cse": True}),
+        ca.Function("roll_jacobian", [poses, gear], [ca.jacobian(rows, poses)], {"cse": True}),
+        ca.Function("roll_hessian", [poses, gear, multipliers], [hessian], {"cse": True}),
+    )
+
+
+class _KinematicSweep:
+    """One kinematic sweep for all kinds of waypoints: (z, planes) → placements, plane gradients."""
+
+    def __init__(self, model: pin.Model, slots: int, cache: Cache) -> None:
+        coordinates = Coordinates(model)
+        z, planes = (
+            ca.SX.sym("z", coordinates.size),
+            ca.SX.sym("C", slots, 12 * (model.njoints - 1)),
+        )
+        placements = get_kinematics(model, cache).build_placements(z)
+        self.function = ca.Function(
+            "sweep",
+            [z, planes],
+            [placements, _differentiate_planes(model, coordinates, z, placements, planes)],
+        )
+        self.nbytes = estimate_size(self.function)
+
+
+def _differentiate_planes(
+    model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any
+) -> Any:
+    """Return the derivatives of planes·vec(M(z)), shape (K, n), with respect to z.
+
+    A coordinate of a joint moves everything that the joint supports by one twist (ω, v): dR = ω ×
+    R, dt = ω × t + v. The derivative of a plane is therefore m·ω + f·v, where m = Σ (Σ_c R_c × C_c
+    + t × C_t) and f = Σ C_t are accumulated over the supported joints. This takes a fraction of the
+    work of multiplying by the derivatives of all placements. If a coordinate moves several joints,
+    each contributes its twist relative to its nearest ancestor moved by the same coordinate.
+    """
+    forces: list[Any] = []
+    moments: list[Any] = []
+    for joint in range(model.njoints - 1):
+        block, placement = planes[:, 12 * joint : 12 * joint + 12], placements[:, joint]
+        columns = [(placement[3 * c : 3 * c + 3], block[:, 3 * c : 3 * c + 3]) for c in range(4)]
+        forces.append(block[:, 9:])
+        moments.append(sum(_cross_rows(point, force) for point, force in columns))
+    for joint in reversed(range(model.njoints - 1)):
+        parent = model.parents[joint + 1] - 1
+        if parent >= 0:
+            forces[parent] += forces[joint]
+            moments[parent] += moments[joint]
+    slopes, twists = [ca.SX(planes.shape[0], 1)] * coordinates.size, dict[tuple[int, int], Any]()
+    for column, joint, *_ in coordinates.moves:
+        placement = placements[:, joint - 1]
+        derivative = ca.jacobian(placement, z[column])
+        rotation_terms = [
+            ca.cross(placement[3 * c : 3 * c + 3], derivative[3 * c : 3 * c + 3]) for c in range(3)
+        ]
+        omega = sum(rotation_terms, ca.SX(3, 1)) / 2
+        twist = twists[column, joint] = ca.vertcat(
+            omega, derivative[9:] - ca.cross(omega, placement[9:])
+        )
+        ancestors = [k for k in model.supports[joint] if (column, k) in twists and k != joint]
+        relative = twist - twists[column, ancestors[-1]] if ancestors else twist
+        slopes[column] = slopes[column] + (
+            moments[joint - 1] @ relative[:3] + forces[joint - 1] @ relative[3:]
+        )
+    return ca.horzcat(*slopes)
+
+
+def _cross_rows(point: Any, rows: Any) -> Any:
+    """Return the cross product of `point` with each of the K `rows`, shape (K, 3)."""
+    x, y, z = point[0], point[1], point[2]
+    return ca.horzcat(
+        y * rows[:, 2] - z * rows[:, 1],
+        z * rows[:, 0] - x * rows[:, 2],
+        x * rows[:, 1] - y * rows[:, 0],
+    )

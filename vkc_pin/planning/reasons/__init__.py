@@ -1,1 +1,0 @@
-"""Why a task cannot be done, as far as that is known."""

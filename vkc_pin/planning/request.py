@@ -1,0 +1,95 @@
+"""Checks the arguments of planning and holds them in one immutable request."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from vkc_pin.errors import InputError, shown
+from vkc_pin.options import Options
+from vkc_pin.planning.initialization.methods import INITIALIZATIONS
+from vkc_pin.planning.progress import Progress
+from vkc_pin.planning.solver.solution import Iteration
+from vkc_pin.utils.arguments import instance, known, number, whole
+from vkc_pin.utils.budget import Budget
+from vkc_pin.utils.cache import Cache
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.terms import Term, trace_terms
+
+__all__ = ["PlanningRequest", "check_arguments", "make_budget", "make_request"]
+
+MAX_PERTURBATION = 3.0
+"""Largest standard deviation of noise on initial guesses, [m] and [rad]."""
+
+
+@dataclass(frozen=True)
+class PlanningRequest:
+    """Arguments of one planning call; see `planner.plan`.
+
+    Attributes:
+        initialization: Initialization method.
+        options: Options of planning.
+        callback: Called after every round of the solver.
+        random_seed: Random seed.
+        perturbation: Standard deviation of noise on initial guesses, [m] and [rad].
+        terms: Constraints and costs of the user.
+        progress: Progress line.
+        cache: Symbolic programs and other results that can be reused.
+    """
+
+    initialization: str
+    options: Options
+    callback: Callable[[Iteration], None] | None = None
+    random_seed: int = 0
+    perturbation: float = 0.0
+    terms: tuple[Term, ...] = ()
+    progress: Progress = field(default_factory=Progress)
+    cache: Cache = field(default_factory=Cache)
+
+
+def make_request(
+    scene: Scene,
+    *,
+    initialization: str,
+    options: Options | None,
+    callback: Callable[[Iteration], None] | None,
+    seed: int,
+    perturbation: float = 0.0,
+    terms: Sequence[Term] = (),
+) -> PlanningRequest:
+    """Return the arguments of `plan` as a request.
+
+    Raises:
+        InputError: An argument is invalid.
+    """
+    options = Options() if options is None else options
+    check_arguments(scene, options, seed)
+    known(initialization, INITIALIZATIONS, "initialization", "initialization")
+    noise = number(perturbation, "perturbation", "a number of at least 0", low=0.0)
+    if noise > MAX_PERTURBATION:
+        expected = f"at most {MAX_PERTURBATION:g}"
+        raise InputError("out of range", field="perturbation", expected=expected, got=noise)
+    if callback is not None and not callable(callback):
+        expected, got = "a function of an Iteration", shown(callback)
+        raise InputError("cannot be called", field="callback", expected=expected, got=got)
+    return PlanningRequest(
+        initialization, options, callback, int(seed), noise, trace_terms(scene, terms)
+    )
+
+
+def make_budget(time_limit: object, effort: object) -> Budget:
+    """Return the budget of a planning call, which starts now; see `plan`.
+
+    Raises:
+        InputError: A limit is invalid.
+    """
+    if time_limit is not None:
+        time_limit = number(time_limit, "time_limit", "seconds, more than 0", low=0.0, above=True)
+    return Budget(time_limit, None if effort is None else whole(effort, "effort", low=1))
+
+
+def check_arguments(scene: object, options: object, seed: object) -> None:
+    """Check the types of a scene, options and a random seed. Raises `InputError`."""
+    for name, value, kind in (("scene", scene, Scene), ("options", options, Options)):
+        instance(value, kind, name)
+    whole(seed, "seed", low=0)

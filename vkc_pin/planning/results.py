@@ -1,0 +1,171 @@
+"""Builds plans from trajectories and their reports, and concatenates the plans of single steps."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from vkc_pin.options import Options
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.request import PlanningRequest
+from vkc_pin.planning.statistics import PlanningStatistics
+from vkc_pin.utils.budget import ENDINGS, current_ending
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.contact_rules import compute_start_opening
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.task.terms import Term
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.splicing import concatenate_trajectories
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+__all__ = [
+    "FINAL",
+    "add_statistics",
+    "build_plan",
+    "concatenate_plans",
+    "make_stationary_trajectory",
+    "sum_statistics",
+]
+
+FINAL = (*ENDINGS, "infeasible")
+"""Statuses after which no alternative is tried."""
+
+
+def sum_statistics(parts: Iterable[PlanningStatistics]) -> PlanningStatistics:
+    """Return the sum of the statistics of several plans."""
+    return sum(parts, start=PlanningStatistics())
+
+
+def add_statistics(plan: Plan, parts: Iterable[PlanningStatistics]) -> Plan:
+    """Return a plan with the summed statistics of several, its own among them."""
+    return dataclasses.replace(plan, statistics=sum_statistics(parts))
+
+
+def build_plan(
+    scene: Scene,
+    steps: Sequence[Step],
+    options: Options,
+    trajectory: Trajectory,
+    report: Report,
+    status: str,
+    *,
+    statistics: PlanningStatistics,
+    random_seed: int,
+    initialization: str,
+    history: Sequence[Mapping[str, float]] = (),
+    terms: tuple[Term, ...] = (),
+) -> Plan:
+    """Return the plan of a trajectory.
+
+    Args:
+        scene: Scene in which it starts.
+        steps: Steps to be done.
+        options: Options of planning.
+        trajectory: The trajectory.
+        report: Its validation.
+        status: See `Plan`.
+        statistics: Times and counts of planning.
+        random_seed: Random seed.
+        initialization: Name of the initial guess it came from.
+        history: One row per round of the solver.
+        terms: Constraints and costs of the user.
+    """
+    return Plan(
+        scene=scene,
+        steps=tuple(steps),
+        options=options,
+        trajectory=trajectory,
+        validation=report,
+        status=status,
+        statistics=statistics,
+        seed=random_seed,
+        initialization=initialization,
+        history=tuple(history),
+        terms=terms,
+    )
+
+
+def concatenate_plans(
+    scene: Scene,
+    steps: Sequence[Step],
+    request: PlanningRequest,
+    parts: Sequence[Plan],
+    *,
+    began: float | None = None,
+    statistics: Sequence[PlanningStatistics] | None = None,
+    notes: Sequence[str] = (),
+    history: Sequence[Mapping[str, float]] | None = None,
+) -> Plan:
+    """Return the plans of consecutive steps as one plan, validated as a whole.
+
+    Without any part the trajectory is stationary.
+
+    Args:
+        scene: Scene in which the first part starts.
+        steps: Steps to be done.
+        request: Arguments of planning.
+        parts: The plans, each from the end of the one before.
+        began: Value of `time.perf_counter()` from which planning time counts; None: the sum of
+            `statistics` and the validation.
+        statistics: Statistics of the parts; None: taken from them. The validation is added.
+        notes: Notes for the report, before those of the last part.
+        history: One row per round of the solver; None: taken from the parts.
+    """
+    total = sum_statistics(
+        [part.statistics for part in parts] if statistics is None else statistics
+    )
+    rows = [row for part in parts for row in part.history] if history is None else history
+    if parts:
+        request.progress.doing("checking all of it")
+        status = current_ending() or ("rejected" if parts[-1].success else parts[-1].status)
+        trajectory = concatenate_trajectories(
+            [part.trajectory for part in parts], pause=request.options.grasp_time
+        )
+        name = ", ".join(part.initialization for part in parts)
+    else:
+        trajectory = make_stationary_trajectory(scene, request.options)
+        status, name = current_ending() or "interrupted", "none"
+    start = time.perf_counter()
+    report = validate(scene, steps, trajectory, request.options, request.terms)
+    took = time.perf_counter() - start
+    if parts:
+        total += PlanningStatistics(planning_time=took, validation_time=took)
+        report = dataclasses.replace(report, notes=(*notes, *parts[-1].validation.notes))
+        status = "success" if report.ok else status
+    if began is not None:
+        planning_time = time.perf_counter() - began - total.build_time
+        total = dataclasses.replace(total, planning_time=planning_time)
+    return build_plan(
+        scene,
+        steps,
+        request.options,
+        trajectory,
+        report,
+        status,
+        statistics=total,
+        random_seed=request.random_seed,
+        initialization=name,
+        history=rows,
+        terms=request.terms,
+    )
+
+
+def make_stationary_trajectory(scene: Scene, options: Options) -> Trajectory:
+    """Return a trajectory of one time step in which robot and objects stay at their start."""
+    values = dict(zip(scene.robot.coordinates.names, scene.start.tolist(), strict=True))
+    for name, placed in scene.objects.items():
+        joints = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
+        values |= {f"{name}.{joint}": value for joint, value in joints}
+    for hold in scene.holds:
+        names = scene.objects[hold.object].object.attachment(hold.attachment).coordinates
+        freedoms = zip(names, hold.at, strict=True)
+        values |= {f"{hold.object}.{name}": value for name, value in freedoms}
+    row = list(values.values())
+    phases = (PhaseSpan("stand", 0, 1, scene.holds, compute_start_opening(scene)),)
+    times, positions = np.array([0.0, options.dt]), np.array([row, row])
+    return Trajectory(tuple(values), times, positions, phases, len(scene.start))

@@ -1,0 +1,101 @@
+"""Limits the jerk of a motion along a path."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vkc_pin.planning.retiming.limits import Limits
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.trajectory.curve import Curve, sample_intervals
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
+
+__all__ = ["limit_jerk"]
+
+_SPAN_FACTORS = np.geomspace(
+    0.25, 4.0, 9
+)  # Averaging intervals, as multiples of the time in which an acceleration may build up.
+_MIN_CUBICS_PER_STEP = 4  # minimum number of cubics per step
+_MAX_CUBIC_DURATION = 0.5  # maximum duration of a cubic, relative to the averaging interval
+_SAMPLES_PER_CUBIC = 8  # samples per cubic to bracket the time of a waypoint
+_NEWTON_ITERATIONS = 6  # iterations of Newton's method
+
+
+def limit_jerk(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits) -> Curve:
+    """Return a curve along a path with limited jerk, and zero acceleration at both ends.
+
+    The progress s(t) along the path is replaced by its moving average, which is smoother by one
+    order and moves neither backwards nor faster. Twice differentiable cubics, each of constant
+    jerk, interpolate the path at the resulting times; at the second point and the last but one they
+    are free, so that the acceleration can vanish at both ends. They are then slowed down until all
+    limits are kept. Several averaging intervals are tried, and the fastest result is returned.
+
+    Args:
+        path: The path, with knots at the ends of each step and the same number of knots in every
+            step.
+        pace: Progress along the path over time, one coordinate, from rest to rest, starting with 0
+            at 0 s.
+        steps: Number of steps.
+        limits: Limits of the path's coordinates.
+    """
+    rise_time = float((limits.acceleration / limits.jerk)[np.isfinite(limits.jerk)].max())
+    candidates = (
+        limits.slow_down(_average_pace(path, pace, steps, factor * rise_time))
+        for factor in _SPAN_FACTORS
+    )
+    return min(candidates, key=lambda curve: float(curve.times[-1]))
+
+
+def _average_pace(path: CubicHermiteSpline, pace: Curve, steps: int, span: float) -> Curve:
+    """Return the curve for an averaging interval `span` [s], before it is slowed down."""
+    from scipy.interpolate import CubicHermiteSpline as Hermite
+    from scipy.interpolate import make_interp_spline
+
+    progress = Hermite(pace.times, pace.positions[:, 0], pace.rates[:, 0])
+    area, last, length = (
+        progress.antiderivative(),
+        float(pace.times[-1]),
+        float(pace.positions[-1, 0]),
+    )
+
+    def compute_progress(times: Floats) -> Floats:
+        now, before = (
+            area(np.clip(t, 0.0, last)) + length * np.maximum(t - last, 0.0)
+            for t in (times, times - span)
+        )
+        return np.asarray((now - before) / span)
+
+    def compute_speed(times: Floats) -> Floats:
+        now, before = (progress(np.clip(t, 0.0, last)) for t in (times, times - span))
+        return np.asarray((now - before) / span)
+
+    waypoint_positions = path.x[:: (len(path.x) - 1) // steps]
+    coarse = np.linspace(0.0, last + span, _SAMPLES_PER_CUBIC * len(pace.times))
+    waypoint_times = np.interp(waypoint_positions, compute_progress(coarse), coarse)
+    for _ in range(_NEWTON_ITERATIONS):
+        waypoint_times[1:-1] -= np.clip(
+            (compute_progress(waypoint_times) - waypoint_positions)
+            / np.maximum(compute_speed(waypoint_times), 1e-12),
+            -span,
+            span,
+        )[1:-1]
+    waypoint_times[0], waypoint_times[-1] = 0.0, last + span
+    parts = max(
+        _MIN_CUBICS_PER_STEP,
+        int(np.ceil(np.diff(waypoint_times).max() / (_MAX_CUBIC_DURATION * span))),
+    )
+    times = sample_intervals(waypoint_times, np.arange(parts) / parts, last=True)
+    rows = path(np.clip(compute_progress(times), 0.0, length))
+    rows[::parts] = path(waypoint_positions)
+    interpolated = np.delete(np.arange(len(times)), [1, -2])
+    knots = np.concatenate([np.repeat(times[0], 3), times, np.repeat(times[-1], 3)])
+    at_rest = [(order, np.zeros(rows.shape[1])) for order in (1, 2)]
+    spline = make_interp_spline(
+        times[interpolated], rows[interpolated], k=3, t=knots, bc_type=(at_rest, at_rest)
+    )
+    rates = spline(times, 1)
+    rates[[0, -1]] = 0.0
+    return Curve(times, spline(times), rates)

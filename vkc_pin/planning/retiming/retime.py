@@ -1,0 +1,334 @@
+"""Turns waypoints into a smooth trajectory that is as fast as its limits allow."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vkc_pin.planning.base_paths.arcs import interpolate_arcs
+from vkc_pin.planning.retiming.jerk_limits import limit_jerk
+from vkc_pin.planning.retiming.limits import Limits
+from vkc_pin.planning.retiming.spline_path import fit_path
+from vkc_pin.planning.retiming.topp_ra import compute_speeds
+from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
+from vkc_pin.planning.retiming.wheeled_paths import compute_slip, fit_rolling_paths
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.curve import MIN_INTERVAL, Curve, concatenate_curves, sample_intervals
+from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.wheels import RollingLimits, make_rolling_limits
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
+
+__all__ = ["retime_trajectory"]
+
+_MIN_PIECES = 3  # minimum pieces per step; the path velocity is linear in time in each
+_MIN_JOINT_STEP = 1e-6  # [m] or [rad], smaller steps of an object's joint count as none
+_MIN_STEP_DURATION = 1e-6  # [s] at full speed; shorter steps count as none
+_WAIT_DURATION = 1e-3  # [s], duration of a step without motion, unless a hand opens or closes in it
+_ROUNDING = 1e-9  # relative
+# jump in acceleration that is allowed with jerk limits, relative to the acceleration limit
+_JUMP_RATIO = 1e-4
+_TORQUE_ITERATIONS, _TORQUE_TOLERANCE = (
+    4,
+    0.02,
+)  # Iterations of the search for speeds within torque limits, and relative change at convergence.
+# [m/s], lateral velocity below which a wheeled base needs no more knots, a fifth of what counts as
+# slip
+_MAX_SLIP = 2e-4
+_MAX_REFINEMENT = 8  # maximum refinement of the knots
+
+
+def retime_trajectory(
+    scene: Scene, trajectory: Trajectory, parts: Ints | None = None, *, jerk_time: float = 0.0
+) -> Trajectory:
+    """Return a smooth trajectory through the same waypoints, as fast as its limits allow.
+
+    It starts and ends at rest, and rests during steps without motion; if a phase begins with such a
+    step, as when a hand opens or closes, the step keeps its duration. It also stops where a joint
+    of an object starts or ceases to move, since the hand changes direction there. Between two stops
+    it follows one path, see `fit_path`, at the speeds of `compute_speeds`; if these cannot be
+    computed, it moves straight from waypoint to waypoint and stops at each. A wheeled base follows
+    `fit_rolling_paths`. The resulting cubics in time are slowed down until they keep the velocity
+    and acceleration limits exactly, and the torque limits if possible. With jerk limits, they are
+    computed by `limit_jerk`.
+
+    Args:
+        scene: Robot and objects.
+        trajectory: Trajectory whose waypoints are kept; its times matter only for waits.
+        parts: Number of parts into which each straight line between waypoints is divided, shape (T
+            − 1,). The path passes through the ends of all parts, so that more parts keep it closer
+            to the straight line. Defaults to one.
+        jerk_time: See `Options.jerk_time`.
+    """
+    limits, parts = (
+        Limits.from_scene(scene, trajectory.names, jerk_time),
+        np.ones(len(trajectory.times) - 1, int) if parts is None else parts,
+    )
+    rolling = make_rolling_limits(scene.robot)
+    places = np.concatenate(
+        [[0], np.cumsum(parts)]
+    )  # indices of the waypoints among all points of the path
+    positions = _subdivide(trajectory.positions, places, rolling)
+    scale = 1.0 / np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
+    is_still = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1) <= _MIN_STEP_DURATION
+    wait_durations = {
+        int(places[phase.first]): float(np.diff(trajectory.times)[phase.first])
+        for phase in trajectory.phases
+    }
+    pieces, ends, torques = list[Curve](), [0], Torques(scene, trajectory)
+    phases = torques.phases_of(np.searchsorted(places, np.arange(places[-1]), side="right") - 1)
+    for steps in _split_into_runs(
+        is_still, np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)) > _MIN_JOINT_STEP
+    ):
+        points = positions[steps[0] : steps[-1] + 2]
+        if is_still[steps[0]]:
+            least = np.array([wait_durations.get(step, _WAIT_DURATION) for step in steps])
+            curves = [(_make_straight_curve(points, limits, least), np.arange(1, len(points)))]
+        else:
+            curves = _follow_waypoints(
+                points,
+                limits,
+                scale,
+                rolling,
+                TorqueBounds(torques, phases[steps]) if torques.torque_limits.is_known else None,
+            )
+        for piece, at in curves:
+            ends += (ends[-1] + at).tolist()
+            pieces.append(piece)
+    curve = concatenate_curves(pieces).shift_time(float(trajectory.times[0]))
+    return replace(trajectory, times=curve.times[np.array(ends)[places]], curve=curve)
+
+
+def _subdivide(positions: Floats, places: Ints, rolling: RollingLimits) -> Floats:
+    """Return waypoints, shape (T, n), and points on the lines (wheeled bases: arcs) between them.
+
+    Args:
+        positions: The waypoints.
+        places: Index of each waypoint among the points, shape (T,).
+        rolling: Motion constraints of the base.
+    """
+    at = np.interp(np.arange(places[-1] + 1), places, np.arange(len(places)))
+    points = np.stack(
+        [np.interp(np.arange(places[-1] + 1), places, column) for column in positions.T], axis=-1
+    )
+    if rolling.is_omnidirectional or len(points) == len(positions):
+        return points
+    step = np.minimum(at.astype(int), len(positions) - 2)
+    points[:, :3] = interpolate_arcs(positions[step, :3], positions[step + 1, :3], at - step)
+    return points
+
+
+def _split_into_runs(is_still: Bools, moving_joints: Bools) -> Iterator[list[int]]:
+    """Yield the steps of each run between stops, see `retime_trajectory`.
+
+    Args:
+        is_still: Mask of steps without motion, shape (N,).
+        moving_joints: Mask of steps in which each joint of an object moves, shape (N, k).
+    """
+    stops = (moving_joints[1:] != moving_joints[:-1]).any(axis=1) | (is_still[1:] != is_still[:-1])
+    edges = [0, *(np.flatnonzero(stops) + 1).tolist(), len(is_still)]
+    yield from (list(range(first, last)) for first, last in itertools.pairwise(edges))
+
+
+def _follow_waypoints(
+    points: Floats,
+    limits: Limits,
+    scale: Floats,
+    rolling: RollingLimits,
+    torque_bounds: TorqueBounds | None,
+) -> list[tuple[Curve, Ints]]:
+    """Return curves through waypoints, shape (m, n), from stop to stop.
+
+    Returns:
+        Each curve with the indices of its knots at waypoints, except the first.
+    """
+    bounds = limits.lower, limits.upper
+    if not rolling.is_omnidirectional:
+        return list(
+            _follow_rolling_paths(
+                points, limits.with_wheels(rolling), scale, rolling, torque_bounds
+            )
+        )
+    result = _retime_path(fit_path(points, scale, bounds), points, limits, torque_bounds)
+    if result is not None:
+        return [result]
+    if not limits.has_unlimited_jerk:
+        steps = [
+            _follow_step(fit_path(step, scale, bounds), step, limits)
+            for step in map(np.array, itertools.pairwise(points))
+        ]
+        return [
+            (
+                curve
+                if torque_bounds is None
+                else torque_bounds.select_steps(k, 1).slow_down(curve),
+                at,
+            )
+            for k, (curve, at) in enumerate(steps)
+        ]
+    straight = _make_straight_curve(points, limits, np.zeros(len(points) - 1))
+    return [
+        (
+            straight if torque_bounds is None else torque_bounds.slow_down(straight),
+            np.arange(1, len(points)),
+        )
+    ]
+
+
+def _follow_rolling_paths(
+    points: Floats,
+    limits: Limits,
+    scale: Floats,
+    rolling: RollingLimits,
+    torque_bounds: TorqueBounds | None,
+    refinement: int = 1,
+) -> Iterator[tuple[Curve, Ints]]:
+    """Yield the curves of `_follow_waypoints` for a wheeled base.
+
+    The number of knots is multiplied by `refinement`, and increased where the base would slip.
+    """
+    bounds, begin = (limits.lower[:-2], limits.upper[:-2]), 0
+    for path, waypoints in fit_rolling_paths(points, scale, bounds, rolling, refinement):
+        bounds_of_path = (
+            None if torque_bounds is None else torque_bounds.select_steps(begin, len(waypoints) - 1)
+        )
+        begin += len(waypoints) - 1
+        result = _retime_path(path, waypoints, limits, bounds_of_path)
+        if result is None:
+            for k in range(len(waypoints) - 1):
+                ((path, step),) = fit_rolling_paths(
+                    waypoints[k : k + 2], scale, bounds, rolling, _MAX_REFINEMENT
+                )
+                curve, at = _follow_step(path, step, limits)
+                yield (
+                    curve
+                    if bounds_of_path is None
+                    else bounds_of_path.select_steps(k, 1).slow_down(curve),
+                    at,
+                )
+        elif refinement < _MAX_REFINEMENT and compute_slip(result[0]) > _MAX_SLIP:
+            yield from _follow_rolling_paths(
+                waypoints, limits, scale, rolling, bounds_of_path, 2 * refinement
+            )
+        else:
+            yield result
+
+
+def _retime_path(
+    path: CubicHermiteSpline, points: Floats, limits: Limits, torque_bounds: TorqueBounds | None
+) -> tuple[Curve, Ints] | None:
+    """Return a curve along a path through waypoints, shape (m, n), and the waypoints' knots.
+
+    Path and limits may have additional columns that are not part of the trajectory. Torques are
+    checked only for the fastest curve within velocity and acceleration limits, since few exceed
+    them. Returns None if the speeds cannot be computed.
+    """
+    knots = (len(path.x) - 1) // (len(points) - 1)  # a step
+    parts = knots * max(_MIN_PIECES // knots, 1)
+    places = sample_intervals(path.x, np.arange(parts // knots) / (parts // knots), last=True)
+    speeds = compute_speeds(path, places, limits.velocity, limits.acceleration)
+    if speeds is None:
+        return None
+    curve, waypoints = _follow_at_speeds(path, places, points, speeds, limits)
+    if (
+        torque_bounds is None
+        or np.abs(torque_bounds.evaluate(curve)).max() <= 1.0
+        or np.abs(torque_bounds.decompose(curve)[0]).max() >= 1.0
+    ):
+        return curve, waypoints  # torques are kept, or exceeded even at rest
+    for _ in range(
+        _TORQUE_ITERATIONS
+        # viscous torques are linearised around the previous speeds
+    ):
+        linear = partial(torque_bounds.linearize, path, places, speeds)
+        slower = compute_speeds(path, places, limits.velocity, limits.acceleration, linear)
+        if slower is None:
+            break
+        converged, speeds = np.allclose(slower, speeds, rtol=_TORQUE_TOLERANCE), slower
+        if converged:
+            break
+    curve, waypoints = _follow_at_speeds(path, places, points, speeds, limits)
+    return torque_bounds.slow_down(curve), waypoints
+
+
+def _follow_at_speeds(
+    path: CubicHermiteSpline, places: Floats, points: Floats, speeds: Floats, limits: Limits
+) -> tuple[Curve, Ints]:
+    """Return the curve along a path at given speeds, and the waypoints' knots.
+
+    Args:
+        path: The path.
+        places: Path positions, shape (K,).
+        points: Waypoints, shape (m, n).
+        speeds: Path velocities at `places`, shape (K,).
+        limits: Limits of the path's coordinates.
+    """
+    times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
+    return _follow_at_pace(path, Curve(times, places[:, None], speeds[:, None]), points, limits)
+
+
+def _follow_at_pace(
+    path: CubicHermiteSpline, pace: Curve, points: Floats, limits: Limits
+) -> tuple[Curve, Ints]:
+    """Return the curve along a path at a pace, or slower, and the knots of the waypoints.
+
+    Args:
+        path: The path.
+        pace: Progress along the path over time.
+        points: Waypoints, shape (m, n).
+        limits: Limits of the path's coordinates.
+    """
+    if limits.has_unlimited_jerk:
+        places = pace.positions[:, 0]
+        curve = limits.slow_down(Curve(pace.times, path(places), path(places, 1) * pace.rates))
+    else:
+        curve = limit_jerk(path, pace, len(points) - 1, limits)
+    size, positions = points.shape[1], np.array(curve.positions[:, : points.shape[1]])
+    parts = (len(positions) - 1) // (len(points) - 1)
+    positions[::parts] = points  # bit-exact
+    return Curve(curve.times, positions, curve.rates[:, :size]), np.arange(1, len(points)) * parts
+
+
+def _follow_step(path: CubicHermiteSpline, points: Floats, limits: Limits) -> tuple[Curve, Ints]:
+    """Return the curve from one waypoint to the next, shape (2, n), with progress 3s² − 2s³."""
+    length, share = path.x[-1], np.linspace(0.0, 1.0, len(path.x))
+    places, speeds = (
+        length * (3.0 - 2.0 * share) * share**2,
+        length * 6.0 * (share - share**2) / _WAIT_DURATION,
+    )
+    return _follow_at_pace(
+        path, Curve(share * _WAIT_DURATION, places[:, None], speeds[:, None]), points, limits
+    )
+
+
+def _make_straight_curve(points: Floats, limits: Limits, least: Floats) -> Curve:
+    """Return straight lines through waypoints, shape (m, n), with a stop at each waypoint.
+
+    3s² − 2s³ has a peak velocity of 1.5 and a peak acceleration of 6, which is attained in a jump.
+    With jerk limits the acceleration is therefore almost zero.
+
+    Args:
+        points: The waypoints.
+        limits: Limits of the coordinates.
+        least: Minimum duration of each step, shape (m − 1,) [s].
+    """
+    distances = np.abs(np.diff(points, axis=0))
+    acceleration = limits.acceleration * (1.0 if limits.has_unlimited_jerk else _JUMP_RATIO)
+    least = np.maximum.reduce(
+        [
+            least,
+            1.5 * (distances / limits.velocity).max(axis=1),
+            np.sqrt(6.0 * (distances / acceleration).max(axis=1)),
+            np.cbrt(12.0 * (distances / limits.jerk).max(axis=1)),
+        ]
+    )
+    times = np.concatenate([[0.0], np.cumsum(np.maximum(least, MIN_INTERVAL) * (1.0 + _ROUNDING))])
+    return Curve(times, points, np.zeros_like(points))

@@ -1,0 +1,66 @@
+"""Fits a smooth path through waypoints that does not overshoot the limits."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.world.trajectory.curve import Curve
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
+
+__all__ = ["fit_path"]
+
+
+def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> CubicHermiteSpline:
+    """Return a cubic spline through waypoints, parametrised by the length of the polyline.
+
+    It is twice differentiable and linear in the waypoints. Linear constraints that hold at all
+    waypoints hold along it, and others, such as a closed chain, up to their curvature. If a
+    coordinate would leave its limits between waypoints, its slopes are limited so that it stays
+    between the values at consecutive waypoints (Hyman, Accurate monotonicity preserving cubic
+    interpolation, 1983).
+
+    Args:
+        points: Waypoints, shape (m, n), m ≥ 2, consecutive ones distinct.
+        scale: Weight of each coordinate in the length, shape (n,).
+        limits: Lower and upper limits, shape (n,) each.
+    """
+    from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+    lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
+    arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
+    steps = np.diff(points, axis=0)
+    chords = steps / lengths[:, None]
+    slopes = (
+        CubicSpline(arc_lengths, points, bc_type="natural")(arc_lengths, 1)
+        if len(points) > 2
+        else np.repeat(chords, 2, axis=0)
+    )
+    overshoots = _find_overshoots(points, slopes, lengths, limits)
+    before, after = np.vstack([chords[:1], chords]), np.vstack([chords, chords[-1:]])
+    directions, steepest = np.sign(after), 3.0 * np.minimum(np.abs(before), np.abs(after))
+    monotone = np.where(
+        before * after > 0.0, directions * np.clip(directions * slopes, 0.0, steepest), 0.0
+    )
+    return CubicHermiteSpline(arc_lengths, points, np.where(overshoots, monotone, slopes))
+
+
+def _find_overshoots(
+    points: Floats, slopes: Floats, lengths: Floats, limits: tuple[Floats, Floats]
+) -> Bools:
+    """Return a mask of coordinates whose cubics exceed limits between two points, shape (n,)."""
+    low, high = Curve(np.concatenate([[0.0], np.cumsum(lengths)]), points, slopes).compute_extrema()
+    segment_lower, segment_upper = (
+        np.minimum(points[:-1], points[1:]),
+        np.maximum(points[:-1], points[1:]),
+    )
+    return np.asarray(
+        (
+            (low < np.minimum(limits[0], segment_lower))
+            | (high > np.maximum(limits[1], segment_upper))
+        ).any(axis=0)
+    )

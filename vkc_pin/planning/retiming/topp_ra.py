@@ -1,0 +1,136 @@
+"""Computes the fastest speed along a path from rest to rest (time-optimal path parametrisation)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vkc_pin.utils.arrays import Floats, Ints
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicHermiteSpline
+
+__all__ = ["compute_speeds"]
+
+_KNOT_OFFSETS = (
+    1e-3,
+    1e-2,
+    # Offsets of the constrained points from the ends of a segment, relative to its length;
+    # accelerations are discontinuous at the ends.
+)
+
+
+def compute_speeds(
+    path: CubicHermiteSpline,
+    positions: Floats,
+    velocity: Floats,
+    acceleration: Floats,
+    linear: Callable[[Floats], tuple[Floats, Floats, Floats]] | None = None,
+) -> Floats | None:
+    """Return the fastest speeds along a path at given positions, from rest to rest.
+
+    Between two positions the speed is linear in time. The speeds are those of TOPP-RA (Pham and
+    Pham, A new approach to time-optimal path parameterization based on reachability analysis,
+    2018), computed by the library `toppra`.
+
+    Args:
+        path: Path of n coordinates.
+        positions: Increasing path positions, including both ends and all knots, shape (K,).
+        velocity: Velocity limits, shape (n,) [m/s], [rad/s]; inf: none.
+        acceleration: Acceleration limits, shape (n,) [m/s²], [rad/s²]; inf: none.
+        linear: Further constraints: returns a, b, c at positions, shape (K, m) each, with |a u + b
+            w² + c| ≤ 1 for the path velocity w and acceleration u. Defaults to none.
+
+    Returns:
+        Path velocities, shape (K,) [1/s], or None if they cannot be computed.
+    """
+    from toppra.algorithm import TOPPRA
+    from toppra.constraint import (
+        DiscretizationType,
+        JointAccelerationConstraint,
+        JointVelocityConstraint,
+    )
+
+    limited = np.flatnonzero(np.isfinite(velocity) & np.isfinite(acceleration))
+    if not len(limited):
+        return None
+    _silence_toppra()
+    rates = JointVelocityConstraint(np.column_stack([-velocity[limited], velocity[limited]]))
+    limits = np.column_stack([-acceleration[limited], acceleration[limited]])
+    changes = JointAccelerationConstraint(
+        limits, discretization_scheme=DiscretizationType.Interpolation
+    )
+    for offset in _KNOT_OFFSETS:
+        grid = _replace_knots(path.x, positions, offset)
+        constraints = (
+            [rates, changes]
+            if linear is None
+            else [rates, changes, _to_toppra_constraint(linear, len(limited))]
+        )
+        solver = TOPPRA(
+            constraints, _to_toppra_path(path, limited), gridpoints=grid, solver_wrapper="seidel"
+        )
+        _, speeds, _ = solver.compute_parameterization(0.0, 0.0)
+        if speeds is not None and np.isfinite(speeds).all() and (speeds[1:-1] > 0.0).all():
+            return np.sqrt(np.interp(positions, grid, np.asarray(speeds) ** 2))
+    return None
+
+
+def _replace_knots(knots: Floats, positions: Floats, offset: float) -> Floats:
+    """Return the grid with each interior knot replaced by two points beside it.
+
+    Accelerations are discontinuous at knots. The offset is relative to the shorter segment.
+    """
+    gaps = np.minimum(np.diff(knots)[1:], np.diff(knots)[:-1]) * offset
+    inside = knots[1:-1]
+    return np.sort(np.concatenate([np.setdiff1d(positions, inside), inside - gaps, inside + gaps]))
+
+
+def _to_toppra_path(path: CubicHermiteSpline, columns: Ints) -> Any:
+    """Return some coordinates of a path as a geometric path of `toppra`."""
+    from toppra.interpolator import AbstractGeometricPath
+
+    class Path(AbstractGeometricPath):
+        dof = len(columns)
+        path_interval = np.array([path.x[0], path.x[-1]])
+
+        def __call__(self, positions: Any, order: int = 0) -> Any:
+            return path(positions, order)[..., columns]
+
+    return Path()
+
+
+def _to_toppra_constraint(
+    linear: Callable[[Floats], tuple[Floats, Floats, Floats]], size: int
+) -> Any:
+    """Return linear constraints for `toppra`, applied at both ends of each grid interval."""
+    from toppra.constraint import LinearConstraint
+    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
+
+    class Bound(LinearConstraint):
+        dof, identical = size, True
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.identical = True
+
+        def compute_constraint_params(
+            self, path: Any, gridpoints: Floats, *_: Any, **__: Any
+        ) -> Any:
+            a, b, c = linear(gridpoints)
+            both = np.vstack([np.eye(a.shape[1]), -np.eye(a.shape[1])])
+            return canlinear_colloc_to_interpolate(
+                a, b, c, both, np.ones(len(both)), None, None, gridpoints, identical=True
+            )
+
+    return Bound()
+
+
+def _silence_toppra() -> None:
+    """Silence the logger of `toppra` unless its level was set; failures are handled here."""
+    logger = logging.getLogger("toppra")
+    if logger.level == logging.NOTSET:
+        logger.setLevel(logging.CRITICAL)

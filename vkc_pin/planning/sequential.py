@@ -1,0 +1,144 @@
+"""Plans steps simultaneously or one after the other, with the attachments that lead to success."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from typing import NamedTuple
+
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.request import PlanningRequest
+from vkc_pin.planning.results import FINAL, add_statistics, concatenate_plans
+from vkc_pin.planning.solve_task import TaskResult, solve_task
+from vkc_pin.utils.budget import ENDINGS, current_ending, reserve_time
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.actions import generate_alternatives, has_open_attachment
+from vkc_pin.world.task.actuation import find_shared_coordinate
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import Task
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.world_model import compute_final_scene
+
+__all__ = [
+    "PlannedStep",
+    "plan_each_step",
+    "plan_sequentially",
+    "plan_simultaneously",
+    "solve_with_alternatives",
+]
+
+
+class PlannedStep(NamedTuple):
+    """A step, planned from the end of the one before.
+
+    Attributes:
+        number: Number of the step, from 0.
+        result: Result of its task.
+    """
+
+    number: int
+    result: TaskResult
+
+
+def plan_sequentially(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
+    """Plan every step from the end of the one before, up to the first that fails, and concatenate the plans.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        task: The task.
+        request: Arguments of planning.
+    """
+    parts = plan_each_step(scene, task, request)
+    steps: list[tuple[Step, ...]] = [(step,) for step in task.steps]
+    for part in parts:  # one step becomes several where an object is grasped anew
+        steps[part.number] = part.result.plan.steps
+    plans = [part.result.plan for part in parts]
+    return concatenate_plans(scene, list(itertools.chain(*steps)), request, plans)
+
+
+def plan_simultaneously(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
+    """Plan all steps as one problem, in which every grasp and base pose can change in favour of later steps.
+
+    If that fails, or holds move the same joint, which a chain can contain only once, the steps are
+    planned sequentially.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        task: The task.
+        request: Arguments of planning.
+    """
+    if find_shared_coordinate(scene, task.holds) is not None:
+        return plan_sequentially(scene, task, request)
+    if len(task.steps) == 1:
+        return solve_with_alternatives(scene, task, request).plan
+    plan = solve_task(scene, task, request).plan
+    final = ENDINGS if any(has_open_attachment(scene, step) for step in task.steps) else FINAL
+    if plan.success or plan.status in final:
+        return plan
+    apart = plan_sequentially(scene, task, request)
+    return add_statistics(apart if apart.success else plan, [plan.statistics, apart.statistics])
+
+
+def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) -> TaskResult:
+    """Solve a task; if that fails, with each of the other attachments that its steps leave open.
+
+    A held object that cannot be moved with its present grasp is released and grasped anew.
+    Attachments without a known collision-free configuration at the end of a phase are skipped.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        task: The task.
+        request: Arguments of planning.
+
+    Returns:
+        The first success, whose steps name the attachment unless it is the default; if all fail,
+        the first result, with notes on the others.
+    """
+    first = last = solve_task(scene, task, request)
+    statistics, notes = [first.plan.statistics], list[str]()
+    # Terms may name phases by their numbers, which grasping anew would change.
+    for name, steps in generate_alternatives(scene, task, anew=not request.terms):
+        if last.plan.success or last.plan.status in ENDINGS or first.is_grasp_independent:
+            break
+        other = compile_task(scene, steps, request.options)
+        last = solve_task(scene, other, request, check_goals_first=True)
+        statistics.append(last.plan.statistics)
+        if last.plan.success:
+            return dataclasses.replace(last, plan=add_statistics(last.plan, statistics))
+        notes.append(f"at {name}: {next(iter(last.plan.validation.notes), last.plan.status)}")
+    if last is first:
+        return first
+    plan = first.plan
+    status = last.plan.status if last.plan.status in ENDINGS else plan.status
+    report = dataclasses.replace(plan.validation, notes=(*plan.validation.notes, *notes))
+    failed = dataclasses.replace(plan, validation=report, status=status)
+    return dataclasses.replace(first, plan=add_statistics(failed, statistics))
+
+
+def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[PlannedStep]:
+    """Plan every step that changes the world from the end of the one before, up to the first that fails.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        task: The task.
+        request: Arguments of planning.
+    """
+    current, parts, reserved = scene, list[PlannedStep](), 0.0
+    for number, step in enumerate(task.steps):
+        # The end of a step is known only once it is planned; the first starts where the task does.
+        own = (
+            compile_task(current, [step], request.options, nothing=True)
+            if number
+            else task.truncate(1)
+        )
+        if not own.phases:
+            continue
+        request.progress.part(number + 1, 1, len(task.steps))
+        result = solve_with_alternatives(current, own, request)
+        parts.append(PlannedStep(number, result))
+        if not result.plan.success or current_ending():
+            break
+        reserved += result.check_time
+        reserve_time("planned steps", reserved)
+        current = compute_final_scene(current, result.plan.trajectory, result.task.after)
+    return parts

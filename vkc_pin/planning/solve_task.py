@@ -1,0 +1,391 @@
+"""Solves a task as one nonlinear program, from initial guess to initial guess until validation accepts a trajectory."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vkc_pin.planning.diagnosis.diagnosis import (
+    BlockedGoal,
+    diagnose_goal,
+    find_impossible_conditions,
+)
+from vkc_pin.planning.diagnosis.paths import diagnose_paths
+from vkc_pin.planning.diagnosis.proofs import find_proofs
+from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
+from vkc_pin.planning.initialization.initial_guess import InitialGuess, PhaseWaypoints
+from vkc_pin.planning.initialization.methods import initialize
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.request import PlanningRequest
+from vkc_pin.planning.results import build_plan, make_stationary_trajectory
+from vkc_pin.planning.retime_validated import MAX_REPAIRS, retime_validated
+from vkc_pin.planning.solver.loop import solve
+from vkc_pin.planning.solver.solution import Iteration, Solution
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
+from vkc_pin.planning.statistics import STAGES, PlanningStatistics
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.budget import (
+    ENDINGS,
+    SpentError,
+    count_evaluations,
+    reserve_time,
+    spend,
+    unlimited,
+)
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.phases import Task
+from vkc_pin.world.task.terms import trace_terms
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+__all__ = ["TaskResult", "solve_task"]
+
+_CHECK_TIME = 2e-3
+"""Time per waypoint [s] that validation takes, until it was measured; rather too long."""
+
+Guess = Callable[[TrajectoryProblem], InitialGuess]
+"""Makes an initial guess for a problem."""
+
+
+@dataclass(frozen=True, eq=False)
+class TaskResult:
+    """Result of one task, solved as one nonlinear program.
+
+    Attributes:
+        scene: Scene in which it starts.
+        task: The task.
+        plan: The best plan found.
+        problem: The nonlinear program; None if the budget ended before it was built.
+        z: Its best waypoints z_1..z_N, shape (N, n).
+        check_time: Time of the last validation [s].
+        is_grasp_independent: Whether the task fails for certain whatever the grasp: the start is
+            invalid, or a joint moves its link into an obstacle.
+    """
+
+    scene: Scene
+    task: Task
+    plan: Plan
+    problem: TrajectoryProblem | None
+    z: Floats
+    check_time: float
+    is_grasp_independent: bool
+
+    def phase_waypoints(self) -> PhaseWaypoints:
+        """Return the best waypoints, as an initial guess of problems with more phases."""
+        assert self.problem is not None
+        phases = tuple(phase.key for phase in self.task.phases)
+        path, ends = self.problem.waypoints(self.z), [0, *self.problem.ends.tolist()]
+        waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
+        names = self.problem.chain.names
+        return PhaseWaypoints(phases, names, waypoints, self.plan.initialization)
+
+
+def solve_task(
+    scene: Scene,
+    task: Task,
+    request: PlanningRequest,
+    *,
+    guess: Guess | None = None,
+    check_goals_first: bool = False,
+) -> TaskResult:
+    """Solve a task as one nonlinear program.
+
+    Args:
+        scene: Scene in which it starts.
+        task: The task.
+        request: Arguments of planning.
+        guess: Makes the only initial guess; None: those of the request's initialization.
+        check_goals_first: Whether to look for collision-free goal configurations before any initial
+            guess, since there are probably none.
+    """
+    began, cache = time.perf_counter(), request.cache
+    built, evaluated = cache.building, count_evaluations()
+    request.progress.begin([phase.name for phase in task.phases])
+    search = _Search(scene, task, request)
+    try:
+        best, status = search.run(guess, check_goals_first)
+    except SpentError as end:
+        best, status = search.find_nearest() or search.make_standing(), str(end)
+    cache.trim()  # a chore has many problems, whose solvers grow while they are used
+    build_time = cache.building - built
+    statistics = PlanningStatistics(
+        planning_time=time.perf_counter() - began - build_time,
+        build_time=build_time,
+        iterations=search.iterations,
+        rounds=search.rounds,
+        evaluations=count_evaluations() - evaluated,
+    ).with_times(search.times)
+    plan = build_plan(
+        scene,
+        task.steps,
+        request.options,
+        best.trajectory,
+        best.report,
+        status,
+        statistics=statistics,
+        random_seed=request.random_seed,
+        initialization=best.name,
+        history=search.history,
+        terms=request.terms,
+    )
+    found = search.problem, best.z, search.check_time, search.is_grasp_independent
+    return TaskResult(scene, task, plan, *found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Trajectory found from one initial guess.
+
+    Attributes:
+        name: Name of the initial guess.
+        z: z_1..z_N, shape (N, n).
+        trajectory: The trajectory.
+        report: Its validation.
+        status: "success", "rejected" or "not converged".
+    """
+
+    name: str
+    z: Floats
+    trajectory: Trajectory
+    report: Report
+    status: str
+
+    @property
+    def violation(self) -> float:
+        """Sum of all violations, over all units."""
+        return sum(violation.amount for violation in self.report.violations)
+
+    def is_better(self, other: _Candidate) -> bool:
+        """Return whether it is valid, or violates less."""
+        return self.report.ok or self.violation < other.violation
+
+    def with_notes(self, notes: Iterable[str]) -> _Candidate:
+        """Return the candidate with notes in its report."""
+        report = dataclasses.replace(self.report, notes=tuple(notes))
+        return dataclasses.replace(self, report=report)
+
+
+class _Search:
+    """State of solving one task.
+
+    Attributes:
+        problem: The nonlinear program, once it is built.
+        times: Stage → time [s].
+        rounds, iterations: Rounds of the solver, iterations of Ipopt.
+        history: One row per round.
+        check_time: Time of the last validation [s].
+        is_grasp_independent: See `TaskResult`.
+    """
+
+    def __init__(self, scene: Scene, task: Task, request: PlanningRequest) -> None:
+        self.scene, self.task, self.request = scene, task, request
+        self.problem: TrajectoryProblem | None = None
+        self.times = dict.fromkeys(STAGES, 0.0)
+        self.rounds = self.iterations = 0
+        self.check_time, self.is_grasp_independent = 0.0, False
+        self.history: list[dict[str, float]] = []
+        self._blocked_phases: list[str] = []  # phases without a path of the base
+        self._best: _Candidate | None = None
+        # The solution nearest to feasibility of those that are too far from it to be validated.
+        self._infeasible: tuple[Solution, str] | None = None
+        self._goals: dict[int, BlockedGoal | None] = {}
+        self._proofs: list[str] | None = None
+
+    def run(self, guess: Guess | None, check_goals_first: bool) -> tuple[_Candidate, str]:
+        """Return the best candidate and the status of the plan; see `solve_task`."""
+        options, terms, cache = self.request.options, self.request.terms, self.request.cache
+        problem = TrajectoryProblem(self.scene, self.task, options, terms, cache=cache)
+        self.problem = problem
+        reserve_time("validation", _CHECK_TIME * problem.segments, default=True)
+        reasons = find_impossible_conditions(problem)
+        if reasons:
+            self.is_grasp_independent = True
+            best = self._make_stationary(problem)
+            return dataclasses.replace(best, report=best.report.with_reasons(reasons)), "infeasible"
+        if check_goals_first and (goals := self._find_blocked_goals(problem)):
+            return self._make_stationary(problem).with_notes(
+                goal.text for goal in goals
+            ), "infeasible"
+        guesses = self._initial_guesses(problem) if guess is None else iter([guess(problem)])
+        return self._try_guesses(problem, guesses, is_search=guess is None)
+
+    def _try_guesses(
+        self, problem: TrajectoryProblem, guesses: Iterator[InitialGuess], *, is_search: bool
+    ) -> tuple[_Candidate, str]:
+        """Return the best candidate and the status, with notes on what prevents success."""
+        goals: list[BlockedGoal] = []
+        for number, guess in enumerate(guesses, start=1):
+            solution = self._solve(problem, guess)
+            if solution.shortfall:
+                found = (solution, guess.name)
+                known = self._infeasible or found
+                self._infeasible = min(known, found, key=lambda one: one[0].shortfall)
+            else:
+                candidate = self._evaluate(problem, solution, guess.name)
+                if self._best is None or candidate.is_better(self._best):
+                    self._best = candidate
+                if self._best.status == "success":
+                    return self._best, "success"
+                if solution.status in ENDINGS:
+                    return self._best, solution.status
+            spend()
+            if is_search and self._find_proofs(problem):
+                break
+            if number == 1 and is_search and not _has_free_ends(problem, guess):
+                goals = self._find_blocked_goals(problem)
+            elif goals:  # two guesses failed, and sampling finds no free goal configuration either
+                break
+            if any(goal.is_deep for goal in goals):
+                break
+        spend()
+        return self._explain_failure(problem, [goal.text for goal in goals], is_search=is_search)
+
+    def _explain_failure(
+        self, problem: TrajectoryProblem, lines: list[str], *, is_search: bool
+    ) -> tuple[_Candidate, str]:
+        """Return the best candidate and the status of a failure, with notes on its causes."""
+        if is_search and self._find_proofs(problem):
+            best = self._make_stationary(problem)
+            return best.with_notes(self._find_proofs(problem)), "infeasible"
+        nearest = self.find_nearest()
+        best = nearest or self._make_stationary(problem)
+        has_cause = bool(lines) or (nearest is None and bool(self._blocked_phases))
+        status = "infeasible" if has_cause else best.status
+        if nearest is None:
+            lines = [*lines, *self._blocked_phases]
+        elif is_search and not lines:
+            seed = self.request.random_seed
+            lines, is_cut_off = diagnose_paths(
+                problem, best.z, best.report, self._blocked_phases, seed
+            )
+            status = "infeasible" if is_cut_off else status
+        return best.with_notes(lines), status
+
+    def find_nearest(self) -> _Candidate | None:
+        """Return the best candidate, else the nearest infeasible solution; None without any."""
+        if self._best is None and self._infeasible and self.problem is not None:
+            return self._evaluate(self.problem, *self._infeasible)
+        return self._best
+
+    def _find_proofs(self, problem: TrajectoryProblem) -> list[str]:
+        """Return proofs of infeasibility, computed once and only after a failure."""
+        if self._proofs is None:
+            hits = find_swept_collisions(problem)
+            self.is_grasp_independent, self._proofs = bool(hits), hits or find_proofs(problem)
+        return self._proofs
+
+    def _find_blocked_goals(
+        self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None
+    ) -> list[BlockedGoal]:
+        """Return the goals of some phases, None: of all, without a known collision-free configuration."""
+        found = []
+        for number in range(len(problem.task.phases)) if numbers is None else numbers:
+            if number not in self._goals:
+                self._goals[number] = diagnose_goal(problem, number, self.request.random_seed)
+            found.append(self._goals[number])
+        return [goal for goal in found if goal is not None]
+
+    def _initial_guesses(self, problem: TrajectoryProblem) -> Iterator[InitialGuess]:
+        request = self.request
+        guesses = initialize(
+            problem,
+            request.initialization,
+            request.random_seed,
+            count=request.options.max_restarts,
+            perturbation=request.perturbation,
+            notes=self._blocked_phases,
+            is_infeasible=lambda phases: (
+                bool(self._find_proofs(problem))
+                or any(goal.is_deep for goal in self._find_blocked_goals(problem, phases))
+            ),
+        )
+        while True:
+            began, built = time.perf_counter(), request.cache.building
+            request.progress.doing("looking for an initial guess")
+            try:
+                guess = next(guesses, None)
+            finally:
+                took = time.perf_counter() - began
+                self.times["initialization"] += took - (request.cache.building - built)
+            if guess is None or self._proofs:
+                return
+            yield guess
+
+    def _solve(self, problem: TrajectoryProblem, guess: InitialGuess) -> Solution:
+        """Return the solution from an initial guess."""
+        solution = solve(problem, guess.z, callback=self._report_round, radius=guess.radius)
+        self.rounds += solution.rounds
+        self.iterations += solution.iterations
+        for key, value in solution.timings.items():
+            self.times[key] += value
+        self.history += [dataclasses.asdict(row) for row in solution.history]
+        return solution
+
+    def _report_round(self, row: Iteration) -> None:
+        self.request.progress(row)
+        if self.request.callback is not None:
+            self.request.callback(row)
+
+    def _evaluate(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Candidate:
+        """Retime and validate a solution; where that finds violations, retime closer to its segments."""
+        with unlimited():
+            waypoints = make_trajectory(problem, solution.z, solution.dt)
+        began, validated = time.perf_counter(), self.times["validation"]
+        if self._has_velocity_terms:
+            trajectory, report = waypoints, self._validate(waypoints)
+        else:
+            # Violations of solutions that have not converged are not the curve's.
+            trajectory, report = retime_validated(
+                self.scene,
+                waypoints,
+                self._validate,
+                repairs=MAX_REPAIRS if solution.converged else 0,
+                jerk_time=self.request.options.jerk_time,
+            )
+        took = time.perf_counter() - began
+        self.times["retiming"] += took - (self.times["validation"] - validated)
+        status = "success" if report.ok else "rejected" if solution.converged else "not converged"
+        return _Candidate(name, solution.z, trajectory, report, status)
+
+    @cached_property
+    def _has_velocity_terms(self) -> bool:
+        """Whether user terms depend on velocities, which then are those of the program's own time."""
+        return any(
+            term.formula.uses_previous for term in trace_terms(self.scene, self.request.terms)
+        )
+
+    def _validate(self, trajectory: Trajectory) -> Report:
+        """Validate a trajectory and measure the time."""
+        began, request = time.perf_counter(), self.request
+        request.progress.doing("checking")
+        report = validate(self.scene, self.task.steps, trajectory, request.options, request.terms)
+        self.check_time = time.perf_counter() - began
+        reserve_time("validation", self.check_time)
+        self.times["validation"] += self.check_time
+        return report
+
+    def _make_stationary(self, problem: TrajectoryProblem) -> _Candidate:
+        """Return a trajectory that stays at the start for the duration of the task."""
+        timing = problem.timing_for(problem.still)
+        return self._evaluate(problem, Solution(problem.still, timing.dt), "none")
+
+    def make_standing(self) -> _Candidate:
+        """Return a trajectory of one time step at the start, the result before the first initial guess."""
+        trajectory = make_stationary_trajectory(self.scene, self.request.options)
+        report = self._validate(trajectory)
+        return _Candidate("none", np.zeros((0, 0)), trajectory, report, "not converged")
+
+
+def _has_free_ends(problem: TrajectoryProblem, guess: InitialGuess) -> bool:
+    """Return whether the configurations of a guess at the ends of the phases are feasible."""
+    contacts = problem.evaluate_contacts(guess.z, reach=problem.options.largest_margin)
+    free = contacts.compute_shortfall(problem.segments)[problem.ends - 1] <= 0.0
+    return bool(free.all()) and problem.pose_error(guess.z) < 1e-2

@@ -1,0 +1,125 @@
+"""Turns collisions between waypoints into witness planes at both ends of the segment."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
+from vkc_pin.planning.solver.tunnelling import Crossing, find_crossings
+from vkc_pin.utils.arrays import Floats, Ints
+
+__all__ = ["SegmentContacts", "find_segment_contacts", "merge_contacts"]
+
+SPACING = 0.02  # [m] or [rad] between the first samples, in the coordinate that moves most
+SEGMENT_MARGIN = 1e-2  # [m] clearance required between waypoints
+REFINEMENT_RANGE = 0.015  # [m] beyond `SEGMENT_MARGIN` within which samples are refined
+REFINEMENT = 4  # samples that replace one
+
+
+class SegmentContacts(NamedTuple):
+    """Close pairs between waypoints.
+
+    Attributes:
+        contacts: Equivalent contacts at z_1..z_N. Margin minus distance is the clearance that the
+            segment lacks; it is negative for pairs that are close but far enough apart.
+        is_free: Whether no sample is closer than `CLEARANCE_TOLERANCE`.
+        crossings: Pairs that pass through each other.
+    """
+
+    contacts: Contacts
+    is_free: bool
+    crossings: list[Crossing]
+
+
+def find_segment_contacts(problem: TrajectoryProblem, z: Floats) -> SegmentContacts:
+    """Find close pairs within segments and express them as contacts at the adjacent waypoints.
+
+    At a sample (1 − s)·z_t + s·z_{t+1} with distance d < m, m being `SEGMENT_MARGIN` or the pair's
+    margin if that is less, the witness points, fixed in their bodies, are transferred to both
+    waypoints. There n·(b − a) has some value v. Requiring v + m − d at both waypoints lifts the
+    sample by m − d, to first order. Only the deepest sample of each segment and pair counts.
+
+    Args:
+        problem: Problem.
+        z: z_1..z_N, shape (N, n).
+    """
+    path, contacts = problem.waypoints(z), problem.contacts.with_released_objects(z)
+    counts = np.maximum(np.ceil(np.abs(np.diff(path, axis=0)).max(axis=1) / SPACING).astype(int), 1)
+    segment = np.repeat(np.arange(len(z)), counts)
+    piece = np.arange(len(segment)) - np.searchsorted(segment, segment)
+    # Check the middle of each piece first, and refine only the pieces that are close to something.
+    middles, waypoints = _interpolate_states(path, segment, (piece + 0.5) / counts[segment])
+    near = contacts.evaluate(middles, waypoints, reach=SEGMENT_MARGIN + REFINEMENT_RANGE)
+    crossings = find_crossings(contacts, middles, segment, near)
+    rows = np.unique(near.waypoint)
+    segment, begin, length = (
+        segment[rows],
+        piece[rows] / counts[segment[rows]],
+        1 / counts[segment[rows]],
+    )
+    if not len(rows):
+        return SegmentContacts(make_empty_contacts(), True, [])
+    segment = np.repeat(segment, REFINEMENT)
+    s = (begin[:, None] + length[:, None] * (np.arange(REFINEMENT) + 0.5) / REFINEMENT).ravel()
+    states, waypoints = _interpolate_states(path, segment, s)
+    found = _select_deepest(
+        contacts.evaluate(states, waypoints, reach=SEGMENT_MARGIN + REFINEMENT_RANGE), segment
+    )
+    # The start may be close to something, so only collisions count in the first segment.
+    found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
+    margin = np.minimum(SEGMENT_MARGIN, found.margin)
+    joints = contacts.get_joints(found.pair)
+    rotations, translations = contacts.compute_placements(states[found.waypoint])
+    ends = problem.chain.joint_placements(path)
+    parts = []
+    for offset in (0, 1):
+        waypoint = segment[found.waypoint] + offset
+        points = []
+        for column, witness in ((0, found.first), (1, found.second)):
+            j, contact = joints[:, column], np.arange(len(joints))
+            local = np.einsum(
+                "cji,cj->ci", rotations[contact, j], witness - translations[contact, j]
+            )
+            points.append(
+                np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j]
+            )
+        value = np.einsum("ci,ci->c", found.normal, points[1] - points[0])
+        inside = waypoint > 0  # the start is fixed
+        part = Contacts(
+            waypoint - 1,
+            found.pair,
+            value,
+            value + margin - found.distance,
+            found.normal,
+            points[0],
+            points[1],
+        )
+        parts.append(part.select(np.flatnonzero(inside)))
+    is_free = bool(np.all(found.distance >= np.minimum(CLEARANCE_TOLERANCE, margin)))
+    return SegmentContacts(merge_contacts(*parts), is_free, crossings)
+
+
+def _interpolate_states(path: Floats, segment: Ints, s: Floats) -> tuple[Floats, Ints]:
+    """Return states at 0 < s < 1 of segments, and the waypoints that determine their phases."""
+    share = s[:, None]
+    return (1 - share) * path[segment] + share * path[segment + 1], segment + 1
+
+
+def _select_deepest(found: Contacts, segment: Ints) -> Contacts:
+    """Return the contact of smallest distance for each segment and pair."""
+    shapes = int(found.pair.max(initial=0)) + 1
+    keys = (segment[found.waypoint] * shapes + found.pair[:, 0]) * shapes + found.pair[:, 1]
+    order = np.lexsort((found.distance, keys))
+    return found.select(order[np.diff(keys[order], prepend=-1) > 0])
+
+
+def merge_contacts(*parts: Contacts) -> Contacts:
+    """Concatenate contacts and sort them by waypoint, largest margin violation first."""
+    merged = Contacts(
+        *(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True))
+    )
+    return merged.select(np.lexsort((merged.distance - merged.margin, merged.waypoint)))

@@ -1,0 +1,1 @@
+"""Generates random furniture, rooms and tasks."""

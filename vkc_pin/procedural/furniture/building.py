@@ -1,0 +1,302 @@
+"""Builds articulated objects from boxes, cylinders and spheres, as URDF and attachments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arrays import Floats
+
+__all__ = ["COLOURS", "LinkBuilder", "ObjectBuilder", "Point"]
+
+Point = Sequence[float]
+
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "dark": (0.2, 0.21, 0.23),
+    "glass": (0.30, 0.36, 0.40),
+    "oak": (0.76, 0.60, 0.42),
+    "sage": (0.55, 0.64, 0.56),
+    "sand": (0.84, 0.79, 0.68),
+    "shade": (0.84, 0.83, 0.79),
+    "slate": (0.38, 0.45, 0.52),
+    "steel": (0.62, 0.64, 0.66),
+    "walnut": (0.45, 0.31, 0.20),
+    "white": (0.93, 0.92, 0.89),
+}
+_DENSITY = 500.0  # [kg/m³], wood; hollow bodies are built of their walls
+_NO_ROTATION = (0.0, 0.0, 0.0)
+_CYLINDER_RPY = {
+    "x": (0.0, math.pi / 2.0, 0.0),
+    "y": (math.pi / 2.0, 0.0, 0.0),
+    "z": _NO_ROTATION,
+}  # roll, pitch, yaw of a cylinder
+_VELOCITY = {"revolute": 1.0, "prismatic": 0.5}  # [rad/s], [m/s]
+_EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """A shape of a link; lengths [m].
+
+    Attributes:
+        kind: "box", "cylinder" or "sphere".
+        size: Edges of a box, radius and length of a cylinder, or radius of a sphere.
+        centre: Its centre in the link's frame.
+        rpy: Its orientation as roll, pitch, yaw [rad].
+        colour: Name of its colour, see `COLOURS`.
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    centre: tuple[float, ...]
+    rpy: tuple[float, float, float]
+    colour: str
+
+    def make_xml(self, element: str) -> str:
+        """Return the URDF element `<visual>` or `<collision>`."""
+        if self.kind == "box":
+            size = f'size="{_format_numbers(self.size)}"'
+        else:
+            size = f'radius="{_format_numbers(self.size[:1])}"' + (
+                f' length="{_format_numbers(self.size[1:])}"' if self.size[1:] else ""
+            )
+        rpy = f' rpy="{_format_numbers(self.rpy, 6)}"' if any(self.rpy) else ""
+        material = f"<material name={quoteattr(self.colour)}/>" if element == "visual" else ""
+        geometry = f"<geometry><{self.kind} {size}/></geometry>"
+        origin = f'<origin xyz="{_format_numbers(self.centre)}"{rpy}/>'
+        return f"    <{element}>{origin}{geometry}{material}</{element}>"
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
+        if self.kind == "box":
+            return _DENSITY * math.prod(self.size)
+        radius = self.size[0]
+        volume = (
+            math.pi * radius**2 * self.size[1]
+            if self.kind == "cylinder"
+            else 4.0 / 3.0 * math.pi * radius**3
+        )
+        return _DENSITY * volume
+
+    @property
+    def inertia(self) -> Floats:
+        """Inertia about its centre along the link's axes, shape (3, 3) [kg·m²]."""
+        if self.kind == "sphere":
+            return np.eye(3) * 0.4 * self.mass * self.size[0] ** 2
+        if self.kind == "box":
+            squares = np.square(self.size)
+            return np.diag(self.mass * (squares.sum() - squares) / 12.0)
+        radius, length = self.size
+        along, across = (
+            0.5 * self.mass * radius**2,
+            self.mass * (3.0 * radius**2 + length**2) / 12.0,
+        )
+        rotation = pin.rpy.rpyToMatrix(*self.rpy)
+        return np.asarray(rotation @ np.diag([across, across, along]) @ rotation.T)
+
+
+@dataclass
+class LinkBuilder:
+    """A link under construction; lengths in metres, in its own frame."""
+
+    name: str
+    shapes: list[_Shape] = field(default_factory=list)
+
+    def add_box(self, low: Point, high: Point, colour: str) -> None:
+        """Add a box between two corners."""
+        size = tuple(b - a for a, b in zip(low, high, strict=True))
+        self.shapes.append(
+            _Shape(
+                "box",
+                size,
+                tuple((a + b) / 2.0 for a, b in zip(low, high, strict=True)),
+                _NO_ROTATION,
+                colour,
+            )
+        )
+
+    def add_cylinder(
+        self, centre: Point, radius: float, length: float, axis: str, colour: str
+    ) -> None:
+        """Add a cylinder along an axis of the link: "x", "y" or "z"."""
+        self.shapes.append(
+            _Shape("cylinder", (radius, length), tuple(centre), _CYLINDER_RPY[axis], colour)
+        )
+
+    def add_rod(self, one: Point, other: Point, radius: float, colour: str) -> None:
+        """Add a cylinder between two points."""
+        axis = np.subtract(other, one)
+        length = float(np.linalg.norm(axis))
+        rpy = (0.0, float(np.arccos(axis[2] / length)), float(np.arctan2(axis[1], axis[0])))
+        self.shapes.append(
+            _Shape("cylinder", (radius, length), tuple(np.add(one, other) / 2.0), rpy, colour)
+        )
+
+    def add_sphere(self, centre: Point, radius: float, colour: str) -> None:
+        """Add a sphere."""
+        self.shapes.append(_Shape("sphere", (radius,), tuple(centre), _NO_ROTATION, colour))
+
+    def add_case(self, low: Point, high: Point, wall: float, colour: str, inside: str) -> None:
+        """Add a case that is open towards -x: two sides, top, bottom and back."""
+        (x0, y0, z0), (x1, y1, z1) = low, high
+        self.add_box((x0, y0, z0), (x1, y0 + wall, z1), colour)
+        self.add_box((x0, y1 - wall, z0), (x1, y1, z1), colour)
+        self.add_box((x0, y0 + wall, z1 - wall), (x1, y1 - wall, z1), colour)
+        self.add_box((x0, y0 + wall, z0), (x1, y1 - wall, z0 + wall), colour)
+        self.add_box((x1 - wall, y0 + wall, z0 + wall), (x1, y1 - wall, z1 - wall), inside)
+
+    def make_xml(self) -> str:
+        """Return the URDF element `<link>`, with mass and inertia of the shapes."""
+        masses = np.array([shape.mass for shape in self.shapes])
+        centres = np.array([shape.centre for shape in self.shapes], float)
+        middle = masses @ centres / masses.sum()
+        inertia = np.zeros((3, 3))
+        for shape, mass, offset in zip(self.shapes, masses, centres - middle, strict=True):
+            inertia += shape.inertia + mass * (
+                offset @ offset * np.eye(3) - np.outer(offset, offset)
+            )
+        entries = " ".join(
+            f'i{"xyz"[i]}{"xyz"[j]}="{_format_numbers([inertia[i, j]], 6)}"'
+            for i in range(3)
+            for j in range(i, 3)
+        )
+        mass, origin = (
+            f'<mass value="{_format_numbers([masses.sum()])}"/>',
+            f'<origin xyz="{_format_numbers(middle)}"/>',
+        )
+        lines = [
+            f"  <link name={quoteattr(self.name)}>",
+            f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>",
+        ]
+        lines += [
+            shape.make_xml(element) for element in ("visual", "collision") for shape in self.shapes
+        ]
+        return "\n".join([*lines, "  </link>"])
+
+
+@dataclass
+class ObjectBuilder:
+    """An articulated object under construction.
+
+    The frame of its base link lies on the floor (or on its support), below the middle of its front:
+    x points into the object, away from the user, z up. `description` is the input of
+    `vkc_pin.load_object`.
+
+    Attributes:
+        name: Its name.
+        base: Base link.
+        links: Other links, each with the URDF element `<joint>` that moves it.
+    """
+
+    name: str
+    base: LinkBuilder
+    links: list[tuple[LinkBuilder, str]] = field(default_factory=list)
+    accelerations: dict[str, float] = field(default_factory=dict)
+    attachments: list[dict[str, Any]] = field(default_factory=list)
+    latches: list[dict[str, Any]] = field(default_factory=list)
+
+    def add_joint(
+        self,
+        name: str,
+        kind: str,
+        origin: Point,
+        axis: Point,
+        upper: float,
+        *,
+        lower: float = 0.0,
+        link: str,
+        parent: str | None = None,
+        acceleration: float = 1.0,
+    ) -> LinkBuilder:
+        """Add a joint, and return the link that it moves.
+
+        Args:
+            name: Name of the joint.
+            kind: "revolute" or "prismatic".
+            origin: Origin of joint and link in the parent's frame [m].
+            axis: Joint axis.
+            upper: Upper limit [rad] or [m].
+            lower: Lower limit [rad] or [m].
+            link: Name of the link.
+            parent: Name of the parent link; None: the base.
+            acceleration: Acceleration limit [rad/s²] or [m/s²].
+        """
+        child = LinkBuilder(link)
+        limits = f'lower="{_format_numbers([lower])}" upper="{_format_numbers([upper])}"'
+        velocity, effort = (_format_numbers([limit[kind]]) for limit in (_VELOCITY, _EFFORT))
+        rates = f'velocity="{velocity}" effort="{effort}"'
+        parent_name = quoteattr(parent or self.base.name)
+        lines = [
+            f'  <joint name={quoteattr(name)} type="{kind}">',
+            f"    <parent link={parent_name}/><child link={quoteattr(link)}/>",
+            f'    <origin xyz="{_format_numbers(origin)}"/><axis xyz="{_format_numbers(axis)}"/>',
+            f"    <limit {limits} {rates}/>",
+            "  </joint>",
+        ]
+        self.links.append((child, "\n".join(lines)))
+        self.accelerations[name] = acceleration
+        return child
+
+    def add_attachment(
+        self,
+        name: str,
+        link: LinkBuilder,
+        position: Point,
+        approach: Point,
+        closing: Point,
+        **freedom: Any,
+    ) -> None:
+        """Add an attachment of a link, given in the link's frame; see `Attachment`."""
+        where = {
+            "position": _round_all(position),
+            "approach": _round_all(approach),
+            "closing": _round_all(closing),
+        }
+        self.attachments.append({"name": name, "link": link.name, **where, **freedom})
+
+    @property
+    def urdf(self) -> str:
+        """The object as a URDF."""
+        links = [self.base, *(link for link, _ in self.links)]
+        used = sorted({shape.colour for link in links for shape in link.shapes})
+        materials = [
+            f'  <material name="{name}"><color rgba="{colour} 1"/></material>'
+            for name, colour in ((name, _format_numbers(COLOURS[name])) for name in used)
+        ]
+        parts = [part for link, joint in self.links for part in (joint, link.make_xml())]
+        head = ['<?xml version="1.0"?>', f"<robot name={quoteattr(self.name)}>", *materials]
+        return "\n".join([*head, self.base.make_xml(), *parts, "</robot>"]) + "\n"
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """The object's description as plain data, including its URDF."""
+        plain: dict[str, Any] = {"urdf": self.urdf}
+        plain["joints"] = {
+            name: {"acceleration": value} for name, value in self.accelerations.items()
+        }
+        plain["attachments"] = [_to_plain_data(item) for item in self.attachments]
+        return {
+            **plain,
+            **(
+                {"latches": [_to_plain_data(item) for item in self.latches]} if self.latches else {}
+            ),
+        }
+
+
+def _format_numbers(values: Sequence[float] | Floats, digits: int = 4) -> str:
+    return " ".join(f"{round(float(value), digits) + 0.0:.10g}" for value in values)
+
+
+def _round_all(values: Point) -> list[float]:
+    return [round(float(value), 6) + 0.0 for value in values]
+
+
+def _to_plain_data(item: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in item.items()}

@@ -1,0 +1,106 @@
+"""Lists the kinds of furniture and appliances that are generated at random."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import yaml
+
+from vkc_pin.errors import InputError
+from vkc_pin.procedural.furniture import flaps, leaves, valves
+from vkc_pin.procedural.furniture.building import ObjectBuilder
+from vkc_pin.procedural.furniture.draws import Sampler
+from vkc_pin.utils.arguments import known, mapping, whole
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.models.object_file import load_object
+
+__all__ = ["KINDS", "Kind", "random_object", "write_object"]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of furniture.
+
+    Attributes:
+        make: Generates an object of random sizes.
+        place: "wall" for an object in an opening of a wall, "floor", or "counter".
+        beside: Width of the floor in front of it that must stay free on either side, for the robot
+            and for doors [m].
+    """
+
+    make: Callable[[Sampler], ObjectBuilder]
+    place: str
+    beside: float
+
+
+KINDS: Mapping[str, Kind] = MappingProxyType(
+    {
+        "cabinet": Kind(leaves.make_cabinet, "floor", 0.7),
+        "chest": Kind(flaps.make_chest, "floor", 0.5),
+        "dishwasher": Kind(flaps.make_dishwasher, "floor", 0.6),
+        "door": Kind(leaves.make_door, "wall", 0.5),
+        "drawers": Kind(flaps.make_drawers, "floor", 0.5),
+        "faucet": Kind(valves.make_faucet, "counter", 0.5),
+        "microwave": Kind(leaves.make_microwave, "counter", 0.6),
+        "oven": Kind(flaps.make_oven, "floor", 0.6),
+        "refrigerator": Kind(leaves.make_refrigerator, "floor", 0.7),
+        "valve": Kind(valves.make_valve, "floor", 0.7),
+    }
+)
+"""Kinds by name."""
+
+
+def random_object(kind: str, seed: int = 0) -> dict[str, Any]:
+    """Return a random piece of furniture or an appliance that can be opened or turned.
+
+    The description, with URDF, joints, handles and attachments, is an input of `load_object`, and
+    `type` of an object in a scene. It is reproducible. The base link is on the floor, or on a
+    counter, with its front towards -x; a door's is on the hinge line, in the middle of a wall.
+
+    Args:
+        kind: `cabinet`, `chest` (with a lid), `dishwasher`, `door`, `drawers`, `faucet`,
+            `microwave`, `oven`, `refrigerator` or `valve`.
+        seed: Random seed, from 0.
+
+    Raises:
+        UnknownNameError: There is no such kind.
+        InputError: `seed` is not an integer of at least 0.
+    """
+    own = KINDS[known(kind, KINDS, "kind of furniture", "kind")]
+    rng = np.random.default_rng([4, zlib.crc32(kind.encode()), whole(seed, "seed", low=0)])
+    return own.make(Sampler(rng)).description
+
+
+def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
+    """Write the description of an object to `<name>.yaml`, and a URDF that it contains beside it.
+
+    Args:
+        description: Result of `random_object`, or plain data of that form.
+        path: Path of the file `<name>.yaml`.
+
+    Returns:
+        Path of the file, an input of `load_object` and of scenes.
+
+    Raises:
+        InputError: The description is invalid, or a file cannot be written.
+    """
+    plain, file = mapping(description, "description"), file_path(path, "path")
+    if file.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            "not an object file",
+            field="path",
+            expected="a path that ends with .yaml",
+            got=file.name,
+        )
+    load_object(plain, folder=file.parent)  # raises an error if it is invalid
+    urdf = plain["urdf"]
+    if urdf.lstrip().startswith("<"):
+        plain = {**plain, "urdf": write_atomically(file.with_suffix(".urdf"), urdf.encode()).name}
+    return write_atomically(file, yaml.safe_dump(plain, sort_keys=False).encode())

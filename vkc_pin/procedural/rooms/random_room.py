@@ -1,0 +1,337 @@
+"""Generates random rooms as scenes, with furniture, objects to open and floor to reach them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.procedural.rooms import parts
+from vkc_pin.procedural.rooms.fixtures import OPENABLE, Fixture, make_fixture, make_fixture_name
+from vkc_pin.procedural.rooms.footprints import Floor, Frame
+from vkc_pin.procedural.rooms.parts import Part
+from vkc_pin.procedural.rooms.settings import RoomSettings
+from vkc_pin.utils.arguments import instance, whole
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.shapes import compute_world_box
+from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
+
+__all__ = ["Layout", "random_room", "sample_layout"]
+
+_MAX_TRIES = 60  # places for one part
+_MAX_ROOMS = 60  # rooms that are started because a part of the one before did not fit
+_MAX_STARTS = 1000  # places for the robot
+# [m] around a turning robot: more than a plan's clearance and half a grid cell
+_TURNING = 0.07
+_DENSITY = 0.45  # pieces of furniture per square metre of floor at clutter 1
+_BEYOND = 2.0  # [m] of floor beyond a wall with a door
+_COLOURS = ("teal", "terracotta", "blue", "cream", "orange", "grey", "green")
+_EDGE = 0.1  # [m] from the middle of a free object to the edges of its table
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A room before it becomes a scene.
+
+    Attributes:
+        number: Number of the room.
+        settings: Its settings.
+        floor: Its floor.
+        parts: Its parts; free objects come last.
+        start: Start of the robot's base, shape (3,): x, y [m] and yaw [rad].
+        radius: Radius of the disc in which the robot can turn with its arm at home [m].
+    """
+
+    number: int
+    settings: RoomSettings
+    floor: Floor
+    parts: tuple[Part, ...]
+    start: tuple[float, float, float]
+    radius: float
+
+    def find_part(self, name: str) -> Part:
+        """Return the part of a name. Raises `UnknownNameError` if there is none."""
+        known = {part.name: part for part in self.parts}
+        if name not in known:
+            raise UnknownNameError("part", name, known)
+        return known[name]
+
+    def make_scene(self) -> Scene:
+        """Return the room as a scene called `room_<number>`."""
+        reach = [self.floor.compute_half_length(side + 1) for side in range(4)]
+        for part in self.parts:
+            if part.side is not None:
+                reach[part.side] = self.floor.compute_half_length(part.side + 1) + _BEYOND
+        document = {
+            "name": f"room_{self.number}",
+            "robot": self.settings.robot,
+            "start": {"base": list(self.start)},
+            "arena": {"x": [-reach[2], reach[0]], "y": [-reach[3], reach[1]]},
+            "obstacles": [
+                *parts.make_walls(self.floor, self.settings.height, self.parts),
+                *(entry for part in self.parts for entry in part.obstacles),
+            ],
+            "objects": [entry for part in self.parts for entry in part.objects],
+        }
+        return Scene.from_document(document, folder("scenes"))
+
+
+def random_room(number: int, settings: RoomSettings | None = None, **changes: Any) -> Scene:
+    """Return the random room of a number, with a robot in it, as a scene; it is reproducible.
+
+    Tables, shelves and boxes stand on the floor, doors are in the walls, and drawers, cabinets and
+    refrigerators are against them. Nothing overlaps. The floor is free in front of objects that can
+    be opened and on one side of every table, and the robot gets there from its start with its arm
+    at home. Whether tasks are feasible is not checked.
+
+    Args:
+        number: Number of the room, from 0.
+        settings: Settings of rooms; None: `RoomSettings()`.
+        changes: Fields of `RoomSettings` that differ, such as `clutter=0.8`.
+
+    Raises:
+        InputError: A number or a field is out of range, or the parts do not fit into a room of this
+            size.
+        UnknownNameError: There is no such field, or no such type of object.
+    """
+    return sample_layout(number, settings, **changes).make_scene()
+
+
+def sample_layout(number: int, settings: RoomSettings | None = None, **changes: Any) -> Layout:
+    """Return the layout of a random room; see `random_room`."""
+    number = whole(number, "number", low=0)
+    known = [item.name for item in dataclasses.fields(RoomSettings)]
+    for name in changes:
+        if name not in known:
+            raise UnknownNameError("field of RoomSettings", name, known, field=name)
+    chosen = dataclasses.replace(
+        RoomSettings() if settings is None else instance(settings, RoomSettings, "settings"),
+        **changes,
+    )
+    rng, radius = (
+        np.random.default_rng([1, number]),
+        _compute_turning_radius(load_robot(chosen.robot)),
+    )
+    named = None if chosen.objects is None else _name_fixtures(chosen.objects, number)
+    for _ in range(_MAX_ROOMS):
+        found = _Room(chosen, rng, radius).furnish(named)
+        if found is not None:
+            floor, standing, start = found
+            return Layout(number, chosen, floor, standing, start, radius)
+    expected = (
+        "less clutter, fewer objects or tables, wider rooms, or a robot with a smaller home pose"
+    )
+    got = f"{chosen.clutter:g}, and a robot with a turning radius of {radius:.2f} m"
+    raise InputError(
+        f"no room in {_MAX_ROOMS} could hold all parts",
+        field="clutter",
+        expected=expected,
+        got=got,
+    )
+
+
+def _name_fixtures(
+    kinds: Sequence[str | Mapping[str, Any]], number: int
+) -> list[tuple[str, Fixture]]:
+    """Return the objects to open, with their names in the room of a number."""
+    names = [make_fixture_name(kind) for kind in kinds]
+    names = [
+        name if names.count(name) == 1 else f"{name}_{names[: k + 1].count(name)}"
+        for k, name in enumerate(names)
+    ]
+    return [
+        (name, make_fixture(kind, 100 * number + k))
+        for k, (name, kind) in enumerate(zip(names, kinds, strict=True))
+    ]
+
+
+class _Room:
+    """A room that is being furnished, by rejection sampling of the places of its parts."""
+
+    def __init__(self, settings: RoomSettings, rng: np.random.Generator, radius: float) -> None:
+        self.settings, self.rng, self.radius = settings, rng, radius
+        width, depth = (round(float(size), 2) for size in rng.uniform(*settings.width, 2))
+        self.floor = Floor(width, depth)
+        self.parts: list[Part] = []
+        self.start: tuple[float, float, float] | None = None
+
+    def furnish(
+        self, named: Sequence[tuple[str, Fixture]] | None
+    ) -> tuple[Floor, tuple[Part, ...], tuple[float, float, float]] | None:
+        """Return floor, parts and start, or None if a part does not fit.
+
+        Args:
+            named: Objects that can be opened, with their names; None: one or two of `OPENABLE`.
+        """
+        if named is None:
+            count = int(self.rng.integers(1, 3))
+            named = _name_fixtures(
+                [str(kind) for kind in self.rng.choice(list(OPENABLE), count, replace=False)], 0
+            )
+        fixed = [self._propose_openables(name, own) for name, own in named]
+        fixed += [self._propose_tables(f"table_{k + 1}") for k in range(self.settings.tables)]
+        if not all(self._add_first_fitting(proposals) for proposals in fixed):
+            return None
+        start = self._sample_start()
+        if start is None:
+            return None
+        self.start = start
+        free = self.floor.width * self.floor.depth - sum(
+            part.footprint.length * part.footprint.width for part in self.parts
+        )
+        furniture = (
+            ("box", self._propose_boxes),
+            ("box", self._propose_boxes),
+            ("shelf", self._propose_shelves),
+            ("table", self._propose_tables),
+        )
+        for k in range(round(self.settings.clutter * _DENSITY * free)):
+            kind, propose = furniture[int(self.rng.integers(4))]
+            if not self._add_first_fitting(propose(f"{kind}_{k + 1 + self.settings.tables}")):
+                return None
+        tables = [part for part in self.parts if part.name == "table_1"]
+        standing = [
+            self._place_carried_object(kind, k, tables[0])
+            for k, kind in enumerate(self.settings.carried)
+        ]
+        return self.floor, (*self.parts, *standing), start
+
+    def _add_first_fitting(self, proposals: Iterator[Part]) -> bool:
+        """Add the first of some proposed parts that fits; return whether one does."""
+        for _, part in zip(range(_MAX_TRIES), proposals, strict=False):
+            if self._does_fit(part):
+                self.parts.append(part)
+                return True
+        return False
+
+    def _does_fit(self, part: Part) -> bool:
+        """Return whether a part is clear of the others, and leaves free what must be free."""
+        own, gap = part.footprint, self.settings.gap
+        if (part.side is None and not self.floor.contains(own)) or (
+            part.clear_floor and not self.floor.contains(part.clear_floor)
+        ):
+            return False
+        for other in self.parts:
+            pairs = [
+                (own, other.footprint),
+                (own, other.clear_floor),
+                (part.clear_floor, other.footprint),
+            ]
+            if any(
+                one is not None and two is not None and one.compute_gap(two) < gap
+                for one, two in pairs
+            ):
+                return False
+        places = [
+            one.standing_place for one in (*self.parts, part) if one.standing_place is not None
+        ]
+        if self.start is not None:
+            places.append(self.start[:2])
+        standing = [one.footprint for one in (*self.parts, part)]
+        if (
+            self.start is not None
+            and not self.floor.find_free([own], self.radius, [self.start[:2]])[0]
+        ):
+            return False
+        return self.floor.is_connected(standing, self.radius, places)
+
+    def _sample_start(self) -> tuple[float, float, float] | None:
+        """Return a start from which the robot reaches all places to stand, or None."""
+        standing = [part.footprint for part in self.parts]
+        places = [part.standing_place for part in self.parts if part.standing_place is not None]
+        half = np.array([self.floor.width, self.floor.depth]) / 2.0
+        for _ in range(_MAX_STARTS):
+            x, y, yaw = (
+                round(float(value), 3)
+                for value in self.rng.uniform([*-half, -math.pi], [*half, math.pi])
+            )
+            if self.floor.find_free(standing, self.radius, [[x, y]])[0] and self.floor.is_connected(
+                standing, self.radius, [*places, (x, y)]
+            ):
+                return x, y, yaw
+        return None
+
+    def _sample_wall_position(self, width: float) -> tuple[int, float]:
+        """Return a random side, and a position along its wall for a part of a width [m]."""
+        side = int(self.rng.integers(4))
+        reach = max(self.floor.compute_half_length(side) - width / 2.0, 0.0)
+        return side, round(float(self.rng.uniform(-reach, reach)), 3)
+
+    def _sample_frame(self, yaw: float) -> Frame:
+        half = np.array([self.floor.width, self.floor.depth]) / 2.0
+        x, y = (round(float(value), 3) for value in self.rng.uniform(-half, half))
+        return Frame(x, y, yaw)
+
+    def _sample_size(self, *intervals: tuple[float, float]) -> tuple[float, ...]:
+        """Return random lengths, rounded to the centimetre [m]."""
+        return tuple(round(float(self.rng.uniform(*interval)), 2) for interval in intervals)
+
+    def _propose_openables(self, name: str, own: Fixture) -> Iterator[Part]:
+        while True:
+            side, along = self._sample_wall_position(1.0)
+            yield parts.make_openable(name, own, self.floor, side, along, self.settings.front)
+
+    def _propose_tables(self, name: str) -> Iterator[Part]:
+        while True:
+            depth, width, height = self._sample_size((0.6, 0.9), (0.8, 1.6), (0.70, 0.78))
+            side, along = self._sample_wall_position(width)
+            wall = self.floor.make_wall_frame(side, along)
+            frame = Frame(*wall.transform_point(-depth / 2.0 - parts.AIR, 0.0), wall.yaw)
+            frame = frame if self.rng.random() < 0.6 else self._sample_frame(wall.yaw)
+            yield parts.make_table(name, frame, (depth, width, height))
+
+    def _propose_shelves(self, name: str) -> Iterator[Part]:
+        while True:
+            depth, width, height = self._sample_size((0.28, 0.4), (0.6, 1.2), (1.2, 2.0))
+            boards = int(self.rng.integers(4, 6))
+            yield parts.make_shelf(
+                name,
+                self.floor.make_wall_frame(*self._sample_wall_position(width)),
+                (depth, width, height),
+                boards,
+            )
+
+    def _propose_boxes(self, name: str) -> Iterator[Part]:
+        colour = _COLOURS[int(self.rng.integers(len(_COLOURS)))]
+        while True:
+            size, yaw = (
+                self._sample_size((0.25, 0.8), (0.25, 0.8), (0.3, 1.4)),
+                round(float(self.rng.uniform(-math.pi, math.pi)), 3),
+            )
+            yield parts.make_box(name, self._sample_frame(yaw), size, colour)
+
+    def _place_carried_object(self, kind: str, number: int, on: Part) -> Part:
+        """Return a free object on a table, near the side at which the robot can stand."""
+        depth, width, _ = on.size
+        count = len(self.settings.carried)
+        slot = (width - 2.0 * _EDGE) / count  # each object has its own part of the edge
+        y = -width / 2.0 + _EDGE + slot * (number + float(self.rng.uniform(0.25, 0.75)))
+        x = -depth / 2.0 + float(self.rng.uniform(_EDGE, 0.3))
+        kinds = self.settings.carried
+        name = kind if kinds.count(kind) == 1 else f"{kind}_{kinds[: number + 1].count(kind)}"
+        return parts.make_carried_object(name, kind, on, x, y)
+
+
+def _compute_turning_radius(robot: Robot) -> float:
+    """Return the radius of a disc in which a robot with its arm at home turns freely [m]."""
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    rest = np.concatenate([np.zeros(3), robot.home])
+    pin.updateGeometryPlacements(
+        robot.model, data, robot.collision, shapes, robot.coordinates.q(rest)
+    )
+    boxes = [
+        compute_world_box(shape.geometry, where)
+        for shape, where in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
+    ]
+    reach = max(
+        float(np.hypot(*np.maximum(np.abs(low[:2]), np.abs(high[:2])))) for low, high in boxes
+    )
+    return reach + max(_TURNING, START_CLEARANCE)

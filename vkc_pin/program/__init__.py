@@ -1,1 +1,0 @@
-"""Equations 1 to 7 as one nonlinear program."""

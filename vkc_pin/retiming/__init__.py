@@ -1,1 +1,0 @@
-"""Timing of motions: a smooth path through waypoints, and how fast it can be gone along."""

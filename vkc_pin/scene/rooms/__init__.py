@@ -1,1 +1,0 @@
-"""Rooms made by rule and number."""

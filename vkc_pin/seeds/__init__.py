@@ -1,1 +1,0 @@
-"""Trajectories for the solver to start from."""

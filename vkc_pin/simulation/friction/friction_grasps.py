@@ -1,0 +1,213 @@
+"""Commands fingers that grasp by friction, and measures their load and slip."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.simulation.friction.fingers import Fingers
+from vkc_pin.simulation.model import PhysicalWorld
+from vkc_pin.simulation.physics import Physics, import_mujoco
+from vkc_pin.simulation.welds import Grip
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+__all__ = ["Span", "Squeezes", "find_grip_changes", "split_spans"]
+
+Span = tuple[Hold, float, float]
+"""A hold with its begin and end [s]."""
+# Fingers are commanded this fraction of their travel beyond the closed position, so that thin
+# objects are pressed too.
+_OVERTRAVEL = 0.15
+_LOST_TIME = 0.1  # [s] without contact after which the object counts as lost
+_AVERAGED_SAMPLES = 2  # number of samples over which forces are averaged
+
+
+def find_grip_changes(trajectory: Trajectory, spans: Sequence[Span]) -> list[int]:
+    """Return the waypoints at which the hand closes or opens."""
+    moments = {time for _, begin, end in spans for time in (begin, end) if np.isfinite(time)}
+    return [
+        phase.first
+        for phase in trajectory.phases
+        if float(trajectory.times[phase.first]) in moments
+    ]
+
+
+@dataclass(eq=False)
+class _Squeeze:
+    """One grasp by friction.
+
+    Attributes:
+        hold, begin, end: The hold with its begin and end [s].
+        hand, link: Masks of the geoms of hand and grasped link, shape (geoms,).
+        pairs: Pairs of their labels, which may touch.
+        grip: Measurements so far.
+        forces: Latest forces and torques, shape (6,) each.
+        place: Tool position in the link's frame when the fingers had closed [m]; None before.
+        missing: Number of consecutive samples without contact.
+    """
+
+    hold: Hold
+    begin: float
+    end: float
+    hand: Bools
+    link: Bools
+    pairs: frozenset[tuple[str, str]]
+    grip: Grip
+    forces: deque[Floats] = field(default_factory=lambda: deque(maxlen=_AVERAGED_SAMPLES))
+    place: Floats | None = None
+    missing: int = 0
+
+
+class Squeezes:
+    """Grasps by friction that follow a schedule.
+
+    Args:
+        physical: The model.
+        fingers: Fingers of the robot's own hand.
+        spans: Schedule of holds, all by the robot's own hand.
+        trajectory: The trajectory.
+        physics: Settings with the time that fingers take.
+        period: Sampling period [s].
+    """
+
+    def __init__(
+        self,
+        physical: PhysicalWorld,
+        fingers: Fingers,
+        spans: Sequence[Span],
+        trajectory: Trajectory,
+        physics: Physics,
+        period: float,
+    ) -> None:
+        self._physical, self._fingers, self._physics, self._period = (
+            physical,
+            fingers,
+            physics,
+            period,
+        )
+        self._engine = import_mujoco()
+        first, last = float(trajectory.times[0]), float(trajectory.times[-1])
+        world, scene = physical.world, physical.world.scene
+        labels = np.full(physical.model.ngeom, "", object)
+        labels[physical.geoms] = world.collision_labels
+        self._squeezes = []
+        for hold, begin, end in spans:
+            hands, link = frozenset(find_touch_links(scene, hold)), find_grasped_link(scene, hold)
+            pairs = frozenset((min(hand, link), max(hand, link)) for hand in hands)
+            own, grip = (
+                np.isin(labels, list(hands)),
+                Grip(str(hold), max(begin, first), min(end, last)),
+            )
+            self._squeezes.append(
+                _Squeeze(hold, begin, end, own, np.asarray(labels == link), pairs, grip)
+            )
+        tree = world.model
+        self._tool = tree.frames[tree.getFrameId(scene.robot.tool_frame)]
+
+    @property
+    def grips(self) -> list[Grip]:
+        """Grips so far."""
+        return [squeeze.grip for squeeze in self._squeezes]
+
+    def compute_commands(self, times: Floats, planned: Floats) -> Floats:
+        """Return the finger commands at times [s], shape (K, k).
+
+        Args:
+            times: Times, shape (K,) [s].
+            planned: Planned finger positions, shape (K, k).
+        """
+        shares, time = np.zeros(len(times)), self._physics.grip_time
+        for squeeze in self._squeezes:
+            begin = max(squeeze.begin, float(times[0]))
+            corners = [
+                begin,
+                begin + time,
+                max(squeeze.end, begin + time),
+                max(squeeze.end, begin + time) + time,
+            ]
+            shares = np.maximum(shares, np.interp(times, corners, [0.0, 1.0, 1.0, 0.0]))
+        fingers = self._fingers
+        closed = fingers.closed + _OVERTRAVEL * (fingers.closed - fingers.open)
+        return np.asarray(planned + shares[:, None] * (closed - planned))
+
+    def allowed_contacts(self, clock: float) -> set[tuple[str, str]]:
+        """Return the label pairs that may touch at a time [s] because of a grasp."""
+        time = self._physics.grip_time
+        return {
+            pair
+            for one in self._squeezes
+            if one.begin <= clock <= one.end + time
+            for pair in one.pairs
+        }
+
+    def measure(self, data: Any, clock: float) -> None:
+        """Record the load and slip of each grasp."""
+        for squeeze in self._squeezes:
+            begin = max(squeeze.begin + self._physics.grip_time, squeeze.grip.begin)
+            if not begin <= clock < squeeze.end or squeeze.grip.broken is not None:
+                continue
+            tool, place = self._find_tool(data, squeeze)
+            squeeze.place = place if squeeze.place is None else squeeze.place
+            pull = self._compute_wrench(data, squeeze, tool)
+            squeeze.missing = 0 if pull is not None else squeeze.missing + 1
+            squeeze.forces.append(np.zeros(6) if pull is None else pull)
+            mean = np.mean(squeeze.forces, axis=0)
+            grip = squeeze.grip
+            force, torque = (
+                max(grip.force, float(np.linalg.norm(mean[:3]))),
+                max(grip.torque, float(np.linalg.norm(mean[3:]))),
+            )
+            slip = max(grip.slip, float(np.linalg.norm(place - squeeze.place)))
+            lost_time = clock if squeeze.missing * self._period >= _LOST_TIME else None
+            squeeze.grip = replace(grip, force=force, torque=torque, slip=slip, broken=lost_time)
+
+    def _find_tool(self, data: Any, squeeze: _Squeeze) -> tuple[Floats, Floats]:
+        """Return the tool's position in the world and in the grasped body's frame [m]."""
+        tool = int(self._physical.bodies[self._tool.parentJoint])
+        where = (
+            data.xpos[tool]
+            + np.asarray(data.xmat[tool]).reshape(3, 3) @ self._tool.placement.translation
+        )
+        body = int(self._physical.model.geom_bodyid[np.flatnonzero(squeeze.link)[0]])
+        turn = np.asarray(data.xmat[body]).reshape(3, 3)
+        return np.asarray(where), np.asarray(turn.T @ (where - data.xpos[body]))
+
+    def _compute_wrench(self, data: Any, squeeze: _Squeeze, tool: Floats) -> Floats | None:
+        """Return the hand's force and torque on the grasped link, shape (6,), at the tool's origin.
+
+        None means that they do not touch.
+        """
+        pairs = np.asarray(data.contact.geom).reshape(-1, 2)
+        ahead = squeeze.hand[pairs[:, 0]] & squeeze.link[pairs[:, 1]]
+        back = squeeze.link[pairs[:, 0]] & squeeze.hand[pairs[:, 1]]
+        total, pushed, wrench = np.zeros(6), False, np.zeros(6)
+        for i in np.flatnonzero(ahead | back).tolist():
+            self._engine.mj_contactForce(self._physical.model, data, i, wrench)
+            pushed |= bool(wrench[0] > 0.0)
+            axes = np.asarray(data.contact.frame[i]).reshape(3, 3)
+            force, torque = (1.0 if ahead[i] else -1.0) * (wrench.reshape(2, 3) @ axes)
+            total[:3] += force
+            total[3:] += torque + np.cross(np.asarray(data.contact.pos[i]) - tool, force)
+        return total if pushed else None
+
+
+def split_spans(spans: Sequence[Span], begin: float) -> tuple[list[Span], list[Span]]:
+    """Divide holds into welds and grasps by friction.
+
+    The robot's own hand grasps by friction. An object that it holds at the start is welded until
+    the fingers have closed.
+
+    Args:
+        spans: All holds.
+        begin: Begin of the trajectory [s].
+    """
+    own = [span for span in spans if span[0].by is None]
+    others = [span for span in spans if span[0].by is not None]
+    return [*((hold, first, begin) for hold, first, _ in own if first < begin), *others], own

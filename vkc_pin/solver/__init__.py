@@ -1,5 +1,0 @@
-"""Ipopt inside the loop of witness planes, and what comes out."""
-
-from vkc_pin.solver.loop import solve
-
-__all__ = ["solve"]

@@ -1,0 +1,1 @@
+"""Provides argument checks, array types, budgets, caches and parallel execution."""

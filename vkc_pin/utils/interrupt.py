@@ -1,0 +1,54 @@
+"""Who has Ctrl-C for a while."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+__all__ = ["deferred", "handled", "raising"]
+
+
+@contextlib.contextmanager
+def handled(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> Iterator[Any]:
+    """Let `handler` have Ctrl-C, and yield what had it before; where it cannot be had, nothing changes.
+
+    Signals reach the main thread only.
+    """
+    before = signal.getsignal(
+        signal.SIGINT
+    )  # None: whoever embeds Python handles it, and could not be put back
+    if before is None or threading.current_thread() is not threading.main_thread():
+        yield before
+        return
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield before
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def deferred() -> Iterator[None]:
+    """Let Ctrl-C wait for the end of something short that must not be left half done."""
+    pressed: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        pressed.append(number)
+
+    try:
+        with handled(note):
+            yield
+    finally:
+        if pressed:
+            signal.raise_signal(signal.SIGINT)
+
+
+@contextlib.contextmanager
+def raising() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt, as it does unless somebody chose otherwise."""
+    with handled(signal.default_int_handler):
+        yield

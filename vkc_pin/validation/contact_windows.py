@@ -1,0 +1,455 @@
+"""Finds the pairs that may be close along a motion, and when, and checks gripper and pushes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.options import Options
+from vkc_pin.utils.arrays import Ints
+from vkc_pin.validation.distances import CollisionShapes
+from vkc_pin.validation.goals import MOTION_TOLERANCE
+from vkc_pin.validation.report import Violation
+from vkc_pin.validation.samples import Samples
+from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
+from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption, find_clearance_exemptions
+from vkc_pin.world.scene.contact_rules import (
+    CONTACT_DEPTH,
+    CONTACT_WINDOW,
+    compute_grasp_opening,
+    compute_hand_clearance,
+    compute_hand_frame,
+    find_grasped_link,
+    find_gripper_hold,
+    find_touch_links,
+    is_rigid_grasp,
+)
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Grasp, Step, Touch
+
+__all__ = ["Window", "check_gripper", "check_pushes", "find_contact_windows"]
+
+_DWELL_TOLERANCE = 1e-6  # accepted shortfall of a rest [s]
+
+_MOTION_TOLERANCE = 1e-9  # [m] or [rad]
+_T = TypeVar("_T")
+
+
+class Window(NamedTuple):
+    """An interval in which pairs may be closer than the usual clearance.
+
+    Attributes:
+        pairs: Pairs of indices of the world's shapes, the smaller index first, shape (k, 2).
+        first, last: First and last waypoint of the interval.
+        margin: Required clearance [m]; -inf if the distance is not checked.
+        contact: Overlap that counts as contact [m].
+        moves_together: Whether the pairs move rigidly together and need no checks between samples.
+        is_exempt: Whether the scene exempts the pairs, rather than an action of the hand.
+    """
+
+    pairs: Ints
+    first: int
+    last: int
+    margin: float
+    contact: float = CONTACT_DEPTH
+    moves_together: bool = False
+    is_exempt: bool = False
+
+
+def find_contact_windows(
+    samples: Samples, solids: CollisionShapes, steps: Sequence[Step], options: Options
+) -> list[Window]:
+    """Find all pairs of a motion that may be close, and when, by the scene's contact rules.
+
+    Args:
+        samples: Sampled motion.
+        solids: Collision shapes of its world.
+        steps: Steps of the task.
+        options: Clearances and time step.
+    """
+    return list(_WindowFinder(samples, solids, options).find(steps))
+
+
+def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
+    """Yield rests that are too short for the gripper, and wrong gripper openings.
+
+    Before and during a grasp the gripper must have the opening of the attachment.
+    """
+    scene, trajectory, gripper = samples.scene, samples.trajectory, samples.scene.robot.gripper
+    times, (low, high), before = trajectory.times, trajectory.ranges(), set(scene.holds)
+    low, high = low[:, : trajectory.robot_size], high[:, : trajectory.robot_size]
+    for number, phase in enumerate(trajectory.phases):
+        changed, before, at = before ^ set(phase.holds), set(phase.holds), phase.first
+        opens = number > 0 and phase.opening != trajectory.phases[number - 1].opening
+        if changed or opens:
+            here = trajectory.positions[at, : trajectory.robot_size]
+            moves = (
+                np.maximum(high - here, here - low).max(axis=1) > MOTION_TOLERANCE
+            )  # between one waypoint and the next
+            moved = np.flatnonzero(moves)
+            k = int(np.searchsorted(moved, at))
+            begin = at if opens else moved[k - 1] + 1 if k else 0  # fingers start to move here
+            end = moved[k] if k < len(moved) else len(times) - 1
+            rest = float(times[end] - times[begin])
+            if not rest >= options.grasp_time - _DWELL_TOLERANCE:
+                detail = f"the robot rests for {rest:.2f} s, {options.grasp_time:g} s are required"
+                subject, amount = (
+                    ", ".join(sorted(map(str, changed))) or "gripper",
+                    options.grasp_time - rest,
+                )
+                yield Violation(
+                    "dwell",
+                    subject,
+                    waypoint=at,
+                    time=float(times[at]),
+                    amount=amount,
+                    unit="s",
+                    detail=detail,
+                )
+        after = trajectory.phases[number + 1].holds if number + 1 < len(trajectory.phases) else ()
+        hold = find_gripper_hold(phase.holds) or find_gripper_hold(after)
+        if gripper is not None and hold is not None:
+            asked = compute_grasp_opening(scene, hold)
+            wide, right = (
+                gripper.rest_opening if opening is None else opening
+                for opening in (phase.opening, asked)
+            )
+            if not abs(wide - right) <= WIDTH_TOLERANCE:
+                detail = (
+                    f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are required"
+                )
+                time, amount = float(times[at]), abs(wide - right)
+                yield Violation(
+                    "opening",
+                    str(hold),
+                    waypoint=at,
+                    time=time,
+                    amount=amount,
+                    unit="m",
+                    detail=detail,
+                )
+
+
+def check_pushes(samples: Samples) -> Iterator[Violation]:
+    """Yield pushes in which the pushed link follows the hand backwards, which it could not do.
+
+    The link's point at the contact must move into the face or rest.
+    """
+    scene, tool = samples.scene, samples.scene.robot.tool_frame
+    for phase in samples.trajectory.phases:
+        for hold in phase.holds:
+            attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+            if attachment.contact != "push":
+                continue
+            rows = samples.get_rows(phase)
+            hands, links = (
+                samples.compute_placements(rows, tool),
+                samples.compute_placements(rows, f"{hold.object}.{attachment.link}"),
+            )
+            foremost = compute_hand_frame(scene.robot, attachment) * attachment.offset.inverse()
+            travel = [0.0]
+            for hand, link, after in zip(hands, links, links[1:], strict=False):
+                contact = (hand * foremost).translation
+                into = (link * attachment.placement).rotation[:, 2]
+                travel.append(
+                    travel[-1] + float(into @ (after.act(link.actInv(contact)) - contact))
+                )
+            back = np.maximum.accumulate(travel) - travel
+            worst = int(np.argmax(back))
+            if not back[worst] <= CONTACT_DEPTH:
+                row, amount = int(rows[worst]), float(back[worst] - CONTACT_DEPTH)
+                at, time = samples.find_waypoint(row), float(samples.times[row])
+                detail = f"goes back by {1e3 * back[worst]:.2f} mm where the hand only pushes"
+                yield Violation(
+                    "push",
+                    str(hold),
+                    waypoint=at,
+                    time=time,
+                    amount=amount,
+                    unit="m",
+                    detail=detail,
+                )
+
+
+class _WindowFinder:
+    def __init__(self, samples: Samples, solids: CollisionShapes, options: Options) -> None:
+        self.samples, self.solids, self.options = samples, solids, options
+        self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
+        self.labels, self.keys = np.array(world.collision_labels), world.collision_keys
+        self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
+        low, high = self.trajectory.ranges()
+        self.steps = (high - low).max(axis=1) > _MOTION_TOLERANCE
+        self.robots = len(self.scene.robot.collision.geometryObjects)
+        self.supports = samples.free_objects.supports
+
+    def find(self, steps: Sequence[Step]) -> Iterator[Window]:
+        for one in find_clearance_exemptions(self.scene, self.options.dist_safe):
+            yield from self._find_exemption_windows(one)
+        holds = [set(phase.holds) for phase in self.trajectory.phases]
+        for hold, first, last in self._find_spans([set(self.scene.holds), *holds]):
+            yield from self._find_hold_windows(hold, first, last)
+        yield from self._find_grasp_windows([step for step in steps if isinstance(step, Grasp)])
+        moved = set[str]()
+        for owner, first, last in sorted(
+            self._find_spans(self._list_carried_objects()),
+            key=lambda run: -1 if run[1] is None else run[1],
+        ):
+            yield from self._find_carry_windows(
+                owner, first or 0, self._find_easing_end(first or 0), new=owner not in moved
+            )
+            for at in [last] if last is not None else []:
+                yield from self._find_carry_windows(
+                    owner, at, self._find_easing_start(at), begin=False
+                )
+            moved.add(owner)
+        for phase, riding in zip(self.trajectory.phases, self.supports, strict=True):
+            for owner, label in riding.items():
+                as_one = {other for other, on in riding.items() if on == label and other != owner}
+                mates = [
+                    k
+                    for k, one in enumerate(self.labels)
+                    if one == label or one.partition(".")[0] in as_one
+                ]
+                yield Window(
+                    self._make_pairs(self._get_shapes(owner), mates),
+                    phase.first,
+                    phase.last,
+                    -np.inf,
+                    moves_together=True,
+                )
+        yield from self._find_touch_windows([step for step in steps if isinstance(step, Touch)])
+
+    def _find_exemption_windows(self, one: ClearanceExemption) -> Iterator[Window]:
+        """Yield windows of a clearance exemption: always, or while its joint ranges hold."""
+        pairs = np.array(one.find_shape_pairs(self.labels.tolist(), self.keys), int).reshape(-1, 2)
+        count = len(self.steps) + 1
+        rows = self.samples.z[self.samples.waypoint_rows]
+        holds = one.is_active(self.samples.world.coordinates.names, rows)
+        contact, together = CONTACT_DEPTH + max(0.0, -one.margin), one.margin == -np.inf
+        for begin, end in (
+            np.flatnonzero(np.diff(holds, prepend=False, append=False)).reshape(-1, 2).tolist()
+        ):
+            if len(pairs):
+                yield Window(
+                    pairs, begin, min(end, count) - 1, one.margin, contact, together, is_exempt=True
+                )
+
+    def _find_hold_windows(
+        self, hold: Hold, first: int | None, last: int | None
+    ) -> Iterator[Window]:
+        """Yield windows of a hold from waypoint `first` to `last` (None: start, end)."""
+        begin, end = 0 if first is None else first, len(self.steps) if last is None else last
+        since, until = (
+            begin if first is None else self._find_easing_start(begin),
+            end if last is None else self._find_easing_end(end),
+        )
+        yield from self._find_hand_windows(hold, since, until)
+        gripped = self._pair_links(
+            find_touch_links(self.scene, hold), {find_grasped_link(self.scene, hold)}
+        )
+        if is_rigid_grasp(self.scene, hold):
+            yield Window(gripped, begin, end, 0.0, moves_together=True)
+        else:
+            yield Window(
+                gripped,
+                begin,
+                end,
+                compute_hand_clearance(
+                    self.scene, hold, find_grasped_link(self.scene, hold), self.options
+                ),
+            )
+
+    def _find_hand_windows(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
+        """Yield windows of the grasping links with all links of the object."""
+        by_clearance: dict[float, set[str]] = {}
+        for link in (
+            label for label in self.labels.tolist() if label.startswith(f"{hold.object}.")
+        ):
+            by_clearance.setdefault(
+                compute_hand_clearance(self.scene, hold, link, self.options), set()
+            ).add(link)
+        for least, links in by_clearance.items():
+            yield Window(
+                self._pair_links(find_touch_links(self.scene, hold), links),
+                first,
+                last,
+                least,
+                0.0 if least else CONTACT_DEPTH,
+            )
+
+    def _find_grasp_windows(self, steps: Sequence[Grasp]) -> Iterator[Window]:
+        """Yield windows around phase ends at which the hand is at a grasp, held or not."""
+        ends = np.array([phase.last for phase in self.trajectory.phases])
+        for step in steps:
+            thing = self.scene.objects[step.object].object
+            for name in (
+                [step.attachment] if step.attachment is not None else list(thing.attachments)
+            ):
+                errors = self.samples.compute_grasp_errors(
+                    step.object, name, self.samples.waypoint_rows[ends], step.by
+                )
+                for at in ends[
+                    (errors <= (self.options.goal_position, self.options.goal_angle)).all(axis=1)
+                ].tolist():
+                    yield from self._find_hand_windows(
+                        self._make_hold(step, name),
+                        self._find_easing_start(at),
+                        self._find_easing_end(at),
+                    )
+
+    def _make_hold(self, step: Grasp, attachment: str) -> Hold:
+        """Make the hold that a step establishes; holds of the object in between are ignored."""
+        owner, _, link = (step.by or "").partition(".")
+        through = (
+            Hold(owner, self.scene.objects[owner].object.attachment().name) if step.by else None
+        )
+        return Hold(step.object, attachment, through, link or None)
+
+    def _find_carry_windows(
+        self, owner: str, at: int, other: int, *, begin: bool = True, new: bool = False
+    ) -> Iterator[Window]:
+        """Yield windows of a free object with its neighbours where carrying begins or ends.
+
+        Where it is lifted for the first time, or grasped at the start (`new`), it may penetrate its
+        neighbours as deep as it did before.
+
+        Args:
+            owner: Name of the object.
+            at: Waypoint at which carrying begins or ends.
+            other: Other end of the window.
+            begin: Whether carrying begins at `at`.
+            new: Whether the object has not moved before.
+        """
+        mine = self._get_shapes(owner)
+        pairs = self._make_pairs(
+            mine, [k for k in range(self.robots, len(self.labels)) if k not in mine]
+        )
+        placed, here = self.solids.place(self.q[[at]]), np.zeros(len(pairs), int)
+        pairs = pairs[placed.compute_lower_bounds(here, pairs) < self.options.dist_safe]
+        distances = placed.compute_distances(here[: len(pairs)], pairs)
+        first, last = (at, other) if begin else (other, at)
+        yield Window(pairs[distances < self.options.dist_safe], first, last, 0.0)
+        for k in np.flatnonzero(distances < -CONTACT_DEPTH).tolist() if new else ():
+            yield Window(
+                pairs[[k]], first, last, float(distances[k]), CONTACT_DEPTH - float(distances[k])
+            )
+
+    def _find_touch_windows(self, steps: Sequence[Touch]) -> Iterator[Window]:
+        """Yield windows around touches with the shapes at their targets."""
+        for step in steps:
+            target = (
+                step.target.translation
+                if isinstance(step.target, pin.SE3)
+                else np.array(step.target)
+            )
+            ends = [phase.last for phase in self.trajectory.phases]
+            frames = self.samples.compute_placements(self.samples.waypoint_rows[ends], step.frame)
+            owner, links = (
+                step.frame.partition(".")[0],
+                _find_touching_links(self.scene, step.frame),
+            )
+            mine = [k for k, label in enumerate(self.labels) if label in links]
+            for at, frame in zip(ends, frames, strict=True):
+                if np.linalg.norm(frame.translation - target) <= self.options.dist_safe:
+                    around = self.solids.place(self.q[[at]]).find_shapes_near(
+                        target, self.options.dist_safe
+                    )
+                    close = [
+                        k
+                        for k in around
+                        if k >= self.robots and self.labels[k].partition(".")[0] != owner
+                    ]
+                    yield Window(
+                        self._make_pairs(mine, close),
+                        self._find_easing_start(at),
+                        self._find_easing_end(at),
+                        0.0,
+                    )
+
+    def _list_carried_objects(self) -> list[set[str]]:
+        """Return the grasped or supported free objects at the start and in every phase."""
+        free = {name for name, placed in self.scene.objects.items() if placed.object.free}
+        phases = zip(self.trajectory.phases, self.supports, strict=True)
+        return [
+            free & self.scene.held.keys(),
+            *(free & (phase.held.keys() | riding.keys()) for phase, riding in phases),
+        ]
+
+    def _find_spans(
+        self, phases: Sequence[Collection[_T]]
+    ) -> Iterator[tuple[_T, int | None, int | None]]:
+        """Yield items with the first and last waypoint of their presence.
+
+        None stands for the start, for items present there, and for the end.
+
+        Args:
+            phases: Items that are present at the start, and in every phase.
+        """
+        spans, begun = self.trajectory.phases, dict[_T, int | None]()
+        for number, now in enumerate(phases):
+            at = spans[number - 1].first if number else None
+            for item in [item for item in begun if item not in now]:
+                yield item, begun.pop(item), at
+            for item in now:
+                begun.setdefault(item, at)
+        yield from ((item, first, None) for item, first in begun.items())
+
+    def _pair_links(self, ones: Collection[str], others: Collection[str]) -> Ints:
+        """Return the pairs of shapes of two sets of links, given by labels."""
+        return self._make_pairs(
+            *(
+                [k for k, label in enumerate(self.labels) if label in links]
+                for links in (ones, others)
+            )
+        )
+
+    def _get_shapes(self, owner: str) -> list[int]:
+        return [
+            k
+            for k, label in enumerate(self.labels)
+            if label.partition(".")[0] == owner and k < self.solids.body_count
+        ]
+
+    def _make_pairs(self, ones: Iterable[int], others: Collection[int]) -> Ints:
+        return np.array([(min(i, j), max(i, j)) for i in ones for j in others], int).reshape(-1, 2)
+
+    def _find_easing_end(self, at: int) -> int:
+        """Return the last exempt waypoint after a contact at `at`; see `CONTACT_WINDOW`."""
+        times, moved, last = self.trajectory.times, 0, at
+        while last < len(self.steps):
+            moved += int(self.steps[last])
+            if times[last + 1] - times[
+                at
+            ] > CONTACT_WINDOW + _MOTION_TOLERANCE and moved > self.options.steps(CONTACT_WINDOW):
+                break
+            last += 1
+        return last
+
+    def _find_easing_start(self, at: int) -> int:
+        """Return the first waypoint at which a pair in contact at `at` may be close."""
+        times, moved, first = self.trajectory.times, 0, at
+        while first > 0:
+            moved += int(self.steps[first - 1])
+            if times[at] - times[
+                first - 1
+            ] > CONTACT_WINDOW + _MOTION_TOLERANCE and moved > self.options.steps(CONTACT_WINDOW):
+                break
+            first -= 1
+        return first
+
+
+def _find_touching_links(scene: Scene, frame: str) -> set[str]:
+    """Return the labels of the links to which the frame of a `Touch` is fixed."""
+    if frame.partition(".")[0] in scene.objects:
+        return {frame}
+    robot = scene.robot
+    joint = robot.model.frames[robot.model.getFrameId(frame)].parentJoint
+    return {
+        robot.link_of(i)
+        for i, shape in enumerate(robot.collision.geometryObjects)
+        if shape.parentJoint == joint
+    }

@@ -1,0 +1,1 @@
+"""States problems and trajectories: files, models, scenes, tasks."""

@@ -1,0 +1,1 @@
+"""Computes signed distances of many shape pairs at once, with coal in compiled code."""

@@ -1,0 +1,276 @@
+// Moving and fixed shapes, and signed distances of pairs of them at many states at once, computed
+// by coal.
+//
+// Shapes are rebuilt here from their dimensions, so that this module shares no C++ objects with
+// coal's Python bindings; the distances are computed by the same libcoal.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <memory>
+#include <stdexcept>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include <coal/distance.h>
+
+#include "arrays.hpp"
+#include "bodies.hpp"
+#include "solids.hpp"
+
+namespace {
+
+using vkc_pin::PLACEMENT;
+constexpr std::size_t COLUMNS = 10; // distance, normal, both witness points
+
+coal::Transform3s transform(const double * numbers)
+{
+  return coal::Transform3s(
+    Eigen::Map<const Eigen::Matrix3d>(numbers), Eigen::Map<const Eigen::Vector3d>(numbers + 9));
+}
+
+std::atomic<std::uint64_t> asked{0}; // number of distances computed since the process began
+
+class Shapes
+{
+public:
+  // A pair at a state, with a lower bound of distance − margin; ties are broken by `rank`.
+  struct Candidate
+  {
+    Index first, second, rank, index;
+    double margin, bound;
+  };
+
+  struct Found
+  {
+    double shortfall, distance, witness[COLUMNS - 1], margin;
+    Index index, rank;
+    bool operator<(const Found & other) const
+    {
+      return std::tie(shortfall, distance, rank) < std::tie(other.shortfall, other.distance, other.rank);
+    }
+  };
+
+  // Queries coal at one state at a time. Results are cleared between queries, since a warm start
+  // would change the last digits.
+  class Asking
+  {
+  public:
+    explicit Asking(const Shapes & shapes)
+    : shapes_(shapes), request_(shapes.request_), places_(shapes.moving_), known_(shapes.moving_, 0)
+    {
+    }
+
+    ~Asking() { asked += count_; }
+
+    void at(const double * placements)
+    {
+      if (placements != placements_)
+        ++state_;
+      placements_ = placements;
+    }
+
+    // Must be called when the numbers behind the current placements have changed.
+    void moved() { ++state_; }
+
+    double distance(Index first, Index second)
+    {
+      ++count_;
+      result_.clear();
+      const auto &one = place(std::size_t(first)), &other = place(std::size_t(second));
+      return coal::distance(
+        shapes_.shapes_[first].get(), one, shapes_.shapes_[second].get(), other, request_, result_);
+    }
+
+    // Of candidates sorted by their bounds, selects at most `most` closer than `reach` with least
+    // distance − margin; see shapes.py.
+    template<typename Candidates>
+    void nearest(
+      std::size_t count, double reach, Index most, double rounding, std::vector<Found> & near, const Candidates & candidates)
+    {
+      for (std::size_t k = 0; k < count; ++k)
+      {
+        const Candidate candidate = candidates(k);
+        if (most >= 0 && Index(near.size()) >= most && (most == 0 || candidate.bound > near[most - 1].shortfall + rounding))
+          break; // neither this candidate nor any later one can be among them
+        Found found;
+        found.distance = distance(candidate.first, candidate.second);
+        if (!(found.distance < reach))
+          continue;
+        found.shortfall = found.distance - candidate.margin;
+        found.margin = candidate.margin;
+        found.index = candidate.index;
+        found.rank = candidate.rank;
+        witness(found.witness);
+        near.insert(std::upper_bound(near.begin(), near.end(), found), found);
+      }
+      if (most >= 0 && Index(near.size()) > most)
+        near.resize(most);
+    }
+
+    void witness(double * out) const
+    {
+      for (const coal::Vec3s * numbers : {&result_.normal, &result_.nearest_points[0], &result_.nearest_points[1]})
+        out = std::copy_n(numbers->data(), 3, out);
+    }
+
+  private:
+    const coal::Transform3s & place(std::size_t shape)
+    {
+      if (shape >= shapes_.moving_)
+        return shapes_.standing_[shape - shapes_.moving_];
+      if (known_[shape] != state_)
+      {
+        places_[shape] = transform(placements_ + PLACEMENT * shape);
+        known_[shape] = state_;
+      }
+      return places_[shape];
+    }
+
+    const Shapes & shapes_;
+    coal::DistanceRequest request_;
+    coal::DistanceResult result_;
+    std::vector<coal::Transform3s> places_;
+    std::vector<std::size_t> known_;
+    const double * placements_ = nullptr;
+    std::size_t state_ = 0, count_ = 0;
+  };
+
+  Shapes(const std::vector<Solid> & solids, const Numbers<2> & standing, double tolerance)
+  {
+    if (standing.shape(1) != PLACEMENT || standing.shape(0) > solids.size())
+      throw std::invalid_argument("placements of what stands are of shape (S, 12), S no more than there are shapes");
+    for (const auto & solid : solids)
+      shapes_.push_back(solid.geometry);
+    moving_ = shapes_.size() - standing.shape(0);
+    for (std::size_t i = 0; i < standing.shape(0); ++i)
+      standing_.push_back(transform(standing.data() + PLACEMENT * i));
+    request_.gjk_tolerance = tolerance;
+  }
+
+  Shapes placed(const Indices<1> & which, const Numbers<2> & where) const
+  {
+    if (where.shape(0) != which.shape(0) || where.shape(1) != PLACEMENT)
+      throw std::invalid_argument("placements are of shape (n, 12)");
+    Shapes other(*this);
+    for (std::size_t k = 0; k < which.shape(0); ++k)
+    {
+      if (which(k) < Index(moving_) || which(k) >= Index(shapes_.size()))
+        throw std::out_of_range("not a shape that stands");
+      other.standing_[which(k) - moving_] = transform(where.data() + PLACEMENT * k);
+    }
+    return other;
+  }
+
+  Array<double> distances(
+    const Numbers<3> & moving, const Indices<1> & states, const Indices<2> & pairs, bool everything, std::size_t threads) const
+  {
+    const std::size_t count = pairs.shape(0), columns = everything ? COLUMNS : 1;
+    check(moving, pairs);
+    if (states.shape(0) != count)
+      throw std::invalid_argument("as many states as pairs are needed");
+    for (std::size_t i = 0; i < count; ++i)
+      if (states(i) < 0 || states(i) >= Index(moving.shape(0)))
+        throw std::out_of_range("no such state");
+    std::vector<double> found(count * columns);
+    const Index *state = states.data(), *pair = pairs.data();
+    const double * where = moving.data();
+    {
+      nb::gil_scoped_release released;
+      in_parts(count, threads, [&](std::size_t, std::size_t first, std::size_t last) {
+        Asking ask(*this);
+        for (std::size_t i = first; i < last; ++i)
+        {
+          ask.at(where + std::size_t(state[i]) * moving_ * PLACEMENT);
+          found[i * columns] = ask.distance(pair[2 * i], pair[2 * i + 1]);
+          if (everything)
+            ask.witness(found.data() + i * columns + 1);
+        }
+      });
+    }
+    if (everything)
+      return handed_over(std::move(found), {count, COLUMNS});
+    return handed_over(std::move(found), {count});
+  }
+
+  // For each state, the candidates from `edges[state]` to `edges[state + 1]` with least distance −
+  // margin; see shapes.py.
+  std::tuple<Array<Index>, Array<double>> shortest(
+    const Numbers<3> & moving,
+    const Indices<1> & edges,
+    const Indices<2> & pairs,
+    const Indices<1> & ranks,
+    const Numbers<2> & limits,
+    double reach,
+    Index most,
+    double rounding,
+    std::size_t threads) const
+  {
+    const std::size_t states = moving.shape(0), count = pairs.shape(0);
+    check(moving, pairs);
+    if (edges.shape(0) != states + 1 || ranks.shape(0) != count || limits.shape(0) != count || limits.shape(1) != 2)
+      throw std::invalid_argument("edges are of shape (W + 1,), ranks (n,), limits (n, 2)");
+    for (std::size_t s = 0; s < states; ++s)
+      if (edges(s) > edges(s + 1))
+        throw std::invalid_argument("edges increase");
+    if (edges(0) != 0 || edges(states) != Index(count))
+      throw std::invalid_argument("edges begin with 0 and end with the number of pairs");
+    std::vector<Index> chosen;
+    std::vector<double> table;
+    const Index *edge = edges.data(), *pair = pairs.data(), *rank = ranks.data();
+    const double *limit = limits.data(), *where = moving.data();
+    {
+      nb::gil_scoped_release released;
+      threads = std::max<std::size_t>(threads, 1);
+      std::vector<std::vector<Found>> parts(threads);
+      in_parts(states, threads, [&](std::size_t part, std::size_t first, std::size_t last) {
+        Asking ask(*this);
+        std::vector<Found> near;
+        for (std::size_t s = first; s < last; ++s)
+        {
+          near.clear();
+          ask.at(where + s * moving_ * PLACEMENT);
+          ask.nearest(std::size_t(edge[s + 1] - edge[s]), reach, most, rounding, near, [&](std::size_t k) {
+            const Index i = edge[s] + Index(k);
+            return Candidate{pair[2 * i], pair[2 * i + 1], rank[i], i, limit[2 * i], limit[2 * i + 1]};
+          });
+          parts[part].insert(parts[part].end(), near.begin(), near.end());
+        }
+      });
+      for (const auto & part : parts)
+        for (const auto & found : part)
+        {
+          chosen.push_back(found.index);
+          table.push_back(found.distance);
+          table.insert(table.end(), found.witness, found.witness + COLUMNS - 1);
+        }
+    }
+    const std::size_t kept = chosen.size();
+    return {handed_over(std::move(chosen), {kept}), handed_over(std::move(table), {kept, COLUMNS})};
+  }
+
+  std::size_t moving() const { return moving_; }
+
+  std::size_t size() const { return shapes_.size(); }
+
+private:
+  void check(const Numbers<3> & moving, const Indices<2> & pairs) const
+  {
+    if (moving.shape(1) != moving_ || moving.shape(2) != PLACEMENT)
+      throw std::invalid_argument("placements of what moves are of shape (W, M, 12)");
+    if (pairs.shape(1) != 2)
+      throw std::invalid_argument("pairs are of shape (n, 2)");
+    const Index * shape = pairs.data();
+    for (std::size_t i = 0; i < 2 * pairs.shape(0); ++i)
+      if (shape[i] < 0 || shape[i] >= Index(shapes_.size()))
+        throw std::out_of_range("no such shape");
+  }
+
+  std::vector<std::shared_ptr<coal::CollisionGeometry>> shapes_;
+  std::vector<coal::Transform3s> standing_;
+  std::size_t moving_;
+  coal::DistanceRequest request_;
+};
+
+} // namespace

@@ -1,0 +1,105 @@
+"""Converts coal shapes to their counterparts in the compiled module."""
+
+from __future__ import annotations
+
+import weakref
+from functools import cache
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import BuildError, InputError
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.optional_imports import REBUILD, compiled_module
+from vkc_pin.world.files.meshes import indices
+
+__all__ = ["convert_solid", "load_compiled"]
+
+
+@cache
+def load_compiled() -> Any:
+    """Return the compiled module, after importing coal and Pinocchio, whose libraries it uses.
+
+    Raises:
+        BuildError: The module is missing, or was compiled against another release of coal or
+            Pinocchio than the installed one.
+    """
+    module = compiled_module("vkc_pin.world.collision._distances")
+    for package, version, installed in (
+        ("coal", module.COAL_VERSION, coal.__version__),
+        ("pin", module.PINOCCHIO_VERSION, pin.__version__),
+    ):
+        built = version.split(".")[:2]
+        if built != installed.split(".")[:2]:
+            raise BuildError(
+                f"vkc_pin.world.collision was compiled against {package} {version}, "
+                f"but {installed} is installed. "
+                f"Either pip install '{package}=={'.'.join(built)}.*', or {REBUILD}"
+            )
+    return module
+
+
+def convert_solid(shape: coal.CollisionGeometry) -> Any:
+    """Return a coal shape as an object of the compiled module, with its swept sphere radius.
+
+    Convex shapes and meshes are cached as long as the shape lives and its points do not change.
+
+    Raises:
+        InputError: The shape is of an unsupported type.
+        BuildError: See `load_compiled`.
+    """
+    if isinstance(shape, coal.Convex):
+        return _convert_cached(
+            shape, np.asarray(shape.points(), np.float64), float(shape.getSweptSphereRadius())
+        )
+    if isinstance(shape, coal.BVHModelOBBRSS):
+        return _convert_cached(shape, np.asarray(shape.vertices(), np.float64), 0.0)
+    if isinstance(shape, coal.Box):
+        numbers = shape.halfSide
+    elif isinstance(shape, coal.Sphere):
+        numbers = (shape.radius,)
+    elif isinstance(shape, coal.Ellipsoid):
+        numbers = shape.radii
+    elif isinstance(shape, coal.Capsule | coal.Cone | coal.Cylinder):
+        numbers = (shape.radius, shape.halfLength)
+    elif isinstance(shape, coal.TriangleP):
+        numbers = (*shape.a, *shape.b, *shape.c)
+    elif isinstance(shape, coal.Halfspace | coal.Plane):
+        numbers = (*shape.n, shape.d)
+    else:
+        supported = "a primitive, a convex shape or a mesh (BVHModelOBBRSS)"
+        raise InputError(
+            "distances to this kind of shape are not known",
+            expected=supported,
+            got=type(shape).__name__,
+        )
+    return load_compiled().primitive(
+        type(shape).__name__,
+        np.asarray(numbers, float).tolist(),
+        float(shape.getSweptSphereRadius()),
+    )
+
+
+_cache: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of the shape
+
+
+def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
+    """Return a convex shape or mesh, from the cache if its points are the same.
+
+    Reading the faces is slow.
+    """
+    key, content = id(shape), points.tobytes()
+    if key in _cache:
+        owner, before, swept, solid = _cache[key]
+        if owner() is shape and before == content and swept == radius:
+            return solid
+    faces = indices(shape)
+    solid = (
+        load_compiled().convex(points, faces, radius)
+        if isinstance(shape, coal.Convex)
+        else load_compiled().mesh(points, faces)
+    )
+    _cache[key] = (weakref.ref(shape, lambda _: _cache.pop(key, None)), content, radius, solid)
+    return solid

@@ -1,0 +1,21 @@
+"""Chooses the number of threads for distance queries."""
+
+from __future__ import annotations
+
+import os
+
+__all__ = ["count_threads"]
+
+_MAX_THREADS = 8
+
+
+def count_threads() -> int:
+    """Return the number of threads to use.
+
+    That is the number of cores available to this process, limited to 8 and to `OMP_NUM_THREADS`.
+    """
+    requested = os.environ.get("OMP_NUM_THREADS", "")
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    return max(1, min(int(requested) if requested.isdigit() else cores, cores, _MAX_THREADS))

@@ -1,0 +1,80 @@
+"""Finds pairs of shapes that may come close between two states, from axis-aligned boxes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.world.collision.solids import load_compiled
+
+__all__ = ["WorldBoxes"]
+
+
+class WorldBoxes:
+    """Axis-aligned boxes in the world frame: of M moving shapes at W states, and of S fixed ones.
+
+    Args:
+        lower: Lower corners of the moving shapes' boxes, shape (W, M, 3) [m].
+        upper: Upper corners of the moving shapes' boxes, shape (W, M, 3) [m].
+        fixed_lower: Lower corners of the fixed shapes' boxes, shape (S, 3) [m].
+        fixed_upper: Upper corners of the fixed shapes' boxes, shape (S, 3) [m].
+
+    Raises:
+        BuildError: See `solids.load_compiled`.
+    """
+
+    def __init__(
+        self, lower: Floats, upper: Floats, fixed_lower: Floats, fixed_upper: Floats
+    ) -> None:
+        corners = (
+            np.ascontiguousarray(part, float) for part in (lower, upper, fixed_lower, fixed_upper)
+        )
+        self.compiled: Any = load_compiled().WorldBoxes(*corners)
+
+    def find_close_pairs(
+        self,
+        first: Ints,
+        last: Ints,
+        pairs: Ints,
+        *,
+        moved: Floats,
+        moves: Bools,
+        phases: Ints,
+        limit: float,
+    ) -> tuple[Ints, Ints]:
+        """Return all pairs that may come closer than `limit` during an interval.
+
+        With b and b' the distances of the boxes at the ends of an interval, two shapes are at least
+        (b + b' − relative motion) / 2 apart during it.
+
+        Args:
+            first: State at the start of each interval, shape (K,).
+            last: State at the end of each interval, shape (K,); may equal `first` if nothing moves.
+            pairs: Pairs of shape indices, shape (P, 2).
+            moved: Upper bound of the motion of any point of each shape in each interval, shape
+                (K, M + S) [m].
+            moves: Whether each shape moves in each phase, shape (phases, M + S). Pairs of which
+                neither shape moves are omitted.
+            phases: Phase of each interval, shape (K,).
+            limit: Distance [m].
+
+        Returns:
+            Interval index and pair index, shape (C,) each, sorted by interval, then by pair.
+
+        Raises:
+            IndexError: A state, phase or shape does not exist.
+        """
+        numbers = (
+            np.ascontiguousarray(part, np.int64)
+            for part in (np.column_stack([first, last]), phases)
+        )
+        flags, rows = (
+            np.ascontiguousarray(moves).view(np.uint8),
+            np.ascontiguousarray(pairs, np.int64),
+        )
+        intervals, which = self.compiled.near(
+            *numbers, flags, rows, np.ascontiguousarray(moved, float), limit
+        )
+        return np.asarray(intervals), np.asarray(which)

@@ -1,0 +1,400 @@
+"""Description files: YAML read safely and checked against a schema, with errors that name file, line and field."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Set
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pydantic
+import yaml
+
+from vkc_pin.errors import InputError, UnknownNameError, shown
+
+__all__ = ["Document", "check", "field_name", "parse_json", "read_bytes", "read_text", "read_yaml"]
+
+LARGEST_FILE = 50_000_000
+"""Largest description file [bytes]."""
+MOST_FIELDS = 300_000
+"""Most fields and items that a YAML file may have, with those of its aliases."""
+DEEPEST = 50
+"""Most lists and fields inside each other."""
+
+Key = str | int
+T = TypeVar("T", bound=pydantic.BaseModel)
+
+_EXPECTED = {
+    "bool_parsing": "true or false",
+    "bool_type": "true or false",
+    "int_type": "a whole number",
+    "dict_type": "fields (name: value)",
+    "finite_number": "a finite number",
+    "float_parsing": "a number",
+    "float_type": "a number",
+    "list_type": "a list",
+    "model_attributes_type": "fields (name: value)",
+    "model_type": "fields (name: value)",
+    "string_type": "text",
+    "tuple_type": "a list",
+}
+_SIGNS = {
+    "greater_than": ">",
+    "greater_than_equal": ">=",
+    "less_than": "<",
+    "less_than_equal": "<=",
+}
+
+
+def field_name(path: tuple[Key, ...]) -> str:
+    """Return a field's path as users write it: ("obstacles", 3, "size") is `obstacles[3].size`."""
+    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
+    return text.removeprefix(".")
+
+
+@dataclass(frozen=True)
+class Document:
+    """Plain data with the place where each of its fields stands.
+
+    Attributes:
+        data: What was read: dictionaries, lists, text, numbers.
+        file: The file it came from, or None for data that was handed over.
+        lines: Field path → line, counted from 1; empty for data that was handed over.
+    """
+
+    data: Any
+    file: Path | None = None
+    lines: dict[tuple[Key, ...], int] = field(default_factory=dict)
+
+    def line(self, path: tuple[Key, ...]) -> int | None:
+        """Return the line of the field at `path`, or of the closest field around it."""
+        while path and path not in self.lines:
+            path = path[:-1]
+        return self.lines.get(path)
+
+    def error(
+        self, path: tuple[Key, ...], problem: str, *, expected: object = None, got: object = None
+    ) -> InputError:
+        """Return (not raise) the error that says that the field at `path` is wrong."""
+        return InputError(
+            problem,
+            file=self.file,
+            line=self.line(path),
+            field=field_name(path),
+            expected=expected,
+            got=got,
+        )
+
+    def unknown(
+        self, path: tuple[Key, ...], kind: str, name: object, choices: Iterator[str] | Any
+    ) -> UnknownNameError:
+        """Return (not raise) the error that says that the field at `path` names something that does not exist."""
+        return UnknownNameError(
+            kind, str(name), choices, file=self.file, line=self.line(path), field=field_name(path)
+        )
+
+    @contextmanager
+    def at(self, path: tuple[Key, ...]) -> Iterator[None]:
+        """Give errors raised inside the place `path`, unless they name a file of their own."""
+        try:
+            yield
+        except InputError as error:
+            if error.file is not None:
+                raise
+            if isinstance(error, UnknownNameError):
+                raise self.unknown(path, error.kind, error.name, error.choices) from error
+            where = f"{error.field}: " if error.field else ""
+            raise self.error(
+                path, where + error.problem, expected=error.expected, got=error.got
+            ) from error
+
+
+def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes:
+    """Return what a file of a `kind` ("YAML", "URDF", "plan") holds.
+
+    Raises:
+        InputError: It does not exist, is no file (but a folder, a pipe, a device), has more than
+            `largest` bytes (None: `LARGEST_FILE`), or cannot be read.
+    """
+    path, expected = Path(file), f"an existing {kind} file"
+    largest = LARGEST_FILE if largest is None else largest
+    try:
+        if (
+            not path.is_file() and not path.is_dir() and path.exists()
+        ):  # reading a pipe would wait for ever
+            raise InputError(
+                f"cannot read the {kind}", file=file, expected=expected, got="a pipe or a device"
+            )
+        with path.open("rb") as stream:
+            data = stream.read(largest + 1)
+            size = max(len(data), os.fstat(stream.fileno()).st_size)
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # the latter: a NUL in the name
+        got = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"cannot read the {kind}", file=file, expected=expected, got=got
+        ) from error
+    if size > largest:
+        raise InputError(
+            f"the {kind} is too large", file=file, expected=f"at most {largest:g} bytes", got=size
+        )
+    return data
+
+
+def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:
+    """Return what a text file holds, as `read_bytes` does.
+
+    Raises:
+        InputError: It cannot be read, or is not encoded in UTF-8.
+    """
+    try:
+        return read_bytes(file, kind, largest).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        got = f"no text: byte {error.start} is {error.object[error.start]:#04x}"
+        raise InputError(
+            f"cannot read the {kind}", file=file, expected=f"a {kind} file in UTF-8", got=got
+        ) from None
+
+
+def parse_json(text: str, file: str | Path) -> Any:
+    """Return what JSON says.
+
+    Raises:
+        InputError: It is no JSON, holds more lists and objects than `MOST_FIELDS`, or more inside
+            each other than `DEEPEST`.
+    """
+    many = text.count("[") + text.count(
+        "{"
+    )  # before they are made: each takes twenty times its text
+    if many > MOST_FIELDS:
+        raise InputError(
+            "too many lists and objects", file=file, expected=f"at most {MOST_FIELDS}", got=many
+        )
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError("not JSON", file=file, line=error.lineno, got=error.msg) from None
+    except (RecursionError, ValueError) as error:  # the latter: a number of thousands of digits
+        raise InputError("not JSON", file=file, got=error) from None
+    level, depth = [data], 0
+    while level := [item for item in level if isinstance(item, dict | list)]:
+        depth += 1
+        if depth > DEEPEST:
+            raise InputError(
+                "too many lists and objects inside each other",
+                file=file,
+                expected=f"at most {DEEPEST}",
+            )
+        level = [
+            inner for item in level for inner in (item.values() if isinstance(item, dict) else item)
+        ]
+    return data
+
+
+def read_yaml(file: str | Path) -> Document:
+    """Read a YAML file, with the line of every field.
+
+    Raises:
+        InputError: The file does not exist, is no valid YAML, holds a key twice, or has more
+            fields, or more inside each other, than a scene can mean: see `MOST_FIELDS` and
+            `DEEPEST`.
+    """
+    path = Path(file)
+    text = read_text(path, "YAML")
+    loader_type = getattr(
+        yaml, "CSafeLoader", yaml.SafeLoader
+    )  # the first is ten times as fast, and not everywhere
+    loader, lines = loader_type(text), dict[tuple[Key, ...], int]()
+    try:
+        _check_depth(yaml.parse(text, Loader=loader_type), path)
+        node = loader.get_single_node()
+        if node is not None:
+            _locate(node, (), lines, path, set())
+        data = None if node is None else loader.construct_document(node)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        problem = "; ".join(part for part in (error.context, error.problem) if part)
+        raise InputError(
+            f"not valid YAML: {problem}", file=path, line=mark.line + 1 if mark else None
+        ) from error
+    except InputError:
+        raise
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
+        raise InputError(f"not valid YAML: {error}", file=path) from error
+    finally:
+        loader.dispose()
+    return Document(data, path, lines)
+
+
+def check(document: Document, schema: type[T]) -> T:
+    """Return `document` as `schema`.
+
+    Raises:
+        InputError: It does not fit; the error is about the first wrong field in the file.
+        UnknownNameError: The same, where a name resembles one that would fit.
+    """
+    _check_plain(document)
+    try:
+        return schema.model_validate(document.data)
+    except pydantic.ValidationError as problem:
+        errors = problem.errors(include_url=False)
+    located = [(_path(document.data, error), error) for error in errors]
+    path, first = min(located, key=lambda item: document.line(item[0]) or 0)
+    raise _translate(document, path, first)
+
+
+def _check_plain(document: Document) -> None:
+    """Raise InputError if something may have no end, or a text, or a field's name, holds half of a surrogate pair."""
+    left: list[tuple[tuple[Key, ...], Any]] = [((), document.data)]
+    while left:
+        path, value = left.pop()
+        if len(path) > DEEPEST:  # data that contain themselves have no end
+            raise document.error(
+                path[:1], "too many lists inside each other", expected=f"at most {DEEPEST}"
+            )
+        if isinstance(value, dict):
+            left += [(path, name) for name in value if isinstance(name, str)]
+            left += [
+                ((*path, name if isinstance(name, int | str) else shown(name)), entry)
+                for name, entry in value.items()
+            ]
+        elif isinstance(value, list | tuple):
+            left += [((*path, place), entry) for place, entry in enumerate(value)]
+        elif isinstance(value, str):
+            try:
+                value.encode("utf-8")
+            except UnicodeEncodeError:
+                raise document.error(
+                    path, "not text", expected="text in UTF-8", got=ascii(value)
+                ) from None
+        elif isinstance(value, Iterable) and not isinstance(
+            value, Mapping | Set | bytes | bytearray
+        ):
+            raise document.error(
+                path,
+                "wrong kind of value",
+                expected="a list, fields, text or a number",
+                got=shown(value),
+            )
+
+
+def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:
+    """Raise InputError if lists and fields are too deep inside each other: what builds them goes down as deep."""
+    depth = 0
+    for event in events:
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > DEEPEST:
+                line = event.start_mark.line + 1 if event.start_mark else None
+                raise InputError(
+                    "too many lists inside each other",
+                    file=file,
+                    line=line,
+                    expected=f"at most {DEEPEST}",
+                )
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+
+
+def _locate(
+    node: yaml.Node,
+    path: tuple[Key, ...],
+    lines: dict[tuple[Key, ...], int],
+    file: Path,
+    above: set[int],
+) -> None:
+    """Write the lines of `node` and of everything below it into `lines`; `above` holds the nodes it stands in."""
+    lines.setdefault(path, node.start_mark.line + 1)
+    if len(lines) > MOST_FIELDS:  # a few lines of aliases of aliases make any number
+        raise InputError(
+            "too many fields",
+            file=file,
+            line=node.start_mark.line + 1,
+            expected=f"at most {MOST_FIELDS}",
+        )
+    if id(node) in above:
+        raise InputError(
+            "an alias contains itself",
+            file=file,
+            line=node.start_mark.line + 1,
+            field=field_name(path),
+        )
+    above = above | {id(node)}
+    if isinstance(node, yaml.MappingNode):
+        seen: dict[str, int] = {}
+        for key, value in node.value:
+            name, line = (
+                key.value if isinstance(key, yaml.ScalarNode) else str(key.value),
+                key.start_mark.line + 1,
+            )
+            if name in seen:
+                lines_of = f"lines {seen[name]} and {line}"
+                problem = "this field stands here twice"
+                raise InputError(
+                    problem, file=file, line=line, field=field_name((*path, name)), got=lines_of
+                )
+            seen[name] = line
+            lines[(*path, name)] = line
+            _locate(value, (*path, name), lines, file, above)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            _locate(item, (*path, index), lines, file, above)
+
+
+def _path(data: Any, error: Any) -> tuple[Key, ...]:
+    """Return the path of an error in the data: pydantic's, without the tags of unions, which are no fields."""
+    path: list[Key] = []
+    location = error["loc"]
+    for position, key in enumerate(location):
+        listed = isinstance(data, list | tuple) and isinstance(key, int) and key < len(data)
+        if listed or (isinstance(data, dict) and key in data):
+            path.append(key)
+            data = data[key]
+        elif position == len(location) - 1 and error["type"] == "missing":
+            path.append(key)
+    if error["type"] == "unknown_field":
+        path.append(error["ctx"]["name"])
+    elif error["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        path.append(error["ctx"]["discriminator"].strip("'"))
+    return tuple(path)
+
+
+def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputError:
+    """Return the exception that says what pydantic's `error` at `path` means."""
+    kind, context, got = error["type"], error.get("ctx", {}), error["input"]
+    if kind == "unknown_field":
+        return document.unknown(path, "field", context["name"], context["choices"])
+    if kind in ("missing", "union_tag_not_found"):
+        tag = kind == "union_tag_not_found"
+        return document.error(
+            path, "missing", expected="the object's kind" if tag else "a value", got="nothing"
+        )
+    if kind in ("union_tag_invalid", "literal_error"):
+        choices = re.findall(
+            r"'([^']*)'", context["expected_tags" if kind == "union_tag_invalid" else "expected"]
+        )
+        return document.unknown(path, str(path[-1]), context.get("tag", got), choices)
+    if kind == "too_long":
+        return document.error(
+            path,
+            "too many",
+            expected=f"at most {context['max_length']}",
+            got=context["actual_length"],
+        )
+    if kind == "vkc":
+        return document.error(
+            path, context["problem"], expected=context["expected"], got=shown(got)
+        )
+    if kind in _SIGNS:
+        problem, expected = (
+            "out of range",
+            f"a number {_SIGNS[kind]} {next(iter(context.values())):g}",
+        )
+    else:
+        problem, expected = "wrong value", _EXPECTED.get(kind, error["msg"])
+    return document.error(path, problem, expected=expected, got=shown(got))

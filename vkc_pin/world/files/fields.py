@@ -1,0 +1,123 @@
+"""Types of the values that description files of robots, objects and scenes have in common."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from vkc_pin.utils.arrays import LARGEST
+
+__all__ = [
+    "JointSchema",
+    "Name",
+    "NotNegative",
+    "Number",
+    "Positive",
+    "Quaternion",
+    "Schema",
+    "Vector3",
+    "count",
+    "fail",
+    "require",
+    "text_for",
+]
+
+
+def fail(problem: str, expected: str) -> PydanticCustomError:
+    """Return (not raise) the error of a validator: what is wrong and what would be right."""
+    return PydanticCustomError("vkc", "{problem}", {"problem": problem, "expected": expected})
+
+
+def _number(value: Any) -> Any:
+    if isinstance(
+        value, bool
+    ):  # YAML turns yes, no, on, off into booleans, and pydantic those into 1 and 0
+        raise fail("wrong value", "a number")
+    return value
+
+
+def require(holds: Callable[[Any], object], problem: str, expected: str) -> AfterValidator:
+    """Return the validator that refuses a value of which something does not hold."""
+
+    def required(value: Any) -> Any:
+        if not holds(value):
+            raise fail(problem, expected)
+        return value
+
+    return AfterValidator(required)
+
+
+def text_for(field: str) -> BeforeValidator:
+    """Return the validator that takes text for a schema with this field alone."""
+    return BeforeValidator(lambda value: {field: value} if isinstance(value, str) else value)
+
+
+def count(number: int) -> BeforeValidator:
+    """Return the validator that wants a list of `number` values: pydantic alone would not say how many it expected."""
+
+    def counted(value: Any) -> Any:
+        if not isinstance(value, list | tuple):
+            raise fail("wrong value", f"a list of {number} values")
+        if len(value) != number:
+            raise fail("wrong number of values", f"{number} values")
+        return value
+
+    return BeforeValidator(counted)
+
+
+_bounded = require(
+    lambda value: abs(value) <= LARGEST,
+    "out of range",
+    f"a number from {-LARGEST:g} to {LARGEST:g}",
+)
+Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False), _bounded]
+Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
+Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
+_NAME = re.compile(r"[^\s./]([^./]*[^\s./])?")
+_is_name = require(
+    lambda name: name.isprintable() and _NAME.fullmatch(name),
+    "not a name",
+    "text without '.', '/' or spaces around it",
+)
+Name = Annotated[str, _is_name]
+
+
+def _normalised(value: tuple[float, ...]) -> tuple[float, ...]:
+    norm = math.hypot(*value)
+    if abs(norm - 1.0) > _UNIT:
+        raise fail("not a rotation", f"a quaternion [x, y, z, w] of length 1, not {norm:.4g}")
+    return tuple(number / norm for number in value)
+
+
+_UNIT = 1e-3  # by which a quaternion may miss length 1: files have three decimals
+Quaternion = Annotated[tuple[Number, Number, Number, Number], count(4), AfterValidator(_normalised)]
+"""A rotation as a unit quaternion, the scalar last: [x, y, z, w]; normalised."""
+
+
+class Schema(BaseModel):
+    """Base of all schemas: immutable, and an unknown field is an error that knows the valid ones."""
+
+    model_config = ConfigDict(frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_fields(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            for key in data:
+                if key not in cls.model_fields:
+                    context = {"name": str(key), "choices": list(cls.model_fields)}
+                    raise PydanticCustomError("unknown_field", "unknown field", context)
+        return data
+
+
+class JointSchema(Schema):
+    """What a URDF cannot say about a joint: [m/s] and [m/s²], or [rad/s] and [rad/s²]."""
+
+    velocity: Positive | None = None
+    acceleration: Positive | None = None

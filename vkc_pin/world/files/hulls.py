@@ -1,0 +1,156 @@
+"""Computes convex hulls of points, and convex polytopes of few vertices around them."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
+
+if TYPE_CHECKING:
+    import trimesh
+    from scipy.spatial import ConvexHull
+
+__all__ = ["FLAT", "compute_hull", "outer_hull", "thickened"]
+
+FLAT = 1e-3
+"""What a part gets as thickness that has none [m]: a picture on a wall, a rug, a pane."""
+_THIN = (
+    1e-5  # of the largest extent: thinner than 10 µm in a metre is drawn as a sheet, not as a solid
+)
+_GAP = 5e-4  # [m]: no cut takes away less
+_DIRECTIONS = 400  # of cuts, spread over the sphere
+# Options of Qhull, tried in this order: scaled to the unit cube, unscaled, and joggled.
+_QHULL = ("QbB Pp Qt", "Pp Qt", "Pp QJ")
+
+
+def thickened(points: ArrayLike) -> tuple[Floats, bool]:
+    """Return points that span a volume, and whether they did not before: then `FLAT` is added across what they lie in.
+
+    A sheet becomes a plate with the sheet in its middle, a line a square bar, a point a cube.
+
+    Args:
+        points: Shape (n, 3), [m].
+    """
+    given = np.asarray(points, float)
+    around = given - given.mean(axis=0)
+    axes = np.linalg.eigh(around.T @ around)[1].T
+    extents = np.ptp(around @ axes.T, axis=0)
+    (flat,) = np.nonzero(extents <= _THIN * extents.max())
+    found = given
+    for axis in axes[flat]:
+        found = np.concatenate([found - FLAT / 2.0 * axis, found + FLAT / 2.0 * axis])
+    return found, bool(len(flat))
+
+
+def compute_hull(points: ArrayLike) -> trimesh.Trimesh:
+    """Return the convex hull of points as a mesh whose faces point outward.
+
+    It equals `trimesh.convex.convex_hull` bit for bit, except for some thin bodies whose hull,
+    scaled by Qhull to the unit cube, has triangles that overlap. trimesh then needs networkx and
+    returns a hull with a triangle that faces inward. Here Qhull runs again without scaling. The
+    result was closed and convex for all 120 such bodies that were tested.
+
+    Args:
+        points: Shape (n, 3), [m].
+
+    Raises:
+        InputError: The points span no volume.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    given = np.asarray(points, float)
+    for options in _QHULL:
+        with contextlib.suppress(QhullError):
+            mesh = _orient(ConvexHull(given, qhull_options=options))
+            if mesh.is_winding_consistent:
+                return mesh
+    expected = "at least four points that are not in one plane"
+    raise InputError("the points span no volume", expected=expected)
+
+
+def _orient(hull: ConvexHull) -> trimesh.Trimesh:
+    """Return the triangles of a hull with normals that point away from its centroid."""
+    import trimesh
+
+    corners = np.sort(hull.vertices)
+    vertices, faces = hull.points[corners], np.searchsorted(corners, hull.simplices)
+    normals, has_area = trimesh.triangles.normals(vertices[faces])
+    faces = faces[has_area]
+    centres = vertices[faces].mean(axis=1)
+    areas = trimesh.triangles.area(vertices[faces])
+    outward = centres - np.average(centres, weights=areas, axis=0)
+    inverted = np.einsum("ij,ij->i", normals, outward) < 0.0
+    faces[inverted] = faces[inverted][:, ::-1]
+    normals[inverted] *= -1.0
+    return trimesh.Trimesh(vertices, faces, face_normals=normals)
+
+
+def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
+    """Return a convex polytope of few vertices that contains `points`; what is flat is thickened first.
+
+    It starts as the box along the principal axes of the hull and is cut, again and again, by the
+    plane that touches the hull and lies deepest below one of the polytope's corners.
+
+    Args:
+        points: Shape (n, 3), [m].
+        vertices: The largest number of its vertices.
+
+    Returns:
+        The polytope; every point lies in it (up to rounding, 1e-9 m).
+    """
+    hull = compute_hull(thickened(points)[0])
+    corners = np.asarray(hull.vertices)
+    normals = _directions(hull)
+    offsets = (corners @ normals.T).max(axis=0)
+    axes = np.linalg.eigh(np.cov(corners.T))[1].T
+    found = []
+    for frame in (np.eye(3), axes):
+        box = np.vstack([frame, -frame])
+        chosen_normals, chosen_offsets = box, (corners @ box.T).max(axis=0)
+        polytope = _intersect(chosen_normals, chosen_offsets, corners)
+        for _ in range(4 * vertices):
+            depth = (polytope.points @ normals.T).max(axis=0) - offsets
+            order = np.argsort(-depth)[:12]
+            trials = []
+            for k in order[depth[order] > _GAP]:
+                planes = (
+                    np.vstack([chosen_normals, normals[k]]),
+                    np.append(chosen_offsets, offsets[k]),
+                )
+                trial = _intersect(*planes, corners)
+                if len(trial.vertices) <= vertices:
+                    trials.append((trial, planes))
+            if not trials:
+                break
+            polytope, (chosen_normals, chosen_offsets) = min(
+                trials, key=lambda trial: trial[0].volume
+            )
+        found.append(polytope)
+    return compute_hull(min(found, key=lambda polytope: polytope.volume).points)
+
+
+def _directions(hull: trimesh.Trimesh) -> Floats:
+    """Return the normals worth trying: those of the hull's faces, and some spread evenly over the sphere."""
+    k = np.arange(_DIRECTIONS) + 0.5
+    z, turn = 1.0 - 2.0 * k / _DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
+    spread = np.stack(
+        [np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1
+    )
+    _, first = np.unique(np.asarray(hull.face_normals).round(2), axis=0, return_index=True)
+    return np.vstack([np.asarray(hull.face_normals)[np.sort(first)], spread])
+
+
+def _intersect(normals: NDArray[Any], offsets: NDArray[Any], inner: NDArray[Any]) -> ConvexHull:
+    """Return the polytope {x: normals·x ≤ offsets}; `inner` are points in it."""
+    from scipy.spatial import ConvexHull, HalfspaceIntersection
+
+    centre = inner.mean(axis=0)
+    corners = HalfspaceIntersection(np.column_stack([normals, -offsets]), centre).intersections
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    _, first = np.unique(corners.round(7), axis=0, return_index=True)
+    return ConvexHull(corners[np.sort(first)])

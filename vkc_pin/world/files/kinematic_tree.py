@@ -1,0 +1,378 @@
+"""Checks of the links and joints of a URDF: they make one tree, of numbers that mean something.
+
+Parsers take that for granted: a circle of links never ends, a link with two parents gets one of
+them without a word, and an origin that is no number becomes none. They also refuse whole files, and
+do not say where, for want of a number that nobody needs, or for what programs of all kinds write
+into a URDF for themselves. So they get what was checked here, and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arrays import LARGEST
+from vkc_pin.world.files.xml import line_of, replace_forbidden
+
+__all__ = ["MOMENTS", "check_tree", "inertial_of", "numbers_of", "origin_of", "plain_tree"]
+
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Attributes of <inertia>, along the rows of the upper triangle."""
+
+_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+_LIMITED = ("revolute", "prismatic")
+_WITHOUT_AXIS = ("fixed", "floating")
+_SILENT = (
+    "xacro:arg",
+    "xacro:property",
+)  # of xacro's elements those that put nothing in their place
+
+
+def check_tree(file: Path, root: ElementTree.Element) -> None:
+    """Check that links and joints make one tree.
+
+    Raises:
+        InputError: A name is missing or given twice, a link has two parents or goes in a circle,
+            there are several roots or none, a joint's type, origin, axis, limit or mimic is wrong,
+            or macros of xacro are still to be put in.
+        UnknownNameError: A joint names a link that does not exist.
+    """
+    for element in root.iter():
+        if element.tag.startswith("xacro:") and element.tag not in _SILENT:
+            expected, line = "a plain URDF: xacro FILE > robot.urdf", line_of(element)
+            raise InputError(
+                "xacro has not been run",
+                file=file,
+                line=line,
+                expected=expected,
+                got=f"<{element.tag}>",
+            )
+    links = _named(file, root, "link")
+    if not links:
+        raise InputError("there are no links", file=file, expected="<link> elements")
+    above: dict[str, tuple[str, str]] = {}  # link → its parent, and the joint between
+    joints = _named(file, root, "joint")
+    for name, joint in joints.items():
+        _check_joint(file, name, joint, joints)
+        parent, child = (_link(file, name, joint, key, links) for key in ("parent", "child"))
+        if child in above:
+            got, line = f"joints '{above[child][1]}' and '{name}'", line_of(joint)
+            raise InputError(
+                "a link with two parents",
+                file=file,
+                line=line,
+                field=child,
+                expected="one joint",
+                got=got,
+            )
+        above[child] = parent, name
+    _check_roots(file, links, above)
+
+
+def plain_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[str]]:
+    """Return links and joints of a URDF that was checked, as one that parsers understand, without shapes and extensions.
+
+    What a limit does not say is 0; joints that say nothing about velocity are named. Mimicking is
+    left to the caller. An <inertial> that is not whole counts as none, with a warning: kinematics
+    need none.
+
+    Args:
+        file: The URDF.
+        root: What it says.
+
+    Returns:
+        The text, and the joints without velocity.
+    """
+    plain = ElementTree.Element("robot", name=root.get("name") or replace_forbidden(file.stem))
+    silent = set[str]()
+    for link in root.findall("link"):
+        added = ElementTree.SubElement(plain, "link", name=link.get("name", ""))
+        if (inertial := link.find("inertial")) is not None:
+            _add_inertial(file, added, inertial)
+    for joint in root.findall("joint"):
+        name, kind = joint.get("name", ""), joint.get("type", "")
+        added = ElementTree.SubElement(plain, "joint", name=name, type=kind)
+        _add_origin(file, added, joint.find("origin"), name)
+        for key in ("parent", "child"):
+            if (end := joint.find(key)) is not None:
+                ElementTree.SubElement(added, key, link=end.get("link", ""))
+        if kind not in _WITHOUT_AXIS and (axis := joint.find("axis")) is not None:
+            ElementTree.SubElement(
+                added,
+                "axis",
+                xyz=_written(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name)),
+            )
+        if (limit := joint.find("limit")) is not None and kind not in _WITHOUT_AXIS:
+            silent.update([name] if limit.get("velocity") is None else [])
+            if kind in _LIMITED and limit.get("lower") is None and limit.get("upper") is None:
+                warnings.warn(
+                    f"{file}:{line_of(limit)}: {name}: a limit without lower and upper: it cannot move",
+                    stacklevel=2,
+                )
+            said = {
+                key: _written(_limit(file, name, limit, key))
+                for key in ("lower", "upper", "velocity", "effort")
+            }
+            ElementTree.SubElement(added, "limit", said)
+    return ElementTree.tostring(plain, encoding="unicode"), frozenset(silent)
+
+
+def _add_origin(
+    file: Path, parent: ElementTree.Element, origin: ElementTree.Element | None, where: str
+) -> None:
+    if origin is not None:
+        said = {
+            key: _written(numbers_of(file, origin, key, 3, default="0 0 0", where=where))
+            for key in ("xyz", "rpy")
+        }
+        ElementTree.SubElement(parent, "origin", said)
+
+
+def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.Element) -> None:
+    """Add mass and inertia to a link, or warn."""
+    try:
+        mass, moments, (position, angles) = inertial_of(file, inertial, link.get("name", ""))
+    except InputError as error:
+        warnings.warn(f"{error}: this <inertial> counts as none", stacklevel=2)
+        return
+    added = ElementTree.SubElement(link, "inertial")
+    ElementTree.SubElement(added, "origin", xyz=_written(position), rpy=_written(angles))
+    ElementTree.SubElement(added, "mass", value=_written((mass,)))
+    ElementTree.SubElement(
+        added,
+        "inertia",
+        {key: _written((value,)) for key, value in zip(MOMENTS, moments, strict=True)},
+    )
+
+
+def origin_of(
+    file: Path, element: ElementTree.Element, where: str
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return what the <origin> of an element says, position [m] and roll, pitch and yaw [rad]; zeros if it has none.
+
+    Raises:
+        InputError: A number is wrong, as in `numbers_of`.
+    """
+    if (origin := element.find("origin")) is None:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    position, angles = (
+        numbers_of(file, origin, key, 3, default="0 0 0", where=where) for key in ("xyz", "rpy")
+    )
+    return position, angles
+
+
+def inertial_of(
+    file: Path, inertial: ElementTree.Element, where: str
+) -> tuple[float, tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Return what an <inertial> says: mass [kg], moments about its centre [kg·m²] as `MOMENTS` names them, and `origin_of` it.
+
+    Raises:
+        InputError: It has no mass or no moments, or a number is wrong, as in `numbers_of`.
+    """
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or inertia is None:
+        lacks = f"an <inertial> without <{'mass' if mass is None else 'inertia'}>"
+        raise InputError(lacks, file=file, line=line_of(inertial), field=where)
+    (weight,) = numbers_of(file, mass, "value", 1, default=None, where=where)
+    moments = tuple(
+        numbers_of(file, inertia, key, 1, default="0", where=where)[0] for key in MOMENTS
+    )
+    return weight, moments, origin_of(file, inertial, where)
+
+
+def _written(values: tuple[float, ...]) -> str:
+    return " ".join(map(repr, values))
+
+
+def numbers_of(
+    file: Path,
+    element: ElementTree.Element,
+    key: str,
+    count: int,
+    *,
+    default: str | None,
+    where: str,
+    largest: float = LARGEST,
+) -> tuple[float, ...]:
+    """Return numbers in an attribute of an element.
+
+    Args:
+        file: The URDF.
+        element: The element.
+        key: The attribute.
+        count: How many there have to be.
+        default: What holds where there is none; None: there has to be one.
+        where: What the element belongs to, for messages.
+        largest: None may be larger, or less than the negative of it.
+
+    Raises:
+        InputError: There are more or less of them, or one is no number, infinite or too large.
+    """
+    text = element.get(key, default)
+    try:
+        values = tuple(float(part) for part in (text or "").split())
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(
+        math.isfinite(value) and abs(value) <= largest for value in values
+    ):
+        field, expected = (
+            f"{where}: {element.tag} {key}",
+            f"{count} finite number{'s' * (count > 1)}",
+        )
+        if values and len(values) == count and all(map(math.isfinite, values)):
+            expected = f"at most {largest:g}"
+        raise InputError(
+            "wrong numbers",
+            file=file,
+            line=line_of(element),
+            field=field,
+            expected=expected,
+            got=text,
+        )
+    return values
+
+
+def _named(file: Path, root: ElementTree.Element, tag: str) -> dict[str, ElementTree.Element]:
+    """Return the elements of a kind by their names."""
+    found: dict[str, ElementTree.Element] = {}
+    for element in root.findall(tag):
+        name = element.get("name", "")
+        if not name.strip():
+            raise InputError(
+                f"a {tag} without a name",
+                file=file,
+                line=line_of(element),
+                expected=f'<{tag} name="...">',
+            )
+        if name in found:
+            got = f"lines {line_of(found[name])} and {line_of(element)}"
+            raise InputError(
+                f"two {tag}s of one name", file=file, line=line_of(element), field=name, got=got
+            )
+        found[name] = element
+    return found
+
+
+def _link(
+    file: Path,
+    name: str,
+    joint: ElementTree.Element,
+    key: str,
+    links: Mapping[str, ElementTree.Element],
+) -> str:
+    """Return the link that a joint names as its "parent" or "child"."""
+    element = joint.find(key)
+    if element is None or element.get("link") is None:
+        raise InputError(
+            "a joint that connects nothing",
+            file=file,
+            line=line_of(joint),
+            field=name,
+            expected=f'<{key} link="...">',
+        )
+    link = element.get("link", "")
+    if link not in links:
+        raise UnknownNameError(
+            "link", link, links, file=file, line=line_of(element), field=f"{name}: {key}"
+        )
+    return link
+
+
+def _limit(file: Path, name: str, limit: ElementTree.Element, key: str) -> tuple[float, ...]:
+    return numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)
+
+
+def _check_joint(
+    file: Path, name: str, joint: ElementTree.Element, joints: Collection[str]
+) -> None:
+    kind, line = joint.get("type"), line_of(joint)
+    if kind not in _KINDS:
+        expected = ", ".join(_KINDS)
+        raise InputError(
+            "this joint type is not supported",
+            file=file,
+            line=line,
+            field=name,
+            expected=expected,
+            got=kind,
+        )
+    for origin in joint.findall("origin"):
+        for key in ("xyz", "rpy"):
+            numbers_of(file, origin, key, 3, default="0 0 0", where=name)
+    for axis in joint.findall("axis") if kind not in _WITHOUT_AXIS else ():
+        if not math.hypot(*numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name)) > 0.0:
+            line = line_of(axis)
+            raise InputError(
+                "an axis without direction", file=file, line=line, field=name, got=axis.get("xyz")
+            )
+    limits = joint.findall("limit")
+    if kind in _LIMITED and not limits:
+        raise InputError(
+            f"a {kind} joint without limits", file=file, line=line, field=name, expected="<limit>"
+        )
+    for limit in limits:
+        lower, upper, _, _ = (
+            _limit(file, name, limit, key)[0] for key in ("lower", "upper", "velocity", "effort")
+        )
+        if kind in _LIMITED and lower > upper:
+            field, got, line = f"{name}: limit", f"{lower:g} and {upper:g}", line_of(limit)
+            problem = "limits in the wrong order"
+            raise InputError(
+                problem, file=file, line=line, field=field, expected="lower ≤ upper", got=got
+            )
+    for mimic in joint.findall("mimic"):
+        if (followed := mimic.get("joint", "")) not in joints:  # published robots have that
+            warnings.warn(
+                f"{file}:{line_of(mimic)}: {name}: there is no joint '{followed}' to follow",
+                stacklevel=2,
+            )
+        for key, default in (("multiplier", "1"), ("offset", "0")):
+            numbers_of(file, mimic, key, 1, default=default, where=name)
+
+
+def _check_roots(
+    file: Path, links: Mapping[str, ElementTree.Element], above: Mapping[str, tuple[str, str]]
+) -> None:
+    """Check that all links hang on one."""
+    roots = [link for link in links if link not in above]
+    if len(roots) > 1:
+        got, line = ", ".join(roots[:5]), line_of(links[roots[1]])
+        raise InputError(
+            "links that nothing connects",
+            file=file,
+            line=line,
+            field=roots[1],
+            expected="one root",
+            got=got,
+        )
+    reaches = set(roots)
+    for link in links:
+        path = list(_up(link, above, reaches))
+        if path and path[-1] in path[:-1]:
+            circle = path[path.index(path[-1]) :]
+            line = line_of(links[link])
+            raise InputError(
+                "links in a circle",
+                file=file,
+                line=line,
+                field=link,
+                expected="a tree",
+                got=" → ".join(circle[::-1]),
+            )
+        reaches.update(path)
+
+
+def _up(link: str, above: Mapping[str, tuple[str, str]], reaches: set[str]) -> Iterator[str]:
+    """Yield a link and those it hangs on, up to one that `reaches` the root, or to one for the second time."""
+    passed: set[str] = set()
+    while link not in reaches:
+        yield link
+        if link in passed:
+            return
+        passed.add(link)
+        link = above[link][0]

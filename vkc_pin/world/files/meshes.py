@@ -1,0 +1,338 @@
+"""Reads mesh files and turns them into coal shapes, and checks that coal holds what the file holds.
+
+Meshes are read with trimesh: coal 3.0.3's own reader restarts the triangle indices at every object
+of an OBJ file, and what it makes of such a file collides where nothing is. Only COLLADA files
+(`.dae`), for which trimesh would need another package, are read by coal.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import coal
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import LARGEST, Floats, Ints
+from vkc_pin.world.files.hulls import FLAT, compute_hull, outer_hull, thickened
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.xml import check_indices
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = [
+    "MeshPart",
+    "coarser",
+    "convex_hull",
+    "indices",
+    "load_convex",
+    "load_mesh",
+    "load_parts",
+    "to_bvh",
+]
+
+_NEIGHBOURS = 255  # coal's corners have no more
+_HULLS = 512  # that a process keeps: robots are loaded again and again
+_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """The part of a mesh that has one colour.
+
+    Attributes:
+        vertices: Shape (n, 3), [m].
+        faces: Shape (m, 3), indices of vertices.
+        colour: Red, green, blue, opacity in [0, 1], or None if the file names none.
+    """
+
+    vertices: Floats
+    faces: NDArray[np.int64]
+    colour: tuple[float, float, float, float] | None = None
+
+
+def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.Trimesh:
+    """Read a mesh file as one mesh.
+
+    Args:
+        path: OBJ, STL, PLY, OFF, glTF or COLLADA file.
+        scale: One factor per axis, or one for all, from the file's unit to [m].
+
+    Returns:
+        The mesh of all the file's objects together, in the file's frame, [m].
+
+    Raises:
+        InputError: The file does not exist, cannot be read, or holds no triangle.
+    """
+    import trimesh
+
+    file = file_path(path, "path", "a mesh file")
+    factors = _factors(file, scale)
+    if not file.is_file():
+        raise InputError("there is no such mesh", file=file, expected="a mesh file")
+    by_coal = file.suffix.lower() == ".dae"
+    if by_coal:
+        check_indices(file)
+    try:
+        if by_coal:
+            shape = coal.MeshLoader().load(str(file), np.ones(3))
+            mesh = trimesh.Trimesh(np.array(shape.vertices()), indices(shape))
+        else:
+            mesh = trimesh.load_mesh(file, force="mesh", skip_materials=True)
+            if isinstance(mesh, trimesh.Scene):
+                mesh = mesh.to_mesh()
+    except Exception as error:  # every format's reader raises what it likes
+        expected = "a COLLADA file" if by_coal else "an OBJ, STL, PLY, OFF, glTF or COLLADA file"
+        raise InputError(f"cannot read the mesh: {error}", file=file, expected=expected) from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError("the mesh is empty", file=file, expected="at least one triangle")
+    if np.shape(mesh.vertices)[1:] != (3,):
+        raise InputError(
+            "cannot read the mesh: its vertices have no three coordinates",
+            file=file,
+            expected="x, y and z of each",
+        )
+    if not np.isfinite(mesh.vertices).all():
+        raise InputError(
+            "the mesh has vertices that are no numbers", file=file, expected="finite coordinates"
+        )
+    with np.errstate(over="ignore"):
+        farthest = float(np.abs(mesh.vertices * factors).max())
+    if farthest > LARGEST:
+        raise InputError(
+            "the mesh is out of range",
+            file=file,
+            expected=f"coordinates up to {LARGEST:g} m",
+            got=f"{farthest:g}",
+        )
+    mesh.apply_transform(np.diag([*factors, 1.0]))
+    return mesh
+
+
+def load_convex(
+    path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, about: str | None = None
+) -> coal.Convex:
+    """Return the convex hull of a mesh file as a coal shape, in the file's frame, [m].
+
+    Args:
+        path: The mesh file, see `load_mesh`.
+        scale: One factor per axis, or one for all, from the file's unit to [m].
+        about: The link or obstacle that it is a part of, for warnings and errors.
+
+    Raises:
+        InputError: The mesh cannot be read or is empty, or coal does not hold what the file holds.
+    """
+    file = file_path(path, "path", "a mesh file")
+    if file.is_file():
+        stat = file.stat()
+        with contextlib.suppress(InputError):  # said below, with what it is a part of
+            kept = _hull(
+                file.absolute(),
+                (stat.st_mtime_ns, stat.st_size),
+                tuple(_factors(file, scale).tolist()),
+            )
+            if kept is not None:
+                return kept
+    return convex_hull(load_mesh(path, scale).vertices, file=path, about=about)
+
+
+@lru_cache(maxsize=_HULLS)
+def _hull(file: Path, version: tuple[int, int], scale: tuple[float, ...]) -> coal.Convex | None:
+    """Return the hull of a mesh in a version of its file, None if that is flat, of which each use warns."""
+    points = load_mesh(file, scale).vertices
+    return None if thickened(np.asarray(points, float))[1] else convex_hull(points, file=file)
+
+
+def convex_hull(
+    points: ArrayLike, *, file: str | Path | None = None, about: str | None = None
+) -> coal.Convex:
+    """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape.
+
+    Points in one plane, as of a picture on a wall, become a plate of 1 mm around that plane, with a
+    warning.
+
+    Args:
+        points: The points.
+        file: The file that they are of, for warnings and errors.
+        about: The link or obstacle that they are a part of, for the same.
+
+    Raises:
+        InputError: There are no points, or coal's volume or area is not that of the hull.
+    """
+    given = np.asarray(points, float)
+    if not len(given):
+        raise InputError("a hull of nothing", file=file, field=about, expected="at least one point")
+    given, was_flat = thickened(given)
+    if was_flat:
+        named = " of ".join(str(part) for part in (about, file) if part is not None) or "a mesh"
+        warnings.warn(
+            f"{named} is flat: it collides as a plate, {1e3 * FLAT:g} mm thick", stacklevel=2
+        )
+    hull = compute_hull(given)
+    if (
+        np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS
+    ):  # the tip of a finely meshed cone, a fine disc
+        hull = outer_hull(hull.vertices, vertices=60)
+    vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    vertices.extend(np.asarray(hull.vertices, float))
+    triangles.extend(coal.Triangle(*face) for face in np.asarray(hull.faces).tolist())
+    shape = coal.Convex(vertices, triangles)
+    corners = np.asarray(shape.points())[indices(shape)]
+    area = (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        ).sum()
+        / 2.0
+    )
+    for what, held, wanted in (
+        ("volume", shape.computeVolume(), hull.volume),
+        ("area", area, hull.area),
+    ):
+        if not abs(held - wanted) <= _TOLERANCE * abs(wanted) or wanted <= 0.0:
+            problem = f"coal does not hold this hull: wrong {what}"
+            raise InputError(problem, file=file, field=about, expected=wanted, got=held)
+    shape.computeLocalAABB()
+    return shape
+
+
+def load_parts(
+    path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: float = 0.0
+) -> list[MeshPart]:
+    """Read a mesh file for display: one part for each of its colours, those of textures averaged.
+
+    Args:
+        path: The mesh file, see `load_mesh`.
+        scale: One factor per axis, or one for all, from the file's unit to [m].
+        detail: Vertices closer together than about this [m] become one; 0 keeps the file's own
+            triangles. The mesh that a maker publishes often has screws and bevels that make a page
+            heavy and that nobody sees.
+
+    Raises:
+        InputError: As `load_mesh`.
+    """
+    import trimesh
+
+    file = Path(path)
+    if file.suffix.lower() != ".obj" or not file.is_file():
+        whole = load_mesh(file, scale)
+        return [coarser(MeshPart(np.asarray(whole.vertices), np.asarray(whole.faces)), detail)]
+    factors = _factors(file, scale)
+    try:
+        scene = trimesh.load_scene(file, process=False, group_material=True, split_object=False)
+    except Exception as error:
+        raise InputError(
+            f"cannot read the mesh: {error}", file=file, expected="an OBJ file"
+        ) from error
+    parts = [
+        MeshPart(np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), _colour(mesh))
+        for mesh in scene.geometry.values()
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
+    ]
+    if not parts:
+        raise InputError("the mesh is empty", file=file, expected="at least one triangle")
+    return [coarser(part, detail) for part in parts]
+
+
+def coarser(part: MeshPart, detail: float) -> MeshPart:
+    """Return a lighter copy: the vertices in each cell of a grid become their mean, triangles without area go.
+
+    Args:
+        part: The triangles.
+        detail: Width of the cells [m]; 0 keeps all as it is.
+    """
+    if detail <= 0.0:
+        return part
+    cells = np.round(part.vertices / detail).astype(np.int64)
+    _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)
+    means = np.zeros((len(count), 3))
+    np.add.at(means, group, part.vertices)
+    faces = group[part.faces]
+    faces = faces[
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    ]
+    if len(faces) == 0:
+        return part
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    return MeshPart(means / count[:, None], faces[np.sort(first)], part.colour)
+
+
+def to_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
+    """Return the triangles of `part` as a coal shape, for display."""
+    shape = coal.BVHModelOBBRSS()
+    shape.beginModel(len(part.faces), len(part.vertices))
+    shape.addVertices(np.asarray(part.vertices, float))
+    shape.addTriangles(np.asarray(part.faces, np.int32))
+    shape.endModel()
+    return shape
+
+
+def _factors(file: Path, scale: ArrayLike) -> Floats:
+    factors = np.asarray(scale, float)
+    if factors.shape not in ((), (1,), (3,)) or not (
+        np.isfinite(factors).all() and (factors != 0.0).all()
+    ):
+        raise InputError(
+            "wrong scale of a mesh",
+            file=file,
+            field="scale",
+            expected="3 finite numbers other than 0",
+            got=scale,
+        )
+    return np.broadcast_to(factors, (3,)).astype(float)
+
+
+def indices(shape: coal.Convex | coal.BVHModelBase) -> Ints:
+    """Return the corners of the triangles of a coal shape, shape (m, 3)."""
+    convex = isinstance(shape, coal.Convex)
+    count, item = (
+        (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
+    )
+    return np.array(
+        [[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64
+    ).reshape(-1, 3)
+
+
+def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
+    material = getattr(mesh.visual, "material", None)
+    if material is None:
+        return None
+    image = getattr(material, "image", None)
+    if image is not None:
+        rgb = np.asarray(image.convert("RGB"), float).reshape(-1, 3).mean(axis=0)
+        return (*(rgb / 255.0).tolist(), 1.0)
+    rgba = np.asarray(material.main_color, float) / 255.0
+    return (float(rgba[0]), float(rgba[1]), float(rgba[2]), float(rgba[3]))
+
+
+def _settle_boxes() -> None:
+    """Let coal take boxes as they are, whatever it is asked first.
+
+    coal 3.0.3 decides once per process, from the first direction in which it looks for a box's
+    furthest corner, whether boxes are 1e-10 larger on their negative sides: yes if a component is
+    zero (a `static` in `getShapeSupport`, gone in later versions). So the first question of a
+    process would decide on the last digits of every distance to a box. This one has no such
+    component. It is asked here, below all that asks for distances; compiled code asks the same
+    library.
+    """
+    turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+    box, here, there = (
+        coal.Box(1.0, 1.0, 1.0),
+        coal.Transform3s(),
+        coal.Transform3s(turned, np.array([3.0, 0.4, 0.2])),
+    )
+    plane = coal.Halfspace(
+        np.array([0.36, 0.48, 0.8]), 0.0
+    )  # for the other one, of shapes with a swept sphere
+    for shape, where in ((coal.Capsule(0.1, 0.5), there), (plane, here)):
+        coal.distance(shape, here, box, where, coal.DistanceRequest(), coal.DistanceResult())
+
+
+_settle_boxes()

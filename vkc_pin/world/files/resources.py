@@ -1,0 +1,155 @@
+"""Finds files that users name and files of the package, and chooses names for new files."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError, shown
+
+__all__ = [
+    "available",
+    "choose_file_names",
+    "example_robot_data",
+    "file_path",
+    "find",
+    "folder",
+    "located",
+    "package_folder",
+]
+
+_LONGEST = 64  # characters of a file name without extension; file systems take 255 bytes with it
+_FILE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_PORTS = {f"{port}{number}" for port in ("com", "lpt") for number in range(10)}
+_DEVICES = {"con", "prn", "aux", "nul", *_PORTS}  # reserved on Windows
+
+
+def package_folder() -> Path:
+    """Return the folder of the package's sources."""
+    return Path(__file__).resolve().parents[2]
+
+
+def folder(kind: str) -> Path:
+    """Return the folder of `kind` ("robots" or "scenes"): inside the installed package, else beside it."""
+    package = package_folder()
+    inside = package / kind
+    return inside if inside.is_dir() else package.parent / kind
+
+
+def available(kind: str, pattern: str) -> dict[str, Path]:
+    """Return name → path of what `folder(kind)` holds, by glob `pattern` (the name is the file's or folder's stem)."""
+    return {path.stem: path for path in sorted(folder(kind).glob(pattern))}
+
+
+def find(kind: str, pattern: str, name: str, *, what: str) -> Path:
+    """Return the path of `name` among `available(kind, pattern)`.
+
+    Raises:
+        UnknownNameError: There is none; `what` ("robot", "scene") names the kind in the message.
+    """
+    found = available(kind, pattern)
+    if name not in found:
+        raise UnknownNameError(what, name, found)
+    return found[name]
+
+
+def file_path(value: Any, field: str, expected: str = "a path") -> Path:
+    """Return the path of a file, whether it exists or not.
+
+    Raises:
+        InputError: It is neither text nor a path, or no file can be called that.
+    """
+    if not isinstance(value, str | Path):
+        raise InputError("not a path", field=field, expected=expected, got=shown(value))
+    name = str(value)
+    try:
+        coded = os.fsencode(name)
+    except UnicodeEncodeError:
+        coded = b""
+    if not coded or b"\0" in coded or len(coded) >= 4096 or max(map(len, coded.split(b"/"))) > 255:
+        raise InputError(
+            "no file can be called that", field=field, expected=expected, got=shown(name)
+        )
+    return Path(value)
+
+
+def located(name_or_path: str | Path, kind: str, pattern: str, *, what: str) -> Path:
+    """Return a file by its path (of a .yaml file, or with a slash in it), or by its name; see `find`.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        InputError: It is neither a name nor a path.
+    """
+    path = file_path(name_or_path, what, f"the name of a {what}, or a path")
+    name = str(name_or_path)
+    by_path = isinstance(name_or_path, Path) or name.endswith((".yaml", ".yml")) or "/" in name
+    return path if by_path else find(kind, pattern, name, what=what)
+
+
+def example_robot_data() -> Path | None:
+    """Return the folder of example-robot-data (in the wheels of cmeel: cmeel.prefix/share), or None."""
+    prefixes = [Path(pin.__file__).resolve().parents[4]]
+    spec = importlib.util.find_spec("cmeel")
+    if spec is not None and spec.origin is not None:
+        prefixes.append(Path(spec.origin).resolve().parents[1] / "cmeel.prefix")
+    for prefix in prefixes:
+        if (prefix / "share" / "example-robot-data" / "robots").is_dir():
+            return prefix / "share" / "example-robot-data"
+    return None
+
+
+def choose_file_names(
+    names: Iterable[str], *, fallback: str = "part", taken: Iterable[str] = ()
+) -> list[str]:
+    """Choose a file name, without extension, for each of some names.
+
+    A file name has 1 to 64 ASCII letters, digits, "_" and "-", differs from all others in its
+    folder by more than upper and lower case, and is not reserved on Windows ("con"). Names that
+    satisfy this are kept. In others, "_" replaces each other character, and a number tells equal
+    results apart.
+
+    Args:
+        names: Names of links, objects or files. Equal names get different file names.
+        fallback: File name for names without ASCII letters and digits.
+        taken: Names of existing files in the folder, without extension.
+
+    Returns:
+        One file name for each name, in the same order.
+    """
+    given = list(names)
+    used, numbers = {name.lower() for name in taken}, dict[str, int]()
+    chosen: dict[int, str] = {}
+    for index, name in enumerate(given):
+        if _is_file_name(name) and name.lower() not in used:
+            chosen[index] = name
+            used.add(name.lower())
+    for index, name in enumerate(given):
+        if index in chosen:
+            continue
+        stem = name if _is_file_name(name) else _replace_characters(name, fallback)
+        new, number = stem, numbers.get(stem.lower(), 1)
+        while new.lower() in used:
+            number += 1
+            new = f"{stem[: _LONGEST - 1 - len(str(number))]}_{number}"
+        numbers[stem.lower()] = number
+        chosen[index] = new
+        used.add(new.lower())
+    return [chosen[index] for index in range(len(given))]
+
+
+def _is_file_name(name: str) -> bool:
+    return _FILE_NAME.fullmatch(name) is not None and name.lower() not in _DEVICES
+
+
+def _replace_characters(name: str, fallback: str) -> str:
+    """Return a name with "_" in place of each character that file names lack, shortened."""
+    stem = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:_LONGEST]
+    if re.search(r"[A-Za-z0-9]", stem) is None:
+        return fallback
+    return f"{stem}_" if stem.lower() in _DEVICES else stem

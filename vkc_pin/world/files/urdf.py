@@ -1,0 +1,394 @@
+"""Reads URDF files: what they say about geometry, and objects without a root joint as Pinocchio models."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files import resources
+from vkc_pin.world.files.kinematic_tree import check_tree, numbers_of, plain_tree
+from vkc_pin.world.files.meshes import load_convex, load_mesh, to_bvh
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.xml import line_of, read_xml
+
+if TYPE_CHECKING:
+    import trimesh
+
+__all__ = ["UrdfFile", "UrdfShape", "load_urdf", "read_urdf", "tree_model"]
+
+Colour = tuple[float, float, float, float]
+_LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)
+# shapes of a kind that become one model: Pinocchio's take the third power of their number in time
+# to grow
+_MOST = 1000
+_JOINTS = ("revolute", "continuous", "prismatic", "fixed")
+
+
+@dataclass(frozen=True)
+class UrdfShape:
+    """One <visual> or <collision> element.
+
+    Attributes:
+        link: The link it belongs to.
+        name: `<link>_<k>`, k counting the elements of that kind of the link.
+        placement: In the link's frame.
+        kind: "box", "sphere", "cylinder", "capsule" or "mesh".
+        size: Edge lengths of a box, radius of a sphere, radius and length of a cylinder or capsule,
+            [m]; scale of a mesh.
+        file: The mesh file.
+        colour: Red, green, blue, opacity, or None if the URDF names none.
+    """
+
+    link: str
+    name: str
+    placement: pin.SE3
+    kind: str
+    size: tuple[float, ...]
+    _: KW_ONLY
+    file: Path | None = None
+    colour: Colour | None = None
+
+    def solid(self) -> coal.CollisionGeometry:
+        """Return it as a coal shape in its own frame, a mesh as its convex hull.
+
+        Raises:
+            InputError: Its mesh cannot be read.
+        """
+        if self.file is not None:
+            return load_convex(self.file, self.size, about=self.link)
+        kinds = {
+            "box": coal.Box,
+            "sphere": coal.Sphere,
+            "cylinder": coal.Cylinder,
+            "capsule": coal.Capsule,
+        }
+        return kinds[self.kind](*self.size)
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Return its triangles in the link's frame, [m]; round shapes as circumscribed polygons of 64 sides."""
+        import trimesh
+
+        if self.file is not None:
+            mesh = load_mesh(self.file, self.size)
+        elif self.kind == "box":
+            mesh = trimesh.creation.box(self.size)
+        elif self.kind == "sphere":
+            mesh = trimesh.creation.icosphere(subdivisions=3, radius=1.005 * self.size[0])
+        elif self.kind == "capsule":
+            mesh = trimesh.creation.capsule(
+                height=self.size[1], radius=self.size[0] / np.cos(np.pi / 64), count=[64, 64]
+            )
+        else:
+            mesh = trimesh.creation.cylinder(
+                self.size[0] / np.cos(np.pi / 64), height=self.size[1], sections=64
+            )
+        return mesh.apply_transform(self.placement.homogeneous)
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfFile:
+    """A URDF file that was read.
+
+    Attributes:
+        path: The file.
+        text: What it says.
+        root: The same as XML.
+        packages: Package name → folder, for `package://` addresses.
+    """
+
+    path: Path
+    text: str
+    root: ElementTree.Element
+    packages: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """The names of the links, in the file's order."""
+        return tuple(link.get("name", "") for link in self.root.findall("link"))
+
+    def shapes(self, kind: str) -> list[UrdfShape]:
+        """Return all elements of `kind`, "visual" or "collision".
+
+        Raises:
+            InputError: One of them is not understood, or its mesh file does not exist.
+        """
+        colours = {
+            material.get("name", ""): colour
+            for material in reversed(
+                list(self.root.iter("material"))
+            )  # where several have one name, the first counts
+            if (colour := self._colour(material))
+        }
+        found = []
+        for link in self.root.findall("link"):
+            name = link.get("name", "")
+            for index, element in enumerate(link.findall(kind)):
+                found.append(self._shape(name, f"{name}_{index}", element, colours))
+        return found
+
+    def few_shapes(self, kind: str) -> list[UrdfShape]:
+        """Return all elements of a kind for one model; see `shapes`.
+
+        Raises:
+            InputError: As there, or there are too many.
+        """
+        shapes = self.shapes(kind)
+        if len(shapes) > _MOST:
+            raise InputError(
+                f"too many <{kind}> elements",
+                file=self.path,
+                expected=f"at most {_MOST}",
+                got=len(shapes),
+            )
+        return shapes
+
+    def resolve(self, address: str) -> Path:
+        """Return the file that a mesh's address means: `package://NAME/...`, `file://...`, absolute or beside the URDF.
+
+        Raises:
+            InputError: There is no such package or file.
+        """
+        if address.startswith("package://"):
+            package, _, inside = address.removeprefix("package://").partition("/")
+            folders = [self.packages[package]] if package in self.packages else []
+            around = dict.fromkeys(
+                [*self.path.parents, *self.path.resolve().parents]
+            )  # of a link to it, and of the file itself
+            folders += [folder / package for folder in around] + list(around)
+            if (
+                package == "example-robot-data"
+                and (data := resources.example_robot_data()) is not None
+            ):
+                folders.append(data)  # for copies of its URDFs, wherever they are
+            candidates = [folder / inside for folder in folders]
+        else:
+            plain = Path(address.removeprefix("file://"))
+            candidates = [
+                folder / plain for folder in (self.path.parent, self.path.resolve().parent)
+            ]  # plain, if absolute
+        for candidate in candidates:
+            if file_path(candidate, "filename", "a mesh file").is_file():
+                return candidate
+        tried = f"nothing at {candidates[0]}"
+        raise InputError(
+            "there is no such mesh",
+            file=self.path,
+            field=address,
+            expected="a mesh file",
+            got=tried,
+        )
+
+    def _shape(
+        self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]
+    ) -> UrdfShape:
+        geometry = element.find("geometry")
+        shape = next(iter(geometry), None) if geometry is not None else None
+        if shape is None:
+            raise InputError(
+                "an element without geometry",
+                file=self.path,
+                line=line_of(element),
+                field=name,
+                expected="<geometry> with a shape",
+            )
+        origin = element.find("origin")
+        placement = pin.SE3.Identity()
+        if origin is not None:
+            position, angles = (
+                self._numbers(origin, "xyz", 3, "0 0 0", name),
+                self._numbers(origin, "rpy", 3, "0 0 0", name),
+            )
+            placement = pin.SE3(_rotation(*angles), np.array(position))
+        material = element.find("material")
+        colour = (
+            None
+            if material is None
+            else self._colour(material) or colours.get(material.get("name", ""))
+        )
+        if shape.tag == "mesh":
+            file, scale = (
+                self.resolve(shape.get("filename", "")),
+                self._numbers(shape, "scale", 3, "1 1 1", name),
+            )
+            return UrdfShape(link, name, placement, "mesh", scale, file=file, colour=colour)
+        if shape.tag == "box":
+            size = self._numbers(shape, "size", 3, None, name)
+        elif shape.tag == "sphere":
+            size = self._numbers(shape, "radius", 1, None, name)
+        elif shape.tag in ("cylinder", "capsule"):
+            size = self._numbers(shape, "radius", 1, None, name) + self._numbers(
+                shape, "length", 1, None, name
+            )
+        else:
+            known = "box, sphere, cylinder, capsule or mesh"
+            raise InputError(
+                "this shape is not supported",
+                file=self.path,
+                line=line_of(element),
+                field=name,
+                expected=known,
+                got=shape.tag,
+            )
+        if min(size) <= 0.0:
+            raise InputError(
+                "a shape without volume",
+                file=self.path,
+                line=line_of(element),
+                field=name,
+                expected="sizes above 0",
+                got=size,
+            )
+        return UrdfShape(link, name, placement, shape.tag, size, colour=colour)
+
+    def _colour(self, material: ElementTree.Element) -> Colour | None:
+        colour = material.find("color")
+        if colour is None or colour.get("rgba") is None:
+            return None
+        red, green, blue, opacity = self._numbers(
+            colour, "rgba", 4, None, material.get("name", "material")
+        )
+        return (red, green, blue, opacity)
+
+    def _numbers(
+        self, element: ElementTree.Element, key: str, count: int, default: str | None, where: str
+    ) -> tuple[float, ...]:
+        return numbers_of(self.path, element, key, count, default=default, where=where)
+
+
+def read_urdf(
+    path: str | Path, packages: Mapping[str, Path] | None = None, *, text: str | None = None
+) -> UrdfFile:
+    """Read a URDF file.
+
+    Args:
+        path: The file.
+        packages: Package name → folder. Other packages are looked for in the folders around the
+            file.
+        text: What it says, where that stands elsewhere: no file is read then, but meshes are looked
+            for as if `path` were one.
+
+    Raises:
+        InputError: The file does not exist, is no XML, no URDF, or its links and joints are no
+            tree; see `check_tree`.
+        UnknownNameError: A joint names a link that does not exist.
+    """
+    file = Path(path)
+    text, root = read_xml(file, "URDF", text)
+    check_tree(file, root)
+    return UrdfFile(file.absolute(), text, root, dict(packages or {}))
+
+
+def tree_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
+    """Return the Pinocchio model of all links and joints of a URDF.
+
+    A joint whose limit says nothing about velocity has none, as one without a limit; efforts play
+    no part here.
+
+    Args:
+        file: The file.
+        *root: A joint that carries all of it, and its name; without one its root stands still.
+
+    Raises:
+        InputError: It is no valid URDF.
+    """
+    text, silent = plain_tree(file.path, file.root)
+    try:
+        model = pin.buildModelFromXML(text, *root)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"not a valid URDF: {error}", file=file.path) from error
+    velocity = model.velocityLimit
+    for j in range(1, model.njoints):
+        if model.names[j] in silent:
+            velocity[model.joints[j].idx_v : model.joints[j].idx_v + model.joints[j].nv] = np.inf
+    model.velocityLimit = velocity
+    return model
+
+
+def load_urdf(
+    path: str | Path, *, text: str | None = None
+) -> tuple[pin.Model, pin.GeometryModel, pin.GeometryModel]:
+    """Return model, collision and visual geometry of a URDF without a root joint; its root link's frame is the universe frame.
+
+    Collision meshes become their convex hulls.
+
+    Args:
+        path: The file.
+        text: What it says, where that stands elsewhere; see `read_urdf`.
+
+    Raises:
+        InputError: There is no such file, it is no valid URDF, a shape is not understood, a mesh
+            cannot be read, a joint type is not supported, or a link is drawn while nothing in the
+            whole file can collide.
+    """
+    file = read_urdf(path, text=text)
+    for joint in file.root.findall(
+        "joint"
+    ):  # what Pinocchio would accept with another meaning, or refuse without saying why
+        name, kind, line = joint.get("name"), joint.get("type"), line_of(joint)
+        if kind not in _JOINTS:
+            problem, expected = "this joint type is not supported", ", ".join(_JOINTS)
+            raise InputError(problem, file=path, line=line, field=name, expected=expected, got=kind)
+        if joint.find("mimic") is not None:  # Pinocchio's parser would let it move on its own
+            problem = "joints that mimic others are not supported"
+            raise InputError(problem, file=path, line=line, field=name, expected="no <mimic>")
+    model = tree_model(file)
+    collision, visual = _geometry(model, file, "collision"), _geometry(model, file, "visual")
+    if len(visual.geometryObjects) > 0 and len(collision.geometryObjects) == 0:
+        raise InputError(
+            "nothing in this URDF can collide",
+            file=path,
+            expected="<collision> elements",
+            got="only <visual> ones",
+        )
+    return model, collision, visual
+
+
+def _geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
+    """Return the shapes of `kind`, "visual" or "collision", on the links of `model`, in the order of its frames."""
+    geometry = pin.GeometryModel()
+    shapes = [
+        (model.getFrameId(shape.link, pin.FrameType.BODY), shape) for shape in file.few_shapes(kind)
+    ]
+    for index, shape in sorted(shapes, key=lambda pair: pair[0]):
+        frame = model.frames[index]
+        solid = (
+            to_bvh(load_mesh(shape.file, shape.size))
+            if kind == "visual" and shape.file is not None
+            else shape.solid()
+        )
+        added = pin.GeometryObject(
+            shape.name, frame.parentJoint, index, frame.placement * shape.placement, solid
+        )
+        added.meshColor, added.overrideMaterial = (
+            np.array(shape.colour or _LIGHT_GREY),
+            shape.colour is not None,
+        )
+        if shape.file is not None:  # viewers draw the file
+            added.meshPath, added.meshScale = str(shape.file), np.array(shape.size)
+        geometry.addGeometryObject(added)
+    return geometry
+
+
+def _rotation(roll: float, pitch: float, yaw: float) -> Floats:
+    """Return the rotation, shape (3, 3), of angles [rad] about fixed axes, to the last bit as Pinocchio's reader has it."""
+    (a, u), (b, v), (c, w) = (
+        (math.sin(angle / 2.0), math.cos(angle / 2.0)) for angle in (roll, pitch, yaw)
+    )
+    x, y, z, s = (
+        a * v * w - u * b * c,
+        u * b * w + a * v * c,
+        u * v * c - a * b * w,
+        u * v * w + a * b * c,
+    )
+    norm = math.sqrt(x * x + y * y + z * z + s * s)
+    return np.array(pin.Quaternion(s / norm, x / norm, y / norm, z / norm).matrix())

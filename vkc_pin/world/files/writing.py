@@ -1,0 +1,321 @@
+"""Writes files and folders completely or not at all, and checks their names and targets first."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import shutil
+import stat
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from vkc_pin.errors import InputError, shown
+from vkc_pin.utils.interrupt import deferred
+from vkc_pin.world.files.documents import parse_json, read_text
+from vkc_pin.world.files.resources import file_path
+
+__all__ = [
+    "check_inside",
+    "check_links",
+    "check_name",
+    "check_outputs",
+    "check_replaceable",
+    "check_writable",
+    "folder_at_once",
+    "write_atomically",
+]
+
+MANIFEST = ".vkc-pin.json"
+"""File in every folder of `folder_at_once` that lists its other files."""
+_LONGEST_NAME = 200  # bytes, so that an ending can be added
+_SHOWN = 3  # files that a message names
+
+
+def write_atomically(path: str | Path, data: bytes) -> Path:
+    """Write `data` to `path` whole or not at all, making its folder if need be; return the path.
+
+    A symbolic link stays, and what it names is written. A file that is there keeps its mode. Ctrl-C
+    waits until it is done.
+
+    Raises:
+        InputError: The path names something else than a file, or it cannot be written.
+    """
+    with _told(path):
+        target, mode = _target(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with deferred():
+            temporary = _temporary(target.parent)
+            try:
+                with temporary.open("xb") as stream:
+                    stream.write(data)
+                    if mode is not None:
+                        os.fchmod(stream.fileno(), mode)
+                temporary.replace(target)
+            except BaseException:
+                temporary.unlink(missing_ok=True)
+                raise
+    return Path(path)
+
+
+def check_writable(path: str | Path, *, field: str | None = None) -> Path:
+    """Return where `write_atomically` would write.
+
+    Raises:
+        InputError: It cannot: the path, which `field` names, is that of something else, or nothing
+            can be made there.
+    """
+    with _told(path, field):
+        target, _ = _target(path)
+        place, missing = target.parent, [target.name]
+        while not place.exists():
+            missing.append(place.name)
+            place = place.parent
+        for name in missing:  # no file system takes any name
+            with contextlib.suppress(FileNotFoundError):
+                (place / name).lstat()
+        temporary = _temporary(place)  # only trying tells: of a disk that is read-only, say
+        with deferred():
+            try:
+                temporary.open("xb").close()
+            finally:
+                temporary.unlink(missing_ok=True)
+    return target
+
+
+def check_outputs(
+    files: Mapping[str, str | Path], *, kept: Mapping[str, str | Path] | None = None
+) -> None:
+    """Check that files can be written, and do not get in each other's way.
+
+    Args:
+        files: Option or argument → the file that it names.
+        kept: Option or argument → a file that is read, and must not be written.
+
+    Raises:
+        InputError: One of them cannot be written, names what another one does, or needs a folder
+            where another one is a file.
+    """
+    taken = {
+        Path(os.path.realpath(file_path(path, field))): field
+        for field, path in (kept or {}).items()
+    }
+    targets: dict[Path, str] = {}
+    for field, path in files.items():
+        target = check_writable(path, field=field)
+        if (other := {**taken, **targets}.get(target)) is not None:
+            raise InputError(
+                "this file is named twice",
+                file=path,
+                field=field,
+                expected=f"another file than {other}",
+            )
+        targets[target] = field
+    for target, field in targets.items():
+        if (
+            above := next((place for place in target.parents if place in targets), None)
+        ) is not None:
+            raise InputError(
+                "a file cannot be a folder",
+                file=above,
+                field=field,
+                got=f"the file of {targets[above]}",
+            )
+
+
+def check_name(name: object, field: str, *, file: str | Path | None = None) -> str:
+    """Return a name of a file or folder, to be joined to a folder that the result must not leave.
+
+    Every name that was read from a file is checked with this before it becomes part of a path.
+
+    Args:
+        name: The name.
+        field: Field or argument that it comes from, for the error.
+        file: File that it was read from, for the error.
+
+    Raises:
+        InputError: It is not text, is empty or too long, begins with a dot, or has a slash, a
+            backslash or a character that cannot be printed.
+    """
+    plain = isinstance(name, str) and name.isprintable() and not {"/", "\\"} & set(name)
+    if (
+        isinstance(name, str)
+        and plain
+        and 0 < len(name.encode()) <= _LONGEST_NAME
+        and name[0] != "."
+    ):
+        return name
+    expected = f"at most {_LONGEST_NAME} bytes of text without slashes, not beginning with a dot"
+    problem, got = "not a plain file name", shown(name)
+    raise InputError(problem, file=file, field=field, expected=expected, got=got)
+
+
+def check_inside(path: str | Path, folder: str | Path) -> None:
+    """Check that a path in a folder is not a symbolic link to a place outside.
+
+    Raises:
+        InputError: It is.
+    """
+    root, target = (Path(os.path.realpath(place)) for place in (folder, path))
+    if not target.is_relative_to(root):
+        expected = f"a path inside {root}"
+        raise InputError(
+            "a symbolic link leads out of the folder", file=path, expected=expected, got=target
+        )
+
+
+def check_links(folder: str | Path) -> None:
+    """Check that no symbolic link anywhere in a folder leads out of it.
+
+    Whatever is written to paths in the folder afterwards changes nothing outside.
+
+    Raises:
+        InputError: A link does, or the folder cannot be read.
+    """
+    with _told(folder):
+        links = [entry.path for entry in _walk(folder) if entry.is_symlink()]
+    for link in links:
+        check_inside(link, folder)
+
+
+def check_replaceable(folder: str | Path) -> None:
+    """Check that a folder has no files but those that `folder_at_once` wrote to it.
+
+    Raises:
+        InputError: It has others, or cannot be read.
+    """
+    with _told(folder):
+        found = {os.path.relpath(entry.path, folder) for entry in _walk(folder)}
+    if others := sorted(found - {MANIFEST} - _read_manifest(Path(folder))):
+        more = f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else ""
+        raise InputError(
+            "the folder has files that vkc-pin did not write, and would delete",
+            file=folder,
+            expected="a folder without them: move them elsewhere",
+            got=f"{', '.join(others[:_SHOWN])}{more}",
+        )
+
+
+def _read_manifest(folder: Path) -> set[str]:
+    """Return the files that a folder's manifest lists; none if there is no valid manifest."""
+    try:
+        files = parse_json(read_text(folder / MANIFEST, "JSON"), folder / MANIFEST)["files"]
+        return {name for name in files if isinstance(name, str)}
+    except (InputError, LookupError, TypeError):
+        return set()
+
+
+def _walk(folder: str | Path) -> Iterator[os.DirEntry[str]]:
+    """Yield every entry below a folder that is not a folder itself. Links are not followed."""
+    pending = [os.fspath(folder)]
+    while pending:
+        with os.scandir(pending.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    pending.append(entry.path)
+                else:
+                    yield entry
+
+
+@contextlib.contextmanager
+def folder_at_once(path: str | Path, *, force: bool = False) -> Iterator[Path]:
+    """Yield a new folder to write into, which becomes `path` if nothing is raised, else is removed.
+
+    A list of its files is written to it as well, so that a later call can replace it safely.
+
+    Args:
+        path: The folder to create, with its parents if necessary.
+        force: Replace an existing folder if it is empty, or has only files that this wrote to it.
+
+    Raises:
+        InputError: The folder exists and may not be replaced, it cannot be created, or `path` is
+            not a folder.
+    """
+    target = Path(os.path.realpath(file_path(path, "path", "a folder")))
+    _check_target(target, path, force)
+    with _told(path):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        staging = _temporary(target.parent)
+        staging.mkdir()
+    try:
+        yield staging
+        _check_target(target, path, force)  # it may have changed in the meantime
+        with _told(path), deferred():
+            _write_manifest(staging)
+            _replace(target, staging)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def _check_target(target: Path, path: str | Path, force: bool) -> None:
+    """Check that a folder does not exist, or may be replaced. Raises InputError if not."""
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise InputError("this is no folder", file=path, expected="a new folder", got="a file")
+    if not force:
+        expected = "a new folder, or force=True (--force) to replace it"
+        raise InputError("this folder is there already", file=path, expected=expected)
+    check_replaceable(target)
+
+
+def _write_manifest(folder: Path) -> None:
+    (folder / MANIFEST).unlink(missing_ok=True)
+    files = sorted(os.path.relpath(entry.path, folder) for entry in _walk(folder))
+    (folder / MANIFEST).write_text(json.dumps({"files": files}, indent=1) + "\n", encoding="utf-8")
+
+
+def _replace(target: Path, staging: Path) -> None:
+    """Rename a folder to `target`, and delete the one that had that name."""
+    if not target.exists():
+        staging.rename(target)
+        return
+    old = _temporary(target.parent)
+    target.rename(old)
+    try:
+        staging.rename(target)
+    except OSError:
+        old.rename(target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _target(path: str | Path) -> tuple[Path, int | None]:
+    """Return what a path leads to, and the mode of what is there; None if nothing is."""
+    target = Path(os.path.realpath(path))
+    try:
+        found = os.stat(path)  # noqa: PTH116 - as text, which tells a folder by its slash
+    except FileNotFoundError:
+        if not str(path) or str(path).endswith(os.sep):
+            raise IsADirectoryError("a folder") from None
+        return target, None
+    if not stat.S_ISREG(found.st_mode):
+        kinds = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
+        raise IsADirectoryError(
+            next((name for is_kind, name in kinds.items() if is_kind(found.st_mode)), "a device")
+        )
+    if not os.access(target, os.W_OK):
+        raise PermissionError("no permission to write it")
+    return target, stat.S_IMODE(found.st_mode)
+
+
+def _temporary(folder: Path) -> Path:
+    """Return a new name in a folder, for a file that is renamed when it is whole."""
+    return folder / f".vkc-pin-{secrets.token_hex(8)}"
+
+
+@contextlib.contextmanager
+def _told(path: str | Path, field: str | None = None) -> Iterator[None]:
+    """Say what is wrong with a path."""
+    path = (
+        path if isinstance(path, str) else file_path(path, "path")
+    )  # text may end with a slash, which paths forget
+    try:
+        yield
+    except (OSError, ValueError) as error:  # the latter: a NUL in the name
+        got = getattr(error, "strerror", None) or str(error)
+        expected = "a regular file or a new one"
+        raise InputError(
+            "cannot write this", file=str(path), field=field, expected=expected, got=got
+        ) from error

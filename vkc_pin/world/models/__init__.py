@@ -1,0 +1,1 @@
+"""Defines robots and articulated objects: Pinocchio models with convex shapes and limits."""

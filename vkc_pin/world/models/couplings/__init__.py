@@ -1,0 +1,1 @@
+"""Handles mimic joints: several joints that share one coordinate, as in a telescope."""

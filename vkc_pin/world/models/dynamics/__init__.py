@@ -1,0 +1,1 @@
+"""Describes dynamics: masses, joint friction, damping and springs, and torque limits."""

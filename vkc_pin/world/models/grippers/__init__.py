@@ -1,0 +1,1 @@
+"""Models grippers: finger joints and the opening between the fingers."""

@@ -1,0 +1,275 @@
+"""Defines robots: a URDF on a planar virtual base, with limits and convex collision shapes."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.urdf import UrdfFile
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.models.dynamics.torque_limits import TorqueLimits, compute_torque_limits
+from vkc_pin.world.models.grafting import round_placement
+from vkc_pin.world.models.grippers.gripper import Gripper
+from vkc_pin.world.models.robot_model import load_visual_geometry
+from vkc_pin.world.models.robot_schema import Wheels
+from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name, triangulate
+
+__all__ = ["Base", "Robot"]
+
+_MIN_LEVER = 0.1  # [m/rad] about the size of a hand
+_FRONT_DISTANCE = 10.0  # [m] larger than any hand
+_LEVER_SAMPLES = 200  # random configurations over which the lever is averaged
+_TIGHT_FACTOR = 0.5  # margin of links that are always close, relative to their largest distance
+
+Base = Literal["omni", "differential", "ackermann", "fixed"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Robot:
+    """A mobile manipulator.
+
+    Its n coordinates z are (base_x, base_y, base_yaw, arm joints), [m] and [rad].
+
+    Attributes:
+        name: Name of the robot.
+        urdf: Path of its URDF.
+        model: Pinocchio model. Joint 1, named "base", is planar; the planned joints follow. All
+            other joints of the URDF are locked.
+        collision: Convex shapes named `<link>_<k>`, with the pairs to check for self-collision.
+        coordinates: Minimal coordinates of `model`.
+        lower, upper: Position limits, shape (n,) [m], [rad]; infinite for the yaw and for
+            continuous joints.
+        velocity, acceleration: Velocity and acceleration limits, shape (n,).
+        home: Home configuration of the arm, shape (n − 3,) [m], [rad].
+        tool_frame: Frame of `model` that grasps: z is the direction of approach, x the direction
+            in which fingers close.
+        base: Type of the base: "omni" moves in any direction, "differential" moves along its x
+            axis and turns, "ackermann" moves along its x axis and turns no tighter than
+            `turning_radius`, "fixed" does not move.
+        touch_links: Links that may touch grasped objects.
+        height: Height of the root link above the floor [m].
+        gripper: Model of the fingers, if the description has one. Otherwise they are locked.
+        wheels: Wheels of the base, if the description has them. They limit the velocity of bases
+            of type "differential" and "ackermann".
+        turning_radius: Minimum turning radius of the base's origin, for "ackermann" bases [m].
+        tight: Pairs of links, each sorted, that are less than 50 mm apart in all configurations,
+            or at home → their largest distance, or that at home [m].
+        file: The parsed URDF.
+    """
+
+    name: str
+    urdf: Path
+    model: pin.Model
+    collision: pin.GeometryModel
+    coordinates: Coordinates
+    lower: Floats
+    upper: Floats
+    velocity: Floats
+    acceleration: Floats
+    home: Floats
+    tool_frame: str
+    base: Base
+    touch_links: tuple[str, ...] = ()
+    height: float = 0.0
+    gripper: Gripper | None = field(default=None, repr=False)
+    wheels: Wheels | None = None
+    turning_radius: float = 0.0
+    tight: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
+    file: UrdfFile = field(repr=False)
+    _opened: dict[float, Robot] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def visual(self) -> pin.GeometryModel:
+        """Visual geometry, loaded on first access, since display meshes are large.
+
+        Raises:
+            InputError: A mesh cannot be read.
+        """
+        return load_visual_geometry(self.model, self.file)
+
+    @cached_property
+    def lever(self) -> float:
+        """Mean motion of the hand per radian, over the arm's joints and configurations [m/rad].
+
+        Searches use it to weigh rotations against translations of the base. All rotations have the
+        same weight: with cheaper wrist rotations, searches would find long ones.
+        """
+        rng, data, frame = (
+            np.random.default_rng(0),
+            self.model.createData(),
+            self.model.getFrameId(self.tool_frame),
+        )
+        turns = [k for k, unit in enumerate(self.coordinates.units) if k > 2 and unit == "rad"]
+        if not turns:
+            return _MIN_LEVER
+        low, high = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
+        squares = np.zeros(len(turns))
+        for z in rng.uniform(low, np.maximum(low, high), (_LEVER_SAMPLES, len(low))):
+            jacobian = pin.computeFrameJacobian(
+                self.model, data, self.coordinates.q(z), frame, pin.LOCAL_WORLD_ALIGNED
+            )
+            squares += (jacobian[:3, turns] ** 2).sum(axis=0)
+        return max(float(np.sqrt(squares / _LEVER_SAMPLES).mean()), _MIN_LEVER)
+
+    @cached_property
+    def efforts(self) -> TorqueLimits:
+        """Torque limits of the joints, as far as the description is plausible."""
+        return compute_torque_limits(self.model, self.coordinates, self.lower, self.upper)
+
+    @cached_property
+    def front(self) -> pin.SE3:
+        """Foremost point of the hand in the tool frame, with the same axes.
+
+        It is the largest extent of the touch links along the direction of approach.
+        """
+        frame = self.model.frames[self.model.getFrameId(self.tool_frame)]
+        ahead = coal.Halfspace(np.array([0.0, 0.0, -1.0]), -_FRONT_DISTANCE)  # beyond the hand
+        tool_shapes = [
+            s for s in self.collision.geometryObjects if s.parentJoint == frame.parentJoint
+        ]
+        hand = [
+            (s.geometry, frame.placement.actInv(s.placement))
+            for s in tool_shapes
+            if get_link_name(s.name) in self.touch_links
+        ]
+        gaps = [
+            compute_shape_distance(geometry, where, ahead, pin.SE3.Identity())
+            for geometry, where in hand
+        ]
+        return pin.SE3(
+            np.eye(3), np.array([0.0, 0.0, _FRONT_DISTANCE - min(gaps, default=_FRONT_DISTANCE)])
+        )
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Digest of all that the distances between links depend on.
+
+        It covers shapes and their placements, limits, home, links and joints.
+        """
+        digest, data = hashlib.sha256(), self.model.createData()
+        for joint in self.file.root.findall("joint"):
+            ends = [
+                element.get("link")
+                for key in ("parent", "child")
+                if (element := joint.find(key)) is not None
+            ]
+            digest.update(repr((joint.get("name"), joint.get("type"), ends)).encode())
+        digest.update(repr((self.coordinates.names, list(self.model.parents))).encode())
+        for values in (self.lower, self.upper, self.home):
+            digest.update(np.asarray(values, float).tobytes())
+        for z in np.random.default_rng(0).uniform(
+            -3.0, 3.0, (3, len(self.lower))
+        ):  # captures axes and placements of joints
+            pin.forwardKinematics(self.model, data, self.coordinates.q(z))
+            digest.update(np.array([place.homogeneous for place in data.oMi]).tobytes())
+        for shape in self.collision.geometryObjects:
+            points, faces = triangulate(shape.geometry)
+            digest.update(repr((shape.name, shape.parentJoint, points.shape, faces.shape)).encode())
+            digest.update(points.tobytes() + shape.placement.homogeneous.tobytes())
+        return digest.hexdigest()
+
+    def opening(self, asked: float | None) -> float | None:
+        """Return the feasible gripper opening nearest to `asked` [m].
+
+        Returns None, which stands for the rest position, if `asked` is None or there is no gripper.
+        """
+        return None if asked is None or self.gripper is None else self.gripper.clamp_opening(asked)
+
+    def opened(self, opening: float | None) -> Robot:
+        """Return a copy of the robot with its fingers locked at an opening.
+
+        Collision pairs and margins stay the same.
+
+        Args:
+            opening: Gripper opening [m]. None stands for the rest position: the robot itself.
+
+        Raises:
+            InputError: The robot has no gripper, or the opening is out of its range.
+        """
+        if opening is None:
+            return self
+        if self.gripper is None:
+            expected = "a `gripper` in its robot.yaml"
+            raise InputError(
+                f"robot '{self.name}' has no gripper that opens",
+                field="opening",
+                expected=expected,
+                got=opening,
+            )
+        if opening not in self._opened:
+            model, collision = pin.Model(self.model), self.collision.copy()
+            for name, placement in self.gripper.compute_frames(opening).items():
+                model.frames[model.getFrameId(name)].placement = placement
+            for shape in collision.geometryObjects:
+                old, new = (
+                    there.frames[shape.parentFrame].placement for there in (self.model, model)
+                )
+                if old != new:
+                    shape.placement = round_placement(new * old.actInv(shape.placement))
+            self._opened[opening] = dataclasses.replace(
+                self, model=model, collision=collision, _opened={}
+            )
+        return self._opened[opening]
+
+    @property
+    def start_limits(self) -> tuple[Floats, Floats]:
+        """Limits of start configurations, shape (n,) each [m], [rad].
+
+        They are the robot's position limits, but a fixed base may be placed anywhere.
+        """
+        lower, upper = self.lower.copy(), self.upper.copy()
+        if self.base == "fixed":
+            lower[:3], upper[:3] = -np.inf, np.inf
+        return lower, upper
+
+    def __repr__(self) -> str:
+        return (
+            f"<Robot {self.name}: {len(self.home)} joints, {self.base} base, "
+            f"tool frame {self.tool_frame}>"
+        )
+
+    def link_of(self, geometry: int) -> str:
+        """Return the link of shape number `geometry` of `collision`.
+
+        Raises:
+            InputError: The shape does not exist.
+        """
+        geometry = whole(geometry, "geometry", low=0, high=len(self.collision.geometryObjects) - 1)
+        return get_link_name(self.collision.geometryObjects[geometry].name)
+
+    def own_margin(self, links: tuple[str, str], margin: float) -> float:
+        """Return the margin of a sorted pair of links: `margin` or half of `tight`, if less [m]."""
+        return min(margin, _TIGHT_FACTOR * self.tight.get(links, np.inf))
+
+    def own_margins(self, margin: float) -> dict[tuple[int, int], float]:
+        """Return the margin of each collision pair, by the indices of its shapes [m].
+
+        Both the NLP and the validation use it.
+
+        Args:
+            margin: Margin of pairs that are not tight: `Options.self_distance` [m].
+        """
+        found, links = {}, [get_link_name(shape.name) for shape in self.collision.geometryObjects]
+        for pair in self.collision.collisionPairs:
+            one, other = sorted((links[pair.first], links[pair.second]))
+            found[pair.first, pair.second] = self.own_margin((one, other), margin)
+        return found
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Links that have collision geometry, each once."""
+        return tuple(
+            dict.fromkeys(get_link_name(shape.name) for shape in self.collision.geometryObjects)
+        )

@@ -1,0 +1,436 @@
+"""Loads robots from their files: URDF, robot.yaml and SRDF."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arguments import mapping, quantity, text
+from vkc_pin.world.files import resources
+from vkc_pin.world.files.documents import Document
+from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.srdf import Srdf, group_tip, read_srdf
+from vkc_pin.world.files.urdf import UrdfFile, read_urdf
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.models.couplings.coupled_joints import apply_couplings
+from vkc_pin.world.models.couplings.limits import apply_robot_limits, tighten_coupled_limits
+from vkc_pin.world.models.grippers.gripper import build_gripper
+from vkc_pin.world.models.robot import Base, Robot
+from vkc_pin.world.models.robot_model import (
+    build_full_model,
+    build_planned_model,
+    compute_rest_positions,
+    find_base_joints,
+    find_default_tool_frame,
+    find_nearest_position,
+    load_collision_geometry,
+)
+from vkc_pin.world.models.robot_schema import (
+    RobotSchema,
+    find_python_packages,
+    read_robot,
+    read_wheels,
+)
+from vkc_pin.world.models.self_collisions import apply_self_collision_analysis, set_collision_pairs
+from vkc_pin.world.models.shapes import LIMIT_SLACK
+
+__all__ = ["find_robot", "list_robots", "load_robot"]
+
+_BASES = get_args(Base)
+_PAIRS = ("srdf", "sampled", "all")
+_SAMPLES = 1000  # configurations sampled for allowed pairs when a robot is loaded
+# Names under which example-robot-data loads URDF files of other names.
+_ALIASES = {
+    "anymal_kinova": "anymal-kinova",
+    "asr_twodof": "TwoDofs",
+    "b1_z1": "b1-z1",
+    "hyq": "hyq_no_sensors",
+    "solo8": "solo",
+}
+
+
+def list_robots() -> dict[str, Path]:
+    """Return robot name → file: robots in robots/, then those of example-robot-data."""
+    known = {
+        path.parent.name: path for path in sorted(resources.folder("robots").glob("*/robot.yaml"))
+    }
+    folder = resources.example_robot_data()
+    if folder is not None:
+        files = sorted(folder.glob("robots/*/*/*.urdf"))
+        stems = {file.stem: file for file in reversed(files)}
+        for stem, file in stems.items():
+            known.setdefault(stem, file)
+            known.setdefault(stem.removesuffix("_robot"), file)
+        for name, stem in _ALIASES.items():
+            if stem in stems:
+                known.setdefault(name, stems[stem])
+    return known
+
+
+def find_robot(name: str | Path) -> Path:
+    """Return the robot.yaml or URDF file of a robot.
+
+    Args:
+        name: A name in `list_robots`, or the path of a URDF file, a robot.yaml, or a folder with a
+            robot.yaml. Strings with a slash or the suffix of such a file are paths.
+
+    Raises:
+        UnknownNameError: There is no robot of that name.
+        InputError: The file does not exist.
+    """
+    path = Path(name)
+    if isinstance(name, Path) or path.suffix.lower() in (".urdf", ".yaml", ".yml") or "/" in name:
+        file = path / "robot.yaml" if path.is_dir() else path
+        if not file.is_file():
+            raise InputError(
+                "this robot file does not exist",
+                file=file,
+                expected="a URDF file, a robot.yaml, or a robot's name",
+            )
+        return file
+    known = list_robots()
+    if name not in known:
+        raise UnknownNameError("robot", str(name), known)
+    return known[str(name)]
+
+
+def load_robot(
+    name: str | Path,
+    *,
+    base: Base = "omni",
+    tool_frame: str | None = None,
+    arm: str | None = None,
+    locked_joints: Mapping[str, float] | None = None,
+    home: Mapping[str, float] | None = None,
+    srdf: str | Path | None = None,
+    pairs: Literal["srdf", "sampled", "all"] = "srdf",
+    packages: Mapping[str, str | Path] | None = None,
+    height: float | None = None,
+    turning_radius: float | None = None,
+) -> Robot:
+    """Load a robot and put it on a planar virtual base.
+
+    The joints between the root and the tool frame are planned. All others (wheels, heads, other
+    arms, fingers) are locked, as are joints of a type other than revolute, continuous and
+    prismatic. Joints coupled to a planned one (<mimic>, or `couplings` in robot.yaml) move with it,
+    wherever they are; coupled joints share the coordinate of their leader.
+
+    Limits come from the URDF and from a `robot.yaml` beside it. Defaults of velocity and
+    acceleration limits are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, and 1 m/s, 2 rad/s,
+    3 m/s² and 6 rad/s² for the base. The default range of the base is ±20 m.
+
+    The virtual base replaces the joints of a planar base in the URDF, unless `base` is "fixed".
+    These are locked at 0, with a warning unless their positions are given.
+
+    The SRDF lists the pairs of links that may touch. Without an SRDF, these are adjacent links and
+    pairs that sampling finds always or never in collision. In both cases, neighbours that are
+    always close, links that always overlap, and links that overlap at home are exempt from
+    collision checks, with a warning if they are not neighbours; see
+    `vkc_pin.world.models.self_collisions`.
+
+    Args:
+        name: Name of a robot in robots/ or in example-robot-data ("panda", "tiago", "ur5"), or path
+            of a URDF.
+        base: "omni", "differential" (no lateral motion), "ackermann" (differential, with
+            `turning_radius`) or "fixed" (limits of 0).
+        tool_frame: Frame that grasps. Default: that of robot.yaml, or else the last frame of the
+            longest chain.
+        arm: Group of the SRDF whose last link grasps; an alternative to `tool_frame`.
+        locked_joints: Positions of additional joints to lock, [m] or [rad]. Other locked joints are
+            at 0 or at the middle of limits that exclude 0.
+        home: Home positions of joints, [m] or [rad]. Default: those of robot.yaml, or else a group
+            state of the SRDF that covers all planned joints (preferably one named home), or else 0,
+            or the middle of limits that exclude 0. If links overlap there, joints without a stated
+            position are moved, with a warning.
+        srdf: Path of the SRDF. Default: the one named in robot.yaml, or one beside the URDF.
+        pairs: Source of the allowed pairs: "srdf"; "sampled", even if there is an SRDF; "all" to
+            make every pair of links in relative motion a collision pair, even adjacent ones, for
+            inspection of the geometry.
+        packages: Package → folder, to resolve `package://` addresses. Other packages are searched
+            for around the file.
+        height: Height of the root link above the floor [m]. Default: that of robot.yaml, or else 0.
+        turning_radius: Minimum turning radius of the root link of an "ackermann" base [m].
+            Default: that of robot.yaml.
+
+    Raises:
+        UnknownNameError: A robot, frame, joint or link does not exist; the error suggests the
+            nearest name.
+        InputError: A file or value is invalid, no joint can be planned, or no links can collide.
+    """
+    for value, field, choices, kind in (
+        (base, "base", _BASES, "kind of base"),
+        (pairs, "pairs", _PAIRS, "source of pairs"),
+    ):
+        if not isinstance(value, str) or value not in choices:
+            raise InputError(
+                f"wrong {kind}", field=field, expected=" or ".join(choices), got=shown(value)
+            )
+    for field, given_name, kind in (
+        ("tool_frame", tool_frame, "the name of a frame"),
+        ("arm", arm, "the name of a group"),
+    ):
+        if given_name is not None:
+            text(given_name, field, kind)
+    if arm is not None and tool_frame is not None:
+        raise InputError(
+            "`arm` and `tool_frame` exclude each other",
+            field="arm, tool_frame",
+            expected="one of them",
+            got=f"{arm}, {tool_frame}",
+        )
+    positions = {}
+    for field, values in (("locked_joints", locked_joints), ("home", home)):
+        checked = mapping({} if values is None else values, field, "joints, each with its position")
+        positions[field] = {
+            joint: quantity(value, f"{field}.{joint}") for joint, value in checked.items()
+        }
+    home, locked_joints = positions["home"], positions["locked_joints"]
+    files = _read_files(
+        name,
+        mapping({} if packages is None else packages, "packages", "packages, each with its folder"),
+    )
+    urdf, settings = files.urdf, files.settings
+    srdf_path = file_path(srdf, "srdf") if srdf is not None else files.find_srdf()
+    semantics = (
+        read_srdf(srdf_path, links=urdf.links)
+        if srdf_path is not None and pairs == "srdf"
+        else None
+    )
+    full = build_full_model(urdf)
+    tool = (
+        tool_frame
+        if tool_frame is not None
+        else files.find_tool_frame(arm, srdf_path) or find_default_tool_frame(full, urdf)
+    )
+    if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
+        raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
+    full = tighten_coupled_limits(full, urdf, tool)
+    base_joints = find_base_joints(full, urdf) if base != "fixed" else ()
+    fingers = {joint: finger.open for joint, finger in settings.gripper.items()}
+    stated_positions = {**settings.locked_joints, **locked_joints}
+    locked = {**fingers, **dict.fromkeys(base_joints, 0.0), **stated_positions}
+    known_positions = {**settings.home, **home, **locked}
+    rest = compute_rest_positions(full, urdf, known_positions)
+    files.check_names(rest)
+    for joint in known_positions:
+        field = "home" if joint in home else "locked_joints"
+        if joint not in rest:
+            raise UnknownNameError("joint", joint, rest, file=urdf.path, field=field)
+        if joint in stated_positions or joint not in (*base_joints, *fingers):
+            files.check_limits(full, joint, known_positions[joint], field)
+    if unstated := ", ".join(joint for joint in base_joints if joint not in stated_positions):
+        problem = "the virtual base replaces the joints of the robot's base, which are locked"
+        warnings.warn(f"{urdf.path}: {problem}: {unstated}", stacklevel=2)
+    root_height, rest = (
+        settings.base.height if height is None else quantity(height, "height"),
+        {**rest, **locked},
+    )
+    model = build_planned_model(full, urdf, tool, rest, locked, height=root_height)
+    coordinates, lower, upper, velocity, acceleration = apply_robot_limits(
+        full, model, settings, base
+    )
+    files.check_followers(model, rest, known_positions)
+    state = _read_rest_state(model, coordinates.names[3:], semantics, known_positions)
+    collision = load_collision_geometry(model, urdf)
+    robot = Robot(
+        name=files.name,
+        urdf=urdf.path,
+        model=model,
+        collision=collision,
+        coordinates=coordinates,
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+        acceleration=acceleration,
+        home=np.clip(
+            [{**rest, **state}[joint] for joint in coordinates.names[3:]], lower[3:], upper[3:]
+        ),  # removes rounding errors
+        tool_frame=tool,
+        base=base,
+        touch_links=settings.touch_links,
+        height=root_height,
+        **read_wheels(base, turning_radius, settings, files.source),
+        gripper=build_gripper(
+            full,
+            urdf,
+            model,
+            collision,
+            tool,
+            rest,
+            settings.gripper,
+            files.document,
+            height=root_height,
+        ),
+        file=urdf,
+    )
+    if pairs == "all":
+        robot = set_collision_pairs(robot, ())
+    else:
+        loose_joints = [
+            joint
+            for joint in coordinates.names[3:]
+            if joint not in known_positions and joint not in state
+        ]
+        robot = apply_self_collision_analysis(robot, semantics, loose_joints, samples=_SAMPLES)
+    if len(robot.collision.collisionPairs) == 0 and (pairs == "all" or semantics is not None):
+        expected = "<collision> elements, and an SRDF that leaves some pairs"
+        raise InputError(
+            "no pair of links is left to check for self-collision",
+            file=robot.urdf,
+            expected=expected,
+        )
+    return robot
+
+
+@dataclass(frozen=True, eq=False)
+class _RobotFiles:
+    """Parsed files of a robot; `source` is its robot.yaml, or its URDF if there is none."""
+
+    source: Path
+    settings: RobotSchema
+    document: Document
+    urdf: UrdfFile
+
+    @property
+    def name(self) -> str:
+        """Name of the robot, which is that of its folder or its file."""
+        return (
+            self.source.resolve().parent.name
+            if self.source.name == "robot.yaml"
+            else self.source.stem
+        )
+
+    def find_srdf(self) -> Path | None:
+        """Return the path of the SRDF named in robot.yaml, or of one beside the URDF, or None."""
+        if self.settings.srdf is not None:
+            return self.source.parent / self.settings.srdf
+        path = self.urdf.path
+        stems = (path.stem, path.stem.removesuffix("_robot"))
+        places = [
+            folder / f"{stem}.srdf"
+            for stem in stems
+            for folder in (path.parent, path.parent.parent / "srdf")
+        ]
+        return next((place for place in places if place.is_file()), None)
+
+    def find_tool_frame(self, arm: str | None, srdf: Path | None) -> str | None:
+        """Return the tool frame named by a group of the SRDF or by robot.yaml, or None."""
+        group = self.settings.arm if arm is None else arm
+        return self.settings.tool_frame if group is None else group_tip(srdf, self.urdf.root, group)
+
+    def check_names(self, joints: Collection[str]) -> None:
+        """Check that the joints and links named in robot.yaml exist.
+
+        Raises:
+            UnknownNameError: A joint or link does not exist.
+        """
+        settings = self.settings
+        for key in ("home", "locked_joints", "gripper", "joints"):
+            for joint in getattr(settings, key):
+                if joint not in joints:
+                    raise self.document.unknown((key, joint), "joint", joint, joints)
+        for link in settings.touch_links:
+            if link not in self.urdf.links:
+                raise self.document.unknown(("touch_links",), "link", link, self.urdf.links)
+
+    def check_limits(self, full: pin.Model, joint: str, position: float, field: str) -> None:
+        """Check that a home or locked position is within the joint's limits.
+
+        Raises:
+            InputError: The position is outside the limits.
+        """
+        moving = full.joints[full.getJointId(joint)]
+        if moving.nq == 1:
+            low, high = full.lowerPositionLimit[moving.idx_q], full.upperPositionLimit[moving.idx_q]
+            if not low - LIMIT_SLACK <= position <= high + LIMIT_SLACK:
+                problem, expected = (
+                    "this position is outside the joint's limits",
+                    f"between {low:g} and {high:g}",
+                )
+                for key, section in (
+                    ("locked_joints", self.settings.locked_joints),
+                    ("home", self.settings.home),
+                ):
+                    if section.get(joint) == position:
+                        raise self.document.error(
+                            (key, joint), problem, expected=expected, got=position
+                        )
+                raise InputError(
+                    problem,
+                    file=self.urdf.path,
+                    field=f"{field}.{joint}",
+                    expected=expected,
+                    got=position,
+                )
+
+    def check_followers(
+        self, model: pin.Model, rest: Mapping[str, float], known_positions: Collection[str]
+    ) -> None:
+        """Check that given home positions agree with the couplings of joints.
+
+        Raises:
+            InputError: A home position contradicts a coupling.
+        """
+        coordinates = Coordinates(model)
+        for move in coordinates.moves[3:]:
+            joint, leader = str(model.names[move.joint]), coordinates.names[move.coordinate]
+            if joint != leader and joint in known_positions:
+                follows = move.factor * rest[leader] + move.offset
+                if abs(rest[joint] - follows) > LIMIT_SLACK:
+                    problem, expected = (
+                        f"this joint follows '{leader}'",
+                        f"{follows:g}, or no value",
+                    )
+                    if joint in self.settings.home:
+                        raise self.document.error(
+                            ("home", joint), problem, expected=expected, got=rest[joint]
+                        )
+                    raise InputError(
+                        problem,
+                        file=self.urdf.path,
+                        field=f"home.{joint}",
+                        expected=expected,
+                        got=rest[joint],
+                    )
+
+
+def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotFiles:
+    """Find and read a robot's URDF and its robot.yaml, if there is one."""
+    file_path(name, "name", "a robot's name, or a path")
+    source = find_robot(name)
+    document = Document({})
+    settings = RobotSchema(urdf=source.name)
+    if source.suffix != ".yaml" and (source.parent / "robot.yaml").is_file():
+        srdf_path, _ = read_robot(source.parent / "robot.yaml")
+        source = source.parent / "robot.yaml" if srdf_path.urdf == source.name else source
+    if source.suffix == ".yaml":
+        settings, document = read_robot(source)
+    folders = {
+        key: file_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()
+    }
+    folders = {
+        **find_python_packages(tuple(p for p in settings.packages if p not in folders), document),
+        **folders,
+    }
+    urdf = read_urdf(source.parent / settings.urdf, folders)
+    apply_couplings(urdf, settings.couplings, document)
+    return _RobotFiles(source, settings, document, urdf)
+
+
+def _read_rest_state(
+    model: pin.Model, arm: Sequence[str], semantics: Srdf | None, known_positions: Collection[str]
+) -> dict[str, float]:
+    """Return the home positions of an arm's joints in an SRDF, without those already known."""
+    state = {} if semantics is None else semantics.state(arm)
+    return {
+        joint: find_nearest_position(model, joint, state[joint])
+        for joint in arm
+        if joint in state and joint not in known_positions
+    }

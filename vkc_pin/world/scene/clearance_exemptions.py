@@ -1,0 +1,508 @@
+"""Finds pairs of shapes that are exempt from the clearance margin, and the joint ranges for it.
+
+Homes are built tightly: a door panel stands in its wall, a refrigerator's door beside the kitchen.
+Such neighbours follow from the scene alone: shapes of articulated objects are compared with all
+other fixed shapes, in the initial state and with all joints at zero, as they were built. A pair is
+exempt on the range of joint values around that state on which it is closer than the margin: its
+distance there depends on these joints alone, so that no motion could increase it. An exemption
+never extends to other shapes of the same links.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_link_name
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import (
+    PlacedObject,
+    find_link_shapes,
+    make_world_shapes,
+    sweep_link_shapes,
+)
+
+__all__ = [
+    "CONTACT_DEPTH",
+    "ClearanceExemption",
+    "ClosePair",
+    "PlacedShapes",
+    "SceneLike",
+    "find_clearance_exemptions",
+    "find_close_pairs",
+    "make_shape_keys",
+    "warn_of_overlaps",
+]
+
+CONTACT_DEPTH = 1e-4
+"""Largest overlap that counts as contact [m]: resting objects overlap their support by rounding."""
+_MARGIN_TOLERANCE = 1e-3  # [m] below the margin: motions may end that close
+_STEPS = 64  # samples of a joint's path to its limit, and of each refinement
+_TURN = np.pi  # [rad] range examined of joints without limits
+
+
+T = TypeVar("T")
+_MAX_NAMED = 6  # pairs that a warning names
+_MAX_CACHED = 4096  # results in a scene's cache
+
+
+class SceneLike(Protocol):
+    """The attributes of a `Scene` that are used here."""
+
+    @property
+    def objects(self) -> Mapping[str, PlacedObject]:
+        """Name → object."""
+
+    @property
+    def obstacles(self) -> Sequence[pin.GeometryObject]:
+        """Shapes of the fixed obstacles."""
+
+    @property
+    def obstacle_labels(self) -> Sequence[str]:
+        """Name of the obstacle of each of these shapes."""
+
+    @property
+    def held(self) -> Collection[str]:
+        """Names of the objects that the robot holds."""
+
+    @property
+    def allowed(self) -> Mapping[frozenset[str], float]:
+        """Pairs of links that may be close → margin that they keep [m]."""
+
+    @property
+    def memory(self) -> dict[Any, Any]:
+        """Cache of derived results."""
+
+
+class ClosePair(NamedTuple):
+    """Two links that are close to each other.
+
+    Attributes:
+        first, second: Their labels; the first link can move.
+        distance: Signed distance [m].
+    """
+
+    first: str
+    second: str
+    distance: float
+
+    def __str__(self) -> str:
+        apart = (
+            f"are {1e3 * self.distance:.1f} mm apart"
+            if self.distance >= 0.0
+            else f"overlap by {-1e3 * self.distance:.1f} mm"
+        )
+        return f"{self.first} – {self.second} {apart}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ClearanceExemption:
+    """Two links, or one shape of each, that are exempt from the clearance margin.
+
+    Attributes:
+        first, second: Labels of the links.
+        margin: Clearance that they keep instead [m]; negative: an allowed penetration; -inf: none.
+        distance: Their distance in the initial state, or as built [m]; `margin` for pairs that the
+            scene's description allows.
+        ranges: Coordinate "<object>.<joint>" → (lower, upper) on which the exemption is active,
+            [rad] or [m]; empty: always.
+        shapes: Exempt shape of each link, see `make_shape_keys`; None: all shapes of both links.
+    """
+
+    first: str
+    second: str
+    margin: float
+    distance: float
+    ranges: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    shapes: tuple[str, str] | None = None
+
+    def is_between(self, one: str, other: str) -> bool:
+        """Return whether the exemption is between two links, given by their labels."""
+        return {one, other} == {self.first, self.second}
+
+    def find_shape_pairs(self, labels: Sequence[str], keys: Sequence[str]) -> list[tuple[int, int]]:
+        """Return the exempt pairs (i, j), i < j, of shapes.
+
+        Args:
+            labels: Label of each shape.
+            keys: Key of each shape, see `make_shape_keys`.
+        """
+        wanted = (None, None) if self.shapes is None else self.shapes
+        ones, others = (
+            [k for k, name in enumerate(labels) if name == label and key in (None, keys[k])]
+            for label, key in zip((self.first, self.second), wanted, strict=True)
+        )
+        return [(min(i, j), max(i, j)) for i in ones for j in others]
+
+    def is_active(self, names: Sequence[str], states: Floats) -> Bools:
+        """Return at which states the exemption is active, shape (S,).
+
+        Args:
+            names: Names of the n coordinates.
+            states: Values of the coordinates, shape (S, n), [rad] or [m].
+        """
+        inside = np.ones(len(states), bool)
+        for name, (lower, upper) in self.ranges.items():
+            column = states[:, names.index(name)]
+            inside &= (lower <= column) & (column <= upper)
+        return inside
+
+    def __str__(self) -> str:
+        return " – ".join(self.shapes or (self.first, self.second))
+
+
+def make_shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return a key for each shape that is the same in every model of a scene.
+
+    The key is the shape's own name, after that of its object: "door.leaf_0", "wall_2".
+
+    Args:
+        labels: Label of each shape: "<object>.<link>", or the name of an obstacle or robot link.
+        names: Name of each shape in the model of its object, or in a model of several objects.
+    """
+    keys = []
+    for label, name in zip(labels, names, strict=True):
+        owner, dot, link = label.partition(".")
+        keys.append(f"{owner}.{link}_{name.rpartition('_')[2]}" if dot else name)
+    return keys
+
+
+def find_clearance_exemptions(scene: SceneLike, dist_safe: float) -> tuple[ClearanceExemption, ...]:
+    """Return all pairs that may be closer than the clearance margin.
+
+    These are the links that the scene allows, and neighbouring shapes.
+
+    Args:
+        scene: Scene.
+        dist_safe: Clearance margin [m].
+    """
+
+    def find() -> tuple[ClearanceExemption, ...]:
+        listed = [
+            ClearanceExemption(min(pair), max(pair), margin, margin)
+            for pair, margin in scene.allowed.items()
+            if len(pair) == 2
+        ]
+        return *listed, *_find_neighbours(scene, dist_safe)
+
+    return _get_cached(
+        scene,
+        (
+            "clearance_exemptions",
+            dist_safe,
+            *(_make_state_key(placed) for placed in scene.objects.values()),
+        ),
+        find,
+    )
+
+
+def find_close_pairs(scene: SceneLike, reach: float) -> list[ClosePair]:
+    """Return the pairs of links closer than `reach` [m] of which one can move.
+
+    Held objects, pairs of links of one object, pairs that the scene allows, and fixed objects on
+    the floor are left out; so are free objects on their support, unless they overlap it.
+    """
+    shapes, found = PlacedShapes(scene, scene.objects), []
+    for (first, second), distance in shapes.find_near_links(reach).items():
+        free = any(
+            scene.objects[label.partition(".")[0]].object.free
+            for label in (first, second)
+            if "." in label
+        )
+        if frozenset((first, second)) not in scene.allowed and (
+            not free or distance < -CONTACT_DEPTH
+        ):
+            found.append(ClosePair(first, second, distance))
+    return sorted(found, key=lambda pair: pair.distance)
+
+
+def warn_of_overlaps(scene: SceneLike, name: str) -> None:
+    """Warn of movable links that overlap other shapes in the scene called `name`."""
+    found = [pair for pair in find_close_pairs(scene, 0.0) if pair.distance < -CONTACT_DEPTH]
+    if found:
+        pairs = "; ".join(map(str, found[:_MAX_NAMED])) + (
+            f"; and {len(found) - _MAX_NAMED} more" if len(found) > _MAX_NAMED else ""
+        )
+        hint = "They may overlap until they have separated once. `allow:` in the scene permits "
+        hint += "contact; `vkc-pin check` lists all pairs."
+        warnings.warn(f"{name}: movable links overlap other shapes: {pairs}. {hint}", stacklevel=4)
+
+
+def _find_neighbours(scene: SceneLike, dist_safe: float) -> Iterator[ClearanceExemption]:
+    """Yield exemptions of shapes of fixed objects closer than `dist_safe` to others.
+
+    Two states are examined: the initial one, and that with all joints at zero.
+    """
+    jointed = {name: placed for name, placed in scene.objects.items() if not placed.object.free}
+    neutral = {
+        name: np.clip(0.0, placed.object.lower, placed.object.upper)
+        for name, placed in jointed.items()
+    }
+    zero = {
+        name: dataclasses.replace(placed, state=neutral[name]) for name, placed in jointed.items()
+    }
+    states = [
+        jointed,
+        *([zero] if any(np.any(zero[name].state != jointed[name].state) for name in zero) else []),
+    ]
+    known = set[tuple[tuple[str, str], float, tuple[tuple[str, tuple[float, float]], ...]]]()
+    for objects in states:
+        standing = PlacedShapes(scene, objects)
+        for (i, j), distance in standing.find_near_shapes(dist_safe - _MARGIN_TOLERANCE).items():
+            ranges, least = standing.find_exempt_ranges(i, j, dist_safe)
+            # With one joint the exemption's range bounds the overlap. With several joints it is
+            # bounded by what each joint does alone.
+            deep = -np.inf if len(ranges) == 1 else min(least, distance)
+            margin = 0.0 if distance > -CONTACT_DEPTH else deep
+            shapes = (standing.keys[i], standing.keys[j])
+            key = (shapes, margin, tuple(ranges.items()))
+            if key not in known:
+                known.add(key)
+                yield ClearanceExemption(
+                    standing.labels[i], standing.labels[j], margin, distance, ranges, shapes
+                )
+
+
+class PlacedShapes:
+    """The S shapes of objects and obstacles in the world.
+
+    Args:
+        scene: Scene.
+        objects: Objects, in the states to examine.
+
+    Attributes:
+        labels: Link or obstacle of each shape.
+        keys: Key of each shape, see `make_shape_keys`.
+    """
+
+    def __init__(self, scene: SceneLike, objects: Mapping[str, PlacedObject]) -> None:
+        self.scene, self.objects = (
+            scene,
+            {n: p for n, p in objects.items() if not (p.object.free and n in scene.held)},
+        )
+        self._shapes, self.labels = list[pin.GeometryObject](), list[str]()
+        for name, placed in self.objects.items():
+            shapes = make_world_shapes(placed)
+            self._shapes += shapes
+            self.labels += [f"{name}.{get_link_name(shape.name)}" for shape in shapes]
+        free = {name for name, placed in self.objects.items() if placed.object.free}
+        self._moving = {
+            label
+            for label in set(self.labels)
+            if label.partition(".")[0] in free or self.find_joints(label)
+        }
+        if self._moving:
+            self._shapes += scene.obstacles
+            self.labels += scene.obstacle_labels
+        self.keys = make_shape_keys(self.labels, [shape.name for shape in self._shapes])
+
+    def find_near_shapes(self, reach: float) -> dict[tuple[int, int], float]:
+        """Return pairs of shapes closer than `reach` [m] → distance [m]; the first can move."""
+        if not self._moving:
+            return {}
+        boxes = [compute_world_box(shape.geometry, shape.placement) for shape in self._shapes]
+        lower, upper = (np.array(side).T for side in zip(*boxes, strict=True))
+        owners = np.array([label.partition(".")[0] for label in self.labels])
+        floor, found = owners == FLOOR, dict[tuple[int, int], float]()
+        for i, (label, shape) in enumerate(zip(self.labels, self._shapes, strict=True)):
+            if label not in self._moving:
+                continue
+            close = ((lower < upper[:, [i]] + reach) & (upper > lower[:, [i]] - reach)).all(
+                axis=0
+            ) & (owners != owners[i])
+            if not self.objects[str(owners[i])].object.free:
+                close &= ~floor  # its height above the floor is given
+            for j in np.flatnonzero(close).tolist():
+                if (j, i) in found:
+                    continue
+                other = self._shapes[j]
+                distance = compute_shape_distance(
+                    shape.geometry, shape.placement, other.geometry, other.placement
+                )
+                if distance < reach:
+                    found[i, j] = distance
+        return found
+
+    def find_near_links(self, reach: float) -> dict[tuple[str, str], float]:
+        """Return pairs of link labels closer than `reach` [m] → smallest distance [m]."""
+        found: dict[tuple[str, str], float] = {}
+        for (i, j), distance in self.find_near_shapes(reach).items():
+            pair = (self.labels[i], self.labels[j])
+            pair = pair[::-1] if pair[::-1] in found else pair
+            found[pair] = min(distance, found.get(pair, np.inf))
+        return found
+
+    def find_exempt_ranges(
+        self, i: int, j: int, reach: float
+    ) -> tuple[dict[str, tuple[float, float]], float]:
+        """Return how far each joint alone can move until two shapes are `reach` [m] apart.
+
+        Args:
+            i: Index of one shape.
+            j: Index of the other shape.
+            reach: Distance at which a range ends [m].
+
+        Returns:
+            Coordinate → (lower, upper), infinite where a joint limit comes first; and the smallest
+            distance on these ranges [m].
+        """
+        found, least = dict[str, tuple[float, float]](), np.inf
+        for own, other in ((i, j), (j, i)):
+            owner = self.labels[own].partition(".")[0]
+            for joint in self.find_joints(self.labels[own]):
+                names = (owner, self.labels[other].partition(".")[0])
+                where = [self.objects[name] for name in names if name in self.objects]
+                key = (
+                    "neighbours",
+                    self.keys[own],
+                    self.labels[other],
+                    self.keys[other],
+                    joint,
+                    reach,
+                    *map(_make_state_key, where),
+                )
+                lower, upper, deepest = _get_cached(
+                    self.scene, key, partial(self._find_exempt_range, own, other, joint, reach)
+                )
+                found[f"{owner}.{joint}"] = (lower, upper)
+                least = min(least, deepest)
+        return found, least
+
+    def _find_exempt_range(
+        self, own: int, other: int, joint: str, reach: float
+    ) -> tuple[float, float, float]:
+        placed = self.objects[self.labels[own].partition(".")[0]]
+        index = placed.object.coordinates.index(joint)
+        at, ends, least = float(placed.state[index]), list[float](), np.inf
+
+        def distance(values: Floats) -> Floats:
+            found: Floats = self.compute_distances(self.labels[own], index, values, [other], reach)[
+                :, self._index_in_link(own), 0
+            ]
+            return found
+
+        for limit, beyond in (
+            (placed.object.lower[index], -_TURN),
+            (placed.object.upper[index], _TURN),
+        ):
+            end = float(limit) if np.isfinite(limit) else at + beyond
+            low, high, left = at, end, False
+            for _ in range(2):
+                values = np.linspace(low, high, _STEPS + 1)
+                apart = distance(values)
+                inside = (
+                    apart[: int(np.argmax(apart >= reach))] if (apart >= reach).any() else apart
+                )
+                if len(inside) and not left:
+                    k = int(np.argmin(inside))
+                    around = np.linspace(
+                        values[max(k - 1, 0)], values[min(k + 1, _STEPS)], _STEPS + 1
+                    )
+                    least = min(least, float(inside[k]), float(distance(around).min()))
+                if len(inside) == len(apart):
+                    break
+                left, k = True, len(inside)
+                low, high = (float(values[max(k - 1, 0)]), float(values[k]))
+            ends.append((low + high) / 2.0 if left else float(np.copysign(np.inf, beyond)))
+        return ends[0], ends[1], least
+
+    def _index_in_link(self, shape: int) -> int:
+        """Return the index of a shape among the shapes of its link."""
+        return self.labels[:shape].count(self.labels[shape])
+
+    def find_shapes(self, labels: Collection[str]) -> list[int]:
+        """Return the indices of the shapes of links or obstacles, given by their labels."""
+        return [k for k, label in enumerate(self.labels) if label in labels]
+
+    def compute_distances(
+        self, label: str, index: int, values: Floats, others: Sequence[int], reach: float
+    ) -> Floats:
+        """Return the distances of a link's shapes from others for values of one coordinate [m].
+
+        Args:
+            label: Link, with K shapes.
+            index: Index of the coordinate of its object.
+            values: Values of the coordinate, shape (V,), [rad] or [m].
+            others: Indices of the other shapes, O of them.
+            reach: Larger distances may be infinite in the result [m].
+
+        Returns:
+            Shape (V, K, O).
+        """
+        own = find_link_shapes(self.objects[label.partition(".")[0]], label.partition(".")[2])
+        targets = [self._shapes[k] for k in others]
+        shapes = Shapes(
+            [shape.geometry for shape in (*own, *targets)], [shape.placement for shape in targets]
+        )
+        where, near = self._sweep_link(label, index, values, targets, reach)
+        row, k, j = np.nonzero(near)
+        found = np.full(near.shape, np.inf)
+        found[row, k, j] = shapes.compute_distances(where, row, np.column_stack([k, len(own) + j]))
+        return found
+
+    def find_links_near_sweep(self, label: str, index: int, values: Floats) -> set[str]:
+        """Return the labels of shapes whose bounding boxes meet those of a moving link.
+
+        Args:
+            label: Link.
+            index: Index of the coordinate of its object.
+            values: Values of the coordinate, shape (V,), [rad] or [m].
+        """
+        _, near = self._sweep_link(label, index, values, self._shapes, 0.0)
+        return {self.labels[j] for j in np.flatnonzero(near.any(axis=(0, 1)))}
+
+    def _sweep_link(
+        self,
+        label: str,
+        index: int,
+        values: Floats,
+        others: Sequence[pin.GeometryObject],
+        reach: float,
+    ) -> tuple[Floats, Bools]:
+        """Return placements of a link's shapes for values of a coordinate, and near pairs.
+
+        Returns:
+            Placements, shape (V, K, 12), and a mask of pairs with close bounding boxes, shape (V,
+            K, O).
+        """
+        owner, _, link = label.partition(".")
+        where, lower, upper = sweep_link_shapes(self.objects[owner], link, index, values)
+        lows, highs = (
+            np.array(side)
+            for side in zip(
+                *(compute_world_box(s.geometry, s.placement) for s in others), strict=True
+            )
+        )
+        near = (lows < upper[:, :, None] + reach) & (highs > lower[:, :, None] - reach)
+        return where, np.asarray(near.all(axis=3))
+
+    def find_joints(self, label: str) -> list[str]:
+        """Return the joints that move a link of a fixed object; for other links, none."""
+        owner, _, link = label.partition(".")
+        if owner not in self.objects or self.objects[owner].object.free:
+            return []
+        item = self.objects[owner].object
+        support = item.model.supports[item.model.frames[item.link_frame(link)].parentJoint]
+        return [str(item.model.names[joint]) for joint in support if joint]
+
+
+def _get_cached(scene: SceneLike, key: Hashable, make: Callable[[], T]) -> T:
+    """Return the value cached under a key in a scene, computed if there is none."""
+    found: T | None = scene.memory.get(key)
+    if found is None:
+        if len(scene.memory) >= _MAX_CACHED:
+            scene.memory.clear()
+        found = scene.memory[key] = make()
+    return found
+
+
+def _make_state_key(placed: PlacedObject) -> tuple[bytes, bytes]:
+    return placed.placement.homogeneous.tobytes(), placed.state.tobytes()

@@ -1,0 +1,124 @@
+"""Defines which shapes may be close to each other, and for how long.
+
+The planner and the independent validation both implement these rules.
+
+- A hand keeps the attachment's clearance from the whole object that it grasps, during the grasp and
+  for `CONTACT_WINDOW` before and after. Without a clearance of its own that is
+  `Options.grasp_clearance`. An object held through another link needs no clearance from that link.
+- The hand and the grasped link are rigidly connected, unless the grasp has a freedom.
+- A hand that pushes touches the link with its foremost point. It needs no clearance from that link,
+  never overlaps it, and moves it forward only.
+- Objects that are lifted or put down, and objects that begin or cease to rest on a moving link, may
+  be as close to their surroundings as they are at that moment, for `CONTACT_WINDOW`. The same holds
+  for a link that touches a target, and the shapes at that target.
+- A supported object and its support are rigidly connected.
+- Shapes of articulated objects that are closer than `Options.dist_safe` to other fixed shapes, in
+  the initial state or with all joints at zero, keep no clearance until their joints have moved them
+  that far apart. They may overlap only if they did so in that state, and no deeper than a single
+  joint takes them; see `clearance_exemptions`.
+- A free object that overlaps its surroundings where it is first lifted may leave them within
+  `CONTACT_WINDOW`.
+- An object grasped at the start counts as lifted there: it may leave what it touches or overlaps
+  within `CONTACT_WINDOW`.
+- Pairs that the scene allows keep the scene's margin, or none; see `Scene.allowed`.
+
+The gripper opening is that of the attachment it holds or grasps next. It changes where an object is
+grasped or released, and before the motion; after the last grasp it stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+import pinocchio as pin
+
+from vkc_pin.options import Options
+from vkc_pin.world.models.articulated_object import Attachment
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
+
+__all__ = [
+    "CONTACT_DEPTH",
+    "CONTACT_WINDOW",
+    "compute_grasp_opening",
+    "compute_hand_clearance",
+    "compute_hand_frame",
+    "compute_start_opening",
+    "find_grasped_link",
+    "find_gripper_hold",
+    "find_touch_links",
+    "is_rigid_grasp",
+]
+
+CONTACT_WINDOW = 1.0
+"""Time before and after a contact in which shapes may be close [s]."""
+
+
+def find_grasped_link(scene: Scene, hold: Hold) -> str:
+    """Return the label of the grasped link, "<object>.<link>"."""
+    return f"{hold.object}.{scene.objects[hold.object].object.attachments[hold.attachment].link}"
+
+
+def find_touch_links(scene: Scene, hold: Hold) -> Collection[str]:
+    """Return the labels of the grasping links: the robot's touch links, or `hold.frame`."""
+    return scene.robot.touch_links if hold.frame is None else (hold.frame,)
+
+
+def compute_hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> float:
+    """Return the clearance that the grasping links keep from a link of the grasped object [m].
+
+    It applies during the grasp and shortly before and after.
+
+    Args:
+        scene: Scene with the objects.
+        hold: Hold.
+        link: Link of the grasped object, "<object>.<link>".
+        options: Clearances for attachments that have none of their own.
+    """
+    attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+    if (hold.by or attachment.contact == "push") and link == find_grasped_link(scene, hold):
+        return 0.0
+    return min(
+        options.grasp_clearance if attachment.clearance is None else attachment.clearance,
+        options.dist_safe,
+    )
+
+
+def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
+    """Return the frame that is brought to an attachment, in the tool frame.
+
+    It is the tool frame itself, or, for a push, the foremost point of the hand.
+    """
+    return (
+        robot.opened(robot.opening(attachment.opening)).front
+        if attachment.contact == "push"
+        else pin.SE3.Identity()
+    )
+
+
+def is_rigid_grasp(scene: Scene, hold: Hold) -> bool:
+    """Return whether the grasping link does not move relative to the grasped link."""
+    attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+    return attachment.contact != "push" and (attachment.firm or not attachment.freedoms)
+
+
+def find_gripper_hold(holds: Iterable[Hold]) -> Hold | None:
+    """Return the hold of the gripper itself, not one through a grasped object; None: none."""
+    return next((hold for hold in holds if hold.by is None), None)
+
+
+def compute_grasp_opening(scene: Scene, hold: Hold) -> float | None:
+    """Return the gripper opening of a hold [m]; None: as in the robot's rest configuration."""
+    return scene.robot.opening(
+        scene.objects[hold.object].object.attachments[hold.attachment].opening
+    )
+
+
+def compute_start_opening(scene: Scene) -> float | None:
+    """Return the gripper opening at the start of a scene [m]; None: as in the rest state."""
+    hold = find_gripper_hold(scene.holds)
+    return (
+        scene.robot.opening(scene.opening) if hold is None else compute_grasp_opening(scene, hold)
+    )

@@ -1,0 +1,323 @@
+"""Defines holds: which object is grasped, at which attachment and through which frame."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from types import MappingProxyType
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arguments import instance, items, mapping, numbers, text
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
+
+__all__ = [
+    "Hold",
+    "Solids",
+    "check_hold_order",
+    "find_reversed_approaches",
+    "make_holds",
+    "place_held_objects",
+    "resolve_holds",
+    "warn_of_openings",
+]
+
+Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
+"""Shapes with their placements in the world frame."""
+
+_MAX_OVERLAP = 0.01  # [m] of hand and object or floor: larger than opening inaccuracies
+_ROUNDING = 2e-4  # [m] of an opening: measured less accurately than it is written
+_APPROACH = (0.0, 0.04, 0.08)  # [m] distances before the grasp at which overlaps are checked
+MAX_HELD = 50
+"""Largest number of objects held at once; each may be held through another."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """An object held at one of its attachments, by the robot's tool or through another held object.
+
+    Holds are equal if object, attachment and grasping frame are equal, whatever the values `at`.
+
+    Attributes:
+        object: Its name in the scene.
+        attachment: Attachment that is grasped.
+        by: Hold of the object that it is held through, such as a stick; None: the robot's tool.
+        link: Link of that object which replaces the tool frame.
+        at: Values of the attachment's freedoms at the start of a scene that has this hold, [m] and
+            [rad]; empty elsewhere.
+    """
+
+    object: str
+    attachment: str
+    by: Hold | None = None
+    link: str | None = None
+    at: tuple[float, ...] = field(default=(), compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("object", "attachment", "link"):
+            if name != "link" or self.link is not None:
+                text(getattr(self, name), f"Hold.{name}", "a name")
+        if self.by is not None:
+            instance(self.by, Hold, "Hold.by")
+        object.__setattr__(
+            self, "at", tuple(numbers(self.at, "Hold.at", "a list of numbers").ravel().tolist())
+        )
+
+    @property
+    def frame(self) -> str | None:
+        """Label of the grasping frame, "<object>.<link>"; None: the tool frame."""
+        return f"{self.by.object}.{self.link}" if self.by else None
+
+    def __str__(self) -> str:
+        return f"{self.object}.{self.attachment}" + (f" by {self.frame}" if self.by else "")
+
+
+def make_holds(
+    held: Mapping[str, str],
+    by: Mapping[str, str] | None = None,
+    at: Mapping[str, Sequence[float]] | None = None,
+) -> tuple[Hold, ...]:
+    """Return the holds that mappings describe, as in files, each after the one it depends on.
+
+    Args:
+        held: Object → attachment.
+        by: Object → "<object>.<link>", for objects that the tool itself does not hold.
+        at: Object → values of its attachment's freedoms, [m] and [rad].
+
+    Raises:
+        UnknownNameError: `by` or `at` name an object that is not held.
+        InputError: Objects hold each other in a cycle, `by` is not of that form, or too many
+            objects are held.
+    """
+    held = mapping(held, "held", "object names, each with that of an attachment")
+    by, at = mapping({} if by is None else by, "by"), mapping({} if at is None else at, "at")
+    if len(held) > MAX_HELD:
+        raise InputError(
+            "too many objects are held", field="held", expected=f"at most {MAX_HELD}", got=len(held)
+        )
+    for field_name, names in (("by", by), ("at", at)):
+        for name in names:
+            if name not in held:
+                raise UnknownNameError("held object", name, held, field=field_name)
+    found: dict[str, Hold] = {}
+
+    def find(name: str, above: tuple[str, ...]) -> Hold:
+        if name in above:
+            raise InputError(
+                "objects hold each other in a cycle", field="by", got=", ".join(sorted(above))
+            )
+        if name not in found:
+            holder, link = None, None
+            if name in by:
+                expected = "<object>.<link>, e.g. stick.tip"
+                owner, _, link = (
+                    by[name].partition(".") if isinstance(by[name], str) else ("", "", "")
+                )
+                if not link:
+                    raise InputError(
+                        "not a link of an object",
+                        field="by",
+                        expected=expected,
+                        got=shown(by[name]),
+                    )
+                if owner not in held:
+                    raise UnknownNameError("held object", owner, held, field="by")
+                holder = find(owner, (*above, name))
+            found[name] = Hold(name, held[name], holder, link, at.get(name, ()))
+        return found[name]
+
+    for name in held:
+        find(name, ())
+    return tuple(found.values())
+
+
+def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
+    """Return the holds as a tuple if each comes after the one it depends on.
+
+    Raises:
+        InputError: A hold comes before the one it depends on.
+    """
+    holds = items(holds, "holds", "a list of Hold", Hold)
+    for number, hold in enumerate(holds):
+        if hold.by not in (None, *holds[:number]):
+            raise InputError(
+                "it is held through an object that is not held before it",
+                field="holds",
+                got=str(hold),
+            )
+    return holds
+
+
+def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) -> tuple[Hold, ...]:
+    """Return holds checked against the objects, with values for all freedoms (default 0).
+
+    Raises:
+        UnknownNameError: There is no such object, attachment or link.
+        InputError: Values do not fit the attachment's freedoms, or an object is held through one
+            that cannot hold it.
+    """
+    found: dict[Hold, Hold] = {}
+    for hold in check_hold_order(holds):
+        if hold.object not in objects:
+            raise UnknownNameError("object", hold.object, objects, field="held")
+        where, freedoms = (
+            f"held.{hold.object}.at",
+            objects[hold.object].object.attachment(hold.attachment).freedoms,
+        )
+        values = hold.at or (0.0,) * len(freedoms)
+        if len(values) != len(freedoms):
+            raise InputError(
+                "wrong number of values",
+                field=where,
+                expected=f"{len(freedoms)}, one per freedom",
+                got=len(values),
+            )
+        for value, freedom in zip(values, freedoms, strict=True):
+            clamp_to_limits(value, freedom.lower, freedom.upper, where)
+        if hold.by is not None:
+            objects[hold.by.object].link_placement(str(hold.link))
+            if not (objects[hold.object].object.free and objects[hold.by.object].object.free):
+                problem = (
+                    "only a free object can be held through another, and only through a free one"
+                )
+                raise InputError(problem, field=f"held.{hold.object}.by", got=hold.frame)
+        found[hold] = dataclasses.replace(
+            hold, at=values, by=None if hold.by is None else found[hold.by]
+        )
+    return tuple(found.values())
+
+
+def place_held_objects(
+    objects: Mapping[str, PlacedObject], tool: Callable[[], pin.SE3], holds: Iterable[Hold]
+) -> Mapping[str, PlacedObject]:
+    """Return the objects with every free held object at its placement in the hand.
+
+    Args:
+        objects: Objects by name.
+        tool: Returns the placement of the tool frame in the world.
+        holds: Holds with the values of all freedoms, each after the one it depends on.
+    """
+    placed = dict(objects)
+    for hold in holds:
+        one = placed[hold.object]
+        if one.object.free:
+            grasp = one.object.attachment(hold.attachment)
+            in_object = one.object.link_placement(grasp.link, one.state) * grasp.tool(hold.at)
+            holder = placed[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
+            placed[hold.object] = dataclasses.replace(one, placement=holder * in_object.inverse())
+    return MappingProxyType(placed)
+
+
+def find_reversed_approaches(
+    objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids
+) -> list[Hold]:
+    """Return the holds whose approach overlaps the object or the floor, unless reversed.
+
+    Args:
+        objects: All objects at their placements.
+        holds: Holds to check.
+        robot: Robot, whose gripper opens as far as each attachment states.
+        floor: Floor, if there is one.
+    """
+    found, hands = list[Hold](), dict[float | None, Solids]()
+    for hold in holds:
+        placed = objects[hold.object]
+        opening = robot.opening(placed.object.attachment(hold.attachment).opening)
+        if opening not in hands:
+            hands[opening] = _find_hand_shapes(robot.opened(opening))
+        hand = hands[opening]
+        if hold.by is not None and hold.link is not None:
+            holder = objects[hold.by.object]
+            back = holder.link_placement(hold.link).inverse()
+            hand = [
+                (shape, back * where)
+                for shape, where in list_placed_shapes(make_world_shapes(holder))
+            ]
+        solids = [*list_placed_shapes(make_world_shapes(placed)), *floor]
+        if hold.attachment in placed.reversed or _is_approach_free(
+            placed, hold.attachment, hand, solids
+        ):
+            continue
+        if _is_approach_free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):
+            found.append(hold)
+    return found
+
+
+def warn_of_openings(
+    objects: Mapping[str, PlacedObject], robot: Robot, start: float | None, where: str
+) -> None:
+    """Warn of openings out of the gripper's range, which are replaced by the nearest possible one.
+
+    Args:
+        objects: Objects whose attachments state an opening.
+        robot: Robot.
+        start: Opening at the start [m]; None: unspecified.
+        where: Beginning of the warning, which names the scene.
+    """
+    requested = {} if start is None else {"the start": start}
+    for name, placed in objects.items():
+        own = placed.object.attachments.values()
+        requested |= {f"{name}.{one.name}": one.opening for one in own if one.opening is not None}
+    openings = ", ".join(f"{what} {1e3 * opening:g} mm" for what, opening in requested.items())
+    if robot.gripper is None and requested:
+        hint = "it keeps its rest configuration; describe `gripper` in its robot.yaml"
+        warnings.warn(
+            f"{where}: the gripper of '{robot.name}' cannot open as requested ({openings}): {hint}",
+            stacklevel=4,
+        )
+    elif robot.gripper is not None:
+        least, most = robot.gripper.min_opening, robot.gripper.max_opening
+        beyond = {
+            what: opening
+            for what, opening in requested.items()
+            if abs(robot.gripper.clamp_opening(opening) - opening) > _ROUNDING
+        }
+        for what, opening in beyond.items():
+            can, nearest = (
+                f"{1e3 * least:.1f} to {1e3 * most:.1f} mm",
+                1e3 * robot.gripper.clamp_opening(opening),
+            )
+            text = f"the gripper of '{robot.name}' opens from {can}"
+            text += f", not {1e3 * opening:g} mm as requested for {what}"
+            warnings.warn(f"{where}: {text}: it opens to {nearest:.1f} mm", stacklevel=4)
+
+
+def _is_approach_free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -> bool:
+    """Return whether the hand approaches an attachment without overlapping solids.
+
+    `hand` is given in the tool frame.
+    """
+    grasp = placed.object.attachment(attachment)
+    where = placed.link_placement(grasp.link)
+    for values in product(*({freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms)):
+        tool = where * grasp.tool(values)
+        approach = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _APPROACH]
+        if (
+            compute_clearance(
+                [(shape, at * local) for at in approach for shape, local in hand],
+                solids,
+                reach=-_MAX_OVERLAP,
+            )
+            >= -_MAX_OVERLAP
+        ):
+            return True
+    return False
+
+
+def _find_hand_shapes(robot: Robot) -> Solids:
+    """Return the shapes of a robot's touch links in its tool frame, with all joints at home."""
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    q = robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, q)
+    pin.updateFramePlacements(robot.model, data)
+    back = data.oMf[robot.model.getFrameId(robot.tool_frame)].inverse()
+    own = [i for i in range(len(shapes.oMg)) if robot.link_of(i) in robot.touch_links]
+    return [(robot.collision.geometryObjects[i].geometry, back * shapes.oMg[i]) for i in own]

@@ -1,0 +1,395 @@
+"""Defines scenes: a robot, its start, and the obstacles and articulated objects around it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from vkc_pin.errors import InputError, shown
+from vkc_pin.utils.arguments import instance, is_number, known, mapping, numbers
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.notebook import show
+from vkc_pin.world.files.resources import file_path, located
+from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
+from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
+from vkc_pin.world.scene.hold import (
+    Hold,
+    find_reversed_approaches,
+    make_holds,
+    place_held_objects,
+    resolve_holds,
+    warn_of_openings,
+)
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
+from vkc_pin.world.scene.poses import as_placement
+
+if TYPE_CHECKING:
+    from vkc_pin.world.models.robot import Robot
+    from vkc_pin.world.scene.scene_schema import RegionSchema, SceneSchema
+
+__all__ = ["START_CLEARANCE", "Scene", "load_scene"]
+
+START_CLEARANCE = 0.03
+"""Minimum distance of a random start from all shapes but the floor [m]."""
+_MAX_TRIES = 2000  # random starts
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A robot and the world around it; immutable, the `with_` methods return changed copies.
+
+    Attributes:
+        name: Its name.
+        file: File it was loaded from, if any.
+        folder: Folder that relative paths in `document` refer to.
+        robot: Robot.
+        start: Initial configuration: base x, y [m], yaw [rad], then the arm joints [rad], shape
+            (n,).
+        objects: Name → articulated object. A free object that is held is placed in the robot's
+            hand.
+        obstacles: Fixed obstacles as convex shapes: parent joint 0, placement in the world frame,
+            colour set. An obstacle of one shape has its name, one of several shapes
+            `<name>_<number>`. The floor is among them.
+        obstacle_labels: Name of the obstacle of each of these shapes (`FLOOR` for the floor).
+        obstacle_names: Names of the obstacles in the order of the file, without the floor.
+        obstacle_visual: Visual shapes of the obstacles, without the floor.
+        floor: Whether there is a floor at z = 0.
+        arena: Part of the floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
+        start_region: Region from which `sample_start` draws, if the scene has one.
+        holds: Holds at the start, each after the one it depends on.
+        allowed: Pairs of link labels that may be close → margin that they keep [m]; -inf: none.
+        opening: Gripper opening at the start if the gripper holds nothing [m]; None: as in the
+            robot's rest configuration.
+        described: Description it was built from; source of the robot, obstacles and files in
+            `document`.
+        memory: Cache of derived results, shared with the copies that the `with_` methods return;
+            affects computation times only.
+    """
+
+    name: str
+    file: Path | None
+    folder: Path
+    robot: Robot
+    start: Floats
+    objects: Mapping[str, PlacedObject]
+    obstacles: tuple[pin.GeometryObject, ...]
+    obstacle_labels: tuple[str, ...]
+    obstacle_names: tuple[str, ...]
+    obstacle_visual: tuple[pin.GeometryObject, ...]
+    floor: bool
+    arena: tuple[float, float, float, float]
+    start_region: RegionSchema | None
+    holds: tuple[Hold, ...]
+    allowed: Mapping[frozenset[str], float]
+    described: SceneSchema
+    opening: float | None = None
+    memory: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False, repr=False)
+
+    def __repr__(self) -> str:
+        return (
+            f"<Scene {self.name}: {self.robot.name}, objects {', '.join(self.objects) or 'none'}, "
+            f"{len(self.obstacle_names)} obstacles>"
+        )
+
+    def _repr_html_(self) -> str:
+        return show(self)
+
+    @property
+    def held(self) -> dict[str, str]:
+        """Object → attachment of the objects held at the start."""
+        return {hold.object: hold.attachment for hold in self.holds}
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The scene as plain data, from which `from_document` builds it again."""
+        from vkc_pin.world.scene.scene_file import make_document
+
+        return make_document(vars(self))
+
+    @staticmethod
+    def from_document(document: Mapping[str, Any], folder: str | Path = ".") -> Scene:
+        """Build a scene from plain data (see `Scene.document` and the scene files).
+
+        Args:
+            document: Dictionaries, lists, strings and numbers.
+            folder: Folder that relative paths in it refer to.
+
+        Raises:
+            InputError: The data are invalid; `UnknownNameError` where a name does not exist.
+        """
+        from vkc_pin.world.files.documents import Document
+        from vkc_pin.world.scene.scene_file import make_scene_fields
+
+        fields = make_scene_fields(
+            Document(mapping(document, "document")), file_path(folder, "folder")
+        )
+        return _check_new_scene(Scene(**fields)._with())
+
+    def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
+        """Return the scene with another start.
+
+        Args:
+            base: x, y [m] and yaw [rad] in the world frame, shape (3,); None keeps it.
+            arm: Arm joints [rad], shape (n - 3,); None keeps them.
+
+        Raises:
+            InputError: Wrong size, a value that is not finite, outside a joint's limits or outside
+                the arena.
+        """
+        start, names = self.start.copy(), self.robot.coordinates.names
+        for part_name, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
+            if values is None:
+                continue
+            given = numbers(values, part_name)
+            if given.shape != start[part].shape:
+                raise InputError(
+                    "wrong number of values",
+                    field=part_name,
+                    expected=start[part].shape,
+                    got=given.shape,
+                )
+            lower, upper = (limits[part] for limits in self.robot.start_limits)
+            start[part] = [
+                clamp_to_limits(value, low, high, f"{part_name}.{name}")
+                for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
+            ]
+        for value, low, high, name in zip(
+            start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True
+        ):
+            if not low <= value <= high:
+                raise InputError(
+                    "outside the arena",
+                    field=f"base.{name}",
+                    expected=f"{low:g} to {high:g}",
+                    got=f"{value:g}",
+                )
+        return self._with(start=start)
+
+    def with_state(self, name: str, values: Mapping[str, float]) -> Scene:
+        """Return the scene with joints of object `name` at `values`.
+
+        Args:
+            name: Object.
+            values: Joint name → value, [rad] or [m].
+
+        Raises:
+            UnknownNameError: There is no such object, or it has no such joint.
+            InputError: A value is not finite or outside the joint's limits.
+        """
+        return self._with(
+            objects=MappingProxyType(
+                {**self.objects, name: self._find_object(name).with_state(values)}
+            )
+        )
+
+    def with_placement(self, name: str, placement: pin.SE3) -> Scene:
+        """Return the scene with object `name` at another placement.
+
+        Args:
+            name: Object.
+            placement: Placement of its base link in the world frame; see `as_placement`.
+
+        Raises:
+            UnknownNameError: There is no such object.
+            InputError: `placement` is not a pose.
+        """
+        placed = dataclasses.replace(
+            self._find_object(name), placement=as_placement(placement, name="placement")
+        )
+        return self._with(objects=MappingProxyType({**self.objects, name: placed}))
+
+    def with_held(
+        self,
+        held: Mapping[str, str] | Iterable[Hold],
+        *,
+        by: Mapping[str, str] | None = None,
+        at: Mapping[str, Sequence[float]] | None = None,
+    ) -> Scene:
+        """Return the scene with the robot holding objects at the start.
+
+        Args:
+            held: Object → attachment; or complete holds, each after the one it depends on.
+            by: Object → "<object>.<link>", for objects held through another object of `held`.
+            at: Object → values of its attachment's freedoms, [m] and [rad]; default 0.
+
+        Raises:
+            UnknownNameError: There is no such object, attachment or link.
+            InputError: Values do not fit the attachment's freedoms, or objects hold each other.
+        """
+        holds = make_holds(held, by, at) if isinstance(held, Mapping) else held
+        return self._with(holds=resolve_holds(self.objects, holds))
+
+    def with_approaches(self, holds: Iterable[Hold], *, stacklevel: int = 2) -> Scene:
+        """Return the scene with those attachments reversed that cannot be approached otherwise.
+
+        These are attachments whose approach would take the hand through the object or the floor.
+        Each reversal raises a warning. Attachments whose other side is no better are unchanged.
+
+        Args:
+            holds: Holds whose approaches are checked.
+            stacklevel: Stack level of the warnings, as for `warnings.warn`.
+        """
+        floor = [
+            shape
+            for shape, label in zip(self.obstacles, self.obstacle_labels, strict=True)
+            if label == FLOOR
+        ]
+        objects = dict(self.objects)
+        for hold in find_reversed_approaches(
+            self.objects, holds, self.robot, list_placed_shapes(floor)
+        ):
+            objects[hold.object] = objects[hold.object].with_reversed(hold.attachment)
+            what = f"{hold.frame or 'the hand'} would approach {hold.object}.{hold.attachment}"
+            text = f"{what} through the object or the floor, so its approach is reversed"
+            hint = f"turn its approach, or set `reversed: [{hold.attachment}]` for the object"
+            warnings.warn(
+                f"{self.file or self.name}: {text}; {hint}",
+                stacklevel=stacklevel,
+            )
+        return (
+            self._with(objects=MappingProxyType(objects)) if objects != dict(self.objects) else self
+        )
+
+    def _find_object(self, name: str) -> PlacedObject:
+        return self.objects[known(name, self.objects, "object")]
+
+    def _with(self, **fields: Any) -> Scene:
+        """Return the scene with other attributes, and with free held objects placed in the hand."""
+        changed = dataclasses.replace(self, **fields)
+        changed = dataclasses.replace(
+            changed,
+            objects=place_held_objects(changed.objects, changed.tool_placement, changed.holds),
+        )
+        # Only copies made here share the cache: `dataclasses.replace` may change obstacles.
+        object.__setattr__(changed, "memory", self.memory)
+        return changed
+
+    def tool_placement(self) -> pin.SE3:
+        """Return the placement of the robot's tool frame in the world frame at the start."""
+        model = self.robot.model
+        data = model.createData()
+        pin.framesForwardKinematics(model, data, self.robot.coordinates.q(self.start))
+        return data.oMf[model.getFrameId(self.robot.tool_frame)].copy()
+
+    def start_clearance(self, *, reach: float = np.inf) -> float:
+        """Return the smallest distance between robot and world at the start [m].
+
+        Objects in the hand count as part of the robot. Distances to the floor, of the robot to
+        itself and to the objects it holds do not count.
+
+        Args:
+            reach: Largest distance of interest [m]: beyond it the result is some number ≥ `reach`.
+        """
+        if not is_number(reach) or reach != reach:
+            raise InputError(
+                "not a number", field="reach", expected="a distance [m]", got=shown(reach)
+            )
+        reach = float(min(reach, 1e300))
+        model, geometry = (
+            self.robot.model,
+            self.robot.opened(self.robot.opening(self.opening)).collision,
+        )
+        data, shapes = model.createData(), geometry.createData()
+        pin.updateGeometryPlacements(
+            model, data, geometry, shapes, self.robot.coordinates.q(self.start)
+        )
+        moving = [
+            (shape.geometry, where)
+            for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+        ]
+        standing = [
+            shape
+            for shape, label in zip(self.obstacles, self.obstacle_labels, strict=True)
+            if label != FLOOR
+        ]
+        for name, placed in self.objects.items():
+            if name not in self.held:
+                standing += make_world_shapes(placed)
+            elif placed.object.free:
+                moving += list_placed_shapes(make_world_shapes(placed))
+        return compute_clearance(moving, list_placed_shapes(standing), reach=reach)
+
+    def sample_start(self, rng: np.random.Generator) -> Scene:
+        """Return the scene with the base at a random collision-free pose in its start region.
+
+        The base's x, y and heading are uniform in the region; poses with a `start_clearance` below
+        `START_CLEARANCE` are rejected.
+
+        Args:
+            rng: Random number generator; the same state gives the same start.
+
+        Raises:
+            InputError: The scene has no start region, the robot holds a fixed object, or no free
+                pose was found.
+        """
+        instance(rng, np.random.Generator, "rng")
+        region, file = self.start_region, self.file
+        if region is None:
+            raise InputError(
+                "the scene has no start region",
+                file=file,
+                field="start_region",
+                expected="x and y intervals",
+            )
+        for name in self.held:
+            if not self.objects[name].object.free:
+                raise InputError(
+                    "the start cannot be sampled while the robot holds a fixed object",
+                    file=file,
+                    field=f"start.held.{name}",
+                )
+        for base in itertools.islice(region.sample_poses(rng), _MAX_TRIES):
+            candidate = self.with_start(base=base)
+            if candidate.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
+                return candidate
+        problem = f"no collision-free start of the robot in {_MAX_TRIES} attempts"
+        raise InputError(
+            problem,
+            file=file,
+            field="start_region",
+            expected=f"a clearance of {START_CLEARANCE} m somewhere",
+        )
+
+
+def load_scene(name_or_path: str | Path) -> Scene:
+    """Load a scene by the name of a file in `scenes`, or by the path of a scene file (.yaml).
+
+    Movable links that overlap other shapes raise a warning.
+
+    Raises:
+        UnknownNameError: There is no such scene, or it names something that does not exist.
+        InputError: The file is invalid; the error names the file, line and field.
+    """
+    from vkc_pin.world.files.documents import read_yaml
+    from vkc_pin.world.scene.scene_file import make_scene_fields
+
+    file = located(name_or_path, "scenes", "*.yaml", what="scene")
+    return _check_new_scene(Scene(**make_scene_fields(read_yaml(file), file.parent))._with())
+
+
+def _check_new_scene(scene: Scene) -> Scene:
+    """Return a new scene with corrected approaches; warn of probable mistakes."""
+    warn_of_overlaps(scene, str(scene.file or scene.name))
+    warn_of_openings(scene.objects, scene.robot, scene.opening, str(scene.file or scene.name))
+    undecided = [
+        item.name
+        for item in scene.described.objects
+        if item.reversed is None and item.name not in scene.held
+    ]
+    holds = (
+        Hold(name, attachment)
+        for name in undecided
+        for attachment in scene.objects[name].object.attachments
+    )
+    return scene.with_approaches(holds, stacklevel=4)

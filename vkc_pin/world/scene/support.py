@@ -1,0 +1,123 @@
+"""Finds out from the shapes which objects rest on which links."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_link_name
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
+
+__all__ = ["MAX_TILT", "SupportedObject", "compute_tilt", "find_supported_objects", "find_supports"]
+
+RESTING_DISTANCE = 5e-3
+"""Displacement of the support test [m].
+
+An object rests on a shape if lowering it by this makes the two overlap by more than half of it, and
+lifting it by this separates them.
+"""
+MAX_TILT = 0.1
+"""Largest tilt of a link while an object rests on it [rad]; dry friction holds beyond that."""
+_DOWN = np.array([0.0, 0.0, -RESTING_DISTANCE])
+
+
+@dataclass(frozen=True, eq=False)
+class SupportedObject:
+    """A free object that rests on a link and moves with it.
+
+    Attributes:
+        object: Its name.
+        hold: Hold of the object that the supporting link belongs to.
+        link: Supporting link.
+        placement_in_link: Placement of its base link in the frame of the supporting link.
+        carrier_placement: Placement of the supporting object when the motion begins, world frame.
+    """
+
+    object: str
+    hold: Hold
+    link: str
+    placement_in_link: pin.SE3
+    carrier_placement: pin.SE3
+
+    @property
+    def support(self) -> str:
+        """Label of the supporting link, "<object>.<link>"."""
+        return f"{self.hold.object}.{self.link}"
+
+
+def find_supports(
+    placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]
+) -> set[str]:
+    """Return the labels of the shapes that an object rests on.
+
+    Args:
+        placed: Object.
+        shapes: Label and shape of every possible support, in the world frame.
+    """
+    own = make_world_shapes(placed)
+    boxes = [compute_world_box(shape.geometry, shape.placement) for shape in own]
+    found: set[str] = set()
+    for label, shape in shapes:
+        if label in found:
+            continue
+        lower, upper = compute_world_box(shape.geometry, shape.placement)
+        near = (
+            (low < upper + RESTING_DISTANCE).all() and (high > lower - RESTING_DISTANCE).all()
+            for low, high in boxes
+        )
+        if any(_is_supporting(shape, one) for one, close in zip(own, near, strict=True) if close):
+            found.add(label)
+    return found
+
+
+def find_supported_objects(
+    objects: Mapping[str, PlacedObject], moving: Mapping[str, Collection[str]], free: Iterable[str]
+) -> dict[str, str]:
+    """Return the free objects that rest on moving links, directly or on top of others.
+
+    Args:
+        objects: All objects at their placements.
+        moving: Object → its links that move.
+        free: Names of the free objects that are not grasped.
+
+    Returns:
+        Free object → "<object>.<link>" of the moving link at the bottom of the stack.
+    """
+    shapes = [
+        (f"{name}.{link}", shape)
+        for name, links in moving.items()
+        for shape in make_world_shapes(objects[name])
+        if (link := get_link_name(shape.name)) in links
+    ]
+    remaining, found = [name for name in free if name not in moving], dict[str, str]()
+    while remaining and shapes:
+        on = {
+            name: min(labels)
+            for name in remaining
+            if (labels := find_supports(objects[name], shapes))
+        }
+        found |= {name: found.get(label, label) for name, label in on.items()}
+        remaining = [name for name in remaining if name not in on]
+        shapes = [(name, shape) for name in on for shape in make_world_shapes(objects[name])]
+    return found
+
+
+def compute_tilt(before: pin.SE3, after: pin.SE3) -> float:
+    """Return the angle between a link's verticals at two placements [rad]."""
+    vertical = (after.rotation @ before.rotation.T)[2]
+    return float(np.arctan2(np.hypot(vertical[0], vertical[1]), vertical[2]))
+
+
+def _is_supporting(shape: pin.GeometryObject, one: pin.GeometryObject) -> bool:
+    """Return whether `shape` supports `one`, a shape of an object."""
+
+    def distance(shift: float) -> float:
+        moved = pin.SE3(one.placement.rotation, one.placement.translation + shift * _DOWN)
+        return compute_shape_distance(one.geometry, moved, shape.geometry, shape.placement)
+
+    lowered = distance(1.0)
+    return lowered < -RESTING_DISTANCE / 2 and distance(-1.0) - lowered > RESTING_DISTANCE

@@ -1,0 +1,1 @@
+"""Compiles steps and user terms to the phases of a task."""

@@ -1,0 +1,134 @@
+"""Finds what steps name in a scene: objects, attachments, links, joints, frames and openings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arguments import known
+from vkc_pin.world.models.articulated_object import Attachment
+from vkc_pin.world.scene.contact_rules import (
+    compute_grasp_opening,
+    compute_start_opening,
+    find_gripper_hold,
+)
+from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.phases import Phase
+
+__all__ = [
+    "check_link",
+    "compute_openings",
+    "find_attachment",
+    "find_joint_limits",
+    "find_object",
+    "find_path_joints",
+    "find_robot_frame",
+]
+
+
+def find_object(scene: Scene, name: str, where: str) -> PlacedObject:
+    """Return an object of a scene.
+
+    Args:
+        scene: Scene.
+        name: Name of the object.
+        where: Field that names it, for the error.
+
+    Raises:
+        UnknownNameError: There is none.
+    """
+    return scene.objects[known(name, scene.objects, "object", where)]
+
+
+def find_attachment(placed: PlacedObject, name: str | None, where: str) -> Attachment:
+    """Return an object's attachment `name`, or its first one.
+
+    Args:
+        placed: Object.
+        name: Name of the attachment; None: the first.
+        where: Field that names it, for errors.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        InputError: The object has no attachment.
+    """
+    attachments = placed.object.attachments
+    if name is None:
+        if not attachments:
+            raise InputError(
+                f"object '{placed.name}' has no attachment, so it cannot be grasped", field=where
+            )
+        return next(iter(attachments.values()))
+    if name not in attachments:
+        raise UnknownNameError(f"attachment of '{placed.name}'", name, attachments, field=where)
+    return attachments[name]
+
+
+def check_link(placed: PlacedObject, link: str, where: str) -> None:
+    """Check that an object has a link.
+
+    Args:
+        placed: Object.
+        link: Name of the link.
+        where: Field that names it, for the error.
+
+    Raises:
+        UnknownNameError: It has no such link.
+    """
+    if link not in placed.object.links:
+        raise UnknownNameError(f"link of '{placed.name}'", link, placed.object.links, field=where)
+
+
+def find_robot_frame(scene: Scene, name: str | None, where: str) -> str:
+    """Return the name of a robot frame, by default the tool frame.
+
+    Args:
+        scene: Scene.
+        name: Name of the frame; None: the tool frame.
+        where: Field that names it, for the error.
+
+    Raises:
+        UnknownNameError: There is none.
+    """
+    frame = name or scene.robot.tool_frame
+    frames = [f.name for f in scene.robot.model.frames]
+    if frame not in frames:
+        raise UnknownNameError("frame of the robot", frame, frames, field=where)
+    return frame
+
+
+def find_path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
+    """Return the names of the joints from an object's base to an attachment's link."""
+    model = placed.object.model
+    joint = model.frames[model.getFrameId(attachment.link, pin.FrameType.BODY)].parentJoint
+    names: list[str] = []
+    while joint:
+        names.insert(0, str(model.names[joint]))
+        joint = model.parents[joint]
+    return names
+
+
+def find_joint_limits(placed: PlacedObject, coordinate: str) -> tuple[float, float]:
+    """Return the limits of an object's coordinate `<object>.<joint>`, [rad] or [m]."""
+    index = placed.object.coordinates.names.index(coordinate.partition(".")[2])
+    return float(placed.object.lower[index]), float(placed.object.upper[index])
+
+
+def compute_openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None]:
+    """Return the gripper opening in each phase [m]; None: as in the robot's rest configuration.
+
+    It is the opening of the attachment that the gripper holds or grasps next; after the last grasp
+    it does not change.
+    """
+    gripper_holds, found = (
+        [find_gripper_hold((*phase.held, *phase.grasps)) for phase in phases],
+        list[float | None](),
+    )
+    for number in range(len(phases)):
+        hold = next((one for one in gripper_holds[number:] if one is not None), None)
+        before = found[-1] if found else compute_start_opening(scene)
+        found.append(before if hold is None else compute_grasp_opening(scene, hold))
+    return found

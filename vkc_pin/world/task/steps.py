@@ -1,0 +1,240 @@
+"""Defines the steps of a task: desired changes in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any
+
+import pinocchio as pin
+
+from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arguments import items, known, mapping, quantity, text
+from vkc_pin.world.scene.poses import as_placement, as_target
+
+__all__ = [
+    "STEPS",
+    "Actuate",
+    "GoTo",
+    "Grasp",
+    "Place",
+    "Reach",
+    "Release",
+    "Step",
+    "Touch",
+    "as_steps",
+    "step_from_dict",
+    "step_to_dict",
+]
+
+
+def _check_names(step: Any, **optional: bool) -> None:
+    """Check that fields of a step are strings, or None where that is allowed."""
+    for name, may_be_none in optional.items():
+        value = getattr(step, name)
+        if value is not None or not may_be_none:
+            object.__setattr__(step, name, text(value, f"{type(step).__name__}.{name}", "a name"))
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Bring a frame of the robot to a pose.
+
+    Attributes:
+        pose: Goal pose in the world frame; see `as_placement` for its forms.
+        frame: Frame of the robot; None: the tool frame.
+    """
+
+    pose: Any
+    frame: str | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", as_placement(self.pose, name="Reach.pose"))
+        _check_names(self, frame=True)
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Grasp an object.
+
+    Attributes:
+        object: Its name in the scene.
+        attachment: Attachment to grasp; None: the object's first one.
+        by: Link of a held object that grasps instead of the tool frame (a stick's tip),
+            "<object>.<link>"; None: the hand.
+    """
+
+    object: str
+    attachment: str | None = None
+    by: str | None = None
+
+    def __post_init__(self) -> None:
+        _check_names(self, object=False, attachment=True, by=True)
+
+
+@dataclass(frozen=True)
+class Actuate:
+    """Bring joints of an object to values; the object is grasped and unlatched first if necessary.
+
+    Attributes:
+        object: Name of the object in the scene.
+        joints: Joint name → final value, [rad] or [m].
+        attachment: Attachment to grasp if the object is not held there; None leaves it open: the
+            present grasp is kept if it can move the joints, else the first attachment that moves
+            them is used, and if planning fails, the others that do.
+    """
+
+    object: str
+    joints: Mapping[str, float] = field(default_factory=dict)
+    attachment: str | None = None
+
+    def __post_init__(self) -> None:
+        _check_names(self, object=False, attachment=True)
+        expected = "a mapping such as {'hinge': 1.2}"
+        if not isinstance(self.joints, Mapping) or not self.joints:
+            raise InputError(
+                "nothing to actuate",
+                field="Actuate.joints",
+                expected=expected,
+                got=shown(self.joints),
+            )
+        given = mapping(self.joints, "Actuate.joints", expected)
+        joints = {
+            name: quantity(value, f"Actuate.joints[{name!r}]") for name, value in given.items()
+        }
+        object.__setattr__(self, "joints", joints)
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Bring a frame of a held object, or of the robot, to a point or a pose.
+
+    Attributes:
+        frame: "<object>.<link>", a link of a free object, which is grasped first unless it is held;
+            or a frame of the robot.
+        target: In the world frame: a point (x, y, z) [m] with any orientation, or a pose; see
+            `as_placement`.
+    """
+
+    frame: str
+    target: Any
+
+    def __post_init__(self) -> None:
+        text(self.frame, "Touch.frame", "<object>.<link>, e.g. stick.tip, or a frame of the robot")
+        object.__setattr__(self, "target", as_target(self.target, name="Touch.target"))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Put a free object down and release it; it is grasped first if necessary.
+
+    Attributes:
+        object: Its name in the scene.
+        pose: Goal of its base link in the world frame: a pose (see `as_placement`), or a point (x,
+            y, z) [m], where it is as upright as before the plan, at any heading; if it is held at
+            the start, with its z axis up.
+        attachment: Attachment to grasp if it is not held yet; None: the object's first one.
+    """
+
+    object: str
+    pose: Any
+    attachment: str | None = None
+
+    def __post_init__(self) -> None:
+        _check_names(self, object=False, attachment=True)
+        object.__setattr__(self, "pose", as_target(self.pose, name="Place.pose"))
+
+
+@dataclass(frozen=True)
+class Release:
+    """Release an object.
+
+    Attributes:
+        object: Its name; None: all held objects.
+    """
+
+    object: str | None = None
+
+    def __post_init__(self) -> None:
+        _check_names(self, object=True)
+
+
+@dataclass(frozen=True)
+class GoTo:
+    """Bring the base to a position; free held objects are carried along, fixed ones are released.
+
+    Attributes:
+        x, y: Position of the base frame in the world [m].
+        yaw: Heading [rad]; None: any.
+    """
+
+    x: float
+    y: float
+    yaw: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "yaw"):
+            if name != "yaw" or self.yaw is not None:
+                object.__setattr__(self, name, quantity(getattr(self, name), f"GoTo.{name}"))
+
+
+Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release
+STEPS = (Reach, Grasp, Actuate, GoTo, Touch, Place, Release)
+"""All step classes."""
+_KINDS: dict[str, Any] = {kind.__name__: kind for kind in STEPS}
+
+
+def as_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """Return steps as a tuple.
+
+    Raises:
+        InputError: They are not a list of steps, or there are none.
+    """
+    if isinstance(steps, STEPS):
+        raise InputError(
+            "a single step", field="steps", expected="a list of steps", got=shown(steps)
+        )
+    found: tuple[Step, ...] = items(steps, "steps", "a list of steps")
+    if not found:
+        raise InputError(
+            "there is nothing to do",
+            field="steps",
+            expected="at least one step",
+            got="an empty list",
+        )
+    for number, step in enumerate(found):
+        if not isinstance(step, STEPS):
+            expected = ", ".join(kind.__name__ for kind in STEPS)
+            raise InputError(
+                "not a step", field=f"steps[{number}]", expected=expected, got=shown(step)
+            )
+    return found
+
+
+def step_to_dict(step: Step) -> dict[str, Any]:
+    """Return `step` as plain data, e.g. for a saved plan."""
+    data = {"step": type(step).__name__, **vars(step)}
+    for name, value in data.items():
+        if isinstance(value, pin.SE3):
+            data[name] = value.homogeneous.tolist()
+    return data
+
+
+def step_from_dict(data: Mapping[str, Any]) -> Step:
+    """Return the step that `step_to_dict` converted to `data`.
+
+    Raises:
+        UnknownNameError: There is no such step, or it has no such field.
+        InputError: A field is missing or invalid.
+    """
+    given = mapping(data, "step", "a step as data")
+    kind = known(given.pop("step", ""), _KINDS, "step", "step")
+    known_fields = {item.name: item for item in fields(_KINDS[kind])}
+    for name in given:
+        if name not in known_fields:
+            raise UnknownNameError(f"field of {kind}", name, known_fields, field=f"{kind}.{name}")
+    for name, item in known_fields.items():
+        if name not in given and item.default is MISSING and item.default_factory is MISSING:
+            raise InputError("this is missing", field=f"{kind}.{name}")
+    step: Step = _KINDS[kind](**given)
+    return step

@@ -1,0 +1,197 @@
+"""Tracks which objects rest on carried or moving links in the course of a task."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+from dataclasses import replace
+
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.models.shapes import get_link_name
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import (
+    MAX_TILT,
+    SupportedObject,
+    compute_tilt,
+    find_supported_objects,
+    find_supports,
+)
+
+__all__ = [
+    "SupportTracker",
+    "compute_placement_after_motion",
+    "find_objects_supported_by",
+    "place_objects",
+]
+
+
+class SupportTracker:
+    """Free objects that rest on links which a robot carries or moves.
+
+    Attributes:
+        carried: Objects that rest on held free objects.
+        moved: Names of the objects that have moved with their support.
+
+    Args:
+        scene: Scene at the start.
+        resting: Free object → its placement, for free objects that are not held; updated here.
+    """
+
+    def __init__(self, scene: Scene, resting: dict[str, pin.SE3]) -> None:
+        self.scene, self.resting = scene, resting
+        self.carried: tuple[SupportedObject, ...] = ()
+        self.moved: set[str] = set()
+        self._on_moving: tuple[SupportedObject, ...] = ()
+        self._before: dict[str, PlacedObject] = {}
+
+    def add_carried(self, hold: Hold, state: Mapping[str, float], where: str) -> None:
+        """Add the objects that rest on an object that is grasped, if that is free."""
+        placed = self.scene.objects[hold.object]
+        if placed.object.free:
+            now = {hold.object: placed, **place_objects(self.scene, state, self.resting)}
+            supported = find_objects_supported_by(self.scene, now, hold, set(), where)
+            self.carried += supported
+            for one in supported:
+                self.resting.pop(one.object)
+                self.moved.add(one.object)
+
+    def release_carried(self, hold: Hold, placement: pin.SE3) -> list[str]:
+        """Release the objects on a free object released at `placement`; return their names."""
+        placed = replace(self.scene.objects[hold.object], placement=placement)
+        ended = [one for one in self.carried if one.hold == hold]
+        for one in ended:
+            self.resting[one.object] = placed.link_placement(one.link) * one.placement_in_link
+        self.carried = tuple(one for one in self.carried if one.hold != hold)
+        return [one.object for one in ended]
+
+    def begin_motion(
+        self, hold: Hold, joints: Set[str], state: Mapping[str, float], where: str
+    ) -> None:
+        """Add the objects that rest on a fixed object of which joints begin to move."""
+        self._before = place_objects(self.scene, state, self.resting)
+        self._on_moving = find_objects_supported_by(self.scene, self._before, hold, joints, where)
+        self.moved |= {one.object for one in self._on_moving}
+
+    def end_motion(self, state: Mapping[str, float], where: str) -> None:
+        """Release the objects added by `begin_motion` at their new placements."""
+        for one in self._on_moving:
+            name, after = one.hold.object, place_objects(self.scene, state, self.resting)
+            self.resting[one.object] = compute_placement_after_motion(
+                one, self._before[name], after[name], where
+            )
+        self._on_moving = ()
+
+    @property
+    def supported(self) -> tuple[SupportedObject, ...]:
+        """Objects that rest on moving links at present."""
+        return (*self.carried, *self._on_moving)
+
+
+def place_objects(
+    scene: Scene, state: Mapping[str, float], resting: Mapping[str, pin.SE3]
+) -> dict[str, PlacedObject]:
+    """Return the objects that are not held at some time of a task, in their states.
+
+    Args:
+        scene: Scene at the start.
+        state: Object coordinate → value, where it differs from the scene's.
+        resting: Free object → its placement, for free objects that are not held.
+    """
+    found = {}
+    for name, placed in scene.objects.items():
+        if placed.object.free and name not in resting:
+            continue
+        values = {
+            c.removeprefix(f"{name}."): v for c, v in state.items() if c.startswith(f"{name}.")
+        }
+        found[name] = replace(placed, placement=resting.get(name, placed.placement)).with_state(
+            values
+        )
+    return found
+
+
+def find_objects_supported_by(
+    scene: Scene, now: Mapping[str, PlacedObject], hold: Hold, joints: Set[str], where: str
+) -> tuple[SupportedObject, ...]:
+    """Return the objects that will rest on a held object while it moves.
+
+    Args:
+        scene: Scene.
+        now: Objects that are not held when the motion begins, and the held one.
+        hold: Hold.
+        joints: Joints of a fixed object that will move; a free object moves with all its links.
+        where: Step, for messages.
+
+    Raises:
+        InputError: An object rests both on a moving and on a fixed link.
+    """
+    item = now[hold.object].object
+    links = set(item.links) if item.free else item.links_moved_by(joints)
+    free = [name for name, placed in now.items() if placed.object.free and name != hold.object]
+    supported = find_supported_objects(now, {hold.object: links}, free)
+    if not supported:
+        return ()
+    static_shapes = [
+        (f"{name}.{get_link_name(shape.name)}", shape)
+        for name, placed in now.items()
+        if name not in supported
+        for shape in make_world_shapes(placed)
+        if name != hold.object or get_link_name(shape.name) not in links
+    ]
+    static_shapes += zip(scene.obstacle_labels, scene.obstacles, strict=True)
+    found = []
+    for name, label in supported.items():
+        other = min(find_supports(now[name], static_shapes), default=None)
+        if other is not None and not item.free:
+            problem = (
+                f"'{name}' rests both on a moving and on a fixed link: '{label}' and '{other}'"
+            )
+            raise InputError(
+                problem,
+                field=where,
+                expected="that it is removed, or rests on one of them only",
+            )
+        link = label.partition(".")[2]
+        carrier = now[hold.object]
+        found.append(
+            SupportedObject(
+                name,
+                hold,
+                link,
+                carrier.link_placement(link).actInv(now[name].placement),
+                carrier.placement,
+            )
+        )
+    return tuple(found)
+
+
+def compute_placement_after_motion(
+    one: SupportedObject, before: PlacedObject, after: PlacedObject, where: str
+) -> pin.SE3:
+    """Return the placement of a supported object after a joint of its support has moved.
+
+    Args:
+        one: Supported object.
+        before: Supporting object before the motion.
+        after: Supporting object after the motion.
+        where: Step, for messages.
+
+    Raises:
+        InputError: The supporting link tilts too much.
+    """
+    link = after.link_placement(one.link)
+    if (angle := compute_tilt(before.link_placement(one.link), link)) > MAX_TILT:
+        problem, got = (
+            f"'{one.object}' rests on '{one.support}', which would tilt too much",
+            f"{angle:.2f} rad",
+        )
+        raise InputError(
+            problem,
+            field=where,
+            expected=f"that it is removed before, or at most {MAX_TILT:g} rad",
+            got=got,
+        )
+    return link * one.placement_in_link

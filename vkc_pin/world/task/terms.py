@@ -1,0 +1,396 @@
+"""Defines constraints and costs of users: CasADi expressions of coordinates and frames.
+
+The user's function is called once, with symbols, and its result is stored as plain data
+(`formula`). The nonlinear program composes that with its kinematics; validation evaluates it at
+placements that it computes itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.utils.arguments import items, mapping, number, numbers
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.task.formula import Formula, State
+
+if TYPE_CHECKING:
+    from vkc_pin.world.scene.scene import Scene
+
+__all__ = [
+    "Constraint",
+    "Cost",
+    "State",
+    "Term",
+    "check_terms_active",
+    "rename_term",
+    "term_from_dict",
+    "term_to_dict",
+    "trace_terms",
+    "trace_terms_without_scene",
+]
+
+Numbers = float | Sequence[float] | NDArray[np.float64]
+Expression = Callable[[State], Any] | Formula
+
+
+@dataclass(frozen=True)
+class _Term:
+    name: str
+    expression: Expression
+    _: KW_ONLY
+    during: Sequence[str] | str | None = None
+    holding: str | None = None
+
+    def _check(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(
+                "not a name",
+                field=f"{type(self).__name__}.name",
+                expected="text",
+                got=shown(self.name),
+            )
+        if not callable(self.expression) and not isinstance(self.expression, Formula):
+            expected = "a function of a State, e.g. lambda s: s.coordinate('elbow_joint')"
+            raise self.make_error("not a function", "expression", expected, shown(self.expression))
+        if self.during is not None:
+            names = (self.during,) if isinstance(self.during, str) else self.during
+            if (
+                not isinstance(names, list | tuple)
+                or not names
+                or not all(isinstance(name, str) for name in names)
+            ):
+                raise self.make_error(
+                    "not phases",
+                    "during",
+                    "names of phases, e.g. ['place cup']",
+                    shown(self.during),
+                )
+            object.__setattr__(self, "during", tuple(names))
+        if self.holding is not None and not isinstance(self.holding, str):
+            raise self.make_error(
+                "not an object", "holding", "an object's name", shown(self.holding)
+            )
+
+    def make_error(
+        self, problem: str, field: str, expected: object = None, got: object = None
+    ) -> InputError:
+        """Return (without raising) the error for an invalid field."""
+        return InputError(
+            problem, field=f"terms[{self.name!r}].{field}", expected=expected, got=got
+        )
+
+    def _check_positive(self, field: str) -> None:
+        """Check that a field is a positive number."""
+        where, expected = f"terms[{self.name!r}].{field}", "a positive finite number"
+        object.__setattr__(
+            self, field, number(getattr(self, field), where, expected, low=0.0, above=True)
+        )
+
+    def is_active(self, phase: str, held: Iterable[str]) -> bool:
+        """Return whether the term applies in a phase called `phase`, in which `held` are held."""
+        return (self.during is None or phase in self.during) and (
+            self.holding is None or self.holding in held
+        )
+
+    @property
+    def formula(self) -> Formula:
+        """The expression as plain data."""
+        if not isinstance(self.expression, Formula):
+            raise self.make_error("not traced yet", "expression")
+        return self.expression
+
+
+@dataclass(frozen=True)
+class Constraint(_Term):
+    """An expression that is bounded at every waypoint of the chosen phases but their first.
+
+    Attributes:
+        name: Name in reports.
+        expression: Maps a `State` to a CasADi number or column. Square roots are evaluated at x +
+            1e-8 instead of x, so that norms are differentiable at zero; comparisons are expressed
+            by the bounds.
+        lower, upper: Bounds, one number or one per entry; None: no bound.
+        during: Names of phases, e.g. "place cup" (listed in `plan.trajectory.phases`); None: all.
+        holding: Object that must be held for the constraint to apply; None: none.
+        tolerance: Violation that validation accepts at a waypoint, in the unit of the expression;
+            ten times as much between waypoints, where the program has no constraint.
+    """
+
+    _: KW_ONLY
+    lower: Numbers | None = None
+    upper: Numbers | None = None
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        self._check()
+        self._check_positive("tolerance")
+        for field in ("lower", "upper"):
+            value = getattr(self, field)
+            if value is not None:
+                object.__setattr__(self, field, self._check_bound(field, value))
+        self.compute_bounds(self.expression.rows if isinstance(self.expression, Formula) else None)
+
+    def _check_bound(self, field: str, value: Any) -> float | tuple[float, ...]:
+        given = numbers(
+            value,
+            f"terms[{self.name!r}].{field}",
+            "a number or a list of them",
+            problem="not a number",
+        )
+        wrong = np.isnan(given) | (given == (np.inf if field == "lower" else -np.inf))
+        if given.ndim > 1 or not given.size or wrong.any():
+            raise self.make_error(
+                "no such bound", field, "a number or a list of them", shown(value)
+            )
+        return float(given) if given.ndim == 0 else tuple(given.tolist())
+
+    def compute_bounds(self, rows: int | None) -> tuple[Floats, Floats]:
+        """Return both bounds, shape (rows,).
+
+        Args:
+            rows: Number of rows of the expression; None: as many as there are bounds.
+
+        Raises:
+            InputError: They do not fit the expression, or each other.
+        """
+        given = [
+            -np.inf if self.lower is None else self.lower,
+            np.inf if self.upper is None else self.upper,
+        ]
+        try:
+            if rows is None:
+                lower, upper = np.broadcast_arrays(*given)
+            else:
+                lower, upper = (np.broadcast_to(bound, (rows,)) for bound in given)
+        except ValueError:
+            expected = (
+                "as many lower as upper ones"
+                if rows is None
+                else f"one number, or {rows}, like the expression"
+            )
+            raise self.make_error(
+                "wrong number of bounds", "lower, upper", expected, shown((self.lower, self.upper))
+            ) from None
+        if not (np.isfinite(lower) | np.isfinite(upper)).all():
+            raise self.make_error(
+                "no bound",
+                "lower, upper",
+                "at least one of them, finite",
+                shown((self.lower, self.upper)),
+            )
+        if (lower > upper).any():
+            raise self.make_error(
+                "lower is more than upper",
+                "lower, upper",
+                "lower <= upper",
+                shown((self.lower, self.upper)),
+            )
+        return lower, upper
+
+
+@dataclass(frozen=True)
+class Cost(_Term):
+    """An expression to minimise: `weight` times its sum over the waypoints of the chosen phases.
+
+    The first waypoint of each phase does not count.
+
+    Attributes:
+        name: Name in error messages.
+        expression: Maps a `State` to a CasADi number; see `Constraint`.
+        weight: Weight beside `Options.velocity_weight_*` and the others.
+        during, holding: When the cost applies, as for a `Constraint`.
+    """
+
+    _: KW_ONLY
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._check()
+        self._check_positive("weight")
+
+
+Term = Constraint | Cost
+
+
+def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Return terms with their expressions as plain data, checked against a scene.
+
+    Raises:
+        UnknownNameError: A frame, coordinate or object does not exist.
+        InputError: They are not terms, two share a name, or an expression is invalid.
+    """
+    terms = items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
+    if not terms:
+        return ()
+    robot = [str(frame.name) for frame in scene.robot.model.frames if frame.name != "universe"]
+    items_by_name = [(name, placed.object) for name, placed in scene.objects.items()]
+    frames = [*robot, *(f"{name}.{link}" for name, item in items_by_name for link in item.links)]
+    joints = [f"{name}.{joint}" for name, item in items_by_name for joint in item.coordinates.names]
+    for term in terms:
+        if term.holding is not None and term.holding not in scene.objects:
+            raise UnknownNameError(
+                "object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding"
+            )
+    return _trace_all(terms, frames, [*scene.robot.coordinates.names, *joints])
+
+
+def trace_terms_without_scene(terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Return terms with their expressions as plain data, with any names of frames and coordinates.
+
+    Raises:
+        InputError: They are not terms, two share a name, or an expression is invalid.
+    """
+    return _trace_all(
+        items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None
+    )
+
+
+def rename_term(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -> Term:
+    """Return a traced term with other frames, and another object that must be held.
+
+    Args:
+        term: Term.
+        frames: Name of a frame in its expression → its new name; others keep theirs.
+        objects: Name of an object in `holding` → its new name.
+    """
+    formula = term.formula
+    formula = replace(formula, frames=tuple(frames.get(name, name) for name in formula.frames))
+    return replace(term, expression=formula, holding=objects.get(term.holding or "", term.holding))
+
+
+def _trace_all(
+    terms: Sequence[Term], frames: Sequence[str] | None, coordinates: Sequence[str] | None
+) -> tuple[Term, ...]:
+    found: list[Term] = []
+    for term in terms:
+        if term.name in (other.name for other in found):
+            raise InputError(
+                "two terms share a name",
+                field="terms",
+                expected="different names",
+                got=shown(term.name),
+            )
+        found.append(_trace(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
+    return tuple(found)
+
+
+def _trace(term: Term, state: State) -> Term:
+    if isinstance(term.expression, Formula):
+        state.check_names(term.expression)
+        return term
+    try:
+        value = term.expression(state)
+    except UnknownNameError:
+        raise
+    except Exception as error:
+        raise term.make_error(
+            "it cannot be evaluated", "expression", "CasADi operations only", str(error)
+        ) from error
+    if isinstance(value, int | float | np.ndarray | np.number | ca.DM):
+        raise term.make_error(
+            "it does not depend on the state",
+            "expression",
+            "an expression of what a State returns",
+            shown(value),
+        )
+    if not isinstance(value, ca.SX):
+        raise term.make_error(
+            "no CasADi expression",
+            "expression",
+            "a number or a column, e.g. of ca.vertcat",
+            shown(value),
+        )
+    if (
+        not value.is_vector()
+        or value.is_empty()
+        or (isinstance(term, Cost) and not value.is_scalar())
+    ):
+        expected = "a number" if isinstance(term, Cost) else "a number or a column"
+        raise term.make_error("wrong shape", "expression", expected, f"shape {value.shape}")
+    try:
+        formula = state.make_formula(ca.vec(value))
+    except RuntimeError as error:
+        raise term.make_error(
+            "it has symbols of its own", "expression", "only those of its State", str(error)
+        ) from error
+    if not formula.input_indices:
+        raise term.make_error(
+            "it does not depend on the state",
+            "expression",
+            "an expression of what a State returns",
+            str(value),
+        )
+    if formula.has_comparison:
+        raise term.make_error(
+            "a comparison", "expression", "an expression that lower and upper bound", str(value)
+        )
+    return replace(term, expression=formula)
+
+
+def check_terms_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str]]]) -> None:
+    """Check that every term applies in some phase of a task.
+
+    Args:
+        terms: Terms.
+        phases: Name of every phase of the task, and the objects held in it.
+
+    Raises:
+        UnknownNameError: `during` names a phase that does not exist.
+        InputError: A term applies in no phase.
+    """
+    names = list(dict.fromkeys(name for name, _ in phases))
+    for term in terms:
+        for name in term.during or ():
+            if name not in names:
+                raise UnknownNameError("phase", name, names, field=f"terms[{term.name!r}].during")
+        if not any(term.is_active(name, held) for name, held in phases):
+            held = ", ".join(
+                f"{name!r} holds {', '.join(held) or 'nothing'}" for name, held in phases
+            )
+            raise term.make_error(
+                "never held in these phases", "holding", held, shown(term.holding)
+            )
+
+
+def term_to_dict(term: Term) -> dict[str, Any]:
+    """Return a traced term as plain data, e.g. for a saved plan."""
+    return {"term": type(term).__name__, **asdict(term)}
+
+
+def term_from_dict(data: Mapping[str, Any]) -> Term:
+    """Return the term that `term_to_dict` converted to `data`.
+
+    Raises:
+        InputError: The data are invalid.
+    """
+    fields = mapping(data, "terms", "a term as data")
+    kinds: dict[str, type[Constraint] | type[Cost]] = {"Constraint": Constraint, "Cost": Cost}
+    try:
+        given = fields.pop("expression")
+        code = tuple(
+            (str(name), tuple(map(int, read)), int(written), float(value))
+            for name, read, written, value in given["code"]
+        )
+        formula = Formula(
+            tuple(given["frames"]), tuple(given["coordinates"]), int(given["rows"]), code
+        )
+        formula.function  # noqa: B018 - what cannot be built is no expression
+        return kinds[fields.pop("term")](expression=formula, **fields)
+    except (
+        LookupError,
+        TypeError,
+        ValueError,
+        OverflowError,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
+        raise InputError(
+            "not a saved term", field="terms", expected="what Plan.save wrote", got=str(error)
+        ) from error

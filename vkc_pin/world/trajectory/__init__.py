@@ -1,0 +1,1 @@
+"""Represents motions over time, the world along them, and their file formats."""

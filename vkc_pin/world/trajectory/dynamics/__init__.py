@@ -1,0 +1,1 @@
+"""Computes motor torques of the arm and contact wrenches of the hand along a motion."""

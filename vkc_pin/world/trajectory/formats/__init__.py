@@ -1,0 +1,1 @@
+"""Reads and writes motions as archives of plans, tables, JSON, and ROS messages."""

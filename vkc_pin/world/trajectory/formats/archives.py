@@ -1,0 +1,330 @@
+"""Reads and writes archives of plans, with size limits and validation of all content."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic.types import FailFast
+
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import finite
+from vkc_pin.world.files.documents import MOST_FIELDS, Document, check, parse_json, read_bytes
+from vkc_pin.world.files.fields import Schema, fail
+from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.writing import write_atomically
+
+__all__ = [
+    "FORMAT",
+    "METRICS",
+    "STATUSES",
+    "read_archive",
+    "resolve_folder",
+    "serialize_folder",
+    "write_archive",
+]
+
+FORMAT = 1
+LARGEST_ARCHIVE, LARGEST_MEMBER = 20_000_000, 40_000_000
+"""Largest file, and largest part of it unpacked [bytes]: some 200 000 waypoints of 25 coordinates."""
+ARRAYS = {"about": ("U", 0), "times": ("f", 1), "positions": ("f", 2)}
+"""Parts of the archive: kind and number of axes of the array."""
+CURVE = {"knot_times": ("f", 1), "knot_positions": ("f", 2), "knot_rates": ("f", 2)}
+"""Additional parts of a motion with a curve."""
+_PARTS = ARRAYS | CURVE
+STATUSES = (
+    *(
+        "success",
+        "infeasible",
+        "not converged",
+        "time limit",
+        "effort spent",
+        "interrupted",
+        "rejected",
+    ),
+    *(
+        "no base pose",
+        "no base path",
+        "arm does not reach",
+        "no inverse kinematics",
+        "collision",
+        "too fast",
+        "closure",
+    ),
+)
+"""Status of plans; those in the second group belong to baselines."""
+METRICS = (
+    *(
+        "planning_time",
+        "build_time",
+        "base_effort",
+        "base_effort_l1",
+        "arm_effort",
+        "clearance",
+        "closure_error",
+        "duration",
+    ),
+    *(
+        "iterations",
+        "rounds",
+        "effort",
+        "time_initialization",
+        "time_coal",
+        "time_casadi",
+        "time_ipopt",
+        "time_validation",
+    ),
+    *("time_retiming", "torque"),
+)
+"""Metrics of every plan; baselines have more."""
+
+_DAMAGED = (
+    *(
+        zipfile.BadZipFile,
+        zlib.error,
+        OSError,
+        EOFError,
+        RuntimeError,
+    ),  # a zip archive that is none, or encrypted
+    *(
+        ValueError,
+        SyntaxError,
+        TypeError,
+        LookupError,
+        OverflowError,
+        MemoryError,
+    ),  # an array that is none
+)
+
+Text = Annotated[str, Field(strict=True)]
+Count = Annotated[int, Field(strict=True, ge=0)]
+Distance = Annotated[float, Field(strict=True, gt=-math.inf)]  # which a NaN is not
+Measured = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
+Named = dict[str, Text]
+
+
+def _number(value: Any) -> bool:
+    try:
+        return isinstance(value, int | float) and math.isfinite(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        return False
+
+
+def _row(found: dict[str, Any]) -> dict[str, Any]:
+    for name, value in found.items():
+        if value != math.inf and not _number(value):
+            raise fail(f"{name!r} is no number", "numbers by name")
+    return found
+
+
+def _folder(found: Named) -> Named:
+    if found != {"package": "scenes"} and set(found) != {"relative", "absolute"}:
+        raise fail("no folder of a scene", 'package: "scenes", or relative and absolute')
+    return found
+
+
+class _Phase(Schema):
+    name: Text
+    first: Count
+    last: Count
+    held: Named
+    by: Named = Field(default_factory=dict)
+    opening: Measured | None = None
+
+
+class _Motion(Schema):
+    names: Annotated[list[Text], FailFast()]
+    robot_size: Count
+    phases: Annotated[list[_Phase], FailFast()]
+
+
+class _Violation(Schema):
+    constraint: Text
+    subject: Text
+    waypoint: Count
+    time: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    amount: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    unit: Text
+    detail: Text
+
+
+class _Others(BaseModel):
+    """Metrics beside those that are known."""
+
+    model_config = ConfigDict(extra="allow")
+
+    @model_validator(mode="after")
+    def _numbers(self) -> Self:
+        for name, value in (self.model_extra or {}).items():
+            if isinstance(value, bool) or not _number(value):
+                raise fail(f"the metric {name!r} is none", "a finite number")
+        return self
+
+
+_LATER = ("effort", "time_retiming", "torque")  # older files do not have it
+_kinds: dict[str, Any] = {
+    name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...)
+    for name in METRICS
+}
+_Metrics = create_model("_Metrics", __base__=_Others, **_kinds)
+
+
+class _Bound(Schema):
+    subject: Text
+    kind: Text
+    share: Measured
+    begin: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    end: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+
+
+class _Exemption(Schema):
+    subject: Text
+    distance: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    reason: Text
+
+
+class _Report(Schema):
+    violations: Annotated[list[_Violation], FailFast()]
+    clearance: Distance
+    closure_error: Measured
+    closure_angle: Measured
+    clearances: Annotated[tuple[Distance, ...], FailFast()] = ()  # older files do not have it
+    states: Count
+    notes: Annotated[list[Text], FailFast()]
+    torque: Measured = 0.0  # older files have none of these
+    bounds: Annotated[tuple[_Bound, ...], FailFast()] = ()
+    remarks: Annotated[tuple[Text, ...], FailFast()] = ()
+    exemptions: Annotated[tuple[_Exemption, ...], FailFast()] = ()
+
+
+class _About(Schema):
+    """The description; what scenes, steps, options and terms make of their parts they check themselves."""
+
+    format: int
+    scene: dict[str, Any]
+    folder: Annotated[Named, AfterValidator(_folder)]
+    steps: Annotated[list[dict[str, Any]], FailFast()]
+    options: dict[str, Any]
+    trajectory: _Motion
+    validation: _Report
+    status: Literal[STATUSES]  # type: ignore[valid-type]
+    metrics: _Metrics  # type: ignore[valid-type]
+    seed: Count
+    initialization: Text
+    history: Annotated[list[Annotated[dict[str, Any], AfterValidator(_row)]], FailFast()]
+    terms: Annotated[list[dict[str, Any]], FailFast()] = Field(default_factory=list)
+
+
+def write_archive(file: str | Path, about: Mapping[str, Any]) -> Path:
+    """Write the archive of a plan atomically from its description; return the path.
+
+    Numbers of the `trajectory` (see `Trajectory.to_dict`) are stored as separate arrays.
+    """
+    motion = dict(about["trajectory"])
+    arrays = {name: np.array(motion.pop(name), float) for name in ("times", "positions")}
+    arrays |= {
+        f"knot_{name}": np.array(values, float) for name, values in motion.pop("curve", {}).items()
+    }
+    buffer, text = io.BytesIO(), json.dumps({"format": FORMAT, **about, "trajectory": motion})
+    np.savez_compressed(buffer, allow_pickle=False, about=np.array(text), **arrays)
+    return write_atomically(file, buffer.getvalue())
+
+
+def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the description in the file of a saved plan, and its arrays: "times", "positions", and "curve", if there is one.
+
+    Nothing is unpacked before its size is known, and there are no pickles in it.
+
+    Raises:
+        InputError: The file cannot be read, is no saved plan, is larger than one can be, or
+            something in it does not fit.
+    """
+    data = read_bytes(file, "plan", LARGEST_ARCHIVE)
+    try:
+        if (parts := data.count(b"PK\x01\x02")) > 2 * len(_PARTS):  # before a list of them is made
+            raise ValueError(f"{parts} parts")
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = sorted(name.removesuffix(".npy") for name in archive.namelist())
+            if names not in (sorted(ARRAYS), sorted(_PARTS)):
+                raise ValueError(
+                    f"its parts are {', '.join(names) or 'none'}, not {', '.join(sorted(ARRAYS))}"
+                )
+            arrays = {
+                info.filename.removesuffix(".npy"): _array(archive, info)
+                for info in archive.infolist()
+            }
+    except _DAMAGED as error:
+        raise InputError(
+            "not a saved plan", file=file, expected="a file written by Plan.save", got=error
+        ) from error
+    text = str(arrays.pop("about"))
+    if text.count(",") > MOST_FIELDS:
+        raise InputError(
+            "the description has too many fields", file=file, expected=f"at most {MOST_FIELDS}"
+        )
+    about = parse_json(text, file)
+    if isinstance(about, dict) and about.get("format") != FORMAT:
+        raise InputError(
+            "unknown format", file=file, field="format", expected=FORMAT, got=about.get("format")
+        )
+    found: dict[str, Any] = {name: finite(array, name, file) for name, array in arrays.items()}
+    knots = {name.removeprefix("knot_"): found.pop(name) for name in CURVE if name in found}
+    return check(Document(about, file), _About).model_dump(), found | (
+        {"curve": knots} if knots else {}
+    )
+
+
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
+    """Return one part of an archive; the header must say what there is of it."""
+    name = info.filename.removesuffix(".npy")
+    kind, axes = _PARTS[name]
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is packed in an unknown way")
+    with archive.open(info) as packed:
+        stream = io.BytesIO(packed.read(LARGEST_MEMBER + 1))
+    if (size := stream.getbuffer().nbytes) > LARGEST_MEMBER:
+        raise ValueError(f"{name} is larger than {LARGEST_MEMBER:g} bytes")
+    major, _ = np.lib.format.read_magic(stream)
+    header = (
+        np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    )
+    shape, columns, dtype = header(stream)
+    begin = stream.tell()
+    if (
+        dtype.kind != kind
+        or len(shape) != axes
+        or math.prod(shape) * dtype.itemsize != size - begin
+        or size == begin
+    ):
+        raise ValueError(f"{name} is an array of {dtype} and shape {shape} in {size - begin} bytes")
+    values = np.frombuffer(stream.getbuffer(), dtype, offset=begin)
+    return (
+        values[0]
+        if kind == "U"
+        else values.reshape(shape, order="F" if columns else "C").astype(float)
+    )
+
+
+def serialize_folder(scene_folder: Path, plan: Path) -> dict[str, str]:
+    """Describe a scene's folder: in the package, or by relative and absolute paths."""
+    there = scene_folder.resolve()
+    if there == folder("scenes").resolve():
+        return {"package": "scenes"}
+    return {"relative": os.path.relpath(there, plan.resolve().parent), "absolute": str(there)}
+
+
+def resolve_folder(data: Mapping[str, str], plan: Path) -> Path:
+    """Return the folder described by `serialize_folder`."""
+    if "package" in data:
+        return folder(data["package"])
+    beside = plan.resolve().parent / data["relative"]
+    return beside if beside.is_dir() else Path(data["absolute"])

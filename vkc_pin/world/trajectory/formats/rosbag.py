@@ -1,0 +1,201 @@
+"""Writes motions as ROS 2 bags with trajectories, base path and velocity, and object joint states.
+
+A motion is plain data as returned by `Trajectory.to_dict`. Messages are built from the data that
+`ros.to_ros` returns.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import number, text
+from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.world.trajectory.formats.ros import to_ros
+
+__all__ = ["TOPICS", "import_rosbags", "write_rosbag"]
+
+TOPICS: Mapping[str, str] = {
+    "arm/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
+    "base/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
+    "base/path": "nav_msgs/msg/Path",
+    "base/cmd_vel": "geometry_msgs/msg/TwistStamped",
+    "objects/joint_states": "sensor_msgs/msg/JointState",
+    "phases": "std_msgs/msg/String",
+}
+"""Recorded topics: suffix of the topic name → message type."""
+_FORMAT = 8  # of rosbag2: the last with profiles of quality as text, which older readers want
+_NANO = 1_000_000_000
+
+
+def write_rosbag(
+    motion: Mapping[str, Any],
+    path: str | Path,
+    *,
+    rate: float | None = None,
+    states: float = 50.0,
+    namespace: str = "/vkc",
+    frame: str = "world",
+    base_frame: str = "base_link",
+    stamp: float = 0.0,
+    force: bool = False,
+) -> Path:
+    """Write a motion as a recording of ROS 2: a folder with metadata.yaml and a database; return its path.
+
+    Trajectories and the path are one message each, at the recording's begin. Velocities of the
+    base, in its own frame, and joint states of objects follow one another at a rate; "phases" says
+    as JSON, where each begins, what is held from then on, and how far the gripper is open. Topics
+    about what the motion does not have (an arm, objects) are left out.
+
+    Args:
+        motion: What to write.
+        path: The folder to make.
+        rate: Points a second of the trajectories and of the path [Hz]; see `to_ros`. None: the
+            knots of the curve, or else the waypoints.
+        states: Velocities of the base and states of objects a second [Hz]; see `to_ros`, too.
+        namespace: What the topics' names begin with.
+        frame: `header.frame_id`, the frame of the base's coordinates.
+        base_frame: The same of the base's velocities.
+        stamp: `header.stamp` of the trajectories [s]; in ROS, zero means at once. The recording
+            begins then.
+        force: Replace a folder that is there.
+
+    Raises:
+        InputError: The package `rosbags` is not installed, the folder cannot be made or is there
+            already, `namespace` is no name of topics, or a rate or `stamp` is out of range.
+    """
+    import_rosbags()
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    states = number(states, "states", "messages a second, more than 0", low=0.0, above=True)
+    begin = _namespace(namespace)
+    store: Any = get_typestore(Stores.ROS2_HUMBLE)
+    own = text(base_frame, "base_frame")
+    messages = _messages(
+        motion, store.types, rate, states, frame=frame, base_frame=own, stamp=stamp
+    )
+    found = sorted(messages, key=lambda item: item[1])
+    with folder_at_once(path, force=force) as staging:
+        inside = staging / Path(path).absolute().name  # which the database is named after
+        with Writer(inside, version=_FORMAT) as writer:
+            ends = [end for end in TOPICS if any(end == own for own, _, _ in found)]
+            topics = {
+                end: writer.add_connection(f"{begin}/{end}", TOPICS[end], typestore=store)
+                for end in ends
+            }
+            for end, when, message in found:
+                writer.write(topics[end], when, bytes(store.serialize_cdr(message, TOPICS[end])))
+        for file in inside.iterdir():
+            file.rename(staging / file.name)
+        inside.rmdir()
+    return Path(path)
+
+
+def import_rosbags() -> Any:
+    """Return the package `rosbags`.
+
+    Raises:
+        InputError: `rosbags` is not installed or cannot be imported.
+    """
+    return optional_package("rosbags", "ros", what="recording for ROS")
+
+
+def _namespace(name: str) -> str:
+    parts = text(name, "namespace").strip("/").split("/") if name != "" else [""]
+    if parts != [""] and not all(part.isascii() and part.isidentifier() for part in parts):
+        raise InputError(
+            "no name of topics",
+            field="namespace",
+            expected="words with slashes between, e.g. /vkc",
+            got=name,
+        )
+    return "".join(f"/{part}" for part in parts if part)
+
+
+def _messages(
+    motion: Mapping[str, Any],
+    types: Any,
+    rate: float | None,
+    states: float,
+    *,
+    frame: str,
+    base_frame: str,
+    stamp: float,
+) -> Iterator[tuple[str, int, Any]]:
+    """Yield every message, with the end of its topic's name and when it is recorded [ns]."""
+    base = to_ros(motion, joints="base", rate=rate, frame=frame, stamp=stamp)
+    begin = _nanoseconds(base["header"]["stamp"])
+    arm = to_ros(motion, joints="arm", rate=rate, frame=frame, stamp=stamp)
+    for end, found in (("arm/joint_trajectory", arm), ("base/joint_trajectory", base)):
+        if found["joint_names"]:
+            yield end, begin, _trajectory(types, found)
+    header, stamped = types["std_msgs/msg/Header"], types["geometry_msgs/msg/PoseStamped"]
+    poses = [
+        stamped(
+            header(_time(types, begin + _nanoseconds(p["time_from_start"])), frame), _pose(types, p)
+        )
+        for p in base["points"]
+    ]
+    yield "base/path", begin, types["nav_msgs/msg/Path"](header(_time(types, begin), frame), poses)
+    for point in to_ros(motion, joints="base", rate=states, derivatives=1)["points"]:
+        when = begin + _nanoseconds(point["time_from_start"])
+        yield "base/cmd_vel", when, _twist(types, point, header(_time(types, when), base_frame))
+    objects = to_ros(motion, joints="objects", rate=states, derivatives=1)
+    for point in objects["points"] if objects["joint_names"] else ():
+        when = begin + _nanoseconds(point["time_from_start"])
+        values = (np.array(point[key], float) for key in ("positions", "velocities", "effort"))
+        state = types["sensor_msgs/msg/JointState"](
+            header(_time(types, when), frame), objects["joint_names"], *values
+        )
+        yield "objects/joint_states", when, state
+    for phase in motion["phases"]:
+        when = begin + round((motion["times"][phase["first"]] - motion["times"][0]) * _NANO)
+        yield "phases", when, types["std_msgs/msg/String"](json.dumps(phase))
+
+
+def _trajectory(types: Any, found: Mapping[str, Any]) -> Any:
+    header, duration = found["header"], types["builtin_interfaces/msg/Duration"]
+    kind = types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    keys = ("positions", "velocities", "accelerations", "effort")
+    points = [
+        kind(*(np.array(point[key], float) for key in keys), duration(**point["time_from_start"]))
+        for point in found["points"]
+    ]
+    named = types["std_msgs/msg/Header"](
+        _time(types, _nanoseconds(header["stamp"])), header["frame_id"]
+    )
+    return types["trajectory_msgs/msg/JointTrajectory"](named, found["joint_names"], points)
+
+
+def _pose(types: Any, point: Mapping[str, Any]) -> Any:
+    x, y, yaw = point["positions"]
+    turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0))
+    return types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](x, y, 0.0), turn)
+
+
+def _twist(types: Any, point: Mapping[str, Any], header: Any) -> Any:
+    """Return a velocity of the base in its own frame."""
+    (vx, vy, turning), yaw, vector = (
+        point["velocities"],
+        point["positions"][2],
+        types["geometry_msgs/msg/Vector3"],
+    )
+    ahead, aside = math.cos(yaw) * vx + math.sin(yaw) * vy, math.cos(yaw) * vy - math.sin(yaw) * vx
+    twist = types["geometry_msgs/msg/Twist"](vector(ahead, aside, 0.0), vector(0.0, 0.0, turning))
+    return types["geometry_msgs/msg/TwistStamped"](header, twist)
+
+
+def _time(types: Any, nanoseconds: int) -> Any:
+    return types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, _NANO))
+
+
+def _nanoseconds(when: Mapping[str, int]) -> int:
+    return when["sec"] * _NANO + when["nanosec"]

@@ -1,0 +1,347 @@
+"""Represents motions of robot and objects by waypoints, phases and an optional smooth curve."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import finite, instance, items, known, mapping, number, text, whole
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.trajectory.curve import Curve, sample_evenly
+from vkc_pin.world.trajectory.formats import ros, rosbag, tables
+from vkc_pin.world.trajectory.phase_span import PhaseSpan, get_required
+
+__all__ = ["Trajectory"]
+
+MOST_SAMPLES = 1_000_000
+"""Largest number of samples of a motion."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Waypoints over time, joined by a smooth curve or by linear interpolation.
+
+    Attributes:
+        names: Names of the n coordinates: base x, y, yaw, arm joints, then
+            `<object>.<joint>`.
+        times: Increasing times of the waypoints, shape (T,) [s].
+        positions: Positions, shape (T, n), [m] and [rad]. Angles are not wrapped.
+        phases: Consecutive phases that cover the whole motion.
+        robot_size: Number of robot coordinates (3 for the base, then the arm).
+        curve: Smooth curve through the waypoints. Default: linear interpolation.
+
+    Raises:
+        InputError: Names are not unique, numbers are not finite, shapes do not match, times do not
+            increase, phases do not cover the motion, or the curve does not lead from the first
+            waypoint through all others to the last.
+    """
+
+    names: tuple[str, ...]
+    times: Floats
+    positions: Floats
+    phases: tuple[PhaseSpan, ...]
+    robot_size: int
+    curve: Curve | None = None
+
+    def __post_init__(self) -> None:
+        listed: tuple[Any, ...] = items(self.names, "Trajectory.names", "a list of names")
+        names = tuple(
+            text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed)
+        )
+        phases = items(self.phases, "Trajectory.phases", "a list of PhaseSpan", PhaseSpan)
+        times, positions = (
+            finite(self.times, "Trajectory.times"),
+            finite(self.positions, "Trajectory.positions"),
+        )
+        counts = Counter(names)
+        if (twice := next((name for name in names if counts[name] > 1), None)) is not None:
+            raise InputError("a name occurs twice", field="Trajectory.names", got=twice)
+        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
+            raise InputError(
+                "times do not increase",
+                field="Trajectory.times",
+                expected="at least 2 increasing numbers",
+            )
+        shape = (len(times), len(names))
+        if positions.shape != shape:
+            raise InputError(
+                "wrong shape", field="Trajectory.positions", expected=shape, got=positions.shape
+            )
+        size = whole(self.robot_size, "Trajectory.robot_size", low=3, high=len(names))
+        edges = [0, *(phase.last for phase in phases)]
+        if edges[-1] != len(times) - 1 or any(
+            phase.first != before or phase.last <= before
+            for phase, before in zip(phases, edges, strict=False)
+        ):
+            problem = "phases do not follow one another from the first waypoint to the last"
+            got = ", ".join(f"{phase.first} to {phase.last}" for phase in phases[:20]) or "none"
+            raise InputError(
+                problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got
+            )
+        if self.curve is not None:
+            instance(self.curve, Curve, "Trajectory.curve").check_through(times, positions)
+        for array in (times, positions):
+            array.setflags(write=False)
+        kept = {
+            "names": names,
+            "times": times,
+            "positions": positions,
+            "phases": phases,
+            "robot_size": size,
+        }
+        for key, value in kept.items():
+            object.__setattr__(self, key, value)
+
+    def at(self, time: ArrayLike) -> Floats:
+        """Return positions, shape (..., n), at `time` [s], shape (...,), clamped to the motion.
+
+        Raises:
+            InputError: `time` is not finite.
+        """
+        time = finite(time, "time")
+        if self.curve is not None:
+            return self.curve.at(time)
+        columns = [np.interp(time, self.times, column) for column in self.positions.T]
+        return np.stack(columns, axis=-1)
+
+    def __call__(self, time: ArrayLike) -> Floats:
+        """Return the positions at `time`; see `at`."""
+        return self.at(time)
+
+    def velocity(self, time: ArrayLike) -> Floats:
+        """Return velocities, shape (..., n) [m/s], [rad/s], at `time` [s], shape (...,).
+
+        Velocities are 0 outside the motion. Without a curve they jump at waypoints, where the next
+        segment counts. Raises `InputError` if `time` is not finite.
+        """
+        time = finite(time, "time")
+        if self.curve is not None:
+            return self.curve.velocity(time)
+        inside = ((time >= self.times[0]) & (time <= self.times[-1]))[..., None]
+        segment = np.clip(
+            np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2
+        )
+        return np.asarray(np.where(inside, self.velocities()[segment], 0.0))
+
+    def acceleration(self, time: ArrayLike) -> Floats:
+        """Return accelerations, shape (..., n) [m/s²], [rad/s²], at `time` [s], shape (...,).
+
+        They jump at the curve's knots. Without a curve they are 0, and velocities jump. Raises
+        `InputError` if `time` is not finite.
+        """
+        time = finite(time, "time")
+        if self.curve is not None:
+            return self.curve.acceleration(time)
+        return np.zeros((*time.shape, len(self.names)))
+
+    def sample(self, rate: float) -> tuple[Floats, Floats]:
+        """Sample the motion at `rate` [Hz] and at its end.
+
+        Returns:
+            Times, shape (K,) [s], and positions, shape (K, n).
+
+        Raises:
+            InputError: `rate` is not positive, or gives too many samples.
+        """
+        rate = number(rate, "rate", "samples a second, more than 0", low=0.0, above=True)
+        duration = float(self.times[-1] - self.times[0])
+        if duration * rate > MOST_SAMPLES:
+            raise InputError(
+                "too many samples",
+                field="rate",
+                expected=f"at most {MOST_SAMPLES / duration:.4g}",
+                got=rate,
+            )
+        times = sample_evenly(self.times, rate)
+        return times, self.at(times)
+
+    def column(self, name: str) -> Floats:
+        """Return a coordinate at all waypoints, shape (T,).
+
+        Raises:
+            UnknownNameError: There is no such coordinate.
+        """
+        return np.array(self.positions[:, self.names.index(known(name, self.names, "coordinate"))])
+
+    def ranges(self) -> tuple[Floats, Floats]:
+        """Return the smallest and largest positions of every segment, shape (T − 1, n) each."""
+        if self.curve is None:
+            return np.minimum(self.positions[:-1], self.positions[1:]), np.maximum(
+                self.positions[:-1], self.positions[1:]
+            )
+        begins = np.searchsorted(self.curve.times, self.times[:-1])
+        low, high = self.curve.compute_extrema()
+        return np.asarray(np.minimum.reduceat(low, begins)), np.asarray(
+            np.maximum.reduceat(high, begins)
+        )
+
+    def velocities(self) -> Floats:
+        """Return the mean velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
+        return np.asarray(np.diff(self.positions, axis=0) / np.diff(self.times)[:, None])
+
+    def accelerations(self) -> Floats:
+        """Return the accelerations at waypoints as in eq. 5, shape (T, n), [m/s²] and [rad/s²].
+
+        They are differences of mean velocities over the shorter of both segments' durations. The
+        motion starts and ends at rest. For accelerations of the curve see `acceleration`.
+        """
+        durations = np.diff(self.times)
+        velocity = np.vstack(
+            [np.zeros(len(self.names)), self.velocities(), np.zeros(len(self.names))]
+        )
+        spans = np.concatenate(
+            [durations[:1], np.minimum(durations[1:], durations[:-1]), durations[-1:]]
+        )
+        return np.asarray(np.diff(velocity, axis=0) / spans[:, None])
+
+    def base_effort(self) -> float:
+        """Return the path length of the base, Σ √(δx² + δy²) [m]."""
+        return float(np.linalg.norm(np.diff(self._path[:, :2], axis=0), axis=1).sum())
+
+    def base_effort_l1(self) -> float:
+        """Return Σ |δx| + |δy| [m], the metric of the method's authors."""
+        return float(np.abs(np.diff(self._path[:, :2], axis=0)).sum())
+
+    def arm_effort(self) -> float:
+        """Return the sum of the arm joints' absolute displacements, Σ |δq_arm| [rad]."""
+        return float(np.abs(np.diff(self._path[:, 3 : self.robot_size], axis=0)).sum())
+
+    @property
+    def _path(self) -> Floats:
+        """Positions at waypoints or knots, dense enough to measure path lengths, shape (K, n)."""
+        return self.positions if self.curve is None else self.curve.positions
+
+    def parts(self) -> list[Trajectory]:
+        """Return the motion of each phase, with its original times."""
+        spans = [slice(phase.first, phase.last + 1) for phase in self.phases]
+        alone = [replace(phase, first=0, last=phase.last - phase.first) for phase in self.phases]
+        return [
+            replace(
+                self,
+                times=self.times[span],
+                positions=self.positions[span],
+                phases=(phase,),
+                curve=None
+                if self.curve is None
+                else self.curve.part(self.times[span.start], self.times[span.stop - 1]),
+            )
+            for span, phase in zip(spans, alone, strict=True)
+        ]
+
+    def metrics(self) -> dict[str, float]:
+        """Return duration [s], base_effort and base_effort_l1 [m], and arm_effort [rad]."""
+        return {
+            "duration": float(self.times[-1] - self.times[0]),
+            "base_effort": self.base_effort(),
+            "base_effort_l1": self.base_effort_l1(),
+            "arm_effort": self.arm_effort(),
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the trajectory as plain data, e.g. for JSON."""
+        data = {
+            "names": list(self.names),
+            "times": self.times.tolist(),
+            "positions": self.positions.tolist(),
+            "robot_size": self.robot_size,
+            "phases": [phase.to_dict() for phase in self.phases],
+        }
+        return data if self.curve is None else {**data, "curve": self.curve.to_dict()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
+        """Return the trajectory described by data from `to_dict`.
+
+        Raises:
+            InputError: A field is missing or invalid.
+        """
+        if not isinstance(data, Mapping):
+            raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
+        listed: tuple[Any, ...] = items(get_required(data, "phases"), "phases", "a list of phases")
+        phases = [PhaseSpan.from_dict(item, f"phases[{k}]") for k, item in enumerate(listed)]
+        names, times, positions, size = (
+            get_required(data, key) for key in ("names", "times", "positions", "robot_size")
+        )
+        curve = data.get("curve")
+        if curve is not None:
+            curve = Curve(
+                *(
+                    get_required(mapping(curve, "curve"), key)
+                    for key in ("times", "positions", "rates")
+                )
+            )
+        return cls(names, times, positions, tuple(phases), size, curve)
+
+    def to_csv(self, path: str | Path, **options: Any) -> Path:
+        """Write a CSV table of times [s], positions [m], [rad] and phases; see `tables.write_csv`."""
+        return tables.write_csv(self.to_dict(), path, **options)
+
+    def to_json(self, path: str | Path) -> Path:
+        """Write `to_dict` atomically as JSON; return the path."""
+        return tables.write_json(self.to_dict(), path)
+
+    def to_ros(self, **options: Any) -> dict[str, Any]:
+        """Convert to plain data with the fields of ROS' `JointTrajectory`; see `ros.to_ros`."""
+        return ros.to_ros(self.to_dict(), **options)
+
+    def to_rosbag(self, path: str | Path, **options: Any) -> Path:
+        """Write a ROS 2 bag into a new folder; see `rosbag.write_rosbag`. Needs the extra `ros`."""
+        return rosbag.write_rosbag(self.to_dict(), path, **options)
+
+    @classmethod
+    def from_csv(cls, path: str | Path, **options: Any) -> Trajectory:
+        """Read a trajectory from a table written by `to_csv`; see `tables.read_csv`.
+
+        Raises:
+            InputError: The file is missing, or something in it does not fit; the error names line
+                and column.
+        """
+        return cls._read(tables.read_csv(path, **options), path)
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> Trajectory:
+        """Read a trajectory from a file written by `to_json`, `Plan.to_json` or `plan --json`.
+
+        Raises:
+            InputError: The file is missing, is no JSON, or something in it does not fit; the error
+                names line or field.
+        """
+        data = tables.read_json(path)
+        if isinstance(data, dict) and "trajectory" in data:
+            return cls._read(data["trajectory"], path, "trajectory")
+        return cls._read(data, path)
+
+    @classmethod
+    def from_ros(
+        cls,
+        message: Mapping[str, Any] | str | Path,
+        *,
+        like: Trajectory | None = None,
+        robot_size: int | None = None,
+    ) -> Trajectory:
+        """Convert data from `to_ros`, or a JSON file with them, to a trajectory; see `ros.from_ros`.
+
+        Raises:
+            InputError: A field is missing or invalid; the error names it.
+        """
+        motion = None if like is None else instance(like, Trajectory, "like").to_dict()
+        data = ros.from_ros(message, like=motion, robot_size=robot_size)
+        return cls._read(data, None if isinstance(message, Mapping) else message)
+
+    @classmethod
+    def _read(cls, data: Any, file: str | Path | None, inside: str = "") -> Trajectory:
+        """Parse the content of a file's field `inside`; errors name the file."""
+        try:
+            return cls.from_dict(data)
+        except InputError as error:
+            field = ".".join(part for part in (inside, error.field) if part) or None
+            raise InputError(
+                error.problem, file=file, field=field, expected=error.expected, got=error.got
+            ) from error

@@ -27,7 +27,7 @@ SEEING = {**SMALL, "simulate": True, "cameras": EYES, "rate": 5}
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     try:
-        with snapshots.drawing_context((8, 8)):
+        with snapshots.open_gl_context((8, 8)):
             pass
     except vkc.VkcError as error:  # no OpenGL on this machine
         pytest.skip(str(error))
@@ -96,7 +96,7 @@ def test_the_digest_knows_of_cameras_and_is_as_it_was_without() -> None:
     ("cameras", "said"),
     [
         ([{**EYES[0], "fov": 180.0}], "fov"),
-        ([{**EYES[0], "target": EYES[0]["position"]}], "no direction"),
+        ([{**EYES[0], "target": EYES[0]["position"]}], "is undefined"),
         ([EYES[0], EYES[0]], "two cameras of one name"),
         ([{**EYES[0], "wdth": 64}], "did you mean 'width'"),
     ],
@@ -117,7 +117,7 @@ def test_cameras_need_physics_frames_and_opengl(
         generate(SEEING, 1, tmp_path / "out")
     monkeypatch.undo()
     try:
-        with snapshots.drawing_context((8, 8)):
+        with snapshots.open_gl_context((8, 8)):
             pass
     except vkc.VkcError as error:
         pytest.skip(str(error))

@@ -17,7 +17,7 @@ from vkc_pin.validation.rolling import (
 )
 from vkc_pin.world.trajectory.curve import Curve
 
-WHEELS = SimpleNamespace(rim=2.0, track=0.5)
+WHEELS = SimpleNamespace(rim_speed=2.0, track=0.5)
 TIMES = np.array([0.0, 1.0, 3.0, 4.0])
 
 
@@ -159,7 +159,7 @@ def test_along_a_curve_a_turn_takes_a_speed_and_wheels_have_a_most() -> None:
     told = {one.constraint: one for one in found(rows, base="ackermann", radius=2.0, rates=rates)}
     assert (told["turning"].waypoint, told["turning"].time, told["turning"].unit) == (1, 1.0, "m/s")
     assert told["turning"].amount == pytest.approx(0.6)
-    slow = SimpleNamespace(rim=1.1, track=0.5)
+    slow = SimpleNamespace(rim_speed=1.1, track=0.5)
     told = {one.constraint: one for one in found(rows, wheels=slow, rates=rates)}
     assert (told["wheels"].waypoint, told["wheels"].time, told["wheels"].unit) == (1, 1.0, "m/s")
     assert told["wheels"].amount == pytest.approx(0.1)

@@ -69,10 +69,10 @@ class Replay(World):
             )
             self._rows[:, self.get_placement_columns(name)][:, 3:] *= signs[:, None]
 
-    def positions(
+    def compute_positions(
         self, trajectory: Trajectory, times: Any = None, free: FreeObjects | None = None
     ) -> Floats:
-        """Return the world coordinates at times [s], shape (K,); see `World.positions`."""
+        """Return the world coordinates at times [s], shape (K,); see `World.compute_positions`."""
         moments = trajectory.times if times is None else np.asarray(times, float)
         return np.column_stack([np.interp(moments, self._times, column) for column in self._rows.T])
 

@@ -152,7 +152,7 @@ def test_flat_shapes_are_part_of_the_floor() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_no_shape_is_lost_for_any_tree(data: st.DataObject) -> None:
+def test_no_shape_is_lost_whatever_the_tree(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 12))
     links = [_box("link_0", z=data.draw(st.sampled_from([0.5, -0.1])))]
     joints = []

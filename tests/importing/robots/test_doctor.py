@@ -33,7 +33,7 @@ def test_home_in_collision_and_below_the_floor(tmp_path: Path) -> None:
     found = vkc.doctor(tmp_path / "robot", samples=20)
     assert not found.healthy
     assert "below the floor" in " ".join(find_texts(found, "fault", "home"))
-    assert "links that overlap at home are not kept apart" in " ".join(
+    assert "links that overlap at home are not checked" in " ".join(
         find_texts(found, "warning", "loading")
     )
     assert str(found).startswith("robot: ")

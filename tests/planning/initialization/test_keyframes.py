@@ -112,7 +112,7 @@ def test_cached_results_are_not_computed_again(
     first = one.sample(start, grasp, "scatter")
     depths = one.compute_shortfall(first[0], grasp)
     monkeypatch.setattr(KeyframeSampler, "_perturb_arms", None)
-    monkeypatch.setattr("vkc_pin.planning.initialization.keyframes.depth", None)
+    monkeypatch.setattr("vkc_pin.planning.initialization.keyframes.compute_shortfall", None)
     for values, same in zip(first, other.sample(start, grasp, "scatter"), strict=True):
         np.testing.assert_array_equal(values, same)
     assert one.rng.bit_generator.state == other.rng.bit_generator.state

@@ -43,7 +43,7 @@ def test_an_installed_package_has_them_inside(
     (inside / "scenes").mkdir(parents=True)
     (inside / "scenes" / "own.yaml").write_text("")
     monkeypatch.setattr(
-        "vkc_pin.world.files.resources.__file__", str(inside / "files" / "resources.py")
+        "vkc_pin.world.files.resources.__file__", str(inside / "world" / "files" / "resources.py")
     )
     assert folder("scenes") == inside / "scenes"
     assert list(available("scenes", "*.yaml")) == ["own"]

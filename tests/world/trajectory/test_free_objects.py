@@ -350,5 +350,5 @@ def test_objects_that_hold_each_other() -> None:
     _, script = fetched()
     data = script.motion().to_dict()
     data["phases"][2]["by"]["stick"] = "ball.ball"
-    with pytest.raises(InputError, match="circle"):
+    with pytest.raises(InputError, match="cycle"):
         Trajectory.from_dict(data)

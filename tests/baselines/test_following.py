@@ -236,5 +236,5 @@ def test_what_falls_short_by_rounding_is_no_collision(monkeypatch: pytest.Monkey
     """Refinement ends on the margin, a hair to one side of it or the other."""
     problem = program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
     arm = module._Arm(problem, KeyframeSampler(problem, np.random.default_rng(0)), refine=True)
-    monkeypatch.setattr(arm.knots, "depth", lambda z, waypoint: np.full(len(z), 1e-7))
+    monkeypatch.setattr(arm.knots, "compute_shortfall", lambda z, waypoint: np.full(len(z), 1e-7))
     assert arm._candidate(problem.start, 1)[1] == ""

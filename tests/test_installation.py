@@ -1,4 +1,4 @@
-"""The built wheel, in a new environment with each of its extras alone, does what the extra is for."""
+"""The wheel works in a new environment with each of its extras alone."""
 
 from __future__ import annotations
 
@@ -64,6 +64,7 @@ def test_every_extra_for_users_is_tested() -> None:
     assert sorted(scripts) == sorted(file.stem for file in SCRIPTS.glob("*.py"))
 
 
+# 11 min on two idle cores with pip's cache: 2 min for the wheel, 1 to 1.5 min for each extra.
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("extra", EXTRAS, ids=lambda extra: extra or "plain")

@@ -31,7 +31,8 @@ HOME = """<robot name="home"><link name="world">
 <limit lower="-1.5" upper="0" effort="1" velocity="1"/></joint></robot>"""
 BOX = """<robot name="box"><link name="body">
 <collision><geometry><mesh filename="pole.obj"/></geometry></collision>
-<collision><origin xyz="0 0 0.4"/><geometry><mesh filename="prism.obj"/></geometry></collision></link>
+<collision><origin xyz="0 0 0.4"/>
+<geometry><mesh filename="prism.obj"/></geometry></collision></link>
 <link name="leaf">
 <collision><origin xyz="0 0.3 0"/><geometry><box size="0.02 0.6 0.3"/></geometry></collision>
 <collision name="handle"><origin xyz="-0.08 0.5 0"/>

@@ -10,7 +10,6 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
-from .equivalent import EQUIVALENT
 from .mutations import Mutant, mutants
 from .running import PACKAGE, ROOT, measured, outcome, warm
 
@@ -82,7 +81,7 @@ def _lot(text: str) -> bytes:
 
 
 def main() -> int:
-    """Run faults; return 1 if one survives that is not known to change nothing."""
+    """Run faults; return 1 if one survives."""
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=__doc__)
     parser.add_argument("--sample", type=int, default=200, help="how many faults")
     parser.add_argument("--seed", type=int, default=1)
@@ -125,7 +124,7 @@ def main() -> int:
         for mutant in drawn(given.module or every, given.sample, given.seed):
             row = known.get(mutant.name)
             again = given.again and row is not None and row["outcome"] in ("survived", "uncovered")
-            if row is None or (again and mutant.name not in EQUIVALENT):
+            if row is None or again:
                 row = {
                     "name": mutant.name,
                     "line": mutant.line,
@@ -138,8 +137,6 @@ def main() -> int:
                         f"{row['outcome']}: {mutant.module}:{mutant.line}: {mutant.what}\n    {mutant.at}\n"
                     )
                     sys.stdout.flush()
-            if row["outcome"] in ("survived", "uncovered") and mutant.name in EQUIVALENT:
-                row = {**row, "outcome": "equivalent", "why": EQUIVALENT[mutant.name]}
             rows.append({**row, "module": mutant.module})
     if given.json:
         about = {"sample": given.sample, "seed": given.seed}
@@ -152,12 +149,12 @@ def main() -> int:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return how many faults of each wing came to what, and the share that was noticed of those that change something."""
-    kinds = ("killed", "endless", "survived", "uncovered", "equivalent")
+    """Return how many faults of each wing came to what, and the share that was noticed."""
+    kinds = ("killed", "endless", "survived", "uncovered")
     lines = ["".join(f"{name:>12}" for name in ("", *kinds, "noticed"))]
     for wing in [*sorted({row["module"].partition("/")[0] for row in rows}), ""]:
         own = Counter(row["outcome"] for row in rows if row["module"].startswith(wing))
-        noticed, all_of_them = own["killed"] + own["endless"], own.total() - own["equivalent"]
+        noticed, all_of_them = own["killed"] + own["endless"], own.total()
         cells = [
             f"{wing or 'all':>12}",
             *(f"{own[kind]:12d}" for kind in kinds),

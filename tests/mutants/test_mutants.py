@@ -9,9 +9,8 @@ import pytest
 
 from . import __main__
 from .__main__ import drawn
-from .equivalent import EQUIVALENT
 from .mutations import mutants
-from .running import PACKAGE, Coverage
+from .running import Coverage
 
 SOURCE = '''"""Docstring 3 < 4."""
 __all__ = ["area"]
@@ -85,21 +84,6 @@ def test_who_is_asked_about_a_constant() -> None:
     assert where["constant: 5.0 → 10.0"] == (3, (16,))
     assert where["constant: 2 → 3"] == (7, ())
     assert where["name: min → max"] == (16, (16,))
-
-
-def test_every_equivalent_fault_has_a_reason() -> None:
-    assert all(len(reason) > 20 for reason in EQUIVALENT.values())
-
-
-def test_every_equivalent_fault_is_one_of_a_line_that_is_there() -> None:
-    """What was said of a line says nothing of another that has taken its place."""
-    gone = []
-    for name in EQUIVALENT:
-        module = name.partition(": ")[0]
-        lines = (PACKAGE / module).read_text(encoding="utf-8").splitlines()
-        if not any(name.startswith(f"{module}: {line.strip()} | ") for line in lines):
-            gone.append(name)
-    assert not gone
 
 
 def test_what_is_written_elsewhere_changes_no_other_draw(

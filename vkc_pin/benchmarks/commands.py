@@ -122,7 +122,7 @@ def add_bench(commands: Any) -> None:
         jobs=1,
         what="random starts of each combination",
     )
-    anything.set_defaults(benchmark="anything.run")
+    anything.set_defaults(benchmark="robot_object_matrix.run")
     _add_choice(
         anything,
         "robots",
@@ -138,7 +138,7 @@ def add_bench(commands: Any) -> None:
     robots = _add_experiment(
         benches, "robots", shown, about, "--goals", default=20, jobs=1, what="poses for each robot"
     )
-    robots.set_defaults(benchmark="anything.robots")
+    robots.set_defaults(benchmark="robot_object_matrix.robots")
     choices = "names of example-robot-data, paths of URDF, xacro and MJCF files (default: all arms and mobile manipulators there)"
     _add_choice(robots, "robots", choices)
 

@@ -181,7 +181,7 @@ def test_what_must_be_opened_further_than_the_hand_goes(
 def test_a_robot_without_a_hand_opens_nothing() -> None:
     found = pair(vkc.load_robot("ur5"), "ur5", "drawers_0")
     assert (found.scene, found.step) == (None, None)
-    assert "the hand of 'ur5_robot' is not known" in found.because
+    assert "the hand of 'ur5_robot' is undefined" in found.because
 
 
 def test_what_the_arm_does_not_get_to_is_out_of_reach(husky: vkc.Robot, tmp_path: Path) -> None:
